@@ -1,0 +1,365 @@
+"""What crosses the wall between Blender and the backend. Standard library only: both sides read this file.
+
+A job is a folder: Blender writes `request.json` and starts `python -m torch_backend run-job FOLDER`; the backend
+appends events to `events.jsonl`, rewrites `status.json`, and stops when a file named `cancel` appears.
+Everything here carries a version; a newer version than ours is refused in words, an older one is migrated.
+
+Frames of reference, here as everywhere: camera axes OpenCV (x right, y down, z forward), `viewmat` world-to-camera,
+row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame numbers are those of the clip.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import json
+import math
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+CONTRACT_VERSION = 1
+
+REQUEST_FILE = "request.json"
+STATUS_FILE = "status.json"
+EVENTS_FILE = "events.jsonl"
+LOG_FILE = "log.txt"
+CANCEL_FILE = "cancel"
+
+HEARTBEAT_SECONDS = 2.0
+"""How often a living job rewrites status.json. A reader believes a job dead after ten of these and no process."""
+
+
+class ExitCode(enum.IntEnum):
+    """Exit codes of every command, documented in docs/troubleshooting.md."""
+
+    OK = 0
+    INTERNAL = 1
+    USAGE = 2
+    FOOTAGE = 3
+    SOLVE = 4
+    TRAIN = 5
+    FREEZE = 6
+    BAKE = 7
+    DISK = 8
+    ENVIRONMENT = 9
+    CANCELLED = 130
+
+
+class JobError(Exception):
+    """A failure that an artist reads: what was wrong and where, in one sentence, and what to do about it."""
+
+    def __init__(self, message: str, hint: str = "", exit_code: int = ExitCode.INTERNAL) -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+        self.exit_code = int(exit_code)
+
+
+class Cancelled(Exception):
+    """Raised by `Reporter.check_cancelled` when someone asked the job to stop."""
+
+
+class Reporter(Protocol):
+    """How a station speaks while it works. Implemented by `job.JobReporter` and by the command line."""
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
+        """`done` of `total` units of `stage` are finished."""
+
+    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
+        """Figures of the run, units in the key names."""
+
+    def image(self, label: str, path: str | Path) -> None:
+        """A picture worth showing was written."""
+
+    def warning(self, message: str, hint: str = "") -> None:
+        """Something the artist should know; the job goes on."""
+
+    def check_cancelled(self) -> None:
+        """Raises `Cancelled` if a stop was asked for."""
+
+
+# ------------------------------------------------------------------------------------------------- job requests
+
+
+@dataclass
+class ImportParams:
+    """Footage into a shot folder."""
+
+    source: str = ""
+    """Video file, image of a sequence, folder of images, or a pattern such as shot.####.exr."""
+    first: int | None = None
+    """First frame number of the clip to take; None: the first there is."""
+    last: int | None = None
+    """Last frame number to take, inclusive; None: the last there is."""
+    step: int = 0
+    """Every how many frames are solved and trained on; 0 chooses. All frames are delivered whatever it is."""
+    working_height: int = 0
+    """Height in pixels of the working frames; 0: the source's, at most 720."""
+
+
+@dataclass
+class SolveParams:
+    """Cameras from the working frames."""
+
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP camera model: SIMPLE_RADIAL or OPENCV (strong or tangential distortion)."""
+    overlap: int = 15
+    """Each solved frame is matched with this many following ones (and with quadratically spaced ones beyond)."""
+
+
+@dataclass
+class TrainParams:
+    """One run of the trainer."""
+
+    run: str = "main"
+    """Name of the run's folder in runs/."""
+    preset: str = "preview"
+    """preview, standard or final."""
+    method: str = "auto"
+    """auto (HexPlane field, gate, support), hexplane (field for all, no gate) or static."""
+    supervision: str = "support"
+    """support, paper or none: which anchoring losses hold ill-supervised Gaussians."""
+    iterations: int = 0
+    """Training steps; 0: the preset's."""
+    width: int = 0
+    """Width in pixels of the training images; 0: the preset's."""
+    max_gaussians: int = 0
+    """Budget of Gaussians; 0: the preset's."""
+    holdout: int = -1
+    """Every how many frames one is kept out for testing; 0: none, -1: the preset's choice."""
+    seed: int = 0
+    """Random seed."""
+    device: str = "auto"
+    """auto, cpu or cuda."""
+    resume: bool = True
+    """Go on from the run's checkpoint if there is one."""
+
+
+@dataclass
+class FreezeParams:
+    """Frozen frames from a run."""
+
+    run: str = "main"
+    """Run to freeze."""
+    take: str = "freeze"
+    """Name of the take's folder in takes/."""
+    t_star: int | None = None
+    """Frame number of the clip at which time stands still; None: suggested from support and sharpness."""
+    t_star_per_frame: dict[str, float] = field(default_factory=dict)
+    """Clip frame number -> t* as a frame number, one per output frame: freeze ramps. Overrides `t_star`."""
+    first: int | None = None
+    """First output frame; None: the clip's first."""
+    last: int | None = None
+    """Last output frame, inclusive; None: the clip's last."""
+    camera_path: str = ""
+    """JSON file of a CameraPath, in solve units, to render from; empty: the clip's own poses."""
+    query: str = "nearest"
+    """nearest: each Gaussian is asked at its nearest supported time to t*; plain: at t* itself."""
+    width: int = 0
+    """Width in pixels of the frozen frames; 0: the preset's delivery size."""
+    only_missing: bool = False
+    """Keep frames of the take that are already rendered from the same run, t* and camera."""
+
+
+PARAMS: dict[str, type] = {
+    "import": ImportParams,
+    "solve": SolveParams,
+    "train": TrainParams,
+    "freeze": FreezeParams,
+}
+"""Kind of job -> the dataclass of its parameters."""
+
+
+@dataclass
+class JobRequest:
+    """What Blender asks for: one station, on one shot."""
+
+    kind: str
+    """import, solve, train or freeze."""
+    shot: str
+    """Absolute path of the shot folder."""
+    params: dict[str, Any] = field(default_factory=dict)
+    """Fields of the kind's dataclass in `PARAMS`."""
+    version: int = CONTRACT_VERSION
+    """Version of this contract."""
+
+    def typed_params(self) -> Any:
+        """The parameters as their dataclass. ValueError names an unknown kind, field or a value of the wrong type."""
+        if self.kind not in PARAMS:
+            raise ValueError(f"unknown job kind {self.kind!r}: expected one of {', '.join(PARAMS)}")
+        return from_dict(PARAMS[self.kind], self.params)
+
+
+@dataclass
+class Event:
+    """One line of events.jsonl. `done` is always the last."""
+
+    type: str
+    """progress, metric, image, warning, error or done."""
+    seq: int
+    """Counts from 0 within the job."""
+    time: float
+    """Seconds since the epoch."""
+    data: dict[str, Any]
+    """progress: stage, done, total, message, eta_seconds. metric: stage, values. image: label, path.
+    warning: message, hint. error: message, hint, exit_code. done: state, result."""
+    version: int = CONTRACT_VERSION
+    """Version of this contract."""
+
+
+@dataclass
+class Status:
+    """status.json: where a job stands. Rewritten whole, at least every `HEARTBEAT_SECONDS` while it lives."""
+
+    kind: str
+    """Kind of job."""
+    state: str
+    """queued, running, done, failed or cancelled."""
+    pid: int
+    """Process id of the child."""
+    started: float
+    """Start of the job, seconds since the epoch."""
+    process_started: float
+    """Start time of the process as the system gives it, so that a reused pid is not believed; 0 if unknown."""
+    heartbeat: float
+    """Last sign of life, seconds since the epoch."""
+    stage: str = ""
+    """Stage at work."""
+    fraction: float = 0.0
+    """Share of that stage that is finished, 0 to 1."""
+    message: str = ""
+    """What it is doing, or the error's sentence."""
+    hint: str = ""
+    """What to do about the error."""
+    eta_seconds: float | None = None
+    """Seconds left in this stage, if it can be told."""
+    exit_code: int | None = None
+    """Exit code once it has ended."""
+    version: int = CONTRACT_VERSION
+    """Version of this contract."""
+
+    @property
+    def ended(self) -> bool:
+        """True once the job will write nothing more."""
+        return self.state in ("done", "failed", "cancelled")
+
+
+# ------------------------------------------------------------------------------------------------- camera paths
+
+
+@dataclass
+class CameraFrame:
+    """One pose of a camera path."""
+
+    frame: int
+    """Frame number of the clip (or of the Blender scene, for a path from Blender)."""
+    viewmat: list[float]
+    """16 floats, world-to-camera, row-major, OpenCV axes, solve units."""
+    K: list[float]
+    """fx, fy, cx, cy in pixels of the path's width and height."""
+    source: str = "registered"
+    """registered (by the mapper), localised (against the model), interpolated, or blender."""
+
+    def __post_init__(self) -> None:
+        if len(self.viewmat) != 16 or len(self.K) != 4:
+            raise ValueError(f"camera frame {self.frame}: viewmat needs 16 numbers and K needs 4")
+        if not all(math.isfinite(v) for v in (*self.viewmat, *self.K)):
+            raise ValueError(f"camera frame {self.frame}: viewmat or K is not finite")
+
+
+@dataclass
+class CameraPath:
+    """A pinhole camera over frames: the solve's answer, or a path that Blender sends."""
+
+    width: int
+    """Image width in pixels."""
+    height: int
+    """Image height in pixels."""
+    frames: list[CameraFrame]
+    """Poses by ascending frame number."""
+    version: int = CONTRACT_VERSION
+    """Version of this contract."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain types, for `json.dump`."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_json(data: Mapping[str, Any]) -> CameraPath:
+        """Inverse of `to_json`; ValueError on an unknown version or malformed frames."""
+        check_version(data, "camera path")
+        frames = [from_dict(CameraFrame, f) for f in data["frames"]]
+        return CameraPath(int(data["width"]), int(data["height"]), frames)
+
+    @staticmethod
+    def load(path: str | Path) -> CameraPath:
+        """Reads a path; FileNotFoundError or ValueError names the file."""
+        return CameraPath.from_json(read_json(path))
+
+
+# ------------------------------------------------------------------------------------------------- reading
+
+
+def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VERSION) -> None:
+    """ValueError, in words, if `data` was written by a newer Splannequin."""
+    version = data.get("version", 1)
+    if not isinstance(version, int) or version > newest:
+        raise ValueError(
+            f"{what} has version {version}, this Splannequin reads up to {newest}: update the add-on and its backend"
+        )
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """A JSON object from a file. FileNotFoundError, or ValueError naming the file and what is wrong in it."""
+    text = Path(path).read_text(encoding="utf-8")
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{path} should hold a JSON object, found {type(data).__name__}")
+    return data
+
+
+def from_dict(cls: type, data: Mapping[str, Any]) -> Any:
+    """A dataclass from plain JSON. ValueError names an unknown or missing field, or a value of the wrong type."""
+    hints = typing.get_type_hints(cls)
+    unknown = set(data) - set(hints)
+    if unknown:
+        raise ValueError(f"{cls.__name__} has no field {sorted(unknown)[0]!r}: it has {', '.join(hints)}")
+    values = {name: _checked(cls.__name__, name, hints[name], value) for name, value in data.items()}
+    try:
+        return cls(**values)
+    except TypeError as error:
+        raise ValueError(f"{cls.__name__}: {error}") from error
+
+
+def _checked(owner: str, name: str, hint: Any, value: Any) -> Any:
+    """`value` if it fits the annotation; ints are taken for floats, bools never for numbers."""
+    accepted = typing.get_args(hint) if type(None) in typing.get_args(hint) else (hint,)
+    for option in accepted:
+        base = typing.get_origin(option) or option
+        if base is Any or (base is type(None) and value is None):
+            return value
+        if base is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+            return float(value)
+        if isinstance(base, type) and isinstance(value, base) and not (base is int and isinstance(value, bool)):
+            return value
+    raise ValueError(f"{owner}.{name} cannot be {value!r}")
+
+
+# ------------------------------------------------------------------------------------------------- frozen frames
+
+EXR_LAYERS = ("Combined", "Depth", "Support", "Motion")
+"""Passes of a frozen frame: premultiplied scene-linear RGBA, planar depth in solve units, two mattes in [0, 1]."""
+
+NO_DEPTH = 1e10
+"""Depth of a pixel that nothing covers (what Blender's own Z pass says)."""
+
+
+def frame_file(frame: int, suffix: str) -> str:
+    """File name of a frame: its number in the clip, six digits (a minus sign for negative ones) and a suffix."""
+    return f"{frame:06d}{suffix}"

@@ -1,0 +1,194 @@
+"""The shot folder: the one state that Blender and the backend share, and how files are written into it.
+
+Layout (design: docs/architecture.md): shot.json, frames/, solve/, runs/<name>/, takes/<name>/, jobs/<id>/.
+Every file is written beside its place, fsynced, and renamed over it, so a reader never sees half a file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import hashlib
+import json
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .contract import ExitCode, JobError, check_version, from_dict, read_json
+
+SHOT_VERSION = 1
+SHOT_SUFFIX = ".splannequin"
+_NAME = re.compile(r"^[\w][\w .-]{0,63}$")
+
+
+@dataclass
+class ShotInfo:
+    """shot.json."""
+
+    name: str
+    """What the artist calls the shot."""
+    source: str = ""
+    """Footage it was imported from, as given (absolute)."""
+    first: int = 0
+    """First frame number of the range, 0 before import."""
+    last: int = 0
+    """Last frame number of the range, inclusive."""
+    step: int = 1
+    """Every how many frames are solved and trained on."""
+    fps: float = 0.0
+    """Frames per second of the source."""
+    width: int = 0
+    """Width in pixels of the working frames."""
+    height: int = 0
+    """Height in pixels of the working frames."""
+    colour: str = "srgb"
+    """Encoding of the working frames: always display-referred sRGB; `linear` if the source was scene-linear."""
+    t_star: int | None = None
+    """Frame number at which time stands still; None until chosen."""
+    created: float = field(default_factory=time.time)
+    """Seconds since the epoch."""
+    version: int = SHOT_VERSION
+    """Version of the shot format."""
+
+
+class Shot:
+    """A shot folder on disk. Holds paths, not state: every read goes to the files."""
+
+    def __init__(self, root: str | Path) -> None:
+        self.root = Path(root).absolute()
+
+    @classmethod
+    def open(cls, root: str | Path) -> Shot:
+        """An existing shot. FileNotFoundError if there is none, ValueError if it is from a newer version."""
+        shot = cls(root)
+        if not shot.info_path.is_file():
+            raise FileNotFoundError(f"{shot.root} is not a shot folder: it has no shot.json")
+        shot.info()
+        return shot
+
+    @classmethod
+    def create(cls, root: str | Path, name: str = "") -> Shot:
+        """Opens the shot at `root`, or makes an empty one there."""
+        shot = cls(root)
+        if shot.info_path.is_file():
+            return cls.open(root)
+        shot.root.mkdir(parents=True, exist_ok=True)
+        shot.save(ShotInfo(name=name or shot.root.name.removesuffix(SHOT_SUFFIX)))
+        return shot
+
+    @property
+    def info_path(self) -> Path:
+        return self.root / "shot.json"
+
+    @property
+    def frames(self) -> Path:
+        return self.root / "frames"
+
+    @property
+    def solve(self) -> Path:
+        return self.root / "solve"
+
+    @property
+    def jobs(self) -> Path:
+        return self.root / "jobs"
+
+    def run(self, name: str) -> Path:
+        """Folder of a run; ValueError if the name could leave it."""
+        return self.root / "runs" / checked_name(name, "run")
+
+    def take(self, name: str) -> Path:
+        """Folder of a take; ValueError if the name could leave it."""
+        return self.root / "takes" / checked_name(name, "take")
+
+    def info(self) -> ShotInfo:
+        """shot.json as it is now."""
+        data = read_json(self.info_path)
+        check_version(data, str(self.info_path), SHOT_VERSION)
+        return from_dict(ShotInfo, data)
+
+    def save(self, info: ShotInfo) -> None:
+        """Rewrites shot.json."""
+        write_json(self.info_path, dataclasses.asdict(info))
+
+    def update(self, **changes: Any) -> ShotInfo:
+        """Rewrites shot.json with some fields changed, and returns it."""
+        info = dataclasses.replace(self.info(), **changes)
+        self.save(info)
+        return info
+
+
+def checked_name(name: str, what: str) -> str:
+    """`name` if it is safe as a folder name; ValueError otherwise."""
+    if not _NAME.match(name) or name.endswith((".", " ")):
+        raise ValueError(f"{what} name {name!r} should be 1 to 64 letters, digits, spaces, '.', '_' or '-'")
+    return name
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A path beside `path`, with the same suffix, to write to; fsynced and renamed over `path` if all went well."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield beside
+        with open(beside, "rb+") as handle:
+            os.fsync(handle.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+
+
+def write_atomic(path: str | Path, data: bytes) -> None:
+    """Writes a whole file, or leaves what was there."""
+    with atomic_path(path) as beside:
+        beside.write_bytes(data)
+
+
+def write_json(path: str | Path, data: Mapping[str, Any]) -> None:
+    """Writes a JSON object. ValueError on NaN or infinity: other programs read these files."""
+    write_atomic(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"))
+
+
+def content_key(*parts: Any) -> str:
+    """Short hash of JSON-able values and of files (given as Path: size and modification time), for "already done?"."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            stat = part.stat()
+            part = [part.name, stat.st_size, stat.st_mtime_ns]
+        elif dataclasses.is_dataclass(part) and not isinstance(part, type):
+            part = dataclasses.asdict(part)
+        digest.update(json.dumps(part, sort_keys=True, default=str).encode("utf-8"))
+    return digest.hexdigest()[:16]
+
+
+def need_disk(folder: str | Path, byte_count: float, what: str) -> None:
+    """JobError if the disk of `folder` has no room for `byte_count` bytes more."""
+    there = Path(folder).absolute()
+    while not there.exists():
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if free < byte_count:
+        raise disk_error(folder, f"{what} needs about {byte_count / 1e6:.0f} MB, {free / 1e6:.0f} MB are free")
+
+
+def disk_error(folder: str | Path, detail: str = "the disk is full") -> JobError:
+    """The one sentence for a full disk."""
+    return JobError(
+        f"No space left in {folder}: {detail}.",
+        "Free some space or choose another output folder, then start again: finished work is kept.",
+        ExitCode.DISK,
+    )
+
+
+def is_disk_full(error: OSError) -> bool:
+    """True if the system refused to write for want of space or quota."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
