@@ -1,0 +1,322 @@
+"""The command line of the backend: `python -m torch_backend COMMAND`, installed as `splannequin`.
+
+Every station is run as a job in the shot's folder, by the same code that serves Blender, with the console listening.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+from . import contract
+from .contract import Event, ExitCode
+from .shot import SHOT_SUFFIX, Shot, disk_error, is_disk_full, write_json
+
+
+class Console:
+    """Listener that prints a job's events: one line per stage on a terminal, a line every few seconds elsewhere."""
+
+    def __init__(self, stream: TextIO | None = None, as_json: bool = False) -> None:
+        self.stream = stream or sys.stdout
+        self.as_json = as_json
+        self._tty = self.stream.isatty()
+        self._last = ("", 0.0)
+        self._open_line = False
+        self.error: dict[str, Any] | None = None
+
+    def __call__(self, event: Event) -> None:
+        if event.type == "error":
+            self.error = event.data
+        if self.as_json:
+            print(json.dumps(dataclasses.asdict(event)), file=self.stream, flush=True)
+        elif event.type == "progress":
+            self._progress(event)
+        elif event.type == "warning":
+            self._line(f"  note: {event.data['message']} {event.data['hint']}".rstrip())
+        elif event.type == "error":
+            self._line(f"Error: {event.data['message']} {event.data['hint']}".rstrip())
+        elif event.type == "done" and event.data["state"] == "cancelled":
+            self._line("Cancelled. Start the same command again to go on: finished work is kept.")
+
+    def _progress(self, event: Event) -> None:
+        data = event.data
+        share = data["done"] / data["total"] if data["total"] else 0.0
+        stage, since = self._last
+        finished = share >= 1.0
+        if data["stage"] == stage and not finished and event.time - since < (0.2 if self._tty else 10.0):
+            return
+        self._last = (data["stage"], event.time)
+        eta = f", {data['eta_seconds']:.0f} s left" if data.get("eta_seconds") and not finished else ""
+        text = f"  {data['stage']:<22} {100 * share:3.0f}%  {data['message']}{eta}"
+        if self._tty:
+            self.stream.write("\r" + text[:118].ljust(118) + ("\n" if finished else ""))
+            self.stream.flush()
+            self._open_line = not finished
+        else:
+            self._line(text.rstrip())
+
+    def _line(self, text: str) -> None:
+        if self._open_line:
+            self.stream.write("\n")
+            self._open_line = False
+        print(text, file=self.stream, flush=True)
+
+
+def run_station(shot: Shot, kind: str, params: Any, console: Console) -> Any:
+    """Runs one station as a job of `shot`; returns its result. SystemExit with the job's code if it did not finish."""
+    from .job import new_job, run_job
+
+    try:
+        folder = new_job(shot, kind, params)
+    except OSError as error:
+        _give_up(error, shot.root)
+    code, result = run_job(folder, console)
+    if code != ExitCode.OK:
+        raise SystemExit(code)
+    return result
+
+
+def freeze_clip(args: argparse.Namespace, console: Console) -> int:
+    """`freeze CLIP`: import, solve, train, freeze; leaves OUTPUT/summary.json."""
+    output = Path(args.output).absolute()
+    started = time.perf_counter()
+    try:
+        shot = Shot.create(output / (args.shot_name + SHOT_SUFFIX), args.shot_name)
+    except OSError as error:
+        _give_up(error, output)
+    stages: dict[str, float] = {}
+    results: dict[str, Any] = {}
+    requests = {
+        "import": contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height),
+        "solve": contract.SolveParams(camera_model=args.camera_model),
+        "train": _train_params(args),
+        "freeze": _freeze_params(args),
+    }
+    for kind, params in requests.items():
+        since = time.perf_counter()
+        results[kind] = run_station(shot, kind, params, console)
+        stages[kind] = round(time.perf_counter() - since, 2)
+    summary = summarise(shot, results, stages, time.perf_counter() - started)
+    write_json(output / "summary.json", summary)
+    print_summary(summary, console)
+    return ExitCode.OK
+
+
+def summarise(shot: Shot, results: dict[str, Any], stages: dict[str, float], wall: float) -> dict[str, Any]:
+    """The figures of a whole run as summary.json holds them; units in the key names."""
+    train, freeze, solve = results["train"], results["freeze"], results["solve"]
+    return {
+        "version": 1,
+        "shot": str(shot.root),
+        "source": shot.info().source,
+        **{k: solve[k] for k in ("frames", "solved_frames", "registered", "reprojection_error_px")},
+        **{k: train[k] for k in ("gaussians", "moving_share", "train_seconds", "iterations", "heldout_psnr_db")},
+        "train_width_px": train["width_px"],
+        "t_star_frame": freeze["t_star_frame"],
+        "exr_dir": freeze["exr_dir"],
+        "contact_sheet": freeze["contact_sheet"],
+        "video": freeze["video"],
+        "ply": freeze["ply"],
+        "take": freeze["take"],
+        "run": train["run"],
+        "wall_seconds_by_stage": stages,
+        "wall_seconds": round(wall, 2),
+    }
+
+
+def print_summary(summary: dict[str, Any], console: Console) -> None:
+    """The closing lines: what came out, how good, how long, where to look."""
+    if console.as_json:
+        return
+    psnr = summary["heldout_psnr_db"]
+    quality = f"{psnr:.2f} dB on held-out frames" if psnr is not None else "no frames held out"
+    print(
+        f"\nFrozen at frame {summary['t_star_frame']}: {summary['frames']} frames, "
+        f"{summary['registered']} of {summary['solved_frames']} solved frames registered.\n"
+        f"{quality}, {summary['gaussians']} Gaussians, {100 * summary['moving_share']:.1f} % of them move, "
+        f"trained in {summary['train_seconds']:.0f} s.\n"
+        f"EXR frames:    {summary['exr_dir']}\nContact sheet: {summary['contact_sheet']}\nVideo:         {summary['video']}",
+        file=console.stream,
+        flush=True,
+    )
+
+
+def doctor(args: argparse.Namespace, console: Console) -> int:
+    """`doctor`: what the backend's environment can do, as JSON on the standard output."""
+    import importlib.metadata
+
+    facts: dict[str, Any] = {"python": sys.version.split()[0], "packages": {}}
+    for name in ("torch", "warp-lang", "pycolmap", "OpenImageIO", "av", "fileseq", "safetensors", "numpy", "scipy"):
+        try:
+            facts["packages"][name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            facts["packages"][name] = None
+    import av
+    import torch
+
+    facts["torch_device"] = "cuda" if torch.cuda.is_available() else "cpu"
+    facts["cuda_device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    facts["cores"] = os.cpu_count()
+    facts["h264"] = "libx264" in av.codecs_available
+    print(json.dumps(facts, indent=1), file=console.stream)
+    return ExitCode.OK
+
+
+def status(args: argparse.Namespace, console: Console) -> int:
+    """`status SHOT`: its jobs, newest last, one line each."""
+    shot = Shot.open(args.shot)
+    for path in sorted(shot.jobs.glob(f"*/{contract.STATUS_FILE}")):
+        job = contract.from_dict(contract.Status, contract.read_json(path))
+        print(f"{path.parent.name}  {job.state:<9} {job.stage} {100 * job.fraction:.0f}%  {job.message}".rstrip())
+    return ExitCode.OK
+
+
+def _train_params(args: argparse.Namespace) -> contract.TrainParams:
+    return contract.TrainParams(
+        run=args.run,
+        preset=args.preset,
+        method=args.method,
+        supervision=args.supervision,
+        iterations=args.iterations,
+        width=args.width,
+        max_gaussians=args.max_gaussians,
+        holdout=args.holdout,
+        seed=args.seed,
+        device=args.device,
+        resume=not args.restart,
+    )
+
+
+def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
+    return contract.FreezeParams(
+        run=args.run,
+        take=args.take,
+        t_star=args.t_star,
+        camera_path=args.camera_path,
+        query=args.freeze_query,
+        width=args.freeze_width,
+    )
+
+
+def _source(clip: str) -> str:
+    return clip if not clip or "://" in clip else str(Path(clip).absolute())
+
+
+def _give_up(error: OSError, where: Path) -> Any:
+    """Ends the command on an output folder that cannot be written, in one sentence."""
+    full = is_disk_full(error)
+    message = disk_error(where) if full else f"Cannot write to {where}: {error.strerror or error}."
+    print(f"Error: {getattr(message, 'message', message)} Choose another --output folder.", file=sys.stderr)
+    raise SystemExit(ExitCode.DISK if full else ExitCode.USAGE)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line's grammar."""
+    top = argparse.ArgumentParser(prog="splannequin", description="Freeze time in a handheld clip of people holding still.")
+    top.add_argument("--json", action="store_true", help="print events as JSON lines instead of text")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    job = commands.add_parser("run-job", help="run the job in a folder (what Blender starts)")
+    job.add_argument("folder")
+
+    whole = commands.add_parser("freeze", help="clip to frozen frames: import, solve, train, freeze")
+    whole.add_argument("clip", help="video file, image sequence or pattern (shot.####.exr)")
+    whole.add_argument("--output", default="output", metavar="DIR", help="folder for the shot and summary.json")
+    whole.add_argument("--shot-name", default="shot", help="name of the shot folder inside it")
+    _add_import_flags(whole)
+    _add_train_flags(whole)
+    _add_freeze_flags(whole)
+
+    for name, text in (("import", "footage into a shot"), ("solve", "cameras"), ("train", "train a run"), ("take", "freeze a run")):
+        one = commands.add_parser(name, help=f"one step on a shot folder: {text}")
+        one.add_argument("shot", help="shot folder")
+        if name == "import":
+            one.add_argument("clip")
+            _add_import_flags(one)
+        elif name == "solve":
+            one.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
+        elif name == "train":
+            _add_train_flags(one)
+        else:
+            _add_freeze_flags(one)
+            one.add_argument("--run", default="main", help="run to freeze")
+    state = commands.add_parser("status", help="jobs of a shot")
+    state.add_argument("shot")
+    commands.add_parser("doctor", help="what this environment can do, as JSON")
+    return top
+
+
+def _add_import_flags(to: argparse.ArgumentParser) -> None:
+    to.add_argument("--first", type=int, help="first frame number")
+    to.add_argument("--last", type=int, help="last frame number, inclusive")
+    to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
+    to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
+    if not any(a.dest == "camera_model" for a in to._actions):
+        to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
+
+
+def _add_train_flags(to: argparse.ArgumentParser) -> None:
+    to.add_argument("--run", default="main", help="name of the run")
+    to.add_argument("--preset", default="preview", choices=("preview", "standard", "final"))
+    to.add_argument("--method", default="auto", choices=("auto", "hexplane", "static"))
+    to.add_argument("--supervision", default="support", choices=("support", "paper", "none"))
+    to.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
+    to.add_argument("--width", type=int, default=0, help="width of the training images in pixels (0: the preset's)")
+    to.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
+    to.add_argument("--holdout", type=int, default=-1, help="keep every n-th frame out for testing (0: none)")
+    to.add_argument("--seed", type=int, default=0)
+    to.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
+    to.add_argument("--restart", action="store_true", help="do not go on from the run's checkpoint")
+
+
+def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
+    to.add_argument("--take", default="freeze", help="name of the take")
+    to.add_argument("--t-star", type=int, help="frame number at which time stands still (default: suggested)")
+    to.add_argument("--camera-path", default="", help="JSON camera path to render from (default: the clip's poses)")
+    to.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"))
+    to.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns an `ExitCode`."""
+    # Spinning OpenMP threads made a frame four times slower when a core was busy; must be set before torch loads.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    args = parser().parse_args(argv)
+    console = Console(as_json=args.json)
+    try:
+        return int(_dispatch(args, console))
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except KeyboardInterrupt:
+        return ExitCode.CANCELLED
+    except (ValueError, FileNotFoundError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return ExitCode.USAGE
+
+
+def _dispatch(args: argparse.Namespace, console: Console) -> int:
+    if args.command == "run-job":
+        from .job import run_job
+
+        return run_job(args.folder)[0]
+    if args.command == "freeze":
+        return freeze_clip(args, console)
+    if args.command == "import":
+        params = contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height)
+        run_station(Shot.create(args.shot), "import", params, console)
+    elif args.command == "solve":
+        run_station(Shot.open(args.shot), "solve", contract.SolveParams(camera_model=args.camera_model), console)
+    elif args.command == "train":
+        run_station(Shot.open(args.shot), "train", _train_params(args), console)
+    elif args.command == "take":
+        run_station(Shot.open(args.shot), "freeze", _freeze_params(args), console)
+    else:
+        return {"status": status, "doctor": doctor}[args.command](args, console)
+    return ExitCode.OK

@@ -1,0 +1,269 @@
+"""Runs one station as a job: typed events out, cancellation in, a status that is true even after a crash.
+
+The same code runs a job for Blender (a child process, `python -m torch_backend run-job DIR`), for the command line
+(in this process, with the console listening) and for tests.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+import traceback
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from . import contract
+from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status
+from .shot import Shot, disk_error, is_disk_full, write_json
+
+_CANCEL_POLL_SECONDS = 0.2
+_PROGRESS_SECONDS = 0.1
+
+Listener = Callable[[Event], None]
+
+
+class JobReporter:
+    """The reporter of a job folder: appends events, keeps status.json fresh, notices the cancel file and Ctrl-C."""
+
+    def __init__(self, folder: Path, kind: str, listener: Listener | None = None) -> None:
+        self.folder = folder
+        self._listener = listener
+        self._lock = threading.RLock()
+        self._seq = 0
+        self._cancelled = False
+        self._last_poll = 0.0
+        self._last_progress = ("", 0.0)
+        self._stage_started = ("", 0.0, 0.0)
+        now = time.time()
+        self.status = Status(kind, "running", os.getpid(), now, process_start(os.getpid()), now)
+        self._events = open(folder / contract.EVENTS_FILE, "a", encoding="utf-8")  # noqa: SIM115 - lives as long as the job
+        self._stop = threading.Event()
+        self._write_status()
+        self._beat = threading.Thread(target=self._heartbeat, name="heartbeat", daemon=True)
+        self._beat.start()
+
+    # -- what stations call
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
+        now = time.time()
+        fraction = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
+        with self._lock:
+            if stage != self._stage_started[0]:
+                self._stage_started = (stage, now, fraction)
+            eta = self._eta(now, fraction)
+            self.status.stage, self.status.fraction = stage, fraction
+            self.status.message, self.status.eta_seconds = message, eta
+            last_stage, last_time = self._last_progress
+            if stage == last_stage and fraction < 1.0 and now - last_time < _PROGRESS_SECONDS:
+                return
+            self._last_progress = (stage, now)
+        self._emit("progress", stage=stage, done=done, total=total, message=message, eta_seconds=eta)
+
+    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
+        self._emit("metric", stage=stage, values=dict(values))
+
+    def image(self, label: str, path: str | Path) -> None:
+        self._emit("image", label=label, path=str(path))
+
+    def warning(self, message: str, hint: str = "") -> None:
+        self._emit("warning", message=message, hint=hint)
+
+    def check_cancelled(self) -> None:
+        now = time.monotonic()
+        if not self._cancelled and now - self._last_poll >= _CANCEL_POLL_SECONDS:
+            self._last_poll = now
+            self._cancelled = (self.folder / contract.CANCEL_FILE).exists()
+        if self._cancelled:
+            raise Cancelled
+
+    # -- the job's own end
+
+    def cancel(self) -> None:
+        """Asks the job to stop at its next `check_cancelled`. Safe in a signal handler."""
+        self._cancelled = True
+
+    def finish(self, state: str, exit_code: int, message: str = "", hint: str = "", result: Any = None) -> None:
+        """Writes the last event and the last status."""
+        self._stop.set()
+        self._beat.join(timeout=5.0)
+        with self._lock:
+            self.status.state, self.status.exit_code = state, exit_code
+            self.status.eta_seconds = None
+            if state == "done":
+                self.status.fraction = 1.0
+            else:
+                self.status.message, self.status.hint = message, hint
+        if state == "failed":
+            self._emit("error", message=message, hint=hint, exit_code=exit_code)
+        self._emit("done", state=state, result=result)
+        self._write_status()
+        self._events.close()
+
+    # -- inside
+
+    def _eta(self, now: float, fraction: float) -> float | None:
+        _, since, at_fraction = self._stage_started
+        gained = fraction - at_fraction
+        if gained <= 0.02 or now - since < 1.0:
+            return None
+        return round((now - since) * (1.0 - fraction) / gained, 1)
+
+    def _emit(self, kind: str, **data: Any) -> None:
+        with self._lock:
+            event = Event(kind, self._seq, time.time(), data)
+            self._seq += 1
+            if not self._events.closed:
+                self._events.write(json.dumps(dataclasses.asdict(event)) + "\n")
+                self._events.flush()
+        if self._listener:
+            self._listener(event)
+
+    def _heartbeat(self) -> None:
+        while not self._stop.wait(contract.HEARTBEAT_SECONDS / 2):
+            self._write_status()
+
+    def _write_status(self) -> None:
+        with self._lock:
+            self.status.heartbeat = time.time()
+            # A full disk or a reader that holds the file open (Windows) must not end the job: the next beat tries again.
+            with contextlib.suppress(OSError):
+                write_json(self.folder / contract.STATUS_FILE, dataclasses.asdict(self.status))
+
+
+def process_start(pid: int) -> float:
+    """Start time of a process in clock ticks since boot, where the system tells (Linux); else 0."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        return float(stat.rpartition(")")[2].split()[19])
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+def new_job(shot: Shot, kind: str, params: Any) -> Path:
+    """Makes a job folder with its request; returns it."""
+    folder = shot.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
+    folder.mkdir(parents=True)
+    values = dataclasses.asdict(params) if dataclasses.is_dataclass(params) and not isinstance(params, type) else params
+    request = JobRequest(kind=kind, shot=str(shot.root), params=values)
+    write_json(folder / contract.REQUEST_FILE, dataclasses.asdict(request))
+    return folder
+
+
+def run_job(folder: str | Path, listener: Listener | None = None) -> tuple[int, Any]:
+    """Runs the request in `folder` to its end. Returns (exit code, result or None); never raises for a failed job."""
+    folder = Path(folder)
+    try:
+        data = contract.read_json(folder / contract.REQUEST_FILE)
+        contract.check_version(data, "job request")
+        request: JobRequest = contract.from_dict(JobRequest, data)
+    except (OSError, ValueError, KeyError) as error:
+        print(f"{folder} holds no job that can be run: {error}", file=sys.stderr)
+        return ExitCode.USAGE, None
+    reporter = JobReporter(folder, request.kind, listener)
+    with _signals_cancel(reporter):
+        return _run(request, reporter)
+
+
+def _run(request: JobRequest, reporter: JobReporter) -> tuple[int, Any]:
+    result: Any = None
+    state, code, message, hint = "done", int(ExitCode.OK), "", ""
+    try:
+        params = request.typed_params()
+        shot = Shot.open(request.shot)
+        reporter.check_cancelled()
+        result = STATIONS[request.kind](shot, params, reporter)
+    except Cancelled:
+        state, code = "cancelled", int(ExitCode.CANCELLED)
+        message, hint = "Cancelled.", "Start it again to go on: finished work is kept."
+    except KeyboardInterrupt:
+        state, code, message = "cancelled", int(ExitCode.CANCELLED), "Cancelled."
+    except JobError as error:
+        state, code, message, hint = "failed", error.exit_code, error.message, error.hint
+    except (ValueError, FileNotFoundError) as error:
+        state, code, message = "failed", int(ExitCode.USAGE), str(error)
+        _log_traceback(reporter.folder)
+    except Exception as error:  # the job's surface: an artist reads a sentence, the log keeps the rest
+        _log_traceback(reporter.folder)
+        full = disk_error(request.shot) if isinstance(error, OSError) and is_disk_full(error) else None
+        state, code = "failed", full.exit_code if full else int(ExitCode.INTERNAL)
+        if isinstance(error, MemoryError) or "out of memory" in str(error).lower():
+            message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."
+        else:
+            message = full.message if full else f"The {request.kind} step broke: {type(error).__name__}: {error}"
+            hint = full.hint if full else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
+    reporter.finish(state, code, message, hint, result)
+    return code, result
+
+
+def _log_traceback(folder: Path) -> None:
+    with contextlib.suppress(OSError), open(folder / contract.LOG_FILE, "a", encoding="utf-8") as log:
+        log.write(traceback.format_exc())
+
+
+@contextlib.contextmanager
+def _signals_cancel(reporter: JobReporter) -> Iterator[None]:
+    """Ctrl-C, SIGTERM and CTRL_BREAK end the job with a checkpoint instead of a traceback."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
+    before = {name: signal.getsignal(getattr(signal, name)) for name in names}
+    for name in names:
+        signal.signal(getattr(signal, name), lambda *_: reporter.cancel())
+    try:
+        yield
+    finally:
+        for name, handler in before.items():
+            signal.signal(getattr(signal, name), handler)
+
+
+# ------------------------------------------------------------------------------------------------- stations
+# Imported inside, so that a job loads only what it needs: torch takes seconds to import, an import job needs none.
+
+
+def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
+    from .footage import FootageConfig, import_footage
+
+    config = FootageConfig(params.first, params.last, params.step, params.working_height)
+    return import_footage(shot, params.source, config, report)
+
+
+def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
+    from .solve import SolveConfig, solve_shot
+
+    return solve_shot(shot, SolveConfig(camera_model=params.camera_model, overlap=params.overlap), report)
+
+
+def _train(shot: Shot, params: contract.TrainParams, report: Reporter) -> Any:
+    from .train import train_shot
+
+    return train_shot(shot, params, report)
+
+
+def _freeze(shot: Shot, params: contract.FreezeParams, report: Reporter) -> Any:
+    from .freeze import freeze_shot
+
+    return freeze_shot(shot, params, report)
+
+
+STATIONS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
+    "import": _import,
+    "solve": _solve,
+    "train": _train,
+    "freeze": _freeze,
+}
+"""Kind of job -> the station that does it: (shot, typed params, reporter) -> JSON-able result."""
+
+
+def free_bytes(folder: Path) -> int:
+    """Free bytes on the disk of `folder`."""
+    return shutil.disk_usage(folder).free
