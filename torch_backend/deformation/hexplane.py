@@ -1,0 +1,155 @@
+"""Host A: a HexPlane field and five heads (4DGaussians; numbers and departures in docs/architecture.md).
+
+Corrected against the published code (design: method-hosts 1.1): time is mapped to the whole plane, the heads' last
+layers start at zero so that the field starts as the identity, learning rates do not follow the scene's extent
+(the scene is normalised), smoothness acts along both axes of a spatial plane, and sampling coordinates are detached:
+the field says how things move, the image says where they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from .protocol import Deltas
+
+_SPATIAL = ((0, 1), (0, 2), (1, 2))
+_WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "sh0": 3}
+
+
+@dataclass
+class HexPlaneConfig:
+    """Sizes, learning rates and regularisers; defaults in brackets are 4DGaussians' (arguments/__init__.py)."""
+
+    features: int = 16
+    """Channels per plane (dynerf: 16)."""
+    resolution: int = 64
+    """Nodes per spatial axis of the coarsest level (64)."""
+    levels: tuple[int, ...] = (1, 2)
+    """Multipliers of the spatial resolution (dynerf: 1, 2)."""
+    time_nodes: int = 37
+    """Nodes on the time axis; about half the trained frames."""
+    width: int = 64
+    """Width of the trunk and the heads (64)."""
+    lr_grid: float = 1e-2
+    """Start learning rate of the planes (1.6e-3 times the scene's extent)."""
+    lr_heads: float = 1e-3
+    """Start learning rate of trunk and heads (1.6e-4 times the scene's extent)."""
+    lr_end: float = 0.1
+    """Learning rates end at this share of their start (0.1)."""
+    smooth_space: float = 2e-4
+    """Weight of the squared second difference along both axes of the spatial planes (2e-4)."""
+    smooth_time: float = 1e-3
+    """Weight of the squared second difference along time on the time planes (1e-3)."""
+    time_l1: float = 1e-4
+    """Weight of mean |1 - plane| on the time planes (1e-4)."""
+
+
+class HexPlane(nn.Module):
+    """The field. `box` [2, 3] is the part of the scene it resolves; outside it the rim's feature holds."""
+
+    def __init__(self, config: HexPlaneConfig, box: Tensor, generator: torch.Generator) -> None:
+        super().__init__()
+        if not bool((box[1] > box[0]).all()):
+            raise ValueError(f"box {box.tolist()} should have its maximum above its minimum on every axis")
+        self.config = config
+        self.box: Tensor
+        self.register_buffer("box", box.float())
+        self.spatial, self.temporal = nn.ParameterList(), nn.ParameterList()
+        for level in config.levels:
+            nodes = config.resolution * level
+            for _ in _SPATIAL:
+                plane = torch.empty(1, config.features, nodes, nodes).uniform_(0.1, 0.5, generator=generator)
+                self.spatial.append(nn.Parameter(plane))
+            for _ in range(3):
+                self.temporal.append(nn.Parameter(torch.ones(1, config.features, config.time_nodes, nodes)))
+        self.trunk = _linear(config.features * len(config.levels), config.width, generator)
+        self.hidden = nn.ModuleDict({name: _linear(config.width, config.width, generator) for name in _WIDTHS})
+        self.out = nn.ModuleDict({name: nn.Linear(config.width, size) for name, size in _WIDTHS.items()})
+        for head in self.out.values():
+            nn.init.zeros_(head.weight)  # type: ignore[arg-type]
+            nn.init.zeros_(head.bias)  # type: ignore[arg-type]
+
+    def features_at(self, means: Tensor, times: Tensor) -> Tensor:
+        """Product of the six planes' samples, levels concatenated: [M, features * levels]."""
+        where = 2.0 * (means.detach() - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
+        when = (2.0 * times - 1.0).expand(len(means))
+        parts = []
+        for level in range(len(self.config.levels)):
+            product: Tensor | None = None
+            for k, (a, b) in enumerate(_SPATIAL):
+                sample = _sample(self.spatial[3 * level + k], where[:, a], where[:, b])
+                product = sample if product is None else product * sample
+            for axis in range(3):
+                product = product * _sample(self.temporal[3 * level + axis], where[:, axis], when)
+            parts.append(product)
+        return torch.cat(parts, dim=1)
+
+    def forward(self, means: Tensor, times: Tensor) -> Deltas:
+        """Deltas of M Gaussians; means [M, 3] scene units (detached here), times [M] or [1] in [0, 1]."""
+        hidden = F.relu(self.trunk(self.features_at(means, times)))
+        out = {name: self.out[name](F.relu(self.hidden[name](hidden))) for name in _WIDTHS}
+        return Deltas(
+            means=out["means"],
+            quats=out["quats"],
+            log_scales=out["log_scales"],
+            opacity_logits=out["opacity_logits"][:, 0],
+            sh0=out["sh0"][:, None, :],
+        )
+
+    def outside(self, means: Tensor) -> int:
+        """How many of means [M, 3] lie outside the box, where the field cannot tell them apart."""
+        return int(((means < self.box[0]) | (means > self.box[1])).any(1).sum())
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Two groups: the planes and the network."""
+        c = self.config
+        planes = [*self.spatial, *self.temporal]
+        known = {id(p) for p in planes}
+        heads = [p for p in self.parameters() if id(p) not in known]
+        return [
+            {"params": planes, "lr": c.lr_grid, "lr_end": c.lr_grid * c.lr_end, "name": "field"},
+            {"params": heads, "lr": c.lr_heads, "lr_end": c.lr_heads * c.lr_end, "name": "heads"},
+        ]
+
+    def regularisation(self) -> Tensor:
+        """Smoothness of the planes and closeness of the time planes to 1, weighted, summed over planes."""
+        c = self.config
+        space = torch.stack([_bend(p, 2) + _bend(p, 3) for p in self.spatial]).sum()
+        time = torch.stack([_bend(p, 2) for p in self.temporal]).sum()
+        still = torch.stack([(1.0 - p).abs().mean() for p in self.temporal]).sum()
+        return c.smooth_space * space + c.smooth_time * time + c.time_l1 * still
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors for a checkpoint, names starting with `field.`."""
+        return {f"field.{name}": value.detach() for name, value in self.state_dict().items()}
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of `state`; RuntimeError names what does not fit."""
+        self.load_state_dict({k.removeprefix("field."): v for k, v in tensors.items() if k.startswith("field.")})
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    nn.init.xavier_uniform_(layer.weight, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def _sample(plane: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    """Bilinear samples [M, C] of a plane [1, C, R_second, R_first] at coordinates in [-1, 1]; the rim holds outside."""
+    grid = torch.stack([first, second], dim=1)[None, None]
+    return F.grid_sample(plane, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
+
+
+def _bend(plane: Tensor, axis: int) -> Tensor:
+    """Mean squared second difference along an axis."""
+    count = plane.shape[axis]
+    if count < 3:
+        return plane.new_zeros(())
+    before, here, after = (plane.narrow(axis, start, count - 2) for start in (0, 1, 2))
+    return (before - 2.0 * here + after).square().mean()

@@ -1,0 +1,105 @@
+"""Time stands still: every Gaussian is asked once, at t* or as near to it as somebody saw it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..deformation import apply_deltas
+from ..supervision import nearest_bin, support_confidence
+from ..train.model import DynamicModel, render
+
+SUPPORT_SECONDS = 2.0
+"""The support matte of a moving Gaussian falls to 1/e at this distance from the nearest time it was seen."""
+
+
+@dataclass
+class FrozenGaussians:
+    """A static scene: N Gaussians at one instant, in scene units, no gradients."""
+
+    state: dict[str, Tensor]
+    """means, quats, log_scales, opacity_logits, sh0, shN of N Gaussians."""
+    sh_degree: int
+    """SH degree in use."""
+    support: Tensor
+    """[N] in 0..1: how well each Gaussian is known at the instant."""
+    motion: Tensor
+    """[N] in 0..1: 1 for Gaussians that move in the clip."""
+
+
+@dataclass
+class FrozenImage:
+    """One frozen frame, display-referred, nothing behind it."""
+
+    color: Tensor
+    """[H, W, 3] premultiplied, display-referred."""
+    alpha: Tensor
+    """[H, W] in 0..1."""
+    depth: Tensor
+    """[H, W] median depth along the camera's axis in scene units; 1e10 where alpha is 0."""
+    support: Tensor
+    """[H, W] in 0..1: how much of what is seen was seen at the instant."""
+    motion: Tensor
+    """[H, W] in 0..1: how much of what is seen moves in the clip."""
+
+
+@torch.no_grad()
+def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "nearest") -> FrozenGaussians:
+    """Freezes a model at a normalised time. The field is evaluated once; views then cost only rasterisation.
+
+    Args:
+        time: t* in [0, 1].
+        seconds: length of the trained range, for the support's decay.
+        query: nearest: a moving Gaussian is asked at its supported bin nearest to t*, so that nobody is shown in a
+            state that no frame has constrained; plain: at t* itself (the published method). ValueError otherwise.
+    """
+    if query not in ("nearest", "plain"):
+        raise ValueError(f"query is {query!r}: it should be nearest or plain")
+    gaussians, rows = model.gaussians, model.open_rows()
+    times = torch.full((len(rows),), float(time))
+    if query == "nearest" and len(rows):
+        bins, known = nearest_bin(gaussians.support[rows], model.centres, time)
+        times = torch.where(known, model.centres[bins], times)
+    state = apply_deltas(gaussians, rows, model.deltas(rows, times))
+    moving = torch.zeros(len(gaussians))
+    moving[rows] = 1.0
+    support = support_confidence(gaussians.support, moving > 0, model.centres, time, SUPPORT_SECONDS / seconds)
+    return FrozenGaussians({k: v.detach() for k, v in state.items()}, model.sh_degree, support, moving)
+
+
+@torch.no_grad()
+def render_frozen(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, width: int, height: int) -> FrozenImage:
+    """One view of a frozen scene: viewmat [4, 4] in scene units, K [3, 3] in pixels."""
+    mattes = torch.stack([frozen.support, frozen.motion], dim=1)
+    out = render(
+        frozen.state, frozen.sh_degree, viewmat, K, width, height, colors=mattes, with_depth=True, with_contributions=False
+    )
+    alpha = out.alphas[0].clamp(0.0, 1.0)
+    # Mattes are shares of what is seen: undo the premultiplication, keep nothing where nothing is.
+    covered = alpha.clamp_min(1e-4)
+    mattes = torch.where(alpha[..., None] > 1e-3, out.colors[0, ..., 3:] / covered[..., None], 0.0).clamp(0.0, 1.0)
+    depth = out.depth_median
+    if depth is None:
+        raise RuntimeError("the rasteriser returned no depth")
+    return FrozenImage(out.colors[0, ..., :3].clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1])
+
+
+def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> int:
+    """Index of the frame to freeze: among trained frames, the one whose people were seen best and whose plate is sharp.
+
+    Args:
+        times: [S] normalised times of the trained frames.
+        sharpness: [S] of their plates; any scale.
+    """
+    rows = model.open_rows()
+    rank = np.argsort(np.argsort(sharpness)) / max(1, len(sharpness) - 1)
+    if len(rows):
+        support = model.gaussians.support[rows]
+        seen = np.array([float(support[:, int((model.centres - t).abs().argmin())].float().mean()) for t in times])
+        seen = seen / max(float(seen.max()), 1e-6)
+    else:
+        seen = np.ones(len(times))
+    return int(np.argmax(seen + 0.5 * rank))

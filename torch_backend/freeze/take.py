@@ -1,0 +1,265 @@
+"""The freeze station: renders a take, frame by frame, and writes what leaves for Blender and for the artist's eyes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import torch
+from torch import Tensor
+
+from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, Reporter, frame_file, read_json
+from ..footage.color import srgb_to_linear
+from ..gaussians.ply import write_ply
+from ..scene import Scene, load_scene
+from ..shot import Shot, content_key, is_disk_full, disk_error, need_disk, write_json
+from ..train import LoadedRun, load_run
+from ..train.run import save_png
+from .contact_sheet import write_contact_sheet
+from .exr import FrameMetadata, write_frozen_exr
+from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen, suggest_t_star
+from .video import write_video
+
+
+@dataclass
+class OutputFrame:
+    """One frame to render."""
+
+    frame: int
+    """Number in the clip."""
+    viewmat: Tensor
+    """[4, 4] world-to-camera, scene units."""
+    K: Tensor
+    """[3, 3] pixels of the output size."""
+    t_star: float
+    """Frame number at which time stands still."""
+
+
+def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
+    """Renders a take of a run and writes EXRs, previews, contact sheet, video and PLY into takes/<name>.
+
+    Returns the take's figures (also in take.json). JobError in words if it cannot be done.
+    """
+    run = load_run(shot, params.run)
+    scene = load_scene(shot)
+    t_star = choose_t_star(shot, scene, run, params, report)
+    width, height = output_size(scene, run, params)
+    frames = plan(scene, params, t_star, width, height)
+    folder = shot.take(params.take)
+    key = take_key(run, params, t_star, width, height, frames)
+    done = _prepare(folder, key, params.only_missing)
+    need_disk(folder, (len(frames) - len(done)) * width * height * 20.0, "the take")
+    try:
+        _render_all(folder, frames, done, scene, run, params.query, (width, height), report)
+        return _finish(shot, scene, run, params, t_star, frames, (width, height), key, report)
+    except OSError as error:
+        raise (disk_error(folder) if is_disk_full(error) else error) from error
+
+
+def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, report: Reporter) -> int:
+    """The frame to freeze at, snapped to a trained one: a time that no frame constrains is a guess."""
+    trained = np.array(run.train_frames)
+    if params.t_star is None:
+        table = {row["frame"]: row for row in read_json(shot.frames / "frames.json")["frames"]}
+        sharpness = np.array([float(table[int(f)].get("sharpness", 0.0)) for f in trained])
+        times = np.array([scene.time_of_frame(f) for f in trained])
+        return int(trained[suggest_t_star(run.model, times, sharpness)])
+    if not scene.frames[0] <= params.t_star <= scene.frames[-1]:
+        raise JobError(
+            f"t* is frame {params.t_star}, the shot has frames {scene.frames[0]} to {scene.frames[-1]}.",
+            "Choose a frame of the shot.",
+            ExitCode.FREEZE,
+        )
+    nearest = int(trained[np.abs(trained - params.t_star).argmin()])
+    if nearest != params.t_star:
+        report.warning(f"Frame {params.t_star} was not trained on: time stands still at frame {nearest}, the nearest that was.")
+    return nearest
+
+
+def output_size(scene: Scene, run: LoadedRun, params: FreezeParams) -> tuple[int, int]:
+    """(width, height) of the frozen frames: as trained, unless asked otherwise."""
+    if params.width <= 0:
+        return run.width, run.height
+    width = min(max(16, params.width), 16_384)
+    return width, max(16, round(scene.height * width / scene.width))
+
+
+def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: int) -> list[OutputFrame]:
+    """The frames of a take: the clip's own poses, or a camera path in solve units."""
+    if params.camera_path:
+        viewmats, Ks, numbers = _path_cameras(scene, CameraPath.load(params.camera_path), width, height)
+    else:
+        viewmats, Ks, numbers = scene.viewmats, scene.camera_at(width, height), scene.frames
+    first = numbers[0] if params.first is None else params.first
+    last = numbers[-1] if params.last is None else params.last
+    ramp = {int(k): float(v) for k, v in params.t_star_per_frame.items()}
+    frames = [
+        OutputFrame(n, viewmats[i], Ks[i], ramp.get(n, float(t_star))) for i, n in enumerate(numbers) if first <= n <= last
+    ]
+    if not frames:
+        raise JobError(
+            f"No frame lies between {first} and {last}.", f"The path has frames {numbers[0]} to {numbers[-1]}.",
+            ExitCode.FREEZE,
+        )  # fmt: skip
+    return frames
+
+
+def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tuple[Tensor, Tensor, list[int]]:
+    """A Blender path, in solve units and its own resolution, as scene cameras of the output size."""
+    if not path.frames:
+        raise JobError("The camera path has no frames.", "Send at least one pose.", ExitCode.FREEZE)
+    viewmats = np.array([f.viewmat for f in path.frames]).reshape(-1, 4, 4)
+    viewmats[:, :3, 3] = scene.scale * (viewmats[:, :3, 3] + viewmats[:, :3, :3] @ scene.centre)
+    x, y = width / path.width, height / path.height
+    Ks = [[[f.K[0] * x, 0, f.K[2] * x], [0, f.K[1] * y, f.K[3] * y], [0, 0, 1]] for f in path.frames]
+    return torch.from_numpy(viewmats).float(), torch.tensor(Ks).float(), [f.frame for f in path.frames]
+
+
+def take_key(
+    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, frames: list[OutputFrame]
+) -> str:
+    """Identifies what a take shows, to tell stale frames from good ones. The frame range is not part of it."""
+    path = Path(params.camera_path) if params.camera_path else ""
+    return content_key(
+        run.folder / "checkpoint.safetensors", t_star, params.t_star_per_frame, params.query, width, height, path
+    )
+
+
+def _prepare(folder: Path, key: str, only_missing: bool) -> set[int]:
+    """Makes the take's folder; returns the frames in it that are already right. Stale frames are removed."""
+    (folder / "preview").mkdir(parents=True, exist_ok=True)
+    state = folder / "state.json"
+    same = state.is_file() and read_json(state).get("key") == key
+    if same and only_missing:
+        have = {int(p.stem) for p in folder.glob("*.exr") if not p.name.startswith(".")}
+        return {n for n in have if (folder / "preview" / frame_file(n, ".png")).is_file()}
+    for old in [*folder.glob("*.exr"), *(folder / "preview").glob("*.png")]:
+        old.unlink()
+    write_json(state, {"version": 1, "key": key})
+    return set()
+
+
+def _render_all(
+    folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, run: LoadedRun, query: str,
+    size: tuple[int, int], report: Reporter,
+) -> None:  # fmt: skip
+    frozen: FrozenGaussians | None = None
+    at = float("nan")
+    for n, output in enumerate(frames):
+        report.check_cancelled()
+        report.progress("freezing", n, len(frames), f"frame {output.frame}")
+        if output.frame in done:
+            continue
+        if frozen is None or output.t_star != at:
+            frozen, at = freeze_at(run.model, scene.time_of_frame(output.t_star), _span(scene, run), query), output.t_star
+        image = render_frozen(frozen, output.viewmat, output.K, *size)
+        _write_frame(folder, output, image, scene)
+    report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
+
+
+def _span(scene: Scene, run: LoadedRun) -> float:
+    """Seconds between the first and the last trained frame."""
+    at = {frame: second for frame, second in zip(scene.frames, scene.seconds, strict=True)}
+    return max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
+
+
+def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: Scene) -> None:
+    save_png(folder / "preview" / frame_file(output.frame, ".png"), image.color + (1.0 - image.alpha[..., None]) * 0.5)
+    viewmat = output.viewmat.double().clone()
+    viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ torch.from_numpy(scene.centre)
+    depth = torch.where(image.depth < NO_DEPTH, image.depth / scene.scale, NO_DEPTH)
+    write_frozen_exr(
+        folder / frame_file(output.frame, ".exr"),
+        scene_linear(image.color.numpy(), image.alpha.numpy()),
+        depth.numpy(),
+        image.support.numpy(),
+        image.motion.numpy(),
+        FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy()),
+    )
+
+
+def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Premultiplied display-referred colour [H, W, 3] and alpha [H, W] -> premultiplied scene-linear RGBA [H, W, 4].
+
+    Splats blend in display space; the conversion acts on the colour that is seen, so it goes through straight alpha.
+    """
+    cover = np.maximum(alpha, 1e-4)[..., None]
+    rgb = srgb_to_linear(np.clip(color / cover, 0.0, 1.0)) * alpha[..., None]
+    return np.concatenate([rgb, alpha[..., None]], axis=2).astype(np.float32)
+
+
+def _finish(
+    shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, t_star: int, frames: list[OutputFrame],
+    size: tuple[int, int], key: str, report: Reporter,
+) -> dict[str, Any]:  # fmt: skip
+    """Contact sheet, video, PLY and take.json; the frames are on disk."""
+    folder = shot.take(params.take)
+    report.progress("finishing the take", 0, 3, "contact sheet")
+    numbers = [f.frame for f in frames]
+    previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
+    sheet = _contact_sheet(shot, folder, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}")
+    report.check_cancelled()
+    report.progress("finishing the take", 1, 3, "video")
+    write_video(folder / "video.mp4", _images(previews), shot.info().fps or 24.0)
+    report.progress("finishing the take", 2, 3, "PLY")
+    frozen = freeze_at(run.model, scene.time_of_frame(t_star), _span(scene, run), params.query)
+    _write_ply(folder / "frozen.ply", frozen, scene)
+    facts = {
+        "version": 1,
+        "key": key,
+        "take": params.take,
+        "run": params.run,
+        "t_star_frame": t_star,
+        "query": params.query,
+        "width": size[0],
+        "height": size[1],
+        "first": numbers[0],
+        "last": numbers[-1],
+        "frames": len(numbers),
+        "fps": shot.info().fps,
+        "scale": scene.scale,
+        "exr_dir": str(folder),
+        "contact_sheet": str(sheet),
+        "video": str(folder / "video.mp4"),
+        "ply": str(folder / "frozen.ply"),
+    }
+    write_json(folder / "take.json", facts)
+    shot.update(t_star=t_star)
+    report.image("contact sheet", sheet)
+    report.progress("finishing the take", 3, 3, "done")
+    return facts
+
+
+def _contact_sheet(shot: Shot, folder: Path, numbers: list[int], previews: list[Path], title: str) -> Path:
+    plates = [shot.frames / frame_file(n, ".png") for n in numbers]
+    if not all(p.is_file() for p in plates):
+        plates = previews  # a camera path of its own has no plates: the sheet then shows the frozen frames alone
+    path = folder / "contact_sheet.png"
+    write_contact_sheet(path, plates, previews, numbers, title)
+    return path
+
+
+def _images(paths: list[Path]) -> Iterator[np.ndarray]:
+    for path in paths:
+        source = oiio.ImageInput.open(str(path))
+        if source is None:
+            raise FileNotFoundError(f"cannot read the frozen preview {path}: {oiio.geterror()}")
+        yield np.ascontiguousarray(source.read_image(0, 0, 0, 3, oiio.UINT8))
+        source.close()
+
+
+def _write_ply(path: Path, frozen: FrozenGaussians, scene: Scene) -> None:
+    """The frozen instant in solve units, as every splat viewer reads it."""
+    s = frozen.state
+    means = s["means"].double() / scene.scale + torch.from_numpy(scene.centre)
+    sh = torch.cat([s["sh0"], s["shN"]], dim=1)
+    write_ply(
+        path, means.float().numpy(), s["quats"].numpy(), (s["log_scales"] - float(np.log(scene.scale))).numpy(),
+        s["opacity_logits"].numpy(), sh.numpy(),
+    )  # fmt: skip
+
+

@@ -1,0 +1,138 @@
+"""Growth within a budget: split what the image pulls hardest, drop what nobody sees.
+
+Departures from 3DGS (design: method-hosts 1.0): the signal is the sum of absolute screen gradients (clashing pulls
+do not cancel); growth is a schedule towards a budget rather than a threshold, so a run's cost is known before it
+starts; a Gaussian is split along its longest axis into two that keep its second moment, never cloned in place,
+because twins at one place get the same gradient; opacities are not reset.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .model import Gaussians
+
+_SHRINK = 1.6
+"""Standard deviation of a child along the split axis is the parent's over this (3DGS densify_and_split)."""
+
+
+@dataclass
+class DensifyConfig:
+    """Schedule and thresholds; iterations are shares of the run's length."""
+
+    budget: int = 25_000
+    """Most Gaussians the run may have."""
+    start: float = 0.06
+    """Share of the run at which growth begins."""
+    stop: float = 0.65
+    """Share of the run at which growth ends; pruning goes on."""
+    every: int = 100
+    """Iterations between two rounds."""
+    prune_opacity: float = 0.01
+    """Gaussians less opaque than this are dropped (3DGS: 0.005)."""
+    max_scale: float = 0.5
+    """Gaussians whose largest standard deviation exceeds this times their distance from the cameras' centre (at
+    least 1 scene unit) are dropped."""
+    min_gradient: float = 0.0
+    """Gaussians with a mean absolute screen gradient below this are never split."""
+
+
+class Densifier:
+    """Gathers the signal between two rounds and carries a round out."""
+
+    def __init__(self, config: DensifyConfig, count: int) -> None:
+        self.config = config
+        self.reset(count)
+
+    def reset(self, count: int) -> None:
+        """Forgets the signal; called after every round, for `count` Gaussians."""
+        self.gradient = torch.zeros(count)
+        self.seen = torch.zeros(count)
+        self.weight = torch.zeros(count)
+
+    @torch.no_grad()
+    def observe(self, absgrad: Tensor, radii: Tensor, weight_max: Tensor) -> None:
+        """Adds one view: |screen gradient| [N] in pixels, radii [N], largest alpha * T over the pixels [N]."""
+        visible = radii > 0
+        self.gradient += torch.where(visible, absgrad, 0.0)
+        self.seen += visible
+        self.weight = torch.maximum(self.weight, weight_max)
+
+    def target(self, initial: int, progress: float) -> int:
+        """How many Gaussians the schedule allows at `progress` (0 to 1) of the run."""
+        c = self.config
+        share = min(max((progress - c.start) / (c.stop - c.start), 0.0), 1.0)
+        return int(initial + (max(c.budget, initial) - initial) * math.sqrt(share))
+
+    @torch.no_grad()
+    def step(self, model: Gaussians, optimizer: torch.optim.Optimizer, initial: int, progress: float) -> tuple[int, int]:
+        """One round: prune, then split up to the schedule. Returns (split, pruned)."""
+        keep = self._keep(model)
+        score = self.gradient / self.seen.clamp_min(1.0)
+        room = self.target(initial, progress) - int(keep.sum())
+        split = self._choose(score, keep, room if progress < self.config.stop else 0)
+        survivors = torch.nonzero(keep & ~split).flatten()
+        parents = torch.nonzero(split).flatten()
+        rows = torch.cat([survivors, parents, parents])
+        fresh = torch.zeros(len(rows), dtype=torch.bool)
+        fresh[len(survivors) :] = True
+        pruned = int((~keep).sum())
+        if len(parents) or pruned:
+            model.rebuild(rows, fresh, optimizer)
+            _separate(model, len(survivors), len(parents))
+        self.reset(len(model))
+        return len(parents), pruned
+
+    def _keep(self, model: Gaussians) -> Tensor:
+        p = model.params
+        finite = torch.isfinite(p["means"]).all(1) & torch.isfinite(p["log_scales"]).all(1)
+        finite &= torch.isfinite(p["quats"]).all(1) & torch.isfinite(p["opacity_logits"])
+        opaque = torch.sigmoid(p["opacity_logits"]) > self.config.prune_opacity
+        largest = p["log_scales"].amax(1)
+        reach = p["means"].norm(dim=1)
+        return finite & opaque & (largest < math.log(self.config.max_scale) + torch.log(reach.clamp_min(1.0)))
+
+    def _choose(self, score: Tensor, keep: Tensor, room: int) -> Tensor:
+        chosen = torch.zeros_like(keep)
+        eligible = keep & (self.seen > 0) & (score > self.config.min_gradient)
+        count = min(room, int(eligible.sum()))
+        if count > 0:
+            ranked = torch.where(eligible, score, -torch.inf)
+            chosen[ranked.topk(count).indices] = True
+        return chosen
+
+
+@torch.no_grad()
+def _separate(model: Gaussians, first: int, count: int) -> None:
+    """Moves the `count` pairs of twins that start at row `first` apart along their longest axis."""
+    if not count:
+        return
+    p = model.params
+    one, two = slice(first, first + count), slice(first + count, first + 2 * count)
+    log_scales = p["log_scales"][one]
+    longest = log_scales.argmax(1)
+    axis = torch.gather(_rotation(p["quats"][one]), 2, longest[:, None, None].expand(-1, 3, 1))[..., 0]
+    # The mixture of the two keeps the parent's second moment: s^2 = d^2 + (s / 1.6)^2.
+    distance = log_scales.gather(1, longest[:, None]).exp() * math.sqrt(1.0 - _SHRINK**-2)
+    shrunk = log_scales.scatter_add(1, longest[:, None], torch.full((count, 1), -math.log(_SHRINK)))
+    # Half the parent's mass each, spread over a shorter axis: peak opacity 1.6 / 2 of the parent's.
+    logit = torch.logit((torch.sigmoid(p["opacity_logits"][one]) * _SHRINK / 2).clamp(1e-4, 1.0 - 1e-4))
+    for rows, sign in ((one, 1.0), (two, -1.0)):
+        p["means"].data[rows] += sign * distance * axis
+        p["log_scales"].data[rows] = shrunk
+        p["opacity_logits"].data[rows] = logit
+
+
+def _rotation(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz, normalised here."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).view(-1, 3, 3)

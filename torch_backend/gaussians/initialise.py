@@ -1,0 +1,109 @@
+"""Where the Gaussians start: the sparse points, and seeds for what has no point.
+
+COLMAP leaves walls and skin almost empty. Pixels far from any sparse point are lifted to the depth of the nearest
+points in the same image: right to within a furniture's width, which a few hundred steps repair, and better than
+holes that densification must fill from the rims (measured on the bundled clip: docs/benchmarks.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ..scene import Scene
+from .model import SH_C0, Gaussians, sh_bases
+
+
+@dataclass
+class InitConfig:
+    """How many Gaussians to start with, and how they look."""
+
+    seeds: int = 8000
+    """Seeds lifted from pixels without a sparse point near them, over all frames together."""
+    frames: int = 12
+    """Training frames that seeds are lifted from, evenly over the clip."""
+    opacity: float = 0.1
+    """Starting opacity of sparse points (3DGS create_from_pcd: 0.1)."""
+    seed_opacity: float = 0.1
+    """Starting opacity of seeds."""
+    sh_degree: int = 2
+    """Highest SH degree the model can hold."""
+    min_scale: float = 1e-4
+    """Smallest starting scale in scene units."""
+
+
+def initialise(
+    scene: Scene, images: Tensor, indices: list[int], bins: int, config: InitConfig, generator: torch.Generator
+) -> Gaussians:
+    """Gaussians from sparse points and seeds.
+
+    Args:
+        scene: the scene; its points [P, 3].
+        images: [I, H, W, 3] training frames, display-referred.
+        indices: [I] frame of the scene that each image shows.
+        bins: time bins of the support bitmap.
+    """
+    points, colors = scene.points, scene.colors
+    opacity = torch.full((len(points),), config.opacity)
+    if config.seeds > 0:
+        picked = np.unique(np.linspace(0, len(indices) - 1, min(config.frames, len(indices))).round().astype(int))
+        each = config.seeds // len(picked)
+        seeds = [_lift_seeds(scene, images[n], indices[n], each, generator) for n in picked]
+        points = torch.cat([points, *(s[0] for s in seeds)])
+        colors = torch.cat([colors, *(s[1] for s in seeds)])
+        opacity = torch.cat([opacity, torch.full((len(points) - len(opacity),), config.seed_opacity)])
+    if len(points) < 4:
+        raise ValueError(f"the solve left {len(points)} points: at least 4 are needed to start")
+    scales = neighbour_distance(points).clamp_min(config.min_scale)
+    count = len(points)
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1.0
+    params = {
+        "means": points.clone(),
+        "quats": quats,
+        "log_scales": scales.log()[:, None].repeat(1, 3),
+        "opacity_logits": torch.logit(opacity),
+        "sh0": ((colors - 0.5) / SH_C0)[:, None, :],
+        "shN": torch.zeros(count, sh_bases(config.sh_degree) - 1, 3),
+    }
+    return Gaussians(params, bins)
+
+
+def neighbour_distance(points: Tensor) -> Tensor:
+    """Root mean squared distance to the 3 nearest neighbours (3DGS create_from_pcd), [N]."""
+    distances = cKDTree(points.numpy()).query(points.numpy(), k=4)[0][:, 1:]
+    return torch.from_numpy(np.sqrt((distances**2).mean(1))).float()
+
+
+def _lift_seeds(
+    scene: Scene, image: Tensor, index: int, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """`count` pixels of one frame, preferably far from sparse points, at a depth between their neighbours' in it."""
+    height, width = image.shape[:2]
+    K = scene.camera_at(width, height)[index]
+    viewmat = scene.viewmats[index]
+    camera = scene.points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    in_front = camera[:, 2] > 1e-3
+    pixels = (camera[:, :2] / camera[:, 2:].clamp_min(1e-3)) * K[[0, 1], [0, 1]] + K[:2, 2]
+    limits = torch.tensor([width, height])
+    seen = in_front & ((pixels >= 0) & (pixels < limits)).all(1)
+    if seen.sum() < 4:
+        return scene.points[:0], scene.colors[:0]
+    tree = cKDTree(pixels[seen].numpy())
+    candidates = torch.rand(4 * count, 2, generator=generator) * limits
+    distance, nearest = tree.query(candidates.numpy(), k=4)
+    far = np.argsort(-distance[:, 0], kind="stable")[: 2 * count]
+    # Half the far ones: a bare top-k would put every seed into the largest hole.
+    keep = far[torch.randperm(len(far), generator=generator)[:count].numpy()]
+    weights = 1.0 / (distance[keep] + 1.0)
+    depth = (weights * camera[seen][:, 2].numpy()[nearest[keep]]).sum(1) / weights.sum(1)
+    chosen = candidates[keep]
+    rays = torch.cat([(chosen - K[:2, 2]) / K[[0, 1], [0, 1]], torch.ones(len(chosen), 1)], dim=1)
+    local = rays * torch.from_numpy(depth).float()[:, None]
+    world = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+    rows, columns = chosen[:, 1].long().clamp(0, height - 1), chosen[:, 0].long().clamp(0, width - 1)
+    return world, image[rows, columns].float()

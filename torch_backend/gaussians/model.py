@@ -1,0 +1,102 @@
+"""The canonical Gaussians: parameters, optimiser state and per-Gaussian memory, which grow and shrink together.
+
+One primitive, `rebuild`, clones, splits and prunes: it takes the row each new Gaussian comes from. What rides along
+(the gate, the support bitmap) is inherited by children, as the support preset needs (docs/architecture.md).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+PARAM_NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0 + ..."""
+
+
+def sh_bases(degree: int) -> int:
+    """Number of spherical harmonics up to a degree."""
+    return (degree + 1) ** 2
+
+
+class Gaussians:
+    """N Gaussians in scene units. Scales as logs, opacities as logits, quaternions wxyz and not normalised.
+
+    params: means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh0 [N, 1, 3], shN [N, K - 1, 3].
+    open: bool [N], the gate: which Gaussians the deformation moves.
+    support: bool [N, B], time bins in which a Gaussian contributed to a training frame.
+    """
+
+    def __init__(self, params: dict[str, Tensor], bins: int) -> None:
+        count = params["means"].shape[0]
+        for name in PARAM_NAMES:
+            if params[name].shape[0] != count:
+                raise ValueError(f"{name} has {params[name].shape[0]} rows, means has {count}")
+        self.params = {name: nn.Parameter(params[name].contiguous()) for name in PARAM_NAMES}
+        self.open = torch.zeros(count, dtype=torch.bool)
+        self.support = torch.zeros(count, bins, dtype=torch.bool)
+
+    def __len__(self) -> int:
+        return self.params["means"].shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree that shN can hold."""
+        return int(round((1 + self.params["shN"].shape[1]) ** 0.5)) - 1
+
+    def sh(self, degree: int) -> Tensor:
+        """sh0 and shN up to `degree`, [N, (degree + 1)^2, 3]."""
+        if degree == 0:
+            return self.params["sh0"]
+        return torch.cat([self.params["sh0"], self.params["shN"][:, : sh_bases(degree) - 1]], dim=1)
+
+    @torch.no_grad()
+    def rebuild(self, parent: Tensor, fresh: Tensor, optimizer: torch.optim.Optimizer) -> None:
+        """Makes row i a copy of row `parent[i]` [M]; rows marked `fresh` [M] start with zero optimiser moments."""
+        replaced: dict[int, nn.Parameter] = {}
+        for name, old in self.params.items():
+            new = nn.Parameter(old.detach()[parent].contiguous())
+            state = optimizer.state.pop(old, None)
+            if state is not None:
+                for key, value in state.items():
+                    if value.shape == old.shape:
+                        moved = value[parent].contiguous()
+                        moved[fresh] = 0.0
+                        state[key] = moved
+                optimizer.state[new] = state
+            replaced[id(old)] = new
+            self.params[name] = new
+        for group in optimizer.param_groups:
+            group["params"] = [replaced.get(id(p), p) for p in group["params"]]
+        self.open = self.open[parent].contiguous()
+        self.support = self.support[parent].contiguous()
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors for a checkpoint; the bitmap packed to bytes."""
+        tensors = {f"gaussians.{name}": p.detach() for name, p in self.params.items()}
+        tensors["gaussians.open"] = self.open
+        tensors["gaussians.support"] = pack_bits(self.support)
+        return tensors
+
+    @staticmethod
+    def from_state(tensors: dict[str, Tensor], bins: int) -> Gaussians:
+        """Inverse of `state`; KeyError names a missing tensor."""
+        model = Gaussians({name: tensors[f"gaussians.{name}"] for name in PARAM_NAMES}, bins)
+        model.open = tensors["gaussians.open"].clone()
+        model.support = unpack_bits(tensors["gaussians.support"], bins)
+        return model
+
+
+_WEIGHTS = torch.tensor([1, 2, 4, 8, 16, 32, 64, 128], dtype=torch.uint8)
+
+
+def pack_bits(flags: Tensor) -> Tensor:
+    """bool [N, B] -> uint8 [N, ceil(B / 8)], lowest bit first."""
+    padded = torch.nn.functional.pad(flags, (0, -flags.shape[1] % 8)).view(flags.shape[0], -1, 8)
+    return (padded * _WEIGHTS).sum(-1, dtype=torch.uint8)
+
+
+def unpack_bits(packed: Tensor, bins: int) -> Tensor:
+    """Inverse of `pack_bits`."""
+    flags = (packed[:, :, None] & _WEIGHTS) != 0
+    return flags.reshape(packed.shape[0], -1)[:, :bins].contiguous()

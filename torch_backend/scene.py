@@ -1,0 +1,162 @@
+"""One normalised scene from a solved shot: cameras, sparse points, training images, time.
+
+Everything after this file lives in scene units: the cameras' median centre is the origin and their extent (95th
+percentile of the distance from it) is 1, so learning rates, near planes and thresholds mean the same in every shot.
+`Scene.scale` and `Scene.centre` lead back to solve units: x_solve = x_scene / scale + centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import torch
+from torch import Tensor
+
+from .contract import CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
+from .shot import Shot
+
+
+@dataclass
+class Scene:
+    """Cameras and points of a shot in scene units (see module). F delivered frames, P points."""
+
+    frames: list[int]
+    """[F] frame numbers of the clip, ascending: every source frame of the range."""
+    seconds: np.ndarray
+    """[F] float64, time of each frame since the first of the range."""
+    times: np.ndarray
+    """[F] float64, the same normalised to [0, 1] over the trained range."""
+    viewmats: Tensor
+    """[F, 4, 4] float32 world-to-camera, OpenCV, scene units."""
+    Ks: Tensor
+    """[F, 3, 3] float32 in pixels of `width` x `height`."""
+    width: int
+    """Width in pixels of the working frames."""
+    height: int
+    """Height in pixels of the working frames."""
+    solved: list[int]
+    """Indices into `frames` whose pose is registered and which the step keeps for training, ascending."""
+    points: Tensor
+    """[P, 3] float32 sparse points, scene units."""
+    colors: Tensor
+    """[P, 3] float32 display-referred colour of the points, 0 to 1."""
+    scale: float
+    """Scene units per solve unit."""
+    centre: np.ndarray
+    """[3] float64, origin of the scene in solve units."""
+    folder: Path
+    """Folder of the undistorted working frames."""
+
+    def image_path(self, index: int) -> Path:
+        """Undistorted working frame of delivered frame `index`."""
+        return self.folder / frame_file(self.frames[index], ".png")
+
+    def time_of_frame(self, frame: float) -> float:
+        """Normalised time of a (possibly fractional) frame number, clamped to the range."""
+        return float(np.interp(frame, self.frames, self.times))
+
+    def camera_at(self, width: int, height: int) -> Tensor:
+        """`Ks` rescaled to another image size, [F, 3, 3]."""
+        return resize_Ks(self.Ks, self.width, self.height, width, height)
+
+
+def resize_Ks(Ks: Tensor, width: int, height: int, new_width: int, new_height: int) -> Tensor:
+    """Intrinsics [C, 3, 3] of the same camera with another image size in pixels (pixel centres at +0.5)."""
+    ratio = torch.tensor([[new_width / width], [new_height / height], [1.0]], dtype=Ks.dtype)
+    return Ks * ratio
+
+
+def load_scene(shot: Shot) -> Scene:
+    """The scene of a solved shot. JobError if it is not solved, or cannot be normalised."""
+    cameras_path, points_path = shot.solve / "cameras.json", shot.solve / "points.npz"
+    if not cameras_path.is_file() or not points_path.is_file():
+        raise JobError(f"{shot.root.name} has no cameras yet.", "Run the camera step first.", ExitCode.SOLVE)
+    path = CameraPath.load(cameras_path)
+    table = {row["frame"]: row for row in read_json(shot.frames / "frames.json")["frames"]}
+    frames = [camera.frame for camera in path.frames]
+    viewmats = np.array([camera.viewmat for camera in path.frames], dtype=np.float64).reshape(-1, 4, 4)
+    solved = [i for i, c in enumerate(path.frames) if c.source == "registered" and table[c.frame]["solve"]]
+    if len(solved) < 3:
+        raise JobError(f"Only {len(solved)} frames have a solved camera.", "Solve the shot again.", ExitCode.SOLVE)
+    with np.load(points_path, allow_pickle=False) as stored:
+        xyz, rgb = stored["xyz"].astype(np.float64), stored["rgb"]
+    scale, centre = _normalisation(viewmats[solved], xyz)
+    viewmats[:, :3, 3] = scale * (viewmats[:, :3, 3] + viewmats[:, :3, :3] @ centre)
+    seconds = np.array([table[f]["seconds"] for f in frames], dtype=np.float64)
+    seconds -= seconds[0]
+    start, end = seconds[solved[0]], seconds[solved[-1]]
+    if not end > start:
+        raise JobError("All solved frames have the same time stamp.", "Import the clip again.", ExitCode.FOOTAGE)
+    return Scene(
+        frames=frames,
+        seconds=seconds,
+        times=np.clip((seconds - start) / (end - start), 0.0, 1.0),
+        viewmats=torch.from_numpy(viewmats).float(),
+        Ks=torch.tensor([[[c.K[0], 0, c.K[2]], [0, c.K[1], c.K[3]], [0, 0, 1]] for c in path.frames]).float(),
+        width=path.width,
+        height=path.height,
+        solved=solved,
+        points=torch.from_numpy((xyz - centre) * scale).float(),
+        colors=torch.from_numpy(rgb).float() / 255.0,
+        scale=scale,
+        centre=centre,
+        folder=shot.frames,
+    )
+
+
+def _normalisation(viewmats: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray]:
+    """Scale and centre of the cameras [S, 4, 4]. The extent is robust: one wild camera must not shrink the scene."""
+    centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    centre = np.median(centres, axis=0)
+    extent = float(np.percentile(np.linalg.norm(centres - centre, axis=1), 95))
+    depth = float(np.median(np.linalg.norm(points - centre, axis=1))) if len(points) else 0.0
+    if not np.isfinite(extent) or extent <= 1e-4 * max(depth, 1e-12):
+        raise JobError(
+            "The camera hardly moves in this clip, so depth cannot be told.",
+            "Use footage in which the camera travels.",
+            ExitCode.SOLVE,
+        )
+    return 1.0 / extent, centre
+
+
+def split_frames(solved: list[int], holdout: int, phase: int = 0) -> tuple[list[int], list[int]]:
+    """(training, held-out) indices: every `holdout`-th solved frame is held out, never the first or last; 0: none."""
+    if holdout <= 0:
+        return list(solved), []
+    if holdout < 2:
+        raise ValueError(f"holdout is {holdout}: it should be 0 or at least 2")
+    test = [i for n, i in enumerate(solved) if n % holdout == phase % holdout and 0 < n < len(solved) - 1]
+    held = set(test)
+    return [i for i in solved if i not in held], test
+
+
+def load_images(scene: Scene, indices: list[int], width: int, height: int, report: Reporter | None = None) -> Tensor:
+    """Working frames `indices` at a training size, [I, height, width, 3] float16 display-referred in [0, 1].
+
+    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip.
+    """
+    images = torch.empty(len(indices), height, width, 3, dtype=torch.float16)
+    for n, index in enumerate(indices):
+        images[n] = read_image(scene.image_path(index), width, height)
+        if report:
+            report.check_cancelled()
+            report.progress("loading frames", n + 1, len(indices), f"frame {scene.frames[index]}")
+    return images
+
+
+def read_image(path: Path, width: int, height: int) -> Tensor:
+    """One display-referred image resized (area-weighted) to [height, width, 3] float32. FileNotFoundError if missing."""
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise FileNotFoundError(f"cannot read the working frame {path}: {oiio.geterror()}")
+    pixels = source.read_image(0, 0, 0, 3, oiio.FLOAT)
+    source.close()
+    image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None]
+    if image.shape[-2:] != (height, width):
+        exact = image.shape[-2] % height == 0 and image.shape[-1] % width == 0
+        mode, antialias = ("area", False) if exact else ("bicubic", True)
+        image = torch.nn.functional.interpolate(image, (height, width), mode=mode, antialias=antialias)
+    return image[0].permute(1, 2, 0).clamp(0.0, 1.0)

@@ -1,0 +1,17 @@
+"""Who was seen when, and what holds a Gaussian at times at which nobody saw it."""
+
+from .anchors import PaperView, SupervisionConfig, paper_loss, support_loss
+from .support import bin_of, bin_times, mark_seen, nearest_bin, nearest_supported, support_confidence
+
+__all__ = [
+    "PaperView",
+    "SupervisionConfig",
+    "bin_of",
+    "bin_times",
+    "mark_seen",
+    "nearest_bin",
+    "nearest_supported",
+    "paper_loss",
+    "support_confidence",
+    "support_loss",
+]

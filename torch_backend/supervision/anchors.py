@@ -1,0 +1,175 @@
+"""The anchoring losses: what is held, to what, how strongly.
+
+`support` needs no rendering: an unsupported (Gaussian, time) is drawn to the deltas of its nearest supported bins.
+`paper` is the Splannequin paper's rule (section "Temporally-Anchored Regularization"): hidden states to the past,
+defective ones to the future, over activated parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from ..deformation import Deformation, Deltas
+from ..gaussians import Gaussians
+from .support import nearest_supported
+
+
+@dataclass
+class SupervisionConfig:
+    """Which losses anchor, and their weights. Shares are of the run's length."""
+
+    preset: str = "support"
+    """support, paper or none."""
+    start: float = 1.0 / 3.0
+    """Share of the run at which anchoring begins (paper: iteration 10,000 of 30,000)."""
+    switch: float = 2.0 / 3.0
+    """Share at which `paper` goes from L2 to L1 (paper: 20,000 of 30,000)."""
+    every: int = 10
+    """`paper` acts every so many iterations (paper: 10)."""
+    tau: float = 5.0
+    """`paper`: decay of the confidence with normalised time (paper: 5)."""
+    weight_hidden: float = 10.0
+    """`paper`: lambda_hidden (paper: 10)."""
+    weight_defective: float = 10.0
+    """`paper`: lambda_defective (paper: 10)."""
+    defective_gradient: float = 1e-9
+    """`paper`: a visible Gaussian with a screen gradient of at most this is defective (paper: 1e-9)."""
+    support_every: int = 2
+    """`support` acts every so many iterations."""
+    support_weight: float = 1.0
+    """`support`: weight of the whole term."""
+    support_samples: int = 1024
+    """`support`: (Gaussian, time) pairs drawn each time."""
+    support_seconds: float = 4.0
+    """`support`: confidence in an anchor decays as exp(-|dt| / this)."""
+
+
+_ATTRIBUTE_WEIGHTS = Deltas(means=5.0, quats=0.2, log_scales=0.2, opacity_logits=0.1, sh0=0.2)  # type: ignore[arg-type]
+"""Weights of the attributes in `support`, so that typical deltas of each count alike; means in scene units."""
+_KNEE = 0.02
+"""Below this the support loss is quadratic, above it linear (Charbonnier)."""
+
+
+def support_loss(
+    model: Gaussians,
+    field: Deformation,
+    centres: Tensor,
+    seconds: float,
+    config: SupervisionConfig,
+    generator: torch.Generator,
+) -> Tensor | None:
+    """Draws deltas at unsupported times to those at the nearest supported bins on either side.
+
+    Canonical parameters are not moved: only the field learns. Near distances are drawn as often as far ones.
+
+    Args:
+        centres: [B] normalised times of the bins.
+        seconds: length of the trained range, so that confidence decays in seconds.
+
+    Returns:
+        The weighted loss, or None if nothing that was drawn needs an anchor.
+    """
+    rows = torch.nonzero(model.open & model.support.any(1)).flatten()
+    if not len(rows):
+        return None
+    rows, bins = _draw(model.support, rows, config.support_samples, generator)
+    if not len(rows):
+        return None
+    support = model.support[rows]
+    left, has_left, right, has_right = nearest_supported(support, bins)
+    means = model.params["means"].detach()[rows]
+    here = field(means, centres[bins])
+    with torch.no_grad():
+        there = field(torch.cat([means, means]), torch.cat([centres[left], centres[right]]))
+        near_left = (centres[bins] - centres[left]) * seconds
+        near_right = (centres[right] - centres[bins]) * seconds
+        share = (near_left / (near_left + near_right).clamp_min(1e-6)).clamp(0.0, 1.0)
+        share = torch.where(has_left & has_right, share, torch.where(has_right, 1.0, 0.0))
+        distance = torch.minimum(
+            torch.where(has_left, near_left, torch.inf), torch.where(has_right, near_right, torch.inf)
+        )
+        confidence = torch.exp(-distance / config.support_seconds)
+    total = torch.zeros(len(rows))
+    for weight, value, anchors in zip(_ATTRIBUTE_WEIGHTS, here, there, strict=True):
+        first, second = anchors.reshape(2, len(rows), -1)
+        gap = value.reshape(len(rows), -1) - torch.lerp(first, second, share[:, None])
+        total = total + weight * (torch.sqrt(gap.square() + _KNEE**2) - _KNEE).sum(1)
+    return config.support_weight * (confidence * total).mean()
+
+
+def _draw(support: Tensor, rows: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Unsupported (Gaussian, bin) pairs: half anywhere, half at a log-uniform distance from a supported bin."""
+    bins = support.shape[1]
+    picked = rows[torch.randint(len(rows), (2 * count,), generator=generator)]
+    anywhere = torch.randint(bins, (count,), generator=generator)
+    start = torch.multinomial(support[picked[count:]].float(), 1, generator=generator)[:, 0]
+    step = torch.exp(torch.rand(count, generator=generator) * math.log(max(bins, 2))).long()
+    sign = 2 * torch.randint(2, (count,), generator=generator) - 1
+    near = start + sign * step
+    chosen = torch.cat([anywhere, near])
+    valid = (chosen >= 0) & (chosen < bins)
+    valid &= ~support[picked, chosen.clamp(0, bins - 1)]
+    return picked[valid][:count], chosen[valid][:count]
+
+
+@dataclass
+class PaperView:
+    """One of the two views that the paper's rule compares: the states and who was supervised in it."""
+
+    time: float
+    """Normalised time."""
+    state: dict[str, Tensor]
+    """Deformed parameters of M Gaussians (means, quats, log_scales, opacity_logits, sh0)."""
+    inside: Tensor
+    """bool [M]: the centre is inside the camera's frustum; False is the paper's `hidden`."""
+    gradient: Tensor
+    """[M] norm of the screen-space gradient of the reconstruction loss."""
+
+
+def paper_loss(one: PaperView, two: PaperView, progress: float, config: SupervisionConfig) -> Tensor | None:
+    """The paper's two terms for a pair of views; None if no valid anchor was found.
+
+    The later view's hidden Gaussians are held to the earlier view, the earlier view's defective ones to the later;
+    the reference must be well supervised (inside the frustum, with gradient) and is detached. Mean over the selected
+    Gaussians, summed over the attributes.
+    """
+    early, late = (one, two) if one.time < two.time else (two, one)
+    if early.time == late.time:
+        return None
+    phi = math.exp(-config.tau * (late.time - early.time))
+    linear = progress >= config.switch
+    well_early = early.inside & (early.gradient > config.defective_gradient)
+    well_late = late.inside & (late.gradient > config.defective_gradient)
+    hidden = ~late.inside & well_early
+    defective = early.inside & ~(early.gradient > config.defective_gradient) & well_late
+    terms = []
+    if bool(hidden.any()):
+        terms.append(config.weight_hidden * phi * _discrepancy(late.state, early.state, hidden, linear))
+    if bool(defective.any()):
+        terms.append(config.weight_defective * phi * _discrepancy(early.state, late.state, defective, linear))
+    return torch.stack(terms).sum() if terms else None
+
+
+def _discrepancy(target: dict[str, Tensor], reference: dict[str, Tensor], chosen: Tensor, linear: bool) -> Tensor:
+    """D(theta_A, theta_B) over activated parameters: L1, or squared L2, averaged over the chosen Gaussians."""
+    a = _activated(target, chosen)
+    b = _activated({k: v.detach() for k, v in reference.items()}, chosen)
+    # q and -q are the same rotation: compare with the nearer one.
+    b["quats"] = torch.where((a["quats"] * b["quats"]).sum(1, keepdim=True) < 0, -b["quats"], b["quats"])
+    gaps = torch.cat([a[k] - b[k] for k in a], dim=1)
+    return (gaps.abs() if linear else gaps.square()).sum(1).mean()
+
+
+def _activated(state: dict[str, Tensor], chosen: Tensor) -> dict[str, Tensor]:
+    return {
+        "means": state["means"][chosen],
+        "log_scales": state["log_scales"][chosen],
+        "quats": F.normalize(state["quats"][chosen], dim=1),
+        "opacities": torch.sigmoid(state["opacity_logits"][chosen])[:, None],
+        "sh": state["sh0"][chosen].flatten(1),
+    }

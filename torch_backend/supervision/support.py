@@ -1,0 +1,75 @@
+"""The support bitmap: per Gaussian, the time bins in which it contributed to a training frame.
+
+It fills for free from the rasteriser's sum of alpha * T, is inherited on split, and answers three questions: where to
+anchor, which instant to ask a Gaussian at, and which frozen pixels are guesses (docs/architecture.md, "support").
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..gaussians import Gaussians
+
+MAX_BINS = 256
+SEEN_WEIGHT = 0.1
+"""Sum of alpha * T over a frame's pixels above which a Gaussian counts as seen in it."""
+
+
+def bin_times(times: np.ndarray) -> Tensor:
+    """Centres of the time bins, [B] float32 ascending: the trained times themselves, or 256 even bins if more."""
+    distinct = np.unique(np.asarray(times, dtype=np.float64))
+    if len(distinct) < 2:
+        raise ValueError(f"{len(distinct)} distinct time: at least 2 are needed")
+    if len(distinct) > MAX_BINS:
+        distinct = (np.arange(MAX_BINS) + 0.5) / MAX_BINS
+    return torch.from_numpy(distinct).float()
+
+
+def bin_of(centres: Tensor, time: float) -> int:
+    """Index of the bin nearest to a time."""
+    return int((centres - time).abs().argmin())
+
+
+@torch.no_grad()
+def mark_seen(model: Gaussians, time_bin: int, weight_sum: Tensor) -> None:
+    """Notes who contributed to a training frame; weight_sum [N] is the sum of alpha * T over its pixels."""
+    model.support[:, time_bin] |= weight_sum > SEEN_WEIGHT
+
+
+def nearest_supported(support: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Nearest supported bins at or before, and at or after, a bin.
+
+    Args:
+        support: bool [M, B].
+        bins: int64 [M].
+
+    Returns:
+        (left [M], has_left [M], right [M], has_right [M]); where there is none the index is the bin itself.
+    """
+    index = torch.arange(support.shape[1]).expand_as(support)
+    before = torch.where(support & (index <= bins[:, None]), index, -1).amax(1)
+    after = torch.where(support & (index >= bins[:, None]), index, support.shape[1]).amin(1)
+    has_left, has_right = before >= 0, after < support.shape[1]
+    return torch.where(has_left, before, bins), has_left, torch.where(has_right, after, bins), has_right
+
+
+def nearest_bin(support: Tensor, centres: Tensor, time: float) -> tuple[Tensor, Tensor]:
+    """For each of M Gaussians the supported bin nearest to a time: (bin [M], has one [M]); ties go to the past."""
+    distance = (centres - time).abs()
+    cost = torch.where(support, distance, torch.inf)
+    best = cost.argmin(1)
+    return best, support.any(1)
+
+
+def support_confidence(support: Tensor, is_open: Tensor, centres: Tensor, time: float, decay: float) -> Tensor:
+    """How well each Gaussian is known at a time, [N] in [0, 1].
+
+    1 for a Gaussian that does not move and was ever seen, or that was seen at that time; for a moving one it decays
+    with the distance to its nearest supported bin as exp(-|dt| / decay), both in normalised time; 0 if never seen.
+    """
+    distance = torch.where(support, (centres - time).abs(), torch.inf).amin(1)
+    half_bin = 0.5 * float((centres[1:] - centres[:-1]).max())
+    known = torch.exp(-(distance - half_bin).clamp_min(0.0) / decay)
+    return torch.where(is_open, known, support.any(1).float())

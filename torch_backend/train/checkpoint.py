@@ -1,0 +1,60 @@
+"""Checkpoints: one safetensors file that holds all a run needs to go on. Nothing in it can execute."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from ..contract import ExitCode, JobError, check_version
+from ..shot import atomic_path
+
+CHECKPOINT_VERSION = 1
+
+
+def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
+    """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then."""
+    contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    text = json.dumps({"version": CHECKPOINT_VERSION, **meta}, allow_nan=False)
+    with atomic_path(path) as beside:
+        save_file(contiguous, str(beside), metadata={"splannequin": text})
+
+
+def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """(tensors, facts). JobError in words if the file is damaged or from a newer version."""
+    try:
+        with safe_open(str(path), framework="pt", device="cpu") as stored:
+            meta = json.loads((stored.metadata() or {})["splannequin"])
+            check_version(meta, str(path), CHECKPOINT_VERSION)
+            return {name: stored.get_tensor(name) for name in stored.keys()}, meta  # noqa: SIM118 - not a dict
+    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+        raise JobError(
+            f"The checkpoint {path} cannot be read ({type(error).__name__}).",
+            "Train the run again with --restart.",
+            ExitCode.TRAIN,
+        ) from error
+
+
+def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Adam's moments by parameter name."""
+    tensors = {}
+    for name, parameter in named.items():
+        for key, value in optimizer.state.get(parameter, {}).items():
+            tensors[f"adam.{key}.{name}"] = torch.as_tensor(value)
+    return tensors
+
+
+def restore_optimizer(
+    named: dict[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]
+) -> None:
+    """Inverse of `optimizer_state`."""
+    for name, parameter in named.items():
+        keys = ("step", "exp_avg", "exp_avg_sq")
+        stored = {key: tensors.get(f"adam.{key}.{name}") for key in keys}
+        if all(value is not None for value in stored.values()):
+            optimizer.state[parameter] = {key: value.clone() for key, value in stored.items() if value is not None}

@@ -1,0 +1,152 @@
+"""Presets and every number of a run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..contract import TrainParams
+from ..deformation import GateConfig, HexPlaneConfig
+from ..gaussians import DensifyConfig, InitConfig
+from ..supervision import SupervisionConfig
+
+
+@dataclass
+class TrainConfig:
+    """One run. Learning rates are per scene unit of camera extent 1; shares are of the run's length."""
+
+    preset: str = "preview"
+    """Preset these numbers come from."""
+    iterations: int = 3000
+    """Training steps of one image each."""
+    width: int = 320
+    """Width in pixels of the training images (never above the working frames')."""
+    holdout: int = 8
+    """Every how many solved frames one is held out, never the first or last; 0: none."""
+    holdout_phase: int = 0
+    """Which of every `holdout` frames: 0 is what is reported; tuning uses another, so as not to tune on the judge."""
+    method: str = "auto"
+    """auto: HexPlane behind the gate. hexplane: HexPlane for all. static: no deformation."""
+    device: str = "cpu"
+    """Where tensors live."""
+    seed: int = 0
+    """Seed of every random draw."""
+    dssim: float = 0.2
+    """Share of D-SSIM in the photometric loss (3DGS: 0.2)."""
+    sh_degree: int = 2
+    """Highest SH degree."""
+    sh_every: float = 0.15
+    """The SH degree rises by one every this share of the run."""
+    lr_means: float = 6e-4
+    """Start learning rate of means (3DGS 1.6e-4 over 30,000 steps; shorter runs need longer ones)."""
+    lr_means_end: float = 6e-6
+    """End learning rate of means."""
+    lr_scales: float = 8e-3
+    """Learning rate of log-scales (3DGS: 5e-3)."""
+    lr_quats: float = 2e-3
+    """Learning rate of quaternions (3DGS: 1e-3)."""
+    lr_opacities: float = 4e-2
+    """Learning rate of opacity logits (3DGS: 5e-2)."""
+    lr_sh0: float = 5e-3
+    """Learning rate of the constant colour (3DGS: 2.5e-3)."""
+    lr_shN: float = 2.5e-4
+    """Learning rate of the other harmonics (3DGS: 2.5e-3 / 20)."""
+    opacity_weight: float = 2e-3
+    """Weight of the mean opacity: keeps what no image needs from staying (3DGS-MCMC: 1e-2)."""
+    scale_weight: float = 2e-3
+    """Weight of the mean standard deviation in scene units (3DGS-MCMC: 1e-2)."""
+    field_every: int = 4
+    """The field's regularisers are evaluated every so many steps, times as strong."""
+    evaluate_every: float = 0.1
+    """Share of the run between two measurements on held-out frames."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between two checkpoints."""
+    init: InitConfig = field(default_factory=InitConfig)
+    """Start of the Gaussians."""
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    """Growth of the Gaussians."""
+    hexplane: HexPlaneConfig = field(default_factory=HexPlaneConfig)
+    """Host A."""
+    gate: GateConfig = field(default_factory=GateConfig)
+    """Which Gaussians move."""
+    supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
+    """Anchoring."""
+
+
+def _preview() -> TrainConfig:
+    return TrainConfig()
+
+
+def _standard() -> TrainConfig:
+    return TrainConfig(
+        preset="standard",
+        iterations=9000,
+        width=640,
+        holdout=0,
+        sh_degree=3,
+        init=InitConfig(seeds=15_000, frames=24, sh_degree=3),
+        densify=DensifyConfig(budget=80_000),
+    )
+
+
+def _final() -> TrainConfig:
+    return TrainConfig(
+        preset="final",
+        iterations=30_000,
+        width=1280,
+        holdout=0,
+        sh_degree=3,
+        init=InitConfig(seeds=30_000, frames=32, sh_degree=3),
+        densify=DensifyConfig(budget=250_000),
+    )
+
+
+PRESETS = {"preview": _preview, "standard": _standard, "final": _final}
+"""Name -> a fresh configuration."""
+METHODS = ("auto", "hexplane", "static")
+SUPERVISIONS = ("support", "paper", "none")
+
+
+def config_from_params(params: TrainParams) -> TrainConfig:
+    """The preset with the artist's changes. ValueError names a choice that does not exist."""
+    for name, value, allowed in (
+        ("preset", params.preset, tuple(PRESETS)),
+        ("method", params.method, METHODS),
+        ("supervision", params.supervision, SUPERVISIONS),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name} is {value!r}: it should be one of {', '.join(allowed)}")
+    config = PRESETS[params.preset]()
+    config.method, config.seed = params.method, params.seed
+    config.iterations = params.iterations or config.iterations
+    config.width = params.width or config.width
+    config.densify.budget = params.max_gaussians or config.densify.budget
+    config.supervision.preset = params.supervision
+    if params.holdout >= 0:
+        config.holdout = params.holdout
+    if config.iterations < 10:
+        raise ValueError(f"iterations is {config.iterations}: a run needs at least 10")
+    return config
+
+
+def config_to_json(config: TrainConfig) -> dict[str, Any]:
+    """Plain types for config.json."""
+    return dataclasses.asdict(config)
+
+
+def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
+    """Inverse of `config_to_json`; ValueError names an unknown field."""
+    nested = {
+        "init": InitConfig, "densify": DensifyConfig, "hexplane": HexPlaneConfig,
+        "gate": GateConfig, "supervision": SupervisionConfig,
+    }  # fmt: skip
+    values = dict(data)
+    try:
+        for name, cls in nested.items():
+            inner = {k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()}
+            values[name] = cls(**inner)
+        return TrainConfig(**values)
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"the run's config.json does not fit this version: {error}") from error

@@ -1,0 +1,85 @@
+"""A dynamic scene as one thing: Gaussians, field and gate, rendered at a time from a camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..deformation import Deltas, HexPlane, apply_deltas
+from ..gaussians import Gaussians, sh_bases
+from ..raster import RasterOutput, RasterSettings, rasterize
+
+
+@dataclass
+class DynamicModel:
+    """Gaussians in scene units; `field` is None while nothing moves."""
+
+    gaussians: Gaussians
+    """Canonical Gaussians with gate and support."""
+    field: HexPlane | None
+    """Host A, once the gate has opened."""
+    centres: Tensor
+    """[B] normalised times of the support bins."""
+    sh_degree: int
+    """SH degree in use."""
+
+    def open_rows(self) -> Tensor:
+        """Rows of the Gaussians that the field moves, int64 [M]."""
+        if self.field is None:
+            return torch.zeros(0, dtype=torch.long)
+        return torch.nonzero(self.gaussians.open).flatten()
+
+    def deltas(self, rows: Tensor, times: Tensor) -> Deltas | None:
+        """The field at the canonical means of `rows` [M]; times [M] or [1]. None without a field or rows."""
+        if self.field is None or not len(rows):
+            return None
+        return self.field(self.gaussians.params["means"][rows], times)
+
+    def state_at(self, time: float) -> dict[str, Tensor]:
+        """All parameters at a normalised time, with gradients."""
+        rows = self.open_rows()
+        return apply_deltas(self.gaussians, rows, self.deltas(rows, torch.tensor([time])))
+
+
+def render(
+    state: dict[str, Tensor],
+    sh_degree: int,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | None = None,
+    **options: Any,
+) -> RasterOutput:
+    """Rasterises one camera (viewmat [4, 4], K [3, 3]) of a parameter state; `options` go to `rasterize`.
+
+    The background [3] (+ extra channels) is what shows where alpha < 1.
+    """
+    sh = state["sh0"] if sh_degree == 0 else torch.cat([state["sh0"], state["shN"][:, : sh_bases(sh_degree) - 1]], dim=1)
+    return rasterize(
+        means=state["means"],
+        quats=state["quats"],
+        log_scales=state["log_scales"],
+        opacity_logits=state["opacity_logits"],
+        sh=sh,
+        viewmats=viewmat[None],
+        Ks=K[None],
+        width=width,
+        height=height,
+        background=background,
+        **options,
+    )
+
+
+def field_box(means: Tensor) -> Tensor:
+    """Box [2, 3] that a field should resolve for the Gaussians means [M, 3]: robust bounds and a margin."""
+    low = torch.quantile(means, 0.01, dim=0) if len(means) < 2**24 else means.amin(0)
+    high = torch.quantile(means, 0.99, dim=0) if len(means) < 2**24 else means.amax(0)
+    margin = 0.15 * (high - low).clamp_min(1e-2)
+    return torch.stack([low - margin, high + margin])
+
+
+__all__ = ["DynamicModel", "RasterSettings", "field_box", "render"]

@@ -1,0 +1,196 @@
+"""The training station: a solved shot and a request in, a run folder out."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..contract import ExitCode, JobError, Reporter, TrainParams, read_json
+from ..scene import Scene, load_images, load_scene, split_frames
+from ..shot import Shot, content_key, write_json
+from .checkpoint import load_checkpoint
+from .config import TrainConfig, config_from_json, config_from_params, config_to_json
+from .model import DynamicModel
+from .trainer import Trainer, restore_model
+
+
+@dataclass
+class LoadedRun:
+    """A finished (or interrupted) run, ready to be rendered."""
+
+    folder: Path
+    """runs/<name>."""
+    config: TrainConfig
+    """Its numbers."""
+    model: DynamicModel
+    """Its Gaussians and field."""
+    width: int
+    """Width in pixels of the images it was trained on."""
+    height: int
+    """Height of them."""
+    train_frames: list[int]
+    """Frame numbers it was trained on."""
+
+
+def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
+    """Trains one run; resumes its checkpoint if asked to and the settings are the same.
+
+    Returns the run's figures, also written to runs/<name>/summary.json. JobError in words if it cannot be done.
+    """
+    config = config_from_params(params)
+    config.device = pick_device(params.device)
+    torch.set_num_threads(os.cpu_count() or 1)
+    folder = shot.run(params.run)
+    scene = load_scene(shot)
+    width, height = training_size(scene, config.width)
+    train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
+    key = content_key(config_to_json(config), shot.solve / "cameras.json", train, test)
+    done = finished(folder, key)
+    if done is not None and params.resume:
+        report.progress("training", 1, 1, "already trained")
+        return done
+    images = load_images(scene, train + test, width, height, report)
+    trainer = Trainer(scene, images[: len(train)], train, config, report)
+    checkpoint = folder / "checkpoint.safetensors"
+    resumed = _resume(trainer, folder, checkpoint, key, params.resume, report)
+    write_json(folder / "config.json", {"version": 1, "key": key, "config": config_to_json(config)})
+    metrics = Metrics(folder, report, fresh=not resumed)
+    held_out = images[len(train) :]
+
+    def evaluate(t: Trainer) -> None:
+        metrics.add(t, test, held_out)
+
+    trainer.run(checkpoint, evaluate)
+    summary = summarise(trainer, params.run, test, held_out, key)
+    write_json(folder / "summary.json", summary)
+    report.metric("train", summary)
+    return summary
+
+
+def training_size(scene: Scene, wanted: int) -> tuple[int, int]:
+    """(width, height) of the training images: the working frames' shape, never larger than they are."""
+    width = min(wanted, scene.width)
+    return width, max(16, round(scene.height * width / scene.width))
+
+
+def pick_device(wanted: str) -> str:
+    """The torch device to use. JobError if a GPU was asked for that this backend cannot drive."""
+    if wanted == "cuda":
+        raise JobError(
+            "Training on the GPU is not part of this version.", "Choose the device auto or cpu.", ExitCode.ENVIRONMENT
+        )
+    return "cpu"
+
+
+def finished(folder: Path, key: str) -> dict[str, Any] | None:
+    """The summary of a run that was finished with the same settings on the same solve, or None."""
+    path = folder / "summary.json"
+    if not path.is_file() or not (folder / "checkpoint.safetensors").is_file():
+        return None
+    summary = read_json(path)
+    return summary if summary.get("key") == key else None
+
+
+def _resume(trainer: Trainer, folder: Path, checkpoint: Path, key: str, wanted: bool, report: Reporter) -> bool:
+    if not (wanted and checkpoint.is_file() and (folder / "config.json").is_file()):
+        return False
+    if read_json(folder / "config.json").get("key") != key:
+        report.warning("The run's settings or cameras changed: it is trained anew.")
+        return False
+    trainer.restore(checkpoint)
+    report.progress("training", trainer.iteration, trainer.config.iterations, f"resumed at step {trainer.iteration}")
+    return True
+
+
+class Metrics:
+    """metrics.jsonl and preview images of a run, while it trains."""
+
+    def __init__(self, folder: Path, report: Reporter, fresh: bool) -> None:
+        self.folder, self.report = folder, report
+        self.path = folder / "metrics.jsonl"
+        (folder / "previews").mkdir(parents=True, exist_ok=True)
+        if fresh:
+            self.path.unlink(missing_ok=True)
+
+    def add(self, trainer: Trainer, test: list[int], held_out: Tensor) -> None:
+        """Measures on the held-out frames, appends a line, shows a preview."""
+        value = trainer.heldout_psnr(test, held_out)
+        row = {
+            "seconds": round(trainer.trained_seconds, 2),
+            "iteration": trainer.iteration,
+            "heldout_psnr_db": None if value is None else round(value, 3),
+            "gaussians": len(trainer.model.gaussians),
+            "moving_share": round(moving_share(trainer.model), 5),
+        }
+        with open(self.path, "a", encoding="utf-8") as lines:
+            lines.write(json.dumps(row) + "\n")
+        self.report.metric("training", row)
+        index = test[len(test) // 2] if test else trainer.train_ids[len(trainer.train_ids) // 2]
+        preview = self.folder / "previews" / f"{trainer.iteration:06d}.png"
+        save_png(preview, trainer.render_frame(index))
+        self.report.image("preview", preview)
+
+
+def moving_share(model: DynamicModel) -> float:
+    """Share of the Gaussians that the field moves."""
+    return len(model.open_rows()) / max(1, len(model.gaussians))
+
+
+def save_png(path: Path, image: Tensor) -> None:
+    """Writes a display-referred [H, W, 3] image as 8-bit PNG."""
+    import OpenImageIO as oiio
+
+    from ..shot import atomic_path
+
+    pixels = (image.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).contiguous().numpy()
+    with atomic_path(path) as beside:
+        out = oiio.ImageOutput.create(str(beside))
+        out.open(str(beside), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.UINT8))
+        if not out.write_image(pixels):
+            raise OSError(f"cannot write {path}: {out.geterror()}")
+        out.close()
+
+
+def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, key: str) -> dict[str, Any]:
+    """The run's figures, units in the key names; what was modelled and what it cost."""
+    value = trainer.heldout_psnr(test, held_out)
+    model = trainer.model
+    return {
+        "version": 1,
+        "key": key,
+        "run": name,
+        "preset": trainer.config.preset,
+        "method": trainer.config.method,
+        "supervision": trainer.config.supervision.preset,
+        "iterations": trainer.iteration,
+        "width_px": trainer.width,
+        "height_px": trainer.height,
+        "train_frames": len(trainer.train_ids),
+        "heldout_frames": len(test),
+        "heldout_psnr_db": None if value is None else round(value, 3),
+        "gaussians": len(model.gaussians),
+        "moving_gaussians": len(model.open_rows()),
+        "moving_share": round(moving_share(model), 5),
+        "sh_degree": model.sh_degree,
+        "train_seconds": round(trainer.trained_seconds, 2),
+    }
+
+
+def load_run(shot: Shot, name: str) -> LoadedRun:
+    """A run as it stands in its checkpoint. JobError if there is none."""
+    folder = shot.run(name)
+    checkpoint = folder / "checkpoint.safetensors"
+    if not checkpoint.is_file() or not (folder / "config.json").is_file():
+        raise JobError(f"{shot.root.name} has no trained run named {name!r}.", "Run the training step first.", ExitCode.FREEZE)
+    config = config_from_json(read_json(folder / "config.json")["config"])
+    tensors, meta = load_checkpoint(checkpoint)
+    if int(meta["iteration"]) == 0:
+        raise JobError(f"The run {name!r} has not been trained yet.", "Run the training step first.", ExitCode.FREEZE)
+    model = restore_model(tensors, meta, config)
+    return LoadedRun(folder, config, model, int(meta["width"]), int(meta["height"]), list(meta["train_frames"]))
