@@ -1,0 +1,134 @@
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from torch_backend.freeze.exr import CHANNELS, HALF_MAX, FrameMetadata, read_frozen_exr, write_frozen_exr
+
+VIEWMAT = np.array([[0, -1, 0, 0.25], [1, 0, 0, -2], [0, 0, 1, 3.5], [0, 0, 0, 1]], dtype=np.float32)
+K = np.array([[1000.5, 0, 31.5], [0, 999.25, 24.5], [0, 0, 1]], dtype=np.float32)
+METADATA = FrameMetadata(frame=1012, t_star_frame=1030.5, viewmat=VIEWMAT, K=K, depth_units="metres")
+
+
+def layers(height=7, width=9, seed=1):
+    rng = np.random.default_rng(seed)
+    rgba = rng.uniform(-0.2, 6.0, (height, width, 4))
+    rgba[..., 3] = rng.uniform(size=(height, width))
+    depth = rng.uniform(0.01, 5000.0, (height, width))
+    depth[0, 0] = 1e10
+    arrays = dict(rgba=rgba, depth=depth, support=rng.uniform(size=depth.shape), motion=rng.uniform(size=depth.shape))
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
+
+
+def test_round_trip_keeps_depth_exact_and_the_rest_to_half(tmp_path):
+    stored = layers()
+    frame = read_frozen_exr(write_frozen_exr(tmp_path / "Größe 測試" / "001012.exr", metadata=METADATA, **stored))
+    np.testing.assert_array_equal(frame.depth, stored["depth"])
+    for name in ("rgba", "support", "motion"):
+        np.testing.assert_array_equal(getattr(frame, name), stored[name].astype(np.float16).astype(np.float32))
+    assert [p.name for p in (tmp_path / "Größe 測試").iterdir()] == ["001012.exr"]
+
+
+def test_metadata_comes_back(tmp_path):
+    read = read_frozen_exr(write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **layers())).metadata
+    for field in dataclasses.fields(FrameMetadata):
+        np.testing.assert_array_equal(getattr(read, field.name), getattr(METADATA, field.name), err_msg=field.name)
+
+
+def test_file_is_one_part_of_zipped_half_and_float_channels_in_linear_rec709(tmp_path):
+    path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **layers())
+    image = oiio.ImageBuf(str(path))
+    spec = image.spec()
+    formats = dict(zip(spec.channelnames, map(str, spec.channelformats), strict=True))
+    assert formats == {name: "float" if name == "Z" else "half" for name in CHANNELS}
+    assert image.nsubimages == 1
+    assert spec.getattribute("compression") == "zip"
+    assert spec.getattribute("oiio:ColorSpace") == "lin_rec709_scene"
+    assert spec.getattribute("chromaticities") == pytest.approx((0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329))
+
+
+def test_world_to_camera_is_imath_row_vectors_looking_along_minus_z(tmp_path):
+    path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **layers())
+    matrix = np.reshape(oiio.ImageBuf(str(path)).spec().getattribute("worldToCamera"), (4, 4))
+    point = np.array([0.3, -0.7, 2.0, 1.0])
+    x, y, z, _ = VIEWMAT.astype(np.float64) @ point
+    np.testing.assert_allclose(point @ matrix, [x, -y, -z, 1.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["rgba", "depth", "support", "motion"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_refuses_not_finite_and_names_layer_and_place(tmp_path, name, bad):
+    stored = layers()
+    stored[name][3, 2] = bad
+    with pytest.raises(ValueError, match=rf"^{name} has \d NaN or infinite values, the first at \(2, 3\)"):
+        write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **stored)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_clamps_to_half_range_but_not_depth(tmp_path):
+    stored = layers()
+    stored["rgba"][0, 0] = [1e6, -1e6, 65519.0, 1.0]
+    stored["depth"][1, 1] = 1e6
+    frame = read_frozen_exr(write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **stored))
+    assert frame.rgba[0, 0].tolist() == [HALF_MAX, -HALF_MAX, HALF_MAX, 1.0]
+    assert frame.depth[1, 1] == 1e6
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("rgba", (7, 9, 3)), ("rgba", (0, 9, 4)), ("depth", (9, 7)), ("support", (7, 9, 1))]
+)
+def test_refuses_wrong_shapes_and_names_the_layer(tmp_path, name, shape):
+    with pytest.raises(ValueError, match=f"^{name} should be"):
+        write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, **layers() | {name: np.zeros(shape)})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"viewmat": np.full((4, 4), np.nan)}, "metadata.viewmat"),
+        ({"K": np.ones(4)}, "metadata.K"),
+        ({"t_star_frame": np.inf}, "metadata.t_star_frame"),
+    ],
+)
+def test_refuses_bad_metadata(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
+        write_frozen_exr(tmp_path / "a.exr", metadata=dataclasses.replace(METADATA, **changes), **layers())
+
+
+def test_refuses_to_read_newer_foreign_damaged_and_missing_files(tmp_path):
+    newer = write_frozen_exr(tmp_path / "new.exr", metadata=dataclasses.replace(METADATA, version=99), **layers())
+    with pytest.raises(ValueError, match="newer version"):
+        read_frozen_exr(newer)
+    oiio.ImageBuf(oiio.ImageSpec(4, 4, 3, oiio.HALF)).write(str(tmp_path / "rgb.exr"))
+    with pytest.raises(ValueError, match=r"no channel A, Z, Support\.V, Motion\.V"):
+        read_frozen_exr(tmp_path / "rgb.exr")
+    whole = write_frozen_exr(tmp_path / "whole.exr", metadata=METADATA, **layers(64, 64)).read_bytes()
+    (tmp_path / "half.exr").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"half\.exr"):
+        read_frozen_exr(tmp_path / "half.exr")
+    with pytest.raises(FileNotFoundError):
+        read_frozen_exr(tmp_path / "none.exr")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="file size limits are POSIX")
+def test_a_write_cut_short_by_the_system_is_an_oserror_and_leaves_nothing(tmp_path):
+    script = """
+import resource, sys
+import numpy as np
+from torch_backend.freeze.exr import FrameMetadata, write_frozen_exr
+resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
+noise = np.random.default_rng(0).uniform(size=(200, 200)).astype(np.float32)
+meta = FrameMetadata(1, 1.0, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32))
+try:
+    write_frozen_exr(sys.argv[1], np.repeat(noise[..., None], 4, 2), noise, noise, noise, meta)
+except OSError as error:
+    print("OSError", error.errno, error.filename)
+"""
+    command = [sys.executable, "-c", script, str(tmp_path / "a.exr")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.startswith("OSError")
+    assert "a.exr" in done.stdout
+    assert list(tmp_path.iterdir()) == []

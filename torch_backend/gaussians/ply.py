@@ -1,0 +1,181 @@
+"""Gaussians as a standard 3DGS PLY: what SuperSplat, KIRI's add-on, Nuke's and Houdini's splat readers open.
+
+Layout of the original 3D Gaussian Splatting code (graphdeco-inria/gaussian-splatting, scene/gaussian_model.py,
+`save_ply`): binary little endian, float32, per vertex x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..(3(K-1)-1)
+channel-major (all bases of red, then of green, then of blue), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..shot import atomic_path
+
+SH_BASES = (1, 4, 9, 16)
+"""K for SH degrees 0 to 3."""
+
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+_MAX_HEADER_LINES = 1000
+
+
+class PlyGaussians(NamedTuple):
+    """Gaussians as stored: nothing activated, world frame of whoever wrote them."""
+
+    means: NDArray[np.float32]
+    """[N,3], world units."""
+    quats: NDArray[np.float32]
+    """[N,4] wxyz, not necessarily of unit length."""
+    log_scales: NDArray[np.float32]
+    """[N,3]."""
+    opacity_logits: NDArray[np.float32]
+    """[N]."""
+    sh: NDArray[np.float32]
+    """[N,K,3], K = (degree + 1)^2; [:,0] is the constant band."""
+
+
+def property_names(bases: int) -> list[str]:
+    """Names of the vertex properties in file order, for K SH bases."""
+    return [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * (bases - 1))),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def write_ply(
+    path: str | Path,
+    means: ArrayLike,  # [N,3]
+    quats: ArrayLike,  # [N,4] wxyz
+    log_scales: ArrayLike,  # [N,3]
+    opacity_logits: ArrayLike,  # [N]
+    sh: ArrayLike,  # [N,K,3]
+) -> Path:
+    """Writes the Gaussians atomically, in the frame and units they are in; values are cast to float32.
+
+    ValueError names the array whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be
+    written.
+    """
+    gaussians = PlyGaussians(
+        *(np.asarray(array, dtype=np.float32) for array in (means, quats, log_scales, opacity_logits, sh))
+    )
+    _check(gaussians)
+    count, bases = gaussians.sh.shape[:2]
+    names = property_names(bases)
+    header = "\n".join(
+        ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+        + [f"property float {name}" for name in names]
+        + ["end_header\n"]
+    )
+    rows = np.concatenate(
+        [
+            gaussians.means,
+            np.zeros((count, 3), dtype=np.float32),
+            gaussians.sh[:, 0],
+            gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (bases - 1)),
+            gaussians.opacity_logits[:, None],
+            gaussians.log_scales,
+            gaussians.quats,
+        ],
+        axis=1,
+        dtype="<f4",
+    )
+    path = Path(path)
+    with atomic_path(path) as beside, open(beside, "wb") as handle:
+        handle.write(header.encode("ascii"))
+        rows.tofile(handle)
+    return path
+
+
+def read_ply(path: str | Path) -> PlyGaussians:
+    """Reads a binary 3DGS PLY of any SH degree from 0 to 3; further vertex properties and elements are passed over.
+
+    FileNotFoundError without a file; ValueError if it is not such a PLY, is cut short, or holds NaN or infinity.
+    """
+    path = Path(path)
+    with open(path, "rb") as handle:
+        count, layout = _read_header(handle, path)
+        need, there = count * layout.itemsize, os.fstat(handle.fileno()).st_size - handle.tell()
+        if there < need:
+            raise ValueError(f"{path}: cut short, {count} Gaussians need {need} bytes and {there} are there")
+        rows = np.fromfile(handle, dtype=layout, count=count)
+    fields = rows.dtype.names or ()
+    rest = sum(name.startswith("f_rest_") for name in fields)
+    bases = rest // 3 + 1
+    if rest % 3 or bases not in SH_BASES:
+        raise ValueError(f"{path}: {rest} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45")
+    missing = [name for name in property_names(bases) if name not in fields and name not in ("nx", "ny", "nz")]
+    if missing:
+        raise ValueError(f"{path}: not a 3D Gaussian PLY, the vertices have no {', '.join(missing[:4])}")
+
+    def columns(*names: str) -> NDArray[np.float32]:
+        return np.stack([rows[name] for name in names], axis=-1).astype(np.float32)
+
+    sh = np.empty((count, bases, 3), dtype=np.float32)
+    sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
+    if rest:
+        sh[:, 1:] = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, bases - 1).transpose(0, 2, 1)
+    gaussians = PlyGaussians(
+        columns("x", "y", "z"),
+        columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        columns("scale_0", "scale_1", "scale_2"),
+        rows["opacity"].astype(np.float32),
+        sh,
+    )
+    _check(gaussians, f"{path}: ")
+    return gaussians
+
+
+def _check(gaussians: PlyGaussians, where: str = "") -> None:
+    count = gaussians.means.shape[0] if gaussians.means.ndim else 0
+    bases = gaussians.sh.shape[1] if gaussians.sh.ndim == 3 else 0
+    if bases not in SH_BASES:
+        raise ValueError(f"{where}sh should be [N,K,3] with K one of {SH_BASES}, got shape {gaussians.sh.shape}")
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, bases, 3))
+    for name, array, shape in zip(gaussians._fields, gaussians, shapes, strict=True):
+        if array.shape != shape:
+            raise ValueError(f"{where}{name} should have shape {shape}, got {array.shape}")
+        if not np.isfinite(array).all():
+            bad = int((~np.isfinite(array.reshape(count, -1))).any(axis=1).sum())
+            raise ValueError(f"{where}{name} of {bad} Gaussians is not finite")
+
+
+def _read_header(handle: BinaryIO, path: Path) -> tuple[int, np.dtype]:
+    """Number of vertices and the layout of one; leaves the handle at the first vertex."""
+    if handle.readline(16).strip() != b"ply":
+        raise ValueError(f"{path}: not a PLY file")
+    count: int | None = None
+    fields: list[tuple[str, str]] = []
+    element = ""
+    for _ in range(_MAX_HEADER_LINES):
+        words = handle.readline(1024).decode("ascii", errors="replace").split()
+        match words:
+            case ["format", "binary_little_endian", _] | ["comment", *_] | ["obj_info", *_]:
+                pass
+            case ["format", kind, *_]:
+                raise ValueError(f"{path}: format {kind}; only binary_little_endian is read")
+            case ["element", name, number] if number.isdecimal():
+                if count is None and name != "vertex":
+                    raise ValueError(f"{path}: element {name} comes before the vertices")
+                element, count = name, int(number) if name == "vertex" else count
+            case ["property", kind, name] if kind in _PLY_TYPES:
+                if element == "vertex":
+                    fields.append((name, _PLY_TYPES[kind]))
+            case ["property", "list", *_] if element != "vertex":
+                pass
+            case ["end_header"] if count is not None and len({name for name, _ in fields}) == len(fields) > 0:
+                return count, np.dtype(fields)
+            case _:
+                raise ValueError(f"{path}: bad line in the PLY header: {' '.join(words)[:80]!r}")
+    raise ValueError(f"{path}: the PLY header does not end within {_MAX_HEADER_LINES} lines")
