@@ -31,7 +31,7 @@ class GateConfig:
     max_share: float = 0.3
     """Most Gaussians that may be open; the largest residuals go first."""
     neighbours: int = 8
-    """A Gaussian's residual is averaged with this many nearest ones: things move in pieces, noise does not."""
+    """The median over this many nearest ones stands for a Gaussian: things move in pieces, noise does not."""
 
 
 def residual_per_gaussian(
@@ -73,8 +73,8 @@ def open_gate(model: Gaussians, residual: Tensor, weight: Tensor, config: GateCo
         return 0
     rows = torch.nonzero(painted).flatten()
     means = model.params["means"].detach()[rows].numpy()
-    nearest = cKDTree(means).query(means, k=config.neighbours + 1)[1]
-    smooth = residual[rows][torch.from_numpy(np.ascontiguousarray(nearest))].mean(1)
+    nearest = cKDTree(means).query(means, k=config.neighbours + 1)[1].reshape(len(rows), -1)
+    smooth = residual[rows][torch.from_numpy(np.ascontiguousarray(nearest))].median(1).values
     median = smooth.median()
     spread = 1.4826 * (smooth - median).abs().median()
     wanted = torch.zeros_like(model.open)

@@ -66,7 +66,7 @@ class Densifier:
         """How many Gaussians the schedule allows at `progress` (0 to 1) of the run."""
         c = self.config
         share = min(max((progress - c.start) / (c.stop - c.start), 0.0), 1.0)
-        return int(initial + (max(c.budget, initial) - initial) * math.sqrt(share))
+        return round(initial + (max(c.budget, initial) - initial) * math.sqrt(share))
 
     @torch.no_grad()
     def step(self, model: Gaussians, optimizer: torch.optim.Optimizer, initial: int, progress: float) -> tuple[int, int]:

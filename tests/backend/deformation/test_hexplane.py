@@ -1,0 +1,100 @@
+"""Host A: identity at the start, time over the whole plane, gradients against finite differences."""
+
+import pytest
+import torch
+from torch_backend.deformation import HexPlane, HexPlaneConfig
+
+BOX = torch.tensor([[-1.0, -2.0, 0.5], [1.0, 2.0, 3.0]])
+
+
+def field(**changes):
+    config = HexPlaneConfig(features=4, resolution=8, time_nodes=5, width=16, **changes)
+    return HexPlane(config, BOX, torch.Generator().manual_seed(0))
+
+
+def points(count=9):
+    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(1))
+    return BOX[0] + unit * (BOX[1] - BOX[0])
+
+
+def stir(module):
+    """Gives the zero heads and flat time planes something to say."""
+    g = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter += 0.3 * torch.randn(parameter.shape, generator=g, dtype=parameter.dtype)
+    return module
+
+
+def test_identity_at_construction():
+    for t in (0.0, 0.3, 1.0):
+        for delta in field()(points(), torch.tensor([t])):
+            assert not delta.any()
+
+
+def test_shapes_and_sizes():
+    deltas = field()(points(7), torch.tensor([0.5]))
+    assert [tuple(d.shape) for d in deltas] == [(7, 3), (7, 4), (7, 3), (7,), (7, 1, 3)]
+
+
+def test_ends_of_time_hit_the_end_nodes():
+    """The published code feeds [0, 1] to a [-1, 1] sampler and never reaches half of the plane (issues #248, #251)."""
+    module = field()
+    with torch.no_grad():
+        for plane in module.temporal:
+            plane.copy_(torch.arange(5.0)[None, None, :, None].expand_as(plane))
+    x = points(3)
+    base = module.features_at(x, torch.tensor([1.0 / 4])) / 1.0
+    assert torch.allclose(module.features_at(x, torch.tensor([0.0])), torch.zeros_like(base), atol=1e-6)
+    assert torch.allclose(module.features_at(x, torch.tensor([1.0])), 64.0 * base, rtol=1e-4)
+
+
+def test_gradients_match_finite_differences_at_float64():
+    module = stir(field()).double()
+    module.box = BOX.double()
+    x, t = points(5).double(), torch.tensor([0.37], dtype=torch.float64)
+    parameters = [p for p in module.parameters() if p.numel() < 2000][:6]
+
+    def loss(*_):
+        return torch.stack([d.sin().sum() for d in module(x, t)]).sum()
+
+    for parameter in parameters:
+        assert torch.autograd.gradcheck(loss, (parameter,), eps=1e-6, atol=1e-7, rtol=1e-4)
+
+
+def test_means_get_no_gradient_through_the_lookup():
+    x = points().requires_grad_()
+    deltas = stir(field())(x, torch.tensor([0.5]))
+    assert torch.stack([d.sum() for d in deltas]).sum().requires_grad
+    assert torch.autograd.grad(sum(d.sum() for d in deltas), x, allow_unused=True)[0] is None
+
+
+def test_smoothness_sees_every_axis():
+    """4DGaussians' spatial term never smooths x; ours must notice a kink along any axis."""
+    for plane_index in range(3):
+        for axis in (2, 3):
+            module = field()
+            with torch.no_grad():
+                for p in module.spatial:
+                    p.fill_(0.3)
+                flat = float(module.regularisation().detach())
+                module.spatial[plane_index].select(axis, 4).add_(1.0)
+            assert float(module.regularisation().detach()) > flat
+
+
+def test_outside_is_counted():
+    x = torch.cat([points(4), BOX[1:] + 1.0])
+    assert field().outside(x) == 1
+
+
+def test_state_round_trip():
+    one = stir(field())
+    two = HexPlane(one.config, BOX + 1.0, torch.Generator().manual_seed(5))
+    two.load_state(one.state())
+    for a, b in zip(one(points(), torch.tensor([0.2])), two(points(), torch.tensor([0.2])), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_empty_box_is_refused():
+    with pytest.raises(ValueError, match="box"):
+        HexPlane(HexPlaneConfig(), torch.zeros(2, 3), torch.Generator())

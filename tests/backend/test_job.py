@@ -1,0 +1,105 @@
+"""Jobs: events in order, statuses that are true, cancellation, errors in words. Real files, real processes."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from torch_backend import contract, job
+from torch_backend.contract import ExitCode, JobError
+from torch_backend.shot import Shot
+
+
+@pytest.fixture
+def shot(tmp_path):
+    return Shot.create(tmp_path / "a.splannequin")
+
+
+def events_of(folder):
+    return [json.loads(line) for line in (folder / contract.EVENTS_FILE).read_text().splitlines()]
+
+
+def status_of(folder):
+    return contract.from_dict(contract.Status, contract.read_json(folder / contract.STATUS_FILE))
+
+
+def run_with(shot, monkeypatch, station):
+    """Runs an import job whose station is `station`: the job machinery is what is under test."""
+    monkeypatch.setitem(job.STATIONS, "import", station)
+    folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
+    return folder, job.run_job(folder)
+
+
+def test_done_is_last_and_status_is_true(shot, monkeypatch):
+    def station(shot, params, report):
+        report.progress("one", 1, 2, "half")
+        report.metric("one", {"psnr_db": 20.0})
+        report.warning("careful", "look")
+        return {"frames": 3}
+
+    folder, (code, result) = run_with(shot, monkeypatch, station)
+    assert (code, result) == (ExitCode.OK, {"frames": 3})
+    events = events_of(folder)
+    assert [e["type"] for e in events] == ["progress", "metric", "warning", "done"]
+    assert [e["seq"] for e in events] == [0, 1, 2, 3]
+    assert events[-1]["data"] == {"state": "done", "result": {"frames": 3}}
+    assert status_of(folder).state == "done"
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "word"),
+    [
+        (JobError("No people.", "Film some.", ExitCode.FOOTAGE), ExitCode.FOOTAGE, "No people."),
+        (ValueError("width is -1"), ExitCode.USAGE, "width is -1"),
+        (OSError(28, "No space left on device"), ExitCode.DISK, "No space left"),
+        (ZeroDivisionError("oops"), ExitCode.INTERNAL, "import step broke"),
+        (RuntimeError("CUDA out of memory"), ExitCode.INTERNAL, "Out of memory"),
+    ],
+)
+def test_errors_become_a_sentence(shot, monkeypatch, error, code, word):
+    def station(shot, params, report):
+        raise error
+
+    folder, (got, _) = run_with(shot, monkeypatch, station)
+    assert got == code
+    status = status_of(folder)
+    assert status.state == "failed"
+    assert word in status.message
+    assert [e["type"] for e in events_of(folder)] == ["error", "done"]
+    assert "Traceback" not in status.message + status.hint
+
+
+def test_cancel_file_stops_a_job(shot, monkeypatch):
+    def station(shot, params, report):
+        folder = next(shot.jobs.iterdir())
+        (folder / contract.CANCEL_FILE).touch()
+        for _ in range(200):
+            time.sleep(0.02)
+            report.check_cancelled()
+        raise AssertionError("never noticed")
+
+    folder, (code, _) = run_with(shot, monkeypatch, station)
+    assert code == ExitCode.CANCELLED
+    assert status_of(folder).state == "cancelled"
+
+
+def test_wrong_parameter_is_named(shot):
+    folder = job.new_job(shot, "train", {"preset": 3})
+    assert job.run_job(folder)[0] == ExitCode.USAGE
+    assert "preset" in status_of(folder).message
+
+
+def test_child_process_reports_an_unreadable_clip(shot, tmp_path):
+    """The command that Blender starts, on a file that is no video: exit code, one sentence, no traceback."""
+    clip = tmp_path / "notes.mp4"
+    clip.write_text("not a video")
+    folder = job.new_job(shot, "import", contract.ImportParams(source=str(clip)))
+    done = subprocess.run(
+        [sys.executable, "-m", "torch_backend", "run-job", str(folder)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == ExitCode.FOOTAGE
+    assert "Traceback" not in done.stdout + done.stderr
+    assert "notes.mp4" in status_of(folder).message
+    assert not list(shot.root.glob("frames/**/*.png"))

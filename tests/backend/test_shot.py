@@ -1,0 +1,67 @@
+"""The shot folder: atomic writes, versions, names, disk."""
+
+import errno
+import json
+
+import pytest
+
+from torch_backend.contract import ExitCode, JobError
+from torch_backend.shot import Shot, atomic_path, checked_name, content_key, need_disk, write_atomic, write_json
+
+
+def test_create_open_update(tmp_path):
+    root = tmp_path / "Ünï cödé.splannequin"
+    Shot.create(root)
+    shot = Shot.open(root)
+    assert shot.info().name == "Ünï cödé"
+    shot.update(first=3, last=9, t_star=5)
+    assert Shot.open(root).info().t_star == 5
+
+
+def test_open_says_what_is_missing(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"shot\.json"):
+        Shot.open(tmp_path)
+
+
+def test_newer_shot_is_refused(tmp_path):
+    shot = Shot.create(tmp_path / "a")
+    data = json.loads(shot.info_path.read_text())
+    shot.info_path.write_text(json.dumps({**data, "version": 99}))
+    with pytest.raises(ValueError, match="version 99"):
+        Shot.open(shot.root)
+
+
+def test_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(OSError, match="full"), atomic_path(path) as beside:
+        beside.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "full")
+    assert json.loads(path.read_text()) == {"a": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_json_refuses_nan(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(tmp_path / "a.json", {"x": float("nan")})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["../up", "a/b", "", ".", "x" * 65, "dot."])
+def test_names_cannot_leave_the_shot(name):
+    with pytest.raises(ValueError, match="name"):
+        checked_name(name, "run")
+
+
+def test_need_disk_says_how_much(tmp_path):
+    with pytest.raises(JobError, match="No space left") as caught:
+        need_disk(tmp_path / "not" / "yet", 1e18, "the take")
+    assert caught.value.exit_code == ExitCode.DISK
+
+
+def test_content_key_follows_files(tmp_path):
+    path = tmp_path / "a"
+    write_atomic(path, b"1")
+    before = content_key(path, {"a": 1})
+    write_atomic(path, b"12")
+    assert content_key(path, {"a": 1}) != before
