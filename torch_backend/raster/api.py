@@ -1,0 +1,114 @@
+"""The rasteriser's one public call."""
+
+import torch
+from torch import Tensor
+
+from . import reference
+from .settings import RasterOutput, RasterSettings, Scene
+
+_BANDS = {1: 0, 4: 1, 9: 2, 16: 3}
+
+
+def _shape(name: str, value: Tensor, expected: tuple[int | str, ...]) -> None:
+    """Raise ValueError unless `value` has the shape `expected`, where a string stands for any size."""
+    ok = value.dim() == len(expected)
+    ok = ok and all(isinstance(e, str) or e == s for e, s in zip(expected, value.shape, strict=True))
+    if not ok:
+        wanted = ", ".join(str(e) for e in expected)
+        raise ValueError(f"{name} must have shape [{wanted}], not {list(value.shape)}")
+
+
+def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> None:
+    _shape("viewmats", viewmats, ("C", 4, 4))
+    _shape("Ks", Ks, (viewmats.shape[0], 3, 3))
+    if width < 1 or height < 1:
+        raise ValueError(f"width and height must be at least 1, not {width} x {height}")
+    if not bool(torch.isfinite(viewmats).all()) or not bool(torch.isfinite(Ks).all()):
+        raise ValueError("viewmats and Ks must be finite")
+    if not bool((Ks[:, 0, 0] > 0).all()) or not bool((Ks[:, 1, 1] > 0).all()):
+        raise ValueError("Ks must have positive focal lengths")
+
+
+def _check_gaussians(scene: Scene) -> None:
+    _shape("means", scene.means, ("N", 3))
+    n = scene.means.shape[0]
+    _shape("quats", scene.quats, (n, 4))
+    _shape("log_scales", scene.log_scales, (n, 3))
+    _shape("opacity_logits", scene.opacity_logits, (n,))
+    if scene.colors is None and scene.sh is None:
+        raise ValueError("give colors [N, D], sh [N, K, 3], or both")
+    if scene.colors is not None:
+        _shape("colors", scene.colors, (n, "D"))
+    if scene.sh is not None:
+        _shape("sh", scene.sh, (n, "K", 3))
+    if scene.background is not None:
+        _shape("background", scene.background, (scene.channels,))
+
+
+def _sh_degree(sh: Tensor | None, degree: int | None) -> int:
+    """Degree to evaluate: `degree`, or all that `sh` [N, K, 3] holds."""
+    if sh is None:
+        return 0
+    held = _BANDS.get(sh.shape[1]) if sh.dim() == 3 else None
+    if held is None:
+        raise ValueError(f"sh must have shape [N, K, 3] with K = 1, 4, 9 or 16, not {list(sh.shape)}")
+    if degree is None:
+        return held
+    if not 0 <= degree <= held:
+        raise ValueError(f"sh_degree is {degree}, but sh holds degrees 0 to {held}")
+    return degree
+
+
+def _body(backend: str, means: Tensor) -> str:
+    if backend not in ("auto", "cpu", "reference"):
+        raise ValueError(f"backend must be 'auto', 'cpu' or 'reference', not {backend!r}")
+    if backend != "reference" and means.device.type != "cpu":
+        raise NotImplementedError(
+            f"there is no rasteriser for {means.device.type} tensors yet: move the tensors to the CPU, or pass "
+            "backend='reference', which is slow")
+    return "cpu" if backend == "auto" else backend
+
+
+def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, colors: Tensor | None = None,
+              sh: Tensor | None = None, *, viewmats: Tensor, Ks: Tensor, width: int, height: int,
+              background: Tensor | None = None, settings: RasterSettings | None = None, backend: str = "auto",
+              with_depth: bool = False, with_contributions: bool = False, sh_degree: int | None = None) -> RasterOutput:
+    """Splat N Gaussians into C pinhole views.
+
+    means [N, 3] world; quats [N, 4] wxyz of any non-zero norm; log_scales [N, 3] natural logs of world units;
+    opacity_logits [N]; colors [N, D] any channels, and/or sh [N, K, 3], K = (degree + 1)^2 with degree 0 to 3: colour =
+    harmonics at the direction from camera to mean + 0.5, floored at 0 (gradient passes the floor when it would raise the
+    colour), no ceiling. With both, the output has the 3 channels of `sh` first, then those of `colors`. `sh_degree` uses
+    the first bands only. viewmats [C, 4, 4] world to camera, OpenCV axes; Ks [C, 3, 3] px, pixel centres at +0.5, no
+    skew; background [D] or None for black.
+
+    Returns a RasterOutput; its attributes give shapes and units. Gradients flow from colors, alphas and depth_expected
+    to means, quats, log_scales, opacity_logits, colors, sh, viewmats and background. `constants.py` states the rules of
+    culling and blending; NaN and infinite Gaussians are culled and get zero gradients.
+
+    backend: 'cpu' (float32, compiled), 'reference' (torch, the inputs' float type and device, slow), 'auto' picks by
+    the device of `means`. Raises ValueError for arguments that do not fit, NotImplementedError for a device without a
+    body.
+
+    Source: Kerbl et al. 2023, "3D Gaussian Splatting"; Zwicker et al. 2001, "EWA Volume Splatting"; opacity compensation:
+    Yu et al. 2024, "Mip-Splatting"; |gradient|: Ye et al. 2024, "AbsGS".
+    """
+    _check_camera(viewmats, Ks, width, height)
+    degree = _sh_degree(sh, sh_degree)
+    body = _body(backend, means)
+    dtype = means.dtype if body == "reference" else torch.float32
+
+    def ready(value: Tensor | None) -> Tensor | None:
+        return None if value is None else value.to(device=means.device, dtype=dtype).contiguous()
+
+    tensors = [ready(v) for v in (means, quats, log_scales, opacity_logits, colors, sh, viewmats, background)]
+    scene = Scene(*tensors[:7], Ks.detach().to("cpu", torch.float64), tensors[7], width, height, degree,  # type: ignore[arg-type]
+                  settings or RasterSettings(), with_depth, with_contributions)
+    _check_gaussians(scene)
+    if scene.settings.threads < 1:
+        raise ValueError(f"settings.threads must be at least 1, not {scene.settings.threads}")
+    if body == "reference":
+        return reference.rasterize(scene)
+    from . import cpu
+
+    return cpu.rasterize(scene)

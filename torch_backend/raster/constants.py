@@ -1,0 +1,48 @@
+"""The rules that every rasteriser body obeys, stated once.
+
+Culling (per Gaussian and camera); every test is phrased so that NaN fails it:
+  finite parameters; ``log_scales <= LOG_SCALE_MAX``; squared quaternion norm > ``QUAT_NORM2_MIN``; camera depth > near;
+  trace of the projected covariance < ``VARIANCE_MAX``; effective opacity > ``ALPHA_MIN``; the box of the ellipse
+  ``alpha >= ALPHA_MIN`` holds the centre of at least one pixel of the image's rectangle.
+Blending (per pixel, front to back by camera depth, ties by index):
+  skip where alpha < ``ALPHA_MIN``; clamp alpha to ``ALPHA_MAX`` (no gradient through the clamp); stop once the
+  transmittance *before* a Gaussian is <= ``T_STOP``.
+Projection: EWA with ``LOW_PASS`` px^2 added to the diagonal; x/z and y/z clamped for the Jacobian to the frustum
+widened by ``FRUSTUM_MARGIN`` half-widths, measured from the principal point, with zero gradient outside.
+"""
+
+import math
+
+ALPHA_MIN = 1.0 / 255.0
+"""A Gaussian whose alpha at a pixel is below this does not touch the pixel."""
+ALPHA_MAX = 0.99
+"""Alpha is clamped here, so that 1 - alpha never vanishes."""
+T_STOP = 1e-4
+"""(1 - ALPHA_MAX)^2: a pixel is finished once its transmittance is at or below this."""
+LOW_PASS = 0.3
+"""Variance in px^2 added to both diagonal entries of every projected covariance."""
+FRUSTUM_MARGIN = 0.3
+"""Widening of the frustum for the Jacobian's clamp, as a share of tan(fov / 2): 1.3 in all when centred."""
+QUAT_NORM2_MIN = 1e-12
+"""Quaternions whose squared norm is not above this are culled."""
+LOG_SCALE_MIN = -30.0
+"""Log-scales are clamped here from below; exp(-30) is no extent at all."""
+LOG_SCALE_MAX = 30.0
+"""Gaussians with a log-scale above this are culled."""
+VARIANCE_MAX = 1e12
+"""px^2: Gaussians whose projected variances sum to this or more are culled (float32 could not invert them)."""
+COMPENSATION2_MIN = 0.005**2
+"""Floor of the squared opacity compensation of the antialiased mode; zero gradient below it."""
+DEPTH_EMPTY = 1e10
+"""Depth of a pixel whose alpha is 0."""
+TILE = 16
+"""Edge of a tile in pixels."""
+
+LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
+
+SH_C0 = 0.28209479177387814
+SH_C1 = 0.4886025119029199
+SH_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+SH_C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
+         -0.4570457994644658, 1.445305721320277, -0.5900435899266435)
+"""Real spherical harmonics in the order and signs of 3D Gaussian Splatting (Kerbl et al. 2023), degrees 0 to 3."""

@@ -1,0 +1,280 @@
+"""CPU body of the rasteriser: C++ snippets compiled by Warp, Python threads over chunks and tiles, own backward.
+
+Warp compiles at first use (a few seconds, cached on disk); `warm_up` does that from the main thread. A launch runs on
+the calling thread and releases the GIL, so workers are Python threads. The environment variable OMP_WAIT_POLICY=passive
+should be set before torch is imported (`torch_backend/__init__.py` does): spinning OpenMP threads would take the cores.
+"""
+
+import ctypes
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+from torch import Tensor
+
+from . import cpu_source as source
+from .constants import FRUSTUM_MARGIN, TILE
+from .reference import expected_depth
+from .settings import RasterOutput, Scene, camera_limits
+
+_HITS_MAX = 2**31 - 1
+_lock = threading.RLock()
+_kernels: dict[int, Callable[[int, int, int], None]] = {}
+_pools: dict[int, ThreadPoolExecutor] = {}
+_idle: list["_Workspace"] = []
+_IDLE_MAX = 4
+
+
+def _import_warp():
+    """Import and initialise Warp without a word on the terminal; anything but its notice of a missing GPU is passed on.
+
+    The notice is written by C code to file descriptor 2, so the descriptor itself is redirected meanwhile.
+    """
+    import warp as wp
+
+    if _kernels:
+        return wp
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as notice:
+        saved = os.dup(2)
+        os.dup2(notice.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            notice.seek(0)
+            lines = notice.read().decode(errors="replace").splitlines(keepends=True)
+    sys.stderr.writelines(line for line in lines if "CUDA driver" not in line)
+    return wp
+
+
+def _compile(channels: int) -> Callable[[int, int, int], None]:
+    """Kernel of the stages that know no channels (channels = 0), or of blending. Called as f(block, stage, worker)."""
+    with _lock:
+        if channels in _kernels:
+            return _kernels[channels]
+        wp = _import_warp()
+        name = f"raster_blend{channels}" if channels else "raster_stages"
+        text = source.blend_source(channels) if channels else source.stages_source()
+
+        def run(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
+
+        run.__name__ = run.__qualname__ = name
+        native = wp.func_native(text)(run)
+
+        def entry(block: wp.uint64, stage: wp.int32, worker: wp.int32):
+            native(block, stage, worker)
+
+        kernel = wp.Kernel(entry, key=name, module=wp.get_module(f"{__name__}.{name}"),
+                           options={"enable_backward": False})
+        wp.load_module(f"{__name__}.{name}", device="cpu")
+
+        def launch(block: int, stage: int, worker: int) -> None:
+            wp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
+
+        _kernels[channels] = launch
+        return launch
+
+
+def warm_up(channels: int = 3) -> None:
+    """Compile, or load from the cache, what images of `channels` channels (one more with depth) need.
+
+    Call it from the main thread before the first `rasterize` of a worker thread.
+    """
+    _compile(0)
+    _compile(channels)
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    if threads not in _pools:
+        _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="raster")
+    return _pools[threads]
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork; the child makes its own.
+    os.register_at_fork(after_in_child=_pools.clear)
+
+
+def _workers(run: Callable[[int, int, int], None], block: source.Block, stage: int, workers: int) -> None:
+    """Run one stage on `workers` threads, the calling one among them."""
+    block.counter = 0
+    address = ctypes.addressof(block)
+    waiting = [_pool(workers - 1).submit(run, address, stage, w) for w in range(1, workers)] if workers > 1 else []
+    run(address, stage, 0)
+    for future in waiting:
+        future.result()
+
+
+class _Workspace:
+    """Scratch of one camera between its forward and backward pass; kept and reused, because fresh pages are slow."""
+
+    def __init__(self):
+        self.buffers: dict[str, Tensor] = {}
+        self.block = source.Block()
+
+    def need(self, name: str, count: int) -> None:
+        """Point the block's field `name` at room for `count` 4-byte values, 64-byte aligned; contents are undefined."""
+        buffer = self.buffers.get(name)
+        if buffer is None or buffer.numel() < count:
+            buffer = self.buffers[name] = torch.empty(max(64, count + count // 4), dtype=torch.int32)
+        setattr(self.block, name, buffer.data_ptr())
+
+
+class _Lease:
+    """Holds a workspace and hands it back for reuse when nothing needs it any more."""
+
+    def __init__(self):
+        with _lock:
+            self.workspace = _idle.pop() if _idle else _Workspace()
+
+    def __del__(self):
+        with _lock:
+            if len(_idle) < _IDLE_MAX:
+                _idle.append(self.workspace)
+
+
+def _point(block: source.Block, **tensors: Tensor | None) -> None:
+    for name, tensor in tensors.items():
+        setattr(block, name, 0 if tensor is None else tensor.data_ptr())
+
+
+def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: int) -> None:
+    """Fill the block with the sizes, flags and camera of one view."""
+    block, n = workspace.block, scene.means.shape[0]
+    block.n, block.width, block.height = n, scene.width, scene.height
+    block.tiles_x, block.tiles_y = -(-scene.width // TILE), -(-scene.height // TILE)
+    block.chunks = -(-n // source.CHUNK)
+    block.n_colors = 0 if scene.colors is None else scene.colors.shape[1]
+    block.n_sh, block.sh_degree = (0, 0) if scene.sh is None else (3, scene.sh_degree)
+    block.sh_stride = 0 if scene.sh is None else 3 * scene.sh.shape[1]
+    block.channels = image_channels
+    block.record_stride = -(-(source.HEAD + image_channels) // 16) * 16
+    block.grad_stride = -(-(source.MOMENTS + image_channels) // 16) * 16
+    block.antialiased, block.want_depth = int(scene.settings.antialiased), int(scene.with_depth)
+    block.want_weights, block.want_abs = int(scene.with_contributions), int(scene.settings.absgrad)
+    block.workers = scene.settings.threads
+    block.view[:] = scene.viewmats[camera, :3].reshape(-1).tolist()
+    K = scene.Ks[camera]
+    block.fx, block.fy, block.cx, block.cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    limits = camera_limits(K, scene.width, scene.height, FRUSTUM_MARGIN)
+    block.x_low, block.x_high, block.y_low, block.y_high = limits
+    block.near = scene.settings.near
+    slots = block.chunks * source.CHUNK
+    for name, each in (("record", block.record_stride), ("aux", 4), ("index", 1), ("hit_count", 1), ("hit_start", 1),
+                       ("order", 1), ("order2", 1), ("key", 1), ("key2", 1)):
+        workspace.need(name, slots * each)
+    tiles = block.tiles_x * block.tiles_y
+    for name, count in (("chunk_count", block.chunks), ("histogram", tiles * block.workers),
+                        ("tile_start", tiles + 1), ("tile_end", tiles)):
+        workspace.need(name, count)
+
+
+def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) -> None:
+    """Project, bin and blend one camera; the block's inputs and outputs are in place."""
+    block, threads = workspace.block, scene.settings.threads
+    stages, blend = _compile(0), _compile(image_channels)
+    address = ctypes.addressof(block)
+    _workers(stages, block, source.PROJECT, threads)
+    stages(address, source.SORT, 0)
+    if block.hits > _HITS_MAX:
+        raise RuntimeError(f"{block.visible} Gaussians cover {block.hits} tiles of a {block.width}x{block.height} image, "
+                           f"more than the {_HITS_MAX} that fit; their scales are far too large")
+    workspace.need("hit_slot", block.hits)
+    workspace.need("hit_place", block.hits)
+    if block.want_weights:
+        workspace.need("hit_weight", 2 * block.hits)
+    _workers(stages, block, source.COUNT, threads)
+    stages(address, source.PREFIX, 0)
+    _workers(stages, block, source.EMIT, threads)
+    _workers(blend, block, source.BLEND, threads)
+    if block.want_weights:
+        _workers(stages, block, source.WEIGHTS, threads)
+
+
+class _Rasterize(torch.autograd.Function):
+    """Autograd's view of the CPU body. Tensors are float32, contiguous, on the CPU."""
+
+    @staticmethod
+    def forward(ctx, scene: Scene, norms: tuple[Tensor, Tensor], means, quats, log_scales, logits, colors, sh, viewmats,
+                background):
+        cameras, n = viewmats.shape[0], means.shape[0]
+        channels = scene.channels + int(scene.with_depth)
+        size = (cameras, scene.height, scene.width)
+        image, alpha = torch.empty(*size, channels), torch.empty(size)
+        median = torch.empty(size if scene.with_depth else (0,))
+        radii, means2d = torch.zeros(cameras, n, dtype=torch.int32), torch.zeros(cameras, n, 2)
+        weights = torch.zeros(2, cameras, n if scene.with_contributions else 0)
+        behind = torch.zeros(channels)
+        if background is not None:
+            behind[: scene.channels] = background
+        leases = [_Lease() for _ in range(cameras)]
+        for c, lease in enumerate(leases):
+            _set_up(lease.workspace, scene, c, channels)
+            _point(lease.workspace.block, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors,
+                   sh=sh, background=behind, image=image[c], alpha=alpha[c],
+                   median=median[c] if scene.with_depth else None, radii=radii[c], means2d=means2d[c],
+                   weight_sum=weights[0, c], weight_max=weights[1, c])
+            _forward_camera(lease.workspace, scene, channels)
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, behind)
+            ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
+        ctx.mark_non_differentiable(median, radii, means2d, weights)
+        ctx.set_materialize_grads(False)
+        return image, alpha, median, radii, means2d, weights
+
+    @staticmethod
+    def backward(ctx, *grads):
+        means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, behind = ctx.saved_tensors
+        scene: Scene = ctx.scene
+        grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
+        grad_alpha = torch.zeros_like(alpha) if grads[1] is None else grads[1].contiguous()
+        out = {"grad_means": torch.zeros_like(means), "grad_quats": torch.zeros_like(quats),
+               "grad_log_scales": torch.zeros_like(log_scales), "grad_logits": torch.zeros_like(logits),
+               "grad_colors": None if colors is None else torch.zeros_like(colors),
+               "grad_sh": None if sh is None else torch.zeros_like(sh)}
+        grad_view = torch.zeros_like(viewmats)
+        stages, blend = _compile(0), _compile(image.shape[-1])
+        for norm in ctx.norms:
+            norm.zero_()
+        for c, lease in enumerate(ctx.leases):
+            workspace = lease.workspace
+            block = workspace.block
+            workspace.need("hit_grad", block.hits * block.grad_stride)
+            partial = torch.zeros(max(1, block.chunks), 12)
+            _point(block, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh,
+                   background=behind, image=image[c], alpha=alpha[c], grad_image=grad_image[c], grad_alpha=grad_alpha[c],
+                   grad_view=partial, grad_norm=ctx.norms[0][c], grad_abs=ctx.norms[1][c], **out)
+            _workers(blend, block, source.BLEND_BACKWARD, scene.settings.threads)
+            _workers(stages, block, source.PROJECT_BACKWARD, scene.settings.threads)
+            grad_view[c, :3] = partial.double().sum(0).reshape(3, 4).float()
+        grad_background = None
+        if background is not None and ctx.needs_input_grad[9]:
+            grad_background = ((1 - alpha)[..., None] * grad_image[..., : scene.channels]).sum((0, 1, 2))
+        return (None, None, *out.values(), grad_view, grad_background)
+
+
+def rasterize(scene: Scene) -> RasterOutput:
+    """All cameras of `scene` (float32, contiguous, CPU)."""
+    channels = scene.channels + int(scene.with_depth)
+    if channels > source.MAX_CHANNELS:
+        raise ValueError(f"{channels} channels, depth included; one call carries at most {source.MAX_CHANNELS}")
+    cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
+    norms = (torch.zeros(cameras, n), torch.zeros(cameras, n))
+    image, alphas, median, radii, means2d, weights = _Rasterize.apply(
+        scene, norms, scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh,
+        scene.viewmats, scene.background)
+    colors, depth = image, None
+    if scene.with_depth:
+        colors, depth_sum = image[..., :-1], image[..., -1]
+        depth = expected_depth(depth_sum, alphas)
+    return RasterOutput(
+        colors=colors, alphas=alphas, depth_expected=depth, depth_median=median if scene.with_depth else None,
+        radii=radii, means2d=means2d, weight_sum=weights[0] if scene.with_contributions else None,
+        weight_max=weights[1] if scene.with_contributions else None, means2d_grad=norms[0], means2d_absgrad=norms[1])

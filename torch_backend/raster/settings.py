@@ -1,0 +1,88 @@
+"""What a caller says to the rasteriser and what comes back."""
+
+import os
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+
+def default_threads() -> int:
+    """Number of worker threads used unless told otherwise: all cores, at most 32."""
+    return max(1, min(os.cpu_count() or 1, 32))
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How to rasterise; everything that is not scene or camera."""
+
+    near: float = 0.01
+    """Gaussians at or nearer than this camera depth are culled (units of the scene, normalised to unit camera extent)."""
+    antialiased: bool = False
+    """Scale each opacity by sqrt(det / det_blurred), so that the low-pass does not thicken what is thinner than a pixel."""
+    absgrad: bool = True
+    """Also gather the sum over pixels of |d loss / d mean2d| in the backward pass (RasterOutput.means2d_absgrad)."""
+    threads: int = field(default_factory=default_threads)
+    """Worker threads of the CPU body. The result is bitwise the same for any number."""
+
+
+@dataclass
+class RasterOutput:
+    """Images and per-Gaussian figures of C cameras, N Gaussians, D channels. Float tensors are float32 (reference: the
+    inputs' type)."""
+
+    colors: Tensor
+    """[C, H, W, D]: sum of alpha T color, plus the remaining transmittance times the background."""
+    alphas: Tensor
+    """[C, H, W]: 1 - remaining transmittance."""
+    depth_expected: Tensor | None
+    """[C, H, W]: camera depth (planar) averaged with weights alpha T; 1e10 where alpha is 0. Differentiable."""
+    depth_median: Tensor | None
+    """[C, H, W]: camera depth of the Gaussian at which the transmittance falls to 0.5 or below; of the largest
+    contributor where it never does; 1e10 where alpha is 0. No gradient."""
+    radii: Tensor
+    """[C, N] int32: half the major axis, in px, of the ellipse alpha >= 1/255, rounded up; 0 = culled."""
+    means2d: Tensor
+    """[C, N, 2]: projected means, px (pixel centres at +0.5); 0 where culled. No gradient flows through it."""
+    weight_sum: Tensor | None
+    """[C, N]: sum over pixels of alpha T. No gradient."""
+    weight_max: Tensor | None
+    """[C, N]: largest alpha T over pixels. No gradient."""
+    means2d_grad: Tensor
+    """[C, N]: |d loss / d mean2d| in 1/px. Zeros until a backward pass writes it in place; each pass overwrites."""
+    means2d_absgrad: Tensor
+    """[C, N]: norm of (sum over pixels |d loss / d x|, sum |d loss / d y|), 1/px; as above. Zeros if settings.absgrad is
+    off."""
+
+
+@dataclass
+class Scene:
+    """Validated inputs of one call, as the bodies take them."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    colors: Tensor | None
+    sh: Tensor | None
+    viewmats: Tensor
+    Ks: Tensor
+    background: Tensor | None
+    width: int
+    height: int
+    sh_degree: int
+    settings: RasterSettings
+    with_depth: bool
+    with_contributions: bool
+
+    @property
+    def channels(self) -> int:
+        """D: 3 channels of the harmonics, if any, then those of `colors`."""
+        return (0 if self.sh is None else 3) + (0 if self.colors is None else self.colors.shape[1])
+
+
+def camera_limits(K: Tensor, width: int, height: int, margin: float) -> tuple[float, float, float, float]:
+    """Bounds of x/z and y/z for the Jacobian: (x_low, x_high, y_low, y_high) of the widened frustum of K [3, 3]."""
+    fx, fy, cx, cy = (float(v) for v in torch.stack((K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+    mx, my = margin * 0.5 * width / fx, margin * 0.5 * height / fy
+    return -cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my
