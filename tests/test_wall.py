@@ -1,0 +1,175 @@
+"""The wall between Blender and the backend, and what no file of the project may do: read from the source."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+BLENDER = {"bpy", "bpy_extras", "mathutils", "gpu", "gpu_extras", "bl_ext", "addon_utils", "blf", "bmesh"}
+STATIONS = (
+    "footage",
+    "solve",
+    "scene",
+    "gaussians",
+    "deformation",
+    "raster",
+    "supervision",
+    "train",
+    "freeze",
+    "live",
+    "report",
+)
+"""In the order of docs/architecture.md: a station imports only stations before it."""
+CODE_RUNNING_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib", "yaml"}
+NETWORK_SERVERS = {"http.server", "socketserver", "xmlrpc.server", "wsgiref"}
+
+
+def sources(folder: str) -> list[Path]:
+    found = sorted((ROOT / folder).rglob("*.py"))
+    assert found, f"{folder} holds no Python files"
+    return found
+
+
+def package_of(path: Path) -> list[str]:
+    """Dotted parts of the package that the file's relative imports start from, seen from the repository root."""
+    return list(path.relative_to(ROOT).parent.parts)
+
+
+def imports(tree: ast.AST, package: list[str]) -> Iterator[tuple[int, str]]:
+    """(line, dotted name from the repository root) of everything a file imports, at whatever depth."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            start = [*base, *(node.module.split(".") if node.module else [])]
+            yield from ((node.lineno, ".".join([*start, alias.name])) for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
+            if node.args and isinstance(node.args[0], ast.Constant):
+                yield node.lineno, str(node.args[0].value)
+
+
+def read(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def not_for_the_addon(name: str) -> bool:
+    parts = name.split(".")
+    if parts[0] == "torch_backend":
+        return parts[1:2] != ["contract"]
+    return parts[0] not in {*BLENDER, *sys.stdlib_module_names, "numpy", "splannequin_addon"}
+
+
+def not_for_the_backend(name: str) -> bool:
+    return name.split(".")[0] in {*BLENDER, "splannequin_addon", "splannequin"}
+
+
+def dangers(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """(line, what) of whatever runs what a file or a string says, opens a shell or serves the network."""
+    for line, name in imports(tree, []):
+        if name.split(".")[0] in CODE_RUNNING_MODULES or any(name.startswith(server) for server in NETWORK_SERVERS):
+            yield line, f"import of {name}"
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        named = {k.arg: ast.unparse(k.value) for k in node.keywords if k.arg}
+        if called in ("eval", "exec", "os.system", "os.popen", "subprocess.getoutput", "subprocess.getstatusoutput"):
+            yield node.lineno, f"{called}()"
+        if named.get("shell", "False") != "False":
+            yield node.lineno, "a shell string"
+        if called == "torch.load" and named.get("weights_only") != "True":
+            yield node.lineno, "torch.load() without weights_only=True"
+        if called in ("np.load", "numpy.load") and named.get("allow_pickle", "False") != "False":
+            yield node.lineno, "pickled arrays"
+
+
+@pytest.mark.parametrize("path", sources("splannequin_addon"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_addon_imports_blender_numpy_and_the_contract_only(path: Path):
+    wrong = [f"{path}:{line}: {name}" for line, name in imports(read(path), package_of(path)) if not_for_the_addon(name)]
+    assert not wrong
+
+
+@pytest.mark.parametrize("path", sources("torch_backend"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_backend_never_imports_blender(path: Path):
+    wrong = [
+        f"{path}:{line}: {name}" for line, name in imports(read(path), package_of(path)) if not_for_the_backend(name)
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize("path", sources("torch_backend"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_a_station_imports_only_stations_before_it(path: Path):
+    station = path.relative_to(ROOT / "torch_backend").parts[0].removesuffix(".py")
+    if station not in STATIONS:
+        return
+    allowed = {*STATIONS[: STATIONS.index(station) + 1], "contract", "shot"}
+    wrong = []
+    for line, name in imports(read(path), package_of(path)):
+        parts = name.split(".")
+        if parts[0] == "torch_backend" and len(parts) > 1 and parts[1] not in {*allowed, "__version__"}:
+            wrong.append(f"{path}:{line}: {name}")
+    assert not wrong
+
+
+def test_nothing_runs_what_a_file_says():
+    files = [ROOT / "splannequin.py", ROOT / "__init__.py", *sources("torch_backend"), *sources("splannequin_addon")]
+    wrong = [f"{path}:{line}: {what}" for path in files for line, what in dangers(read(path))]
+    assert not wrong
+
+
+def test_the_extension_package_imports_nothing_at_module_level():
+    top = [node for node in read(ROOT / "__init__.py").body if isinstance(node, (ast.Import, ast.ImportFrom))]
+    assert not top
+
+
+@pytest.mark.parametrize("module", ["torch_backend", "torch_backend.contract", "torch_backend.shot", "torch_backend.cli"])
+def test_light_modules_load_nothing_heavy(module: str):
+    heavy = ("torch", "numpy", "warp", "pycolmap", "OpenImageIO", "av", "scipy", "safetensors")
+    code = f"import sys, {module}; print([m for m in {heavy!r} if m in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert (ran.stdout.strip(), ran.stderr) == ("[]", "")
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import torch",
+        "from torch_backend import shot",
+        "from ..torch_backend import job",
+        "from ..torch_backend.footage import color",
+        "def f():\n    import OpenImageIO",
+        "import importlib\nimportlib.import_module('warp')",
+    ],
+)
+def test_the_scan_sees_a_breach_from_the_addon(source: str):
+    assert any(not_for_the_addon(name) for _, name in imports(ast.parse(source), ["splannequin_addon"]))
+
+
+@pytest.mark.parametrize("source", ["import bpy", "from mathutils import Vector", "from ..splannequin_addon import jobs"])
+def test_the_scan_sees_a_breach_from_the_backend(source: str):
+    assert any(not_for_the_backend(name) for _, name in imports(ast.parse(source), ["torch_backend"]))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "eval('1')",
+        "import subprocess\nsubprocess.run('ls', shell=True)",
+        "torch.load(path)",
+        "np.load(path, allow_pickle=True)",
+        "from http.server import HTTPServer",
+    ],
+)
+def test_the_scan_sees_code_that_runs_files(source: str):
+    assert list(dangers(ast.parse(source)))
+
+
+def test_the_scan_lets_the_contract_through():
+    source = "from ..torch_backend import contract\nfrom ..torch_backend.contract import Event\nimport bpy, numpy, json"
+    assert not [name for _, name in imports(ast.parse(source), ["splannequin_addon"]) if not_for_the_addon(name)]
