@@ -389,7 +389,9 @@ def _step(
 
 def condense_pip(line: str) -> str | None:
     """pip's output, one line per package: `torch 2.13.0 (190.2 MB)`. None for what an artist need not read."""
-    wheel = re.match(r"(?:Downloading|Using cached|Processing) (?:\S*[/\\])?([^\s/\\]+)\.whl(?: (\(\d[^)]*\)))?", line)
+    wheel = re.match(
+        r"(?:Downloading|Using cached|Processing) (?:\S*[/\\])?([^\s/\\]+)\.whl(?!\S)(?: (\(\d[^)]*\)))?", line
+    )
     if wheel:
         name, version = wheel.group(1).split("-")[:2]
         return f"{name} {version.replace('%2B', '+')} {wheel.group(2) or ''}".rstrip()

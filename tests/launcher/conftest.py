@@ -1,0 +1,53 @@
+"""Real virtual environments, made offline from a wheel that the test writes."""
+
+import base64
+import hashlib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import splannequin
+
+
+@pytest.fixture
+def write_wheel(tmp_path: Path):
+    """Writes a wheel of one module and returns its path."""
+
+    def write(name: str, version: str, source: str) -> Path:
+        info = f"{name}-{version}.dist-info"
+        files = {
+            f"{name}.py": source,
+            f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n",
+            f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        }
+        rows = []
+        for path, content in files.items():
+            digest = base64.urlsafe_b64encode(hashlib.sha256(content.encode()).digest()).rstrip(b"=").decode()
+            rows.append(f"{path},sha256={digest},{len(content)}\n")
+        files[f"{info}/RECORD"] = "".join([*rows, f"{info}/RECORD,,\n"])
+        wheel = tmp_path / f"{name}-{version}-py3-none-any.whl"
+        with zipfile.ZipFile(wheel, "w") as archive:
+            for path, content in files.items():
+                archive.writestr(path, content)
+        return wheel
+
+    return write
+
+
+@pytest.fixture
+def requirements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A requirements folder of the test's own, and a pip that looks nowhere else."""
+    folder = tmp_path / "requirements"
+    folder.mkdir()
+    (folder / "constraints.txt").write_text("")
+    monkeypatch.setattr(splannequin, "REQUIREMENTS", folder)
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    return folder
+
+
+@pytest.fixture
+def environment(tmp_path: Path, requirements: Path, write_wheel) -> splannequin.Environment:
+    """An environment of one small package, not made yet."""
+    (requirements / "small.txt").write_text(f"{write_wheel('smallthing', '1.0', 'value = 1')}\n")
+    return splannequin.Environment("the test", tmp_path / "home" / ".venv", ("small.txt",), "import smallthing", 0.01)

@@ -1,0 +1,140 @@
+"""Set-up of an environment: once, resumed after an interruption, refused in a sentence."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import splannequin
+from splannequin import Environment, LauncherError, set_up
+
+
+def value_of(environment: Environment) -> str:
+    code = "import smallthing; print(smallthing.value)"
+    return subprocess.run([environment.python, "-c", code], capture_output=True, text=True).stdout.strip()
+
+
+def site_packages(environment: Environment) -> Path:
+    return next(environment.folder.rglob("smallthing.py")).parent
+
+
+def test_set_up_once_then_nothing_is_started(environment: Environment, monkeypatch: pytest.MonkeyPatch):
+    assert not environment.ready()
+    assert set_up(environment, sys.executable) > 0
+    assert environment.ready()
+    assert value_of(environment) == "1"
+
+    monkeypatch.setattr(subprocess, "Popen", None)  # any child process would now fail
+    assert set_up(environment, "no such python") == 0
+
+
+def test_changed_requirements_are_installed(environment: Environment, requirements: Path, write_wheel):
+    set_up(environment, sys.executable)
+    (requirements / "small.txt").write_text(f"{write_wheel('smallthing', '2.0', 'value = 2')}\n")
+    assert not environment.ready()
+    set_up(environment, sys.executable)
+    assert value_of(environment) == "2"
+
+
+def test_a_superset_of_the_requirements_is_ready_for_the_subset(environment: Environment, requirements, write_wheel):
+    (requirements / "more.txt").write_text(f"{write_wheel('otherthing', '1.0', '')}\n")
+    more = dataclasses.replace(environment, requirements=("small.txt", "more.txt"))
+    set_up(environment, sys.executable)
+    assert not more.ready()
+    set_up(more, sys.executable)
+    assert more.ready() and environment.ready()
+
+
+def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment):
+    set_up(environment, sys.executable)
+    packages = site_packages(environment)
+    # What a kill in the middle of pip leaves: the marker, a package whose files are not all there, no RECORD.
+    environment.begun.touch()
+    (packages / "smallthing-1.0.dist-info" / "RECORD").unlink()
+    (packages / "smallthing.py").unlink()
+    assert not environment.ready()
+    set_up(environment, sys.executable)
+    assert environment.ready()
+    assert value_of(environment) == "1"
+
+
+def test_an_environment_of_ours_without_an_interpreter_is_made_anew(environment: Environment):
+    environment.state.mkdir(parents=True)
+    (environment.folder / "pyvenv.cfg").touch()
+    set_up(environment, sys.executable)
+    assert value_of(environment) == "1"
+
+
+def test_an_environment_made_by_hand_is_adopted(environment: Environment):
+    subprocess.run([sys.executable, "-m", "venv", str(environment.folder)], check=True)
+    kept = environment.folder / "kept"
+    kept.touch()
+    set_up(environment, sys.executable)
+    assert environment.ready() and kept.exists()
+
+
+def test_a_folder_of_someone_else_is_left_alone(environment: Environment):
+    environment.folder.mkdir(parents=True)
+    precious = environment.folder / "precious.txt"
+    precious.touch()
+    with pytest.raises(LauncherError, match="move it away") as refused:
+        set_up(environment, sys.executable)
+    assert precious.exists()
+    assert refused.value.exit_code == 9
+
+
+def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Environment, requirements: Path):
+    (requirements / "small.txt").write_text("there-is-no-such-package==1.0\n")
+    with pytest.raises(LauncherError) as refused:
+        set_up(environment, sys.executable)
+    message = str(refused.value)
+    assert "installing packages" in message
+    assert "there-is-no-such-package" in message
+    assert "package index" in message
+    assert str(environment.log) in message
+    assert "there-is-no-such-package" in environment.log.read_text()
+    assert not environment.ready()
+
+
+def test_a_package_that_does_not_import_is_not_ready(environment: Environment, requirements: Path, write_wheel):
+    (requirements / "small.txt").write_text(f"{write_wheel('smallthing', '3.0', 'import absent_library')}\n")
+    with pytest.raises(LauncherError, match="absent_library"):
+        set_up(environment, sys.executable)
+    assert not environment.ready()
+
+
+def test_a_full_disk_is_said_before_anything_is_written(environment: Environment):
+    with pytest.raises(LauncherError, match="GB free") as refused:
+        set_up(dataclasses.replace(environment, disk_gb=1e9), sys.executable)
+    assert refused.value.exit_code == 8
+    assert not environment.folder.exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "shown"),
+    [
+        ("Downloading warp_lang-1.19.0-py3-none-manylinux_2_34_x86_64.whl (149.3 MB)", "warp_lang 1.19.0 (149.3 MB)"),
+        ("  Using cached https://x.org/a/av-18.1.0-cp311-abi3.whl (38.4 MB)".strip(), "av 18.1.0 (38.4 MB)"),
+        ("Processing /wheels/torch-2.13.0%2Bcpu-cp311-cp311-linux_x86_64.whl (from -r b.txt)", "torch 2.13.0+cpu"),
+        ("Downloading numpy-2.4.6-cp311-cp311-win_amd64.whl.metadata (62 kB)", None),
+        ("Installing collected packages: mpmath, zstandard, torch", "installing 3 packages"),
+        ("Requirement already satisfied: numpy in ./x", None),
+    ],
+)
+def test_pip_in_one_line_per_package(line: str, shown: str | None):
+    assert splannequin.condense_pip(line) == shown
+
+
+def test_every_wheel_has_pinned_requirements():
+    for series in splannequin.BPY_WHEELS:
+        lines = (splannequin.REQUIREMENTS / f"bpy-{series}.txt").read_text().splitlines()
+        assert [line for line in lines if line.startswith(f"bpy=={series}.")]
+        assert [line for line in lines if line.startswith("numpy==")]
+
+
+def test_every_requirement_is_pinned_exactly():
+    for path in splannequin.REQUIREMENTS.glob("*.txt"):
+        for line in path.read_text().splitlines():
+            assert not line.strip() or line.startswith(("#", "-c ")) or line.count("==") == 1, f"{path.name}: {line}"
