@@ -350,7 +350,7 @@ def _step(
     child = start_child(command, child_environ(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
     def read() -> None:
-        assert child.stdout is not None  # noqa: S101  (PIPE above)
+        assert child.stdout is not None  # PIPE, above
         for raw in child.stdout:
             lines.put(raw.decode("utf-8", "replace"))
         lines.put(None)
@@ -634,6 +634,7 @@ def setup(series: Sequence[str], testing: bool, output: Path) -> int:
         stages[blender.label.replace(" ", "-")] = round(took, 2)
     write_json(output / "summary.json", {"command": "setup", "exit_code": 0, "wall_seconds_by_stage": stages})
     say("Ready: " + ", ".join(stages))
+    say(f"Backend Python, for the add-on's preferences: {backend_environment().python}")
     return 0
 
 
