@@ -130,3 +130,14 @@ def test_an_error_while_frames_are_made_keeps_the_old_video(tmp_path):
         write_video(path, broken(), 25)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["video.mp4"]
+
+
+def test_without_h264_it_says_so_and_still_writes(tmp_path, monkeypatch):
+    """Some builds of PyAV come without x264."""
+    monkeypatch.setattr(av, "codecs_available", {"mpeg4"})
+    stored = list(moving_picture(4, 120, 160))
+    path = tmp_path / "video.mp4"
+    assert "no H.264 encoder" in write_video(path, stored, 25)
+    codec, *_, frames = decode(path)
+    assert codec == "mpeg4"
+    assert min(psnr(a, b) for a, b in zip(stored, frames, strict=True)) > 35.0
