@@ -1,0 +1,157 @@
+"""What a frame is worth before any solve: sharpness, exposure, blank and duplicate frames, cuts, and which are kept."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .color import srgb_to_linear
+from .images import resize
+
+LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""Rec. 709 weights, for luma of encoded values and for luminance of linear ones."""
+
+THUMB_WIDTH, THUMB_HEIGHT = 64, 36
+BLANK_DEVIATION = 1.5 / 255.0
+DUPLICATE_DIFFERENCE = 0.5 / 255.0
+CUT_SCORE = 0.11
+"""Above the worst of three continuous handheld clips (0.087, at a gap of half a second), below the least of 18 splices
+of those clips (0.125)."""
+CUT_OUTLIER = 5.0
+"""A cut also stands out from its neighbours by this factor: a whip pan does not."""
+BLUR_RATIO = 0.7
+TARGET_SOLVED = 68
+MAX_STEP_SECONDS = 0.4
+
+
+@dataclass
+class FrameMeasures:
+    """What was measured on one working frame."""
+
+    frame: int
+    """Frame number of the clip."""
+    sharpness: float
+    """Variance of the Laplacian of luma, in squared 8-bit steps."""
+    exposure: float
+    """Mean luminance in stops above 18 % grey."""
+    flags: list[str] = field(default_factory=list)
+    """blank, duplicate, corrupt."""
+    thumb: NDArray[np.float32] = field(repr=False, default_factory=lambda: np.zeros((0, 0, 3), np.float32))
+    """[36, 64, 3] encoded colour in [0, 1]."""
+    luma: NDArray[np.float32] = field(repr=False, default_factory=lambda: np.zeros((0, 0), np.float32))
+    """Every other pixel of luma in [0, 1]."""
+
+
+def measure(frame: int, pixels: NDArray) -> FrameMeasures:
+    """Measures a working frame, [H, W, 3] uint8 or uint16 sRGB."""
+    scale = 1.0 / (65535.0 if pixels.dtype == np.uint16 else 255.0)
+    luma = (pixels @ LUMA) * np.float32(scale)
+    inner = luma[1:-1, 1:-1]
+    laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4.0 * inner
+    thumb = resize(pixels, THUMB_WIDTH, THUMB_HEIGHT).astype(np.float32) * np.float32(scale)
+    luminance = float((srgb_to_linear(thumb) @ LUMA).mean())
+    flags = ["blank"] if float(luma.std()) < BLANK_DEVIATION else []
+    return FrameMeasures(
+        frame=frame,
+        sharpness=float(laplacian.var() * 255.0**2) if laplacian.size else 0.0,
+        exposure=float(np.log2(max(luminance, 1e-6) / 0.18)),
+        flags=flags,
+        thumb=thumb,
+        luma=np.ascontiguousarray(luma[::2, ::2]),
+    )
+
+
+def flag_duplicate(current: FrameMeasures, last_distinct: FrameMeasures | None) -> bool:
+    """Flags `current` if it repeats the last frame that was not itself a repeat; returns whether it does."""
+    if last_distinct is None or last_distinct.luma.shape != current.luma.shape:
+        return False
+    repeated = float(np.abs(current.luma - last_distinct.luma).mean()) < DUPLICATE_DIFFERENCE
+    if repeated:
+        current.flags.append("duplicate")
+    return repeated
+
+
+def shifted_correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """Best normalised cross-correlation of two [h, w] pictures over all shifts that overlap by at least half.
+
+    Masked normalised cross-correlation through the Fourier transform, after D. Padfield, "Masked Object Registration
+    in the Fourier Domain", IEEE TIP 2012.
+    """
+    h, w = a.shape
+    shape = (2 * h - 1, 2 * w - 1)
+    flipped = b[::-1, ::-1]
+
+    def transform(x: NDArray) -> NDArray:
+        return np.fft.rfft2(x, shape)
+
+    def inverse(x: NDArray) -> NDArray:
+        return np.fft.irfft2(x, shape)
+
+    ones = transform(np.ones((h, w)))
+    fa, fb = transform(a), transform(flipped)
+    count = np.maximum(inverse(ones * ones), 1.0)
+    sum_a, sum_b = inverse(fa * ones), inverse(ones * fb)
+    square_a, square_b = inverse(transform(a * a) * ones), inverse(ones * transform(flipped * flipped))
+    covariance = inverse(fa * fb) - sum_a * sum_b / count
+    spread = np.maximum(square_a - sum_a**2 / count, 1e-6) * np.maximum(square_b - sum_b**2 / count, 1e-6)
+    return float((covariance / np.sqrt(spread))[count >= 0.5 * h * w].max())
+
+
+def cut_score(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """How unlike two [h, w, 3] thumbnails are, camera motion allowed for: 0 the same scene, about 0.25 a cut."""
+    correlation = shifted_correlation(a.mean(axis=2), b.mean(axis=2))
+    return (1.0 - correlation) * float(np.abs(_histogram(a) - _histogram(b)).sum()) / 2.0
+
+
+def _histogram(thumb: NDArray[np.float32]) -> NDArray[np.float64]:
+    bins = np.clip((thumb * 6).astype(int), 0, 5)
+    index = (bins[..., 0] * 6 + bins[..., 1]) * 6 + bins[..., 2]
+    return np.bincount(index.ravel(), minlength=216) / index.size
+
+
+def find_cuts(measures: Sequence[FrameMeasures]) -> list[tuple[int, int]]:
+    """Hard cuts as (last frame before, first frame after). Blank frames are stepped over; a flash is not a cut."""
+    seen = [m for m in measures if not {"blank", "corrupt"} & set(m.flags)]
+    scores = np.array([cut_score(a.thumb, b.thumb) for a, b in itertools.pairwise(seen)])
+    cuts = []
+    for i in np.flatnonzero(scores > CUT_SCORE):
+        near = np.concatenate([scores[max(0, i - 8) : i], scores[i + 1 : i + 9]])
+        if near.size and scores[i] < CUT_OUTLIER * float(np.median(near)):
+            continue
+        before, after = seen[max(0, i - 1)], seen[min(len(seen) - 1, i + 2)]
+        if all(cut_score(x.thumb, y.thumb) > CUT_SCORE for x, y in ((before, seen[i + 1]), (seen[i], after))):
+            cuts.append((seen[i].frame, seen[i + 1].frame))
+    return cuts
+
+
+def automatic_step(count: int, fps: float) -> int:
+    """Step that leaves nearest to 68 of `count` frames, but never further apart than 0.4 s: tracks would break."""
+    longest = max(1, round(fps * MAX_STEP_SECONDS)) if fps > 0 else 1
+    steps = range(1, min(longest, max(1, count // 8)) + 1)
+    return min(steps, key=lambda s: abs(np.log(max(1.0, count / s) / TARGET_SOLVED)))
+
+
+def choose_solved(measures: Sequence[FrameMeasures], step: int) -> set[int]:
+    """Frame numbers that the solve and the training use: every `step`-th, and the first and last usable one.
+
+    A chosen frame that is flagged, or much blurrier than a neighbour nearer to it than to the next choice, gives way
+    to the sharpest of those neighbours.
+    """
+    if step < 1:
+        raise ValueError(f"step should be at least 1, got {step}")
+    usable = [m for m in measures if not m.flags]
+    if not usable:
+        return set()
+    chosen = {usable[0].frame, usable[-1].frame}
+    reach = (step - 1) // 2
+    for anchor in range(0, len(measures), step):
+        window = [m for m in measures[max(0, anchor - reach) : anchor + reach + 1] if not m.flags]
+        if window:
+            best = max(window, key=lambda m: m.sharpness)
+            own = measures[anchor]
+            chosen.add(own.frame if own in window and own.sharpness >= BLUR_RATIO * best.sharpness else best.frame)
+    return chosen

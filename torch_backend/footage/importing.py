@@ -1,0 +1,318 @@
+"""Footage into a shot folder: working frames, what each is worth, and which of them are solved and trained on."""
+
+from __future__ import annotations
+
+import shutil
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..contract import Reporter, frame_file, read_json
+from ..shot import Shot, content_key, need_disk, write_json
+from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
+from .images import resize, working_size, write_png
+from .sources import Source, SourceFrame, footage_error, open_source
+
+FRAMES_VERSION = 1
+FRAMES_FILE = "frames.json"
+LEAST_FRAMES = 8
+MANY_FRAMES = 1500
+EXPOSURE_DRIFT_STOPS = 1.0
+CLIPPED_SHARE = 0.01
+_WRITERS = 2
+_DISK_CHECK_FRAMES = 16
+
+
+@dataclass
+class FootageConfig:
+    """What is taken of the footage, and how large."""
+
+    first: int | None = None
+    """First frame number to take; None: the first there is."""
+    last: int | None = None
+    """Last frame number to take, inclusive; None: the last there is."""
+    step: int = 0
+    """Every how many frames are solved and trained on; 0 aims at 68 of them. All are delivered whatever it is."""
+    working_height: int = 0
+    """Height in pixels of the working frames; 0: the source's, at most 720. Frames are never enlarged."""
+    fps: float = 0.0
+    """Rate of an image sequence, frames per second; 0: what its files say, else 24. Videos have their own clock."""
+
+
+@dataclass
+class _Extracted:
+    """Frames on disk and what was measured of them, in order."""
+
+    measures: list[FrameMeasures]
+    seconds: list[float]
+    clipped: float
+    width: int
+    height: int
+
+
+def import_footage(shot: Shot, source: str, config: FootageConfig, report: Reporter) -> dict[str, Any]:
+    """Extracts every source frame of the range into `shot`, and writes frames.json and shot.json.
+
+    Frames are frames/raw/NNNNNN.png, 8-bit sRGB, or 16-bit where the source is deeper; `seconds` in frames.json count
+    from the first frame of the range. A finished import of the same source and configuration is left alone. Another
+    one replaces it, and the solve made from it is removed.
+
+    Returns {frames, solved_frames, first, last, step, width, height, fps, colour, source}.
+    Raises JobError (FOOTAGE, DISK) in one sentence, and Cancelled; either leaves no half import behind.
+    """
+    _check(config)
+    opened = open_source(source, config.fps)
+    _check_range(opened, config)
+    key = content_key(FRAMES_VERSION, opened.info.key, config)
+    done = _finished(shot, key)
+    if done is not None:
+        report.progress("import", 1, 1, "already imported")
+        return _result(shot, done)
+    partial = shot.frames / "raw.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        extracted = _extract(shot, opened, config, partial, report)
+        _refuse_unusable(extracted.measures)
+        for message, hint in opened.warnings + _remarks(extracted):
+            report.warning(message, hint)
+        record = _record(opened, config, extracted, key)
+        _publish(shot, partial, record, source)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return _result(shot, record)
+
+
+def load_frames(shot: Shot) -> dict[str, Any]:
+    """frames.json of a finished import. JobError says to import first."""
+    path = shot.frames / FRAMES_FILE
+    if not path.is_file():
+        raise footage_error(f"The shot {shot.root.name} has no frames yet.", "Import footage first.")
+    return read_json(path)
+
+
+def _check(config: FootageConfig) -> None:
+    if config.step < 0 or config.working_height < 0 or config.fps < 0:
+        raise ValueError(
+            f"step, working_height and fps cannot be negative: {config.step}, {config.working_height}, {config.fps}"
+        )
+    if config.first is not None and config.last is not None and config.last - config.first + 1 < LEAST_FRAMES:
+        raise footage_error(
+            f"Frames {config.first} to {config.last} are too few: a freeze needs at least {LEAST_FRAMES}.",
+            "Widen the range.",
+        )
+
+
+def _check_range(opened: Source, config: FootageConfig) -> None:
+    info = opened.info
+    if info.last is None:
+        return
+    first = info.first if config.first is None else config.first
+    last = info.last if config.last is None else config.last
+    if first > info.last or last < info.first:
+        raise footage_error(f"Frames {first} to {last} lie outside of the clip, which has {info.first} to {info.last}.")
+
+
+def _finished(shot: Shot, key: str) -> dict[str, Any] | None:
+    path = shot.frames / FRAMES_FILE
+    if not path.is_file():
+        return None
+    record = read_json(path)
+    whole = record.get("key") == key and all((shot.frames / f["file"]).is_file() for f in record["frames"])
+    return record if whole else None
+
+
+def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, report: Reporter) -> _Extracted:
+    """Decodes, resizes, measures and writes every frame of the range."""
+    info = opened.info
+    width, height = working_size(info.width, info.height, config.working_height)
+    if config.working_height > info.height:
+        report.warning(f"The clip is {info.height} pixels high: the working frames stay that high.")
+    total = _expected(opened, config)
+    frame_bytes = width * height * (5.0 if info.deep else 2.0)
+    # Twice: the solve writes the undistorted frames beside these.
+    need_disk(shot.root, 2.0 * total * frame_bytes + (64 << 20), "The import of this clip")
+    into.mkdir(parents=True)
+    measures: list[FrameMeasures] = []
+    seconds: list[float] = []
+    clipped, distinct = 0.0, None
+    pending: deque[Future[FrameMeasures]] = deque()
+
+    def collect() -> None:
+        nonlocal distinct
+        one = pending.popleft().result()
+        if not flag_duplicate(one, distinct):
+            distinct = one
+        one.luma = one.luma if one is distinct else np.zeros((0, 0), np.float32)
+        measures.append(one)
+        report.progress("import", len(measures), max(total, len(measures)), f"frame {one.frame}")
+
+    with ThreadPoolExecutor(_WRITERS) as pool:
+        for frame in opened.frames(config.first, config.last):
+            report.check_cancelled()
+            if len(seconds) % _DISK_CHECK_FRAMES == 0:
+                need_disk(shot.root, (_DISK_CHECK_FRAMES + 2) * frame_bytes, "The import of this clip")
+            seconds.append(frame.seconds)
+            clipped = max(clipped, frame.clipped)
+            pending.append(pool.submit(_work, frame, width, height, into))
+            while len(pending) > 2 * _WRITERS:
+                collect()
+        while pending:
+            collect()
+    return _Extracted(measures, seconds, clipped, width, height)
+
+
+def _work(frame: SourceFrame, width: int, height: int, into: Path) -> FrameMeasures:
+    pixels = resize(frame.pixels, width, height)
+    write_png(into / frame_file(frame.number, ".png"), pixels)
+    measures = measure(frame.number, pixels)
+    if frame.corrupt:
+        measures.flags.append("corrupt")
+    return measures
+
+
+def _expected(opened: Source, config: FootageConfig) -> int:
+    info = opened.info
+    if info.last is None:
+        return config.last - config.first + 1 if config.first and config.last else 1
+    first = max(info.first, info.first if config.first is None else config.first)
+    return min(info.last, info.last if config.last is None else config.last) - first + 1
+
+
+def _refuse_unusable(measures: list[FrameMeasures]) -> None:
+    """JobError for a clip that no solve could use: too short, a still, or cut."""
+    if len(measures) < LEAST_FRAMES:
+        raise footage_error(
+            f"The clip has only {len(measures)} frames: a freeze needs at least {LEAST_FRAMES}.",
+            "Choose a longer clip or range.",
+        )
+    usable = sum(not m.flags for m in measures)
+    repeated = sum("duplicate" in m.flags for m in measures)
+    if usable < LEAST_FRAMES:
+        if repeated > len(measures) // 2:
+            raise footage_error(
+                f"The picture does not change in {repeated} of {len(measures)} frames: the camera stands still.",
+                "A freeze needs a clip in which the camera moves sideways by a step or more.",
+            )
+        raise footage_error(
+            f"Only {usable} of {len(measures)} frames are usable, the others are blank, damaged or repeated.",
+            f"A freeze needs at least {LEAST_FRAMES}: choose another range.",
+        )
+    cuts = find_cuts(measures)
+    if cuts:
+        raise _cut_error(measures, cuts)
+
+
+def _cut_error(measures: list[FrameMeasures], cuts: list[tuple[int, int]]) -> Exception:
+    starts = [measures[0].frame, *(after for _, after in cuts)]
+    ends = [*(before for before, _ in cuts), measures[-1].frame]
+    shots = [f"{a} to {b}" for a, b in zip(starts, ends, strict=True)]
+    where = " and ".join(f"{after}" for _, after in cuts[:3]) + (" and later" if len(cuts) > 3 else "")
+    longest = max(zip(starts, ends, strict=True), key=lambda pair: pair[1] - pair[0])
+    return footage_error(
+        f"The clip has a hard cut at frame {where}: a freeze needs one continuous take.",
+        f"Pass the range of one take: {', '.join(shots[:6])} (for example --first {longest[0]} --last {longest[1]}).",
+    )
+
+
+def _remarks(extracted: _Extracted) -> list[tuple[str, str]]:
+    """Warnings (message, hint) about a clip that is usable."""
+    remarks = []
+    measures = extracted.measures
+    stops = [m.exposure for m in measures if not m.flags]
+    drift = max(stops) - min(stops)
+    if drift > EXPOSURE_DRIFT_STOPS:
+        remarks.append(
+            (
+                f"The exposure changes by {drift:.1f} stops over the clip.",
+                "Lock exposure and white balance when filming.",
+            )
+        )
+    if extracted.clipped > CLIPPED_SHARE:
+        remarks.append(
+            (
+                f"Up to {100 * extracted.clipped:.0f} % of a frame is brighter than white and is clipped.",
+                "Lower the exposure.",
+            )
+        )
+    if len(measures) > MANY_FRAMES:
+        remarks.append((f"The clip has {len(measures)} frames, which will take long.", "Take a shorter range."))
+    for flag, words in (("duplicate", "repeat the one before"), ("blank", "are blank"), ("corrupt", "are damaged")):
+        count = sum(flag in m.flags for m in measures)
+        if count:
+            remarks.append((f"{count} of {len(measures)} frames {words} and are neither solved nor trained on.", ""))
+    return remarks
+
+
+def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: str) -> dict[str, Any]:
+    """frames.json."""
+    measures, info = extracted.measures, opened.info
+    step = config.step or automatic_step(len(measures), info.fps)
+    solved = choose_solved(measures, step)
+    if len(solved) < LEAST_FRAMES:
+        raise footage_error(
+            f"A step of {step} leaves {len(solved)} frames to solve, at least {LEAST_FRAMES} are needed.",
+            "Choose a smaller step.",
+        )
+    start = extracted.seconds[0]
+    frames = [
+        {
+            "frame": m.frame,
+            "seconds": round(seconds - start, 6),
+            "file": "raw/" + frame_file(m.frame, ".png"),
+            "solve": m.frame in solved,
+            "sharpness": round(m.sharpness, 3),
+            "exposure": round(m.exposure, 4),
+            "flags": m.flags,
+        }
+        for m, seconds in zip(measures, extracted.seconds, strict=True)
+    ]
+    return {
+        "version": FRAMES_VERSION,
+        "width": extracted.width,
+        "height": extracted.height,
+        "fps": info.fps,
+        "colour": info.colour,
+        "bits": 16 if info.deep else 8,
+        "step": step,
+        "config": asdict(config),
+        "key": key,
+        "frames": frames,
+    }
+
+
+def _publish(shot: Shot, partial: Path, record: dict[str, Any], source: str) -> None:
+    """Puts the new frames in the place of the old. frames.json goes first and comes back last: it says "whole"."""
+    (shot.frames / FRAMES_FILE).unlink(missing_ok=True)
+    for stale in shot.frames.glob("*.png"):
+        stale.unlink()
+    shutil.rmtree(shot.solve, ignore_errors=True)
+    shutil.rmtree(shot.frames / "raw", ignore_errors=True)
+    partial.rename(shot.frames / "raw")
+    write_json(shot.frames / FRAMES_FILE, record)
+    frames = record["frames"]
+    shot.update(
+        source=str(source),
+        first=frames[0]["frame"],
+        last=frames[-1]["frame"],
+        step=record["step"],
+        fps=record["fps"],
+        width=record["width"],
+        height=record["height"],
+        colour=record["colour"],
+    )
+
+
+def _result(shot: Shot, record: dict[str, Any]) -> dict[str, Any]:
+    frames = record["frames"]
+    return {
+        "frames": len(frames),
+        "solved_frames": sum(f["solve"] for f in frames),
+        "first": frames[0]["frame"],
+        "last": frames[-1]["frame"],
+        **{name: record[name] for name in ("step", "width", "height", "fps", "colour")},
+        "source": shot.info().source,
+    }

@@ -1,0 +1,89 @@
+"""Opens footage: which kind it is, what it holds, and its frames one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from numpy.typing import NDArray
+
+from ..contract import ExitCode, JobError
+
+
+@dataclass
+class SourceFrame:
+    """One frame as the source holds it."""
+
+    number: int
+    """Frame number: from 1 in a video, the file's number in a sequence."""
+    seconds: float
+    """Presentation time in seconds on the source's own clock."""
+    pixels: NDArray
+    """[H, W, 3] uint8 or uint16 display-referred sRGB, square pixels, upright."""
+    corrupt: bool = False
+    """The decoder had to guess parts of it."""
+    clipped: float = 0.0
+    """Share of pixels whose linear value lay above 1 and was cut there."""
+
+
+@dataclass
+class SourceInfo:
+    """What is known of the footage before it is decoded."""
+
+    width: int
+    """Width in pixels, upright and with square pixels."""
+    height: int
+    """Height in pixels."""
+    fps: float
+    """Frames per second, the average if they vary."""
+    first: int
+    """Number of the first frame."""
+    last: int | None
+    """Number of the last frame; None where the container does not say."""
+    deep: bool
+    """True if working frames keep 16 bits."""
+    colour: str
+    """srgb, or linear for scene-linear pictures."""
+    key: list
+    """What tells this footage from another: names, sizes, modification times."""
+
+
+class Source(Protocol):
+    """A video or a numbered sequence."""
+
+    info: SourceInfo
+    warnings: list[tuple[str, str]]
+
+    def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
+        """Frames `first` to `last`, inclusive, in order. Those that cannot be decoded are left out, with a warning."""
+        ...
+
+
+def footage_error(message: str, hint: str = "") -> JobError:
+    """An error about the footage, as the artist reads it."""
+    return JobError(message, hint, ExitCode.FOOTAGE)
+
+
+def open_source(source: str, fps: float = 0.0) -> Source:
+    """Opens a video file, a folder or file or pattern of a numbered sequence. `fps` overrides a sequence's rate.
+
+    JobError in one sentence for what is missing, empty, or no footage at all.
+    """
+    from .sequence import PICTURES, SequenceSource, find_sequence
+    from .video import VideoSource
+
+    if not source:
+        raise footage_error(
+            "No footage was given.", "Choose a video file, a picture of a numbered sequence, or a folder."
+        )
+    path = Path(source)
+    is_pattern = not path.exists() and any(mark in path.name for mark in ("#", "%", "@", "*"))
+    if is_pattern or path.is_dir() or path.suffix.lower() in PICTURES:
+        return SequenceSource(find_sequence(path), fps)
+    if not path.is_file():
+        raise footage_error(
+            f"The footage {source} does not exist.", "Check the path; a clip on a server must be mounted."
+        )
+    return VideoSource(path)

@@ -1,0 +1,101 @@
+"""Runs the COLMAP worker as a child process: progress in, cancellation out, its last words if it dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import re
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from ..contract import ExitCode, JobError, Reporter
+
+_POLL_SECONDS = 0.2
+_LAST_LINES = 3
+_COUNT = re.compile(rb"Process(?:ed|ing) \w+ \[(\d+)/(\d+)\]")
+"""How COLMAP's log counts images and blocks of pairs. (Its database must not be looked into meanwhile: a second copy of
+SQLite in one process breaks the first one's locks.)"""
+
+
+def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
+    """Runs `worker.py` on a request file; returns its last message ({"result"} or {"failure"}).
+
+    The worker is killed on cancellation and on any other exception here. JobError (SOLVE) if it dies by itself, with
+    the end of COLMAP's log, which is kept in `log`.
+    """
+    package_root = Path(__file__).resolve().parents[2]
+    environment = dict(os.environ)
+    # A caller's folder must be found by the child as well, whatever this process was started from.
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(package_root), environment.get("PYTHONPATH", "")]))
+    with open(log, "wb") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "torch_backend.solve.worker", str(request)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env=environment,
+        )
+        try:
+            answer = _listen(process, log, report)
+            code = process.wait()
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe:
+                    pipe.close()
+    if answer is None or code != 0:
+        raise JobError(
+            f"The camera solve broke off (COLMAP ended with code {code}): {_tail(log)}",
+            "Try again with a shorter range or a smaller working height; if it stays, please report it with the log.",
+            ExitCode.SOLVE,
+        )
+    return answer
+
+
+def _listen(process: subprocess.Popen[bytes], log: Path, report: Reporter) -> dict[str, Any] | None:
+    lines: queue.Queue[bytes | None] = queue.Queue()
+
+    def read() -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=read, name="solve output", daemon=True).start()
+    answer, stage = None, "start"
+    with open(log, "rb") as tail:
+        while True:
+            report.check_cancelled()
+            try:
+                line = lines.get(timeout=_POLL_SECONDS)
+            except queue.Empty:
+                line = b""
+            if line is None:
+                return answer
+            counts = _COUNT.findall(tail.read())
+            if counts:
+                _tell(report, stage, int(counts[-1][0]), int(counts[-1][1]))
+            if not line.startswith(b"{"):
+                continue
+            message = json.loads(line)
+            if "stage" in message:
+                stage = message["stage"]
+                _tell(report, stage, message.get("done", 0), message.get("total", 1))
+            else:
+                answer = message
+
+
+def _tell(report: Reporter, stage: str, done: int, total: int) -> None:
+    report.progress(f"solve: {stage}", done, total, f"{done} of {total}" if done else "")
+
+
+def _tail(log: Path) -> str:
+    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    wanted = [line for line in lines if line.startswith(("F2", "E2")) or "Error" in line] or lines
+    return " ".join(wanted[-_LAST_LINES:]) or "it left no message."

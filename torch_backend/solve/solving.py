@@ -1,0 +1,357 @@
+"""Cameras from the working frames: COLMAP in a child process, then undistorted frames and plain files."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
+from ..footage import load_frames
+from ..footage.images import read_png, write_png
+from ..shot import Shot, atomic_path, content_key, write_json
+from .child import run_worker
+from .poses import camera_centre, fill_poses
+from .undistort import warp
+
+SOLVE_VERSION = 1
+CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV")
+LEAST_REGISTERED = 8
+REFUSED_SHARE = 0.5
+GOOD_SHARE, GOOD_ERROR_PX = 0.95, 1.2
+LEAST_ANGLE_DEG = 2.0
+LEAST_POINTS = 100
+POINT_MAX_ERROR_PX = 2.0
+POINT_LEAST_TRACK = 3
+POINT_FARTHEST = 20.0
+_WRITERS = 2
+
+STILL_HINT = "A freeze needs a clip in which the camera moves sideways by a step or more."
+
+
+@dataclass
+class SolveConfig:
+    """How cameras are found."""
+
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP camera model, one camera for all frames: SIMPLE_RADIAL, or OPENCV for strong or tangential distortion."""
+    overlap: int = 15
+    """Each solved frame is matched with those 1, 2, 4, ... 2^overlap frames after it."""
+    features: int = 4096
+    """Most SIFT features per frame, from the upsampled octave on."""
+    localise: bool = True
+    """Place frames that the step left out against the model, each by itself; else they are interpolated."""
+    neighbours: int = 2
+    """A frame to be placed is matched with this many registered frames on either side of it."""
+
+
+class SolveResult(TypedDict):
+    """What `solve_shot` returns, and summary.json repeats."""
+
+    frames: int
+    """Source frames of the range; each has a camera."""
+    solved_frames: int
+    """Frames given to the mapper."""
+    registered: int
+    """Of these, frames that the mapper placed."""
+    localised: int
+    """Further frames placed against the model."""
+    interpolated: int
+    """Frames whose pose is interpolated or held."""
+    reprojection_error_px: float
+    """Mean over the model's observations."""
+    points: int
+    """Points in points.npz."""
+    focal_px: float
+    """Focal length of the undistorted frames in pixels."""
+    quality: str
+    """The same in words."""
+
+
+def solve_shot(shot: Shot, config: SolveConfig, report: Reporter) -> SolveResult:
+    """Finds the camera of every frame of `shot` and writes the undistorted frames.
+
+    Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
+    contract.CameraPath in COLMAP's world ("solve units"), OpenCV axes, world-to-camera, pinhole of the undistorted
+    frames. A shot already solved from the same frames with the same configuration is left alone.
+
+    Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
+    """
+    _check(config)
+    frames = load_frames(shot)
+    key = content_key(SOLVE_VERSION, config, frames["key"])
+    done = _finished(shot, frames, key)
+    if done is not None:
+        report.progress("solve", 1, 1, "already solved")
+        return done["result"]
+    for name in ("solve.json", "cameras.json"):
+        (shot.solve / name).unlink(missing_ok=True)
+    scratch = shot.solve / "scratch"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    try:
+        answer = _ask_worker(shot, frames, config, scratch, report)
+        result = _finish(shot, frames, answer, scratch, config, key, report)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return result
+
+
+def load_points(shot: Shot) -> dict[str, NDArray]:
+    """points.npz: xyz float32 [P, 3] solve units, rgb uint8 [P, 3], error float32 [P] px, track uint16 [P]."""
+    path = shot.solve / "points.npz"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: solve the shot first")
+    with np.load(path, allow_pickle=False) as data:
+        return {name: data[name] for name in ("xyz", "rgb", "error", "track")}
+
+
+def _check(config: SolveConfig) -> None:
+    if config.camera_model not in CAMERA_MODELS:
+        raise ValueError(f"camera_model should be one of {', '.join(CAMERA_MODELS)}, got {config.camera_model!r}")
+    if not 1 <= config.overlap <= 31 or config.features < 128 or config.neighbours < 1:
+        raise ValueError(
+            "overlap should be 1 to 31, features at least 128 and neighbours at least 1, got "
+            f"{config.overlap}, {config.features} and {config.neighbours}"
+        )
+
+
+def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | None:
+    path = shot.solve / "solve.json"
+    if not path.is_file():
+        return None
+    record = read_json(path)
+    needed = [shot.solve / "cameras.json", shot.solve / "points.npz"]
+    needed += [shot.frames / frame_file(f["frame"], ".png") for f in frames["frames"]]
+    return record if record.get("key") == key and all(p.is_file() for p in needed) else None
+
+
+def _ask_worker(
+    shot: Shot, frames: dict[str, Any], config: SolveConfig, scratch: Path, report: Reporter
+) -> dict[str, Any]:
+    names = {True: [], False: []}
+    for frame in frames["frames"]:
+        names[bool(frame["solve"])].append(Path(frame["file"]).name)
+    # Blank frames have nothing to be placed by.
+    request = {
+        "images": str(shot.frames / "raw"),
+        "solved": names[True],
+        "others": names[False],
+        "camera_model": config.camera_model,
+        "overlap": config.overlap,
+        "features": config.features,
+        "neighbours": config.neighbours if config.localise else 0,
+        "threads": max(1, min(os.cpu_count() or 1, 16)),
+    }
+    write_json(scratch / "request.json", request)
+    answer = run_worker(scratch / "request.json", shot.solve / "colmap.log", report)
+    if "failure" in answer:
+        raise _failure(answer)
+    return answer["result"]
+
+
+def _failure(answer: dict[str, Any]) -> JobError:
+    flow = answer["flow_px"]
+    if answer["failure"] == "still":
+        message = f"The camera does not move: features shift by at most {flow:.1f} px over the clip."
+        return JobError(message, STILL_HINT, ExitCode.SOLVE)
+    return JobError(
+        "No two frames show enough of the same scene from different places to start a camera solve.",
+        f"{STILL_HINT} Blur, bare walls and a camera that only turns give no parallax.",
+        ExitCode.SOLVE,
+    )
+
+
+def _refuse_poor(answer: dict[str, Any], solved: int) -> None:
+    """JobError for a model that nothing could be trained on."""
+    registered, angle = answer["registered"], answer["triangulation_angle_deg"]
+    if registered < min(LEAST_REGISTERED, solved) or registered < REFUSED_SHARE * solved:
+        sizes = [size for size in answer["model_sizes"] if size >= LEAST_REGISTERED]
+        parts = f" (it falls into {len(sizes)} parts that do not connect)" if len(sizes) > 1 else ""
+        raise JobError(
+            f"Cameras were found for only {registered} of {solved} frames{parts}.",
+            "Choose a range without fast pans or blur, or a smaller step.",
+            ExitCode.SOLVE,
+        )
+    if angle < LEAST_ANGLE_DEG or answer["points"] < LEAST_POINTS:
+        raise JobError(
+            f"The camera moves too little for depth: points are seen under {angle:.1f} degrees, "
+            f"{answer['points']} of them.",
+            STILL_HINT,
+            ExitCode.SOLVE,
+        )
+
+
+def _finish(
+    shot: Shot,
+    frames: dict[str, Any],
+    answer: dict[str, Any],
+    scratch: Path,
+    config: SolveConfig,
+    key: str,
+    report: Reporter,
+) -> SolveResult:
+    """Checks the worker's answer and writes the solve's files, solve.json last."""
+    solved = sum(f["solve"] for f in frames["frames"])
+    _refuse_poor(answer, solved)
+    poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
+    with np.load(scratch / "undistort.npz", allow_pickle=False) as data:
+        pinhole, where = data["pinhole"], data["where"]
+    path = _camera_path(frames, poses, pinhole)
+    with np.load(scratch / "points.npz", allow_pickle=False) as data:
+        points = filter_points({name: data[name] for name in data.files}, _centres(path))
+    _undistort_all(shot, frames, where, report)
+    with atomic_path(shot.solve / "points.npz") as beside:
+        np.savez(beside, **points)  # pyright: ignore[reportArgumentType]
+    shutil.rmtree(shot.solve / "colmap", ignore_errors=True)
+    (scratch / "model").rename(shot.solve / "colmap")
+    write_json(shot.solve / "cameras.json", path.to_json())
+    result = _result(answer, path, solved, len(points["xyz"]), float(pinhole[0]))
+    warnings = _warnings(frames, path, result)
+    for message, hint in warnings:
+        report.warning(message, hint)
+    record = {
+        "version": SOLVE_VERSION,
+        "key": key,
+        "registered": result["registered"],
+        "solved_frames": solved,
+        "total_frames": result["frames"],
+        "reprojection_error_px": result["reprojection_error_px"],
+        "points": result["points"],
+        "camera_model": answer["camera_model"],
+        "distortion": answer["distortion"],
+        "focal_px": answer["focal_px"],
+        "triangulation_angle_deg": answer["triangulation_angle_deg"],
+        "quality": result["quality"],
+        "warnings": [" ".join(w).strip() for w in warnings],
+        "result": result,
+    }
+    write_json(shot.solve / "solve.json", record)
+    report.metric("solve", dict(result))
+    return result
+
+
+def _camera_path(frames: dict[str, Any], poses: dict[str, Any], pinhole: NDArray) -> CameraPath:
+    """A camera for every frame: registered, localised, or interpolated in time between those."""
+    listed = frames["frames"]
+    names = [Path(f["file"]).name for f in listed]
+    known = {i: np.array(poses[name]["pose"]) for i, name in enumerate(names) if name in poses}
+    filled = fill_poses(np.array([f["seconds"] for f in listed]), known)
+    cameras = []
+    for frame, name, pose in zip(listed, names, filled, strict=True):
+        viewmat = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]]).ravel().tolist()
+        source = poses[name]["source"] if name in poses else "interpolated"
+        cameras.append(CameraFrame(frame["frame"], viewmat, pinhole.tolist(), source))
+    return CameraPath(frames["width"], frames["height"], cameras)
+
+
+def _centres(path: CameraPath) -> NDArray[np.float64]:
+    return np.array([camera_centre(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
+
+
+def filter_points(points: dict[str, NDArray], centres: NDArray) -> dict[str, NDArray]:
+    """The points to train from: error below 2 px, seen by 3 frames or more, before all cameras, no far outliers.
+
+    `points` holds xyz [P, 3], rgb, error, track and depth [P] (the least over its cameras); `centres` [C, 3] are the
+    cameras. Far means 20 times the median distance to the cameras' middle: points of distant windows are kept.
+    """
+    distance = np.linalg.norm(points["xyz"] - np.median(centres, axis=0), axis=1)
+    keep = (points["error"] < POINT_MAX_ERROR_PX) & (points["track"] >= POINT_LEAST_TRACK) & (points["depth"] > 0)
+    keep &= np.isfinite(points["xyz"]).all(axis=1)
+    if keep.any():
+        keep &= distance < POINT_FARTHEST * np.median(distance[keep])
+    return {name: points[name][keep] for name in ("xyz", "rgb", "error", "track")}
+
+
+def _undistort_all(shot: Shot, frames: dict[str, Any], where: NDArray, report: Reporter) -> None:
+    listed = frames["frames"]
+
+    def one(frame: dict[str, Any]) -> int:
+        pixels = read_png(shot.frames / frame["file"])
+        write_png(shot.frames / frame_file(frame["frame"], ".png"), warp(pixels, where))
+        return frame["frame"]
+
+    with ThreadPoolExecutor(_WRITERS) as pool:
+        waiting = [pool.submit(one, frame) for frame in listed]
+        try:
+            for done, future in enumerate(waiting, start=1):
+                report.check_cancelled()
+                report.progress("solve: undistort", done, len(listed), f"frame {future.result()}")
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _result(answer: dict[str, Any], path: CameraPath, solved: int, points: int, focal: float) -> SolveResult:
+    sources = [f.source for f in path.frames]
+    error = round(float(answer["reprojection_error_px"]), 4)
+    registered = int(answer["registered"])
+    return SolveResult(
+        frames=len(sources),
+        solved_frames=solved,
+        registered=registered,
+        localised=sources.count("localised"),
+        interpolated=sources.count("interpolated"),
+        reprojection_error_px=error,
+        points=points,
+        focal_px=round(focal, 3),
+        quality=quality_words(registered, solved, error),
+    )
+
+
+def quality_words(registered: int, solved: int, error_px: float) -> str:
+    """One sentence: Good, Fair or Poor, and the figures."""
+    share = registered / max(1, solved)
+    if share >= GOOD_SHARE and error_px <= GOOD_ERROR_PX:
+        word = "Good"
+    else:
+        word = "Fair" if share >= 0.8 and error_px <= 1.5 * GOOD_ERROR_PX else "Poor"
+    return f"{word}: {registered} of {solved} frames registered, {error_px:.2f} px."
+
+
+def _warnings(frames: dict[str, Any], path: CameraPath, result: SolveResult) -> list[tuple[str, str]]:
+    warnings = []
+    lost = [
+        camera.frame
+        for camera, frame in zip(path.frames, frames["frames"], strict=True)
+        if frame["solve"] and camera.source != "registered"
+    ]
+    if lost:
+        warnings.append(
+            (
+                f"{len(lost)} solved frames were not registered: {spans(lost)}.",
+                "Their cameras are placed from their neighbours.",
+            )
+        )
+    guessed = [i for i, camera in enumerate(path.frames) if camera.source == "interpolated"]
+    placed = [i for i, camera in enumerate(path.frames) if camera.source != "interpolated"]
+    held = [path.frames[i].frame for i in guessed if i < placed[0] or i > placed[-1]]
+    if held:
+        warnings.append(
+            (
+                f"The camera holds its pose in frames {spans(held)}, beyond the last frame that was placed.",
+                "Cut them off.",
+            )
+        )
+    if result["reprojection_error_px"] > 1.5 * GOOD_ERROR_PX:
+        warnings.append(("The reprojection error is high: the picture will be soft.", "Try the OPENCV camera model."))
+    return warnings
+
+
+def spans(numbers: Sequence[int]) -> str:
+    """'3-5, 9' for 3, 4, 5, 9."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
+        else:
+            parts.append([number, number])
+    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in parts)

@@ -1,0 +1,381 @@
+"""The child process in which COLMAP runs: `python -m torch_backend.solve.worker REQUEST.json`.
+
+A process of its own because pycolmap and OpenImageIO cannot share one (see footage/images.py), because COLMAP ends its
+process on a failed check, and because a process can be stopped at any moment. It is the only module that imports
+pycolmap.
+
+Standard input is held open by the parent: when it closes, the parent is gone and so is the worker. Standard output
+carries JSON lines: {"stage"} when one begins, with {"done", "total"} where COLMAP calls back; {"result": {...}} or
+{"failure": "reason"} at the end.
+Beside the request it writes: model/ (binary COLMAP model), points.npz, poses.json (cameras from world, 3x4) and
+undistort.npz (camera of the undistorted frames and where each of its pixels lies in the distorted ones).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+SEED = 0
+STILL_SHARE = 0.008
+"""Largest median flow between any two frames, as a share of the image width, below which the camera stands still."""
+LOCALISE_MAX_ERROR_PX = 4.0
+LOCALISE_LEAST_INLIERS = 24
+LOCALISE_LEAST_RATIO = 0.4
+
+
+class Request:
+    """What the parent asks for, from its JSON."""
+
+    def __init__(self, path: Path) -> None:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        self.scratch = path.parent
+        self.database = self.scratch / "database.db"
+        self.images = Path(data["images"])
+        self.solved: list[str] = data["solved"]
+        self.others: list[str] = data["others"]
+        self.order: list[str] = sorted(self.solved + self.others, key=lambda name: int(Path(name).stem))
+        self.camera_model: str = data["camera_model"]
+        self.overlap: int = data["overlap"]
+        self.features: int = data["features"]
+        self.neighbours: int = data["neighbours"]
+        self.threads: int = data["threads"]
+
+
+def say(**message: Any) -> None:
+    """One line to the parent."""
+    sys.stdout.write(json.dumps(message) + "\n")
+    sys.stdout.flush()
+
+
+def main(path: str) -> int:
+    """Runs the request; 0 unless something broke that no sentence covers."""
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    request = Request(Path(path))
+    pycolmap.set_random_seed(SEED)
+    extract(request, request.solved, None)
+    match(request)
+    flow, width = median_flow(request)
+    if flow < STILL_SHARE * width:
+        say(failure="still", flow_px=flow)
+        return 0
+    models = build(request)
+    if not models:
+        say(failure="no_pair", flow_px=flow)
+        return 0
+    sizes = sorted((m.num_reg_images() for m in models), reverse=True)
+    # The first model that the mapper writes is often a fragment: the largest is meant.
+    model = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
+    poses = localise(request, model)
+    write_answers(request, model, poses)
+    camera = next(iter(model.cameras.values()))
+    say(
+        result={
+            "registered": model.num_reg_images(),
+            "model_sizes": sizes,
+            "reprojection_error_px": model.compute_mean_reprojection_error(),
+            "points": model.num_points3D(),
+            "triangulation_angle_deg": triangulation_angle(model),
+            "camera_model": camera.model_name,
+            "focal_px": camera.mean_focal_length(),
+            "distortion": [float(camera.params[i]) for i in camera.extra_params_idxs()],
+            "flow_px": flow,
+            "localised": len(poses) - model.num_reg_images(),
+        }
+    )
+    return 0
+
+
+# --------------------------------------------------------------------------------------------------- COLMAP's stages
+
+
+def extract(request: Request, names: list[str], camera_id: int | None) -> None:
+    """SIFT features of `names` into the database; one camera for all, an existing one if `camera_id` is given."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = request.camera_model
+    if camera_id is not None:
+        reader.existing_camera_id = camera_id
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = request.threads
+    options.sift.max_num_features = request.features
+    say(stage="features" if camera_id is None else "features of other frames")
+    pycolmap.extract_features(
+        request.database,
+        request.images,
+        image_names=names,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _matching(request: Request) -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = request.threads
+    geometry = pycolmap.TwoViewGeometryOptions()
+    geometry.ransac.random_seed = SEED
+    return options, geometry
+
+
+def match(request: Request) -> None:
+    """Matches each frame with its next ones at distances 1, 2, 4, ... within the overlap (quadratic overlap)."""
+    options, geometry = _matching(request)
+    pairing = pycolmap.SequentialPairingOptions()
+    pairing.overlap = request.overlap
+    pairing.quadratic_overlap = True
+    pairing.num_threads = request.threads
+    say(stage="matches")
+    pycolmap.match_sequential(request.database, options, pairing, geometry, device=pycolmap.Device.cpu)
+
+
+def median_flow(request: Request) -> tuple[float, int]:
+    """Largest over image pairs of the median displacement in pixels of their matches, and the image width."""
+    largest = 0.0
+    with closing_database(request) as database:
+        width = database.read_all_cameras()[0].width
+        keypoints = {i.image_id: database.read_keypoints(i.image_id)[:, :2] for i in database.read_all_images()}
+        pairs, geometries = database.read_two_view_geometries()
+        for pair, geometry in zip(pairs, geometries, strict=True):
+            matches = geometry.inlier_matches
+            if len(matches) < 15:
+                continue
+            a, b = pycolmap.pair_id_to_image_pair(pair)
+            shift = np.linalg.norm(keypoints[a][matches[:, 0]] - keypoints[b][matches[:, 1]], axis=1)
+            largest = max(largest, float(np.median(shift)))
+    return largest, width
+
+
+def build(request: Request) -> list[pycolmap.Reconstruction]:
+    """Incremental mapping; every model that it finds."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = request.threads
+    options.random_seed = SEED
+    options.mapper.random_seed = SEED
+    options.triangulation.random_seed = SEED
+    # A clip of 75 frames needs no global adjustment every 10 % of growth: 37 % less time, error unchanged (0.795 px
+    # against 0.797 px on examples/sitting.mp4).
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+    options.ba_global_max_refinements = 2
+    options.ba_local_max_refinements = 1
+    folder = request.scratch / "models"
+    folder.mkdir()
+    total = len(request.solved)
+    done = 2
+    say(stage="cameras", done=0, total=total)
+
+    def next_image() -> None:
+        nonlocal done
+        done += 1
+        say(stage="cameras", done=min(done, total), total=total)
+
+    found = pycolmap.incremental_mapping(
+        request.database, request.images, folder, options, next_image_callback=next_image
+    )
+    say(stage="cameras", done=total, total=total)
+    return [m for m in found.values() if m.num_reg_images() >= 2]
+
+
+# --------------------------------------------------------------------------------------------------- other frames
+
+
+def localise(request: Request, model: pycolmap.Reconstruction) -> dict[str, dict[str, Any]]:
+    """Poses of all frames that can be had: {name: {"pose": 3x4 list, "source", "inliers"}}.
+
+    Registered ones are the model's. Each other one is matched with its nearest registered frames on either side and
+    placed against their points (P3P in LO-RANSAC, then refined), if enough points agree.
+    """
+    poses: dict[str, dict[str, Any]] = {}
+    ids: dict[str, int] = {}
+    for image in model.images.values():
+        if image.has_pose:
+            ids[image.name] = image.image_id
+            poses[image.name] = {"pose": image.cam_from_world().matrix().tolist(), "source": "registered"}
+    missing = [name for name in request.order if name not in ids]
+    if not missing or request.neighbours < 1:
+        return poses
+    pairs = {name: _nearest_registered(request, name, ids) for name in missing}
+    new = [name for name in request.others if name in pairs]
+    if new:
+        camera_id = next(iter(model.cameras))
+        extract(request, new, camera_id)
+    _match_pairs(request, pairs)
+    camera = next(iter(model.cameras.values()))
+    with closing_database(request) as database:
+        for name in missing:
+            found = _place(database, model, camera, name, [ids[other] for other in pairs[name]])
+            if found is not None:
+                poses[name] = found
+    return poses
+
+
+def _nearest_registered(request: Request, name: str, ids: dict[str, int]) -> list[str]:
+    at = request.order.index(name)
+    before = [other for other in request.order[:at] if other in ids][-request.neighbours :]
+    after = [other for other in request.order[at + 1 :] if other in ids][: request.neighbours]
+    return before + after
+
+
+def _match_pairs(request: Request, pairs: dict[str, list[str]]) -> None:
+    lines = [f"{name} {other}" for name, others in pairs.items() for other in others]
+    listing = request.scratch / "pairs.txt"
+    listing.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    options, geometry = _matching(request)
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listing
+    pairing.block_size = 4 * request.neighbours  # COLMAP counts its progress in blocks
+    say(stage="matches of other frames")
+    pycolmap.match_image_pairs(request.database, options, pairing, geometry, device=pycolmap.Device.cpu)
+
+
+def _place(
+    database: pycolmap.Database, model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str, others: list[int]
+) -> dict[str, Any] | None:
+    """The pose of one image from its matches with registered ones, or None."""
+    image = database.read_image_with_name(name)
+    if image is None or not database.exists_keypoints(image.image_id):
+        return None
+    keypoints = database.read_keypoints(image.image_id)[:, :2]
+    links: dict[tuple[int, int], None] = {}
+    for other in others:
+        if not database.exists_matches(image.image_id, other):
+            continue
+        matches = database.read_two_view_geometry(image.image_id, other).inlier_matches
+        points = model.images[other].points2D
+        for own, theirs in matches:
+            point = points[int(theirs)]
+            if point.has_point3D():
+                links[int(own), int(point.point3D_id)] = None
+    if len(links) < LOCALISE_LEAST_INLIERS:
+        return None
+    xy = np.array([keypoints[own] for own, _ in links], np.float64)
+    xyz = np.array([model.points3D[point].xyz for _, point in links], np.float64)
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = LOCALISE_MAX_ERROR_PX
+    options.ransac.random_seed = SEED
+    found = pycolmap.estimate_and_refine_absolute_pose(xy, xyz, camera, options)
+    if found is None:
+        return None
+    inliers = int(found["num_inliers"])
+    if inliers < LOCALISE_LEAST_INLIERS or inliers < LOCALISE_LEAST_RATIO * len(links):
+        return None
+    return {"pose": found["cam_from_world"].matrix().tolist(), "source": "localised", "inliers": inliers}
+
+
+# --------------------------------------------------------------------------------------------------- answers
+
+
+def triangulation_angle(model: pycolmap.Reconstruction) -> float:
+    """Median over points (at most 2000) of the widest angle in degrees under which a point is seen."""
+    centres = {i.image_id: i.projection_center() for i in model.images.values() if i.has_pose}
+    points = sorted(model.points3D.items())
+    angles = []
+    for _, point in points[:: max(1, len(points) // 2000)]:
+        seen = np.array([centres[e.image_id] for e in point.track.elements])
+        rays = seen - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def write_answers(request: Request, model: pycolmap.Reconstruction, poses: dict[str, dict[str, Any]]) -> None:
+    """Everything the parent needs, in formats that need no pycolmap."""
+    folder = request.scratch / "model"
+    folder.mkdir()
+    model.write_binary(folder)
+    points = [model.points3D[i] for i in sorted(model.points3D)]
+    np.savez(
+        request.scratch / "points.npz",
+        xyz=np.array([p.xyz for p in points], np.float32).reshape(-1, 3),
+        rgb=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+        error=np.array([p.error for p in points], np.float32),
+        track=np.array([min(p.track.length(), 65535) for p in points], np.uint16),
+        depth=smallest_depths(model, points),
+    )
+    (request.scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
+    camera = next(iter(model.cameras.values()))
+    pinhole, where = undistortion(camera)
+    np.savez(request.scratch / "undistort.npz", pinhole=pinhole, where=where)
+
+
+def smallest_depths(model: pycolmap.Reconstruction, points: list[pycolmap.Point3D]) -> NDArray[np.float32]:
+    """[P]: the least depth of each point over the images that see it, in solve units."""
+    rows = {i.image_id: i.cam_from_world().matrix()[2] for i in model.images.values() if i.has_pose}
+    return np.array(
+        [min(float(rows[e.image_id] @ np.append(p.xyz, 1.0)) for e in p.track.elements) for p in points], np.float32
+    )
+
+
+def undistortion(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """The pinhole camera of the undistorted frames, and where its pixels lie in the distorted ones.
+
+    Same size and principal point; the widest view in which no pixel falls outside of the distorted image (COLMAP's
+    blank_pixels = 0). Returns ([fx, fy, cx, cy], [H, W, 2] x and y in pixels, centres at +0.5).
+    """
+    width, height = camera.width, camera.height
+    cx, cy = camera.principal_point_x, camera.principal_point_y
+    focal = np.array([camera.focal_length_x, camera.focal_length_y])
+    x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
+    border = np.concatenate(
+        [
+            np.stack([x, np.full_like(x, y[0])], 1),
+            np.stack([x, np.full_like(x, y[-1])], 1),
+            np.stack([np.full_like(y, x[0]), y], 1),
+            np.stack([np.full_like(y, x[-1]), y], 1),
+        ]
+    )
+
+    def distorted(pixels: NDArray, zoom: float) -> NDArray:
+        rays = np.ones((len(pixels), 3))
+        rays[:, :2] = (pixels - [cx, cy]) / (focal * zoom)
+        return np.asarray(camera.img_from_cam(rays))
+
+    def inside(zoom: float) -> bool:
+        at = distorted(border, zoom)
+        slack = 1e-6
+        low, high = 0.5 - slack, np.array([width, height]) - 0.5 + slack
+        return bool(((at >= low) & (at <= high)).all())
+
+    low, high = 0.5, 2.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if inside(middle) else (middle, high)
+    zoom = high
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    where = distorted(grid.reshape(-1, 2), zoom).reshape(height, width, 2).astype(np.float32)
+    return np.array([*(focal * zoom), cx, cy]), where
+
+
+# --------------------------------------------------------------------------------------------------- plumbing
+
+
+def _die_with_parent() -> None:
+    # Unbuffered: the interpreter could not close a buffer that a thread still reads.
+    while os.read(0, 64):
+        pass
+    os._exit(1)
+
+
+@contextmanager
+def closing_database(request: Request) -> Any:
+    """COLMAP's database, closed afterwards."""
+    database = pycolmap.Database.open(request.database)
+    try:
+        yield database
+    finally:
+        database.close()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1]))
