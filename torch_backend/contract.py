@@ -303,6 +303,15 @@ class CameraPath:
 # ------------------------------------------------------------------------------------------------- reading
 
 
+def process_start(pid: int) -> float:
+    """Start time of a process in clock ticks since boot, where the system tells (Linux); else 0."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        return float(stat.rpartition(")")[2].split()[19])
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
 def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VERSION) -> None:
     """ValueError, in words, if `data` was written by a newer Splannequin."""
     version = data.get("version", 1)
@@ -358,6 +367,33 @@ EXR_LAYERS = ("Combined", "Depth", "Support", "Motion")
 
 NO_DEPTH = 1e10
 """Depth of a pixel that nothing covers (what Blender's own Z pass says)."""
+
+
+def summarise(
+    shot: str, source: str, results: Mapping[str, Mapping[str, Any]], stages: Mapping[str, float], wall_seconds: float
+) -> dict[str, Any]:
+    """The figures of a whole run as DIR/summary.json holds them; units in the key names.
+
+    Args:
+        shot: absolute path of the shot folder.
+        source: footage as given.
+        results: what the jobs "solve", "train" and "freeze" answered in their `done` event.
+        stages: seconds by kind of job.
+        wall_seconds: seconds in all.
+    """
+    train, freeze, solve = results["train"], results["freeze"], results["solve"]
+    return {
+        "version": CONTRACT_VERSION,
+        "shot": shot,
+        "source": source,
+        **{k: solve[k] for k in ("frames", "solved_frames", "registered", "reprojection_error_px")},
+        **{k: train[k] for k in ("gaussians", "moving_share", "train_seconds", "iterations", "heldout_psnr_db")},
+        "train_width_px": train["width_px"],
+        **{k: freeze[k] for k in ("t_star_frame", "exr_dir", "contact_sheet", "video", "ply", "take")},
+        "run": train["run"],
+        "wall_seconds_by_stage": dict(stages),
+        "wall_seconds": round(wall_seconds, 2),
+    }
 
 
 def frame_file(frame: int, suffix: str) -> str:

@@ -1,0 +1,102 @@
+"""Where the backend is: the Python that runs it, and the folder that holds `torch_backend`."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+
+from ..torch_backend import contract
+from . import jobs
+
+PACKAGE: str = (__package__ or "").rpartition(".")[0]
+"""Name of the extension package, such as bl_ext.user_default.splannequin."""
+PYTHON_VARIABLE = "SPLANNEQUIN_BACKEND_PYTHON"
+
+
+def package_root() -> Path:
+    """Folder of the extension: it holds `torch_backend`."""
+    return Path(__file__).resolve().parent.parent
+
+
+def venv_python(folder: Path) -> Path:
+    """Interpreter of a virtual environment."""
+    return folder / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+
+
+def candidates() -> list[tuple[str, Path]]:
+    """Where the backend's Python may be, in order: (what it is called, path)."""
+    found: list[tuple[str, Path]] = []
+    addon = bpy.context.preferences.addons.get(PACKAGE)
+    chosen = getattr(addon.preferences, "backend_python", "") if addon and addon.preferences else ""
+    if chosen:
+        found.append(("the add-on's preferences", Path(bpy.path.abspath(chosen))))
+    if os.environ.get(PYTHON_VARIABLE):
+        found.append((PYTHON_VARIABLE, Path(os.environ[PYTHON_VARIABLE])))
+    try:
+        user = Path(bpy.utils.extension_path_user(PACKAGE))
+        found.append(("the extension's own folder", venv_python(user / "venv")))
+    except ValueError:
+        pass  # not loaded as an installed extension: it has no such folder
+    home = os.environ.get("SPLANNEQUIN_HOME")
+    if home:
+        found.append(("SPLANNEQUIN_HOME", venv_python(Path(home) / ".venv")))
+    found.append(("the checkout", venv_python(package_root() / ".venv")))
+    return found
+
+
+def python() -> str:
+    """The backend's interpreter. JobError if there is none, or if the chosen one is missing."""
+    for where, path in candidates():
+        if path.is_file():
+            return str(path)
+        if where in ("the add-on's preferences", PYTHON_VARIABLE):
+            raise contract.JobError(
+                f"The backend's Python named in {where} does not exist: {path}.",
+                "Correct the path, or clear it to have the backend found by itself.",
+                contract.ExitCode.ENVIRONMENT,
+            )
+    raise contract.JobError(
+        "Splannequin's backend is not set up: no Python environment for it was found.",
+        "Run `python3 splannequin.py setup`, then choose its .venv Python in the add-on's preferences "
+        f"(or in {PYTHON_VARIABLE}).",
+        contract.ExitCode.ENVIRONMENT,
+    )
+
+
+def available() -> bool:
+    """True if a Python for the backend was found."""
+    try:
+        return bool(python())
+    except contract.JobError:
+        return False
+
+
+def doctor() -> str:
+    """What the backend's environment can do, as the JSON that `torch_backend doctor` prints. JobError if it fails."""
+    root = package_root()
+    command = [python(), "-m", "torch_backend", "doctor"]
+    try:
+        done = subprocess.run(
+            command, cwd=root, env=jobs.backend_environ(root), capture_output=True, text=True, timeout=120, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise contract.JobError(
+            f"The backend did not answer: {error}.", "Set it up again.", contract.ExitCode.ENVIRONMENT
+        ) from error
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise contract.JobError(
+            f"The backend's environment is incomplete: {last}.",
+            "Run `python3 splannequin.py setup` again.",
+            contract.ExitCode.ENVIRONMENT,
+        )
+    return done.stdout
+
+
+def start(job: jobs.Job) -> None:
+    """Starts the backend on a job made by `jobs.new_job`. JobError if there is no backend."""
+    jobs.start(job, python(), package_root())

@@ -1,0 +1,110 @@
+"""Frozen frames through the scene's compositor to the artist's output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..torch_backend import contract
+from . import cameras, compat, compositor, scene_setup, shots
+
+DIGITS = "######"
+_DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (what Blender gives a new file)
+
+
+def insert(scene: Any, shot: Path, take: str) -> list[str]:
+    """Puts a take into the scene's compositor, or updates it; returns what was changed, in words.
+
+    Raises:
+        contract.JobError: the take has no frames.
+    """
+    try:
+        frozen = compositor.take_of(shot / "takes" / take, cameras.depth_scale(scene, shot))
+    except FileNotFoundError as error:
+        raise contract.JobError(
+            f"The take {take!r} of {shot.name} holds no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
+        ) from error
+    plate = compositor.frame_path(shot / "frames", frozen.first, ".png")
+    return compositor.insert(scene, frozen, plate if plate.is_file() else None)
+
+
+def remove(scene: Any) -> bool:
+    """Takes the freeze out of the scene's compositor. True if it was there."""
+    return compositor.remove(scene)
+
+
+def missing_frames(shot: Path, take: str, first: int, last: int) -> list[int]:
+    """Frames of a range that a take lacks."""
+    there = set(compositor.frame_numbers(shot / "takes" / take))
+    return [n for n in range(first, last + 1) if n not in there]
+
+
+def default_output(shot: Path, take: str) -> Path:
+    """Where a bake goes if the scene names no folder of its own."""
+    return shot / "bake" / take
+
+
+def choose_output(scene: Any, shot: Path, take: str) -> list[str]:
+    """Gives the scene an output path if it still has Blender's default; returns what was changed, in words."""
+    if scene.render.filepath not in _DEFAULT_OUTPUTS:
+        return []
+    folder = default_output(shot, take)
+    scene.render.filepath = compositor.blend_path(folder / DIGITS)
+    return [f"Output path set to {folder}."]
+
+
+def fit_take(scene: Any, shot: Path, take: str) -> list[str]:
+    """Gives the scene the size, rate and range of a take, so that its pixels leave as they are; says what changed."""
+    frozen = compositor.take_of(shot / "takes" / take)
+    fps = float(shots.read(shot).info.get("fps", 0.0))
+    return scene_setup.fit_clip(scene, frozen.size, fps, (frozen.first, frozen.last))
+
+
+def render(scene: Any, folder: Path, png: bool = True, on_frame: Callable[[int, int], None] | None = None) -> list[int]:
+    """Renders the scene's range through the compositor to folder/NNNNNN.*, blocking; returns the frames written.
+
+    Args:
+        scene: a scene with the freeze inserted.
+        folder: where the pictures go.
+        png: write 8-bit RGB PNG; else what the scene's output format says.
+        on_frame: called with (frames done, frames in all).
+
+    Raises:
+        contract.JobError: Blender refused, or a frame is not on disk afterwards.
+    """
+    wanted = list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
+    folder.mkdir(parents=True, exist_ok=True)
+    scene.render.filepath = str(folder / DIGITS)
+    scene.render.use_file_extension = True
+    scene.render.use_overwrite = True
+    if png:
+        compat.set_png(scene.render.image_settings)
+    done = []
+
+    def count(*_: Any) -> None:
+        done.append(scene.frame_current)
+        if on_frame:
+            on_frame(len(done), len(wanted))
+
+    bpy.app.handlers.render_write.append(count)
+    try:
+        bpy.ops.render.render(animation=True, scene=scene.name)
+    except RuntimeError as error:
+        raise contract.JobError(
+            f"Blender could not render the scene: {str(error).strip()}",
+            "Open shot.blend and render it there to see why.",
+            contract.ExitCode.BAKE,
+        ) from error
+    finally:
+        bpy.app.handlers.render_write.remove(count)
+    lost = [n for n in wanted if not Path(scene.render.frame_path(frame=n)).is_file()]
+    if lost:
+        raise contract.JobError(
+            f"Blender wrote no picture for frame {lost[0]} in {folder}.",
+            "Is the disk full, or the folder not yours to write?",
+            contract.ExitCode.BAKE,
+        )
+    return wanted

@@ -1,0 +1,315 @@
+"""The solve in Blender, and the only place where camera axes are converted.
+
+OpenCV (x right, y down, z forward; viewmat world-to-camera) against Blender (x right, y up, looking along -z; camera to
+world). The solve arrives under one Empty that carries the solve-to-scene transform: moving it moves camera and points
+together, and depth and camera paths are read back through it.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Quaternion, Vector
+
+from ..torch_backend import contract
+from . import compat, compositor, shots
+
+_TAG = "splannequin"
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenCV camera axes to Blender's, and back."""
+SENSOR_MM = 36.0
+"""Width given to the camera's sensor. Only its ratio to the focal length matters."""
+
+
+def camera_to_world(viewmat: np.ndarray) -> np.ndarray:
+    """Blender's camera matrix from an OpenCV one.
+
+    Args:
+        viewmat: world-to-camera, OpenCV axes, [4, 4] float64.
+
+    Returns:
+        Camera-to-world with Blender's camera axes, [4, 4] float64, in the same world.
+    """
+    return np.linalg.inv(np.asarray(viewmat, dtype=np.float64)) @ _FLIP
+
+
+def viewmat_from_camera(matrix: np.ndarray) -> np.ndarray:
+    """Inverse of `camera_to_world`. A scaled camera object is taken without its scale."""
+    matrix = np.array(matrix, dtype=np.float64)
+    matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)
+    return np.linalg.inv(matrix @ _FLIP)
+
+
+def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -> tuple[float, float, float]:
+    """(focal length in mm, shift_x, shift_y) for a camera with horizontal sensor fit and a sensor of `SENSOR_MM`.
+
+    Args:
+        k: fx, fy, cx, cy in pixels, pixel centres at +0.5.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    fx, _, cx, cy = k
+    return fx * SENSOR_MM / width, (width / 2 - cx) / width, (cy - height / 2) / width
+
+
+def k_from_lens(
+    lens: float, shift_x: float, shift_y: float, sensor: float, width: int, height: int, aspect: float = 1.0
+) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a camera with horizontal sensor fit; inverse of `lens_from_k`.
+
+    `aspect` is the render's pixel_aspect_y / pixel_aspect_x.
+    """
+    fx = lens * width / sensor
+    return fx, fx / aspect, width / 2 - shift_x * width, height / 2 + shift_y * width / aspect
+
+
+def pixel_aspect(k: tuple[float, float, float, float]) -> tuple[float, float]:
+    """(pixel_aspect_x, pixel_aspect_y) of a render that shows fx and fy as they are; Blender wants both >= 1."""
+    fx, fy = k[0], k[1]
+    ratio = fx / fy
+    if abs(ratio - 1.0) < 5e-4:  # half a pixel over a thousand
+        return 1.0, 1.0
+    return (1.0, ratio) if ratio > 1.0 else (1.0 / ratio, 1.0)
+
+
+def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarray:
+    """A first guess of the solve-to-scene transform: cameras upright, floor at z = 0, shot around the origin.
+
+    Args:
+        path: the solved cameras, solve units.
+        points: sparse points, [P, 3], solve units.
+
+    Returns:
+        [4, 4] float64, rotation and translation, no scale.
+    """
+    matrices = np.stack([camera_to_world(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
+    up = matrices[:, :3, 1].mean(axis=0)
+    forward = -matrices[:, :3, 2].mean(axis=0)
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    ahead = forward - up * float(forward @ up)
+    if np.linalg.norm(ahead) < 1e-6:  # looking straight up or down
+        ahead = np.cross(up, np.roll(up, 1))
+    ahead = ahead / np.linalg.norm(ahead)
+    rotation = np.stack([np.cross(ahead, up), ahead, up])  # scene x, y, z in solve coordinates
+    seen = (points if len(points) else matrices[:, :3, 3]) @ rotation.T
+    centre = np.median(seen, axis=0)
+    centre[2] = np.percentile(seen[:, 2], 2.0)
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, -centre
+    return result
+
+
+def build(scene: Any, shot: Path) -> Any:
+    """Brings the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
+
+    What an earlier call made for the same shot is replaced; the root's transform, which the artist may have set, stays.
+
+    Args:
+        scene: the scene to build in; its camera is set, nothing else of it is changed.
+        shot: shot folder with a finished solve.
+
+    Returns:
+        The camera object.
+
+    Raises:
+        FileNotFoundError: there is no solve.
+    """
+    path = contract.CameraPath.load(shot / "solve" / "cameras.json")
+    xyz, rgb = _points(shot)
+    name = shot.name.removesuffix(shots.SHOT_SUFFIX)
+    kept = _clear(scene, name)
+    collection = bpy.data.collections.new(f"Splannequin {name}")
+    collection[_TAG] = name
+    scene.collection.children.link(collection)
+
+    root = bpy.data.objects.new(f"{name} root", None)
+    root.empty_display_type = "ARROWS"
+    root[_TAG] = name
+    root.matrix_world = kept if kept is not None else Matrix(scene_from_solve(path, xyz).tolist())
+    camera_data = bpy.data.cameras.new(f"{name} camera")
+    camera = bpy.data.objects.new(f"{name} camera", camera_data)
+    cloud = bpy.data.objects.new(f"{name} points", _point_mesh(f"{name} points", xyz, rgb))
+    cloud.hide_render = True
+    cloud.color = (0.9, 0.9, 0.9, 1.0)
+    root.empty_display_size = _extent(path)
+    camera_data.display_size = max(_extent(path) * 0.5, 0.05)
+    for item in (root, camera, cloud):
+        collection.objects.link(item)
+        item[_TAG] = name
+    for item in (camera, cloud):
+        item.parent = root
+        item.hide_select = item is cloud
+    _animate(camera, path)
+    camera_data.clip_start, camera_data.clip_end = _clip(path, xyz)
+    _show_plate(camera_data, shot, name)
+    scene.camera = camera
+    return camera
+
+
+def find(scene: Any, shot: Path, kind: str) -> Any | None:
+    """Our object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points)."""
+    name = shot.name.removesuffix(shots.SHOT_SUFFIX)
+    return next((o for o in scene.objects if o.get(_TAG) == name and o.type == kind), None)
+
+
+def depth_scale(scene: Any, shot: Path) -> float:
+    """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
+    root = find(scene, shot, "EMPTY")
+    return float(sum(root.matrix_world.to_scale()) / 3.0) if root else 1.0
+
+
+def remove(scene: Any, shot: Path) -> bool:
+    """Takes everything that `build` made out of the file. True if there was something."""
+    return _clear(scene, shot.name.removesuffix(shots.SHOT_SUFFIX)) is not None
+
+
+def _clear(scene: Any, name: str) -> Matrix | None:
+    """Removes what was built for a shot; returns the transform its root had."""
+    kept = None
+    for item in [o for o in scene.objects if o.get(_TAG) == name]:
+        data, images = item.data, []
+        actions = [b.animation_data.action for b in (item, data) if b is not None and b.animation_data]
+        if item.type == "EMPTY":
+            kept = item.matrix_world.copy()
+        if item.type == "CAMERA":
+            images = [b.image for b in data.background_images]
+        bpy.data.objects.remove(item)
+        unused = [b for b in (data, *actions) if b is not None and b.users <= int(b.use_fake_user)]
+        bpy.data.batch_remove(unused)
+        bpy.data.batch_remove([i for i in images if i is not None and i.users == 0])
+    for collection in [c for c in bpy.data.collections if c.get(_TAG) == name and not c.objects]:
+        bpy.data.collections.remove(collection)
+    return kept
+
+
+def _animate(camera: Any, path: contract.CameraPath) -> None:
+    """Keys the camera on the clip's own frame numbers, straight between keys."""
+    data = camera.data
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR_MM
+    data.sensor_height = SENSOR_MM * path.height / path.width
+    camera.rotation_mode = "QUATERNION"
+    lenses = [lens_from_k((f.K[0], f.K[1], f.K[2], f.K[3]), path.width, path.height) for f in path.frames]
+    varies = max(map(max, zip(*lenses))) > 0 and any(
+        max(column) - min(column) > 1e-6 * max(abs(max(column)), 1.0) for column in zip(*lenses)
+    )
+    before: Quaternion | None = None
+    for frame, lens in zip(path.frames, lenses):
+        location, rotation, _ = Matrix(camera_to_world(np.reshape(frame.viewmat, (4, 4))).tolist()).decompose()
+        if before is not None and before.dot(rotation) < 0:  # q and -q turn alike, but keys would go the long way
+            rotation.negate()
+        before = rotation
+        camera.location, camera.rotation_quaternion = location, rotation
+        camera.keyframe_insert("location", frame=frame.frame)
+        camera.keyframe_insert("rotation_quaternion", frame=frame.frame)
+        data.lens, data.shift_x, data.shift_y = lens
+        if varies:
+            for channel in ("lens", "shift_x", "shift_y"):
+                data.keyframe_insert(channel, frame=frame.frame)
+    for block in (camera, data):
+        for curve in compat.fcurves(block):
+            for key in curve.keyframe_points:
+                key.interpolation = "LINEAR"
+
+
+def _show_plate(data: Any, shot: Path, name: str) -> None:
+    """The undistorted plate behind the camera, fitting the sensor; frame n of the scene shows file n."""
+    span = shots.plate_range(shot)
+    if span is None:
+        return
+    first, last = span
+    path = compositor.frame_path(shot / "frames", first, ".png")
+    if not path.is_file():
+        return
+    background = data.background_images.new()
+    background.image = compositor.load_sequence(path, f"Plate {name}", "srgb")
+    compositor.show_sequence(background.image_user, background.image, first, last)
+    background.frame_method = "FIT"
+    background.display_depth = "BACK"
+    background.alpha = 1.0
+    data.show_background_images = True
+
+
+def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Sparse points of the solve: xyz [P, 3] float32 in solve units, rgb [P, 3] uint8; empty without them."""
+    file = shot / "solve" / "points.npz"
+    if not file.is_file():
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    with np.load(file, allow_pickle=False) as stored:
+        return stored["xyz"].astype(np.float32), stored["rgb"].astype(np.uint8)
+
+
+def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> Any:
+    """A mesh of loose vertices with their colours in the point attribute "Col"."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(xyz))
+    mesh.vertices.foreach_set("co", np.ascontiguousarray(xyz, dtype=np.float32).ravel())
+    colour = mesh.color_attributes.new("Col", "BYTE_COLOR", "POINT")
+    rgba = np.ones((len(rgb), 4), dtype=np.float32)
+    rgba[:, :3] = rgb / 255.0
+    if len(rgb):
+        colour.data.foreach_set("color_srgb", rgba.ravel())
+    mesh.update()
+    return mesh
+
+
+def _extent(path: contract.CameraPath) -> float:
+    """Length of the diagonal of the box around the camera's path, solve units; at least 0.1."""
+    centres = np.stack([camera_to_world(np.reshape(f.viewmat, (4, 4)))[:3, 3] for f in path.frames])
+    return max(float(np.linalg.norm(centres.max(axis=0) - centres.min(axis=0))), 0.1)
+
+
+def _clip(path: contract.CameraPath, xyz: np.ndarray) -> tuple[float, float]:
+    """Clip distances that show every point from everywhere on the path."""
+    if not len(xyz):
+        return 0.01, 1000.0
+    reach = float(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1).max()) + _extent(path)
+    return max(reach * 1e-4, 1e-3), max(reach * 4.0, 100.0) if math.isfinite(reach) else 1000.0
+
+
+def path_from_camera(scene: Any, camera_name: str, shot: Path, frames: range) -> contract.CameraPath:
+    """An animated Blender camera as a path in solve units, for the freeze: sampled on whole frames of the scene.
+
+    Raises:
+        ValueError: the object is no perspective camera.
+    """
+    camera = scene.objects.get(camera_name)
+    if camera is None or camera.type != "CAMERA" or camera.data.type != "PERSP":
+        raise ValueError(f"{camera_name!r} is no perspective camera of this scene")
+    width, height = compositor.render_size(scene)
+    aspect = scene.render.pixel_aspect_y / scene.render.pixel_aspect_x
+    root = find(scene, shot, "EMPTY")
+    now = scene.frame_current
+    poses = []
+    for frame in frames:
+        scene.frame_set(frame)
+        solve = (root.matrix_world.inverted() if root else Matrix()) @ camera.matrix_world
+        data = camera.data
+        lens, sensor = data.lens, _horizontal_sensor(data, width, height, aspect)
+        shift = _shift_in_widths(data, width, height, aspect)
+        k = k_from_lens(lens, shift[0], shift[1], sensor, width, height, aspect)
+        viewmat = viewmat_from_camera(np.array(solve))
+        poses.append(contract.CameraFrame(frame, [float(v) for v in viewmat.ravel()], list(k), "blender"))
+    scene.frame_set(now)
+    return contract.CameraPath(width, height, poses)
+
+
+def _fits_width(data: Any, width: int, height: int, aspect: float) -> bool:
+    return data.sensor_fit == "HORIZONTAL" or (data.sensor_fit == "AUTO" and width >= height * aspect)
+
+
+def _horizontal_sensor(data: Any, width: int, height: int, aspect: float) -> float:
+    """Sensor width in mm that the picture's width covers, whatever side the camera fits."""
+    if _fits_width(data, width, height, aspect):
+        return data.sensor_width
+    tall = data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width
+    return tall * width / (height * aspect)
+
+
+def _shift_in_widths(data: Any, width: int, height: int, aspect: float) -> Vector:
+    """Shift in units of the picture's width; Blender counts in units of the side that the sensor fits."""
+    side = 1.0 if _fits_width(data, width, height, aspect) else height * aspect / width
+    return Vector((data.shift_x * side, data.shift_y * side))

@@ -1,0 +1,161 @@
+"""Every difference between Blender 4.2 and 5.2 that the add-on meets, and nowhere else.
+
+The compositor tree moved from `scene.node_tree` (4.x, output: Composite node) to `scene.compositing_node_group`
+(5.x, output: the group's output node); Math and Mix nodes took the shader names; node options became sockets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import bpy
+
+HAS_COMPOSITING_GROUP = bpy.app.version >= (5, 0, 0)
+"""True where the compositor is a node group of the scene (5.0 on)."""
+
+
+def compositor_tree(scene: Any) -> Any | None:
+    """The scene's compositor tree, or None if it has none."""
+    return scene.compositing_node_group if HAS_COMPOSITING_GROUP else scene.node_tree
+
+
+def compositor_enabled(scene: Any) -> bool:
+    """True if rendering the scene runs its compositor tree."""
+    used = HAS_COMPOSITING_GROUP or scene.use_nodes
+    return bool(used and scene.render.use_compositing and compositor_tree(scene))
+
+
+def enable_compositor(scene: Any) -> None:
+    """Makes rendering the scene run its compositor tree."""
+    scene.render.use_compositing = True
+    if not HAS_COMPOSITING_GROUP:
+        scene.use_nodes = True
+
+
+def disable_compositor(scene: Any) -> None:
+    """Undoes `enable_compositor` where it changed something: rendering no longer runs the tree."""
+    if HAS_COMPOSITING_GROUP:
+        scene.render.use_compositing = False
+    else:
+        scene.use_nodes = False
+
+
+def new_compositor_tree(scene: Any, name: str) -> Any:
+    """An empty tree with an output node, made the scene's own. Only for a scene without one."""
+    if not HAS_COMPOSITING_GROUP:
+        scene.use_nodes = True
+        tree = scene.node_tree
+        tree.nodes.clear()
+        tree.nodes.new("CompositorNodeComposite")
+        return tree
+    tree = bpy.data.node_groups.new(name, "CompositorNodeTree")
+    tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    tree.nodes.new("NodeGroupOutput")
+    scene.compositing_node_group = tree
+    return tree
+
+
+def drop_compositor_tree(scene: Any) -> None:
+    """Takes the tree that `new_compositor_tree` made away again."""
+    if not HAS_COMPOSITING_GROUP:
+        scene.node_tree.nodes.clear()
+        scene.use_nodes = False
+        return
+    tree = scene.compositing_node_group
+    scene.compositing_node_group = None
+    if tree.users == 0:
+        bpy.data.node_groups.remove(tree)
+
+
+def output_socket(tree: Any) -> Any | None:
+    """The input socket through which the tree's picture leaves: of the Composite or of the group output node."""
+    if HAS_COMPOSITING_GROUP:
+        nodes = [n for n in tree.nodes if n.bl_idname == "NodeGroupOutput" and n.is_active_output]
+        sockets = [s for n in nodes for s in n.inputs if s.type == "RGBA"]
+        return sockets[0] if sockets else None
+    nodes = [n for n in tree.nodes if n.bl_idname == "CompositorNodeComposite"]
+    # Several Composite nodes are legal and which one renders is not told: the active one, then a linked one.
+    nodes.sort(key=lambda n: (n == tree.nodes.active, n.inputs["Image"].is_linked))
+    return nodes[-1].inputs["Image"] if nodes else None
+
+
+def new_output_node(tree: Any) -> Any:
+    """Adds the missing output node to a tree; returns the socket through which the picture leaves."""
+    if not HAS_COMPOSITING_GROUP:
+        return tree.nodes.new("CompositorNodeComposite").inputs["Image"]
+    colours = [i for i in tree.interface.items_tree if i.item_type == "SOCKET" and i.in_out == "OUTPUT"]
+    if not any(i.socket_type == "NodeSocketColor" for i in colours):
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    tree.nodes.new("NodeGroupOutput")
+    return output_socket(tree)
+
+
+def new_mix_node(tree: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """A colour mix node: (node, factor socket, first colour, second colour, result)."""
+    if HAS_COMPOSITING_GROUP:
+        node = tree.nodes.new("ShaderNodeMix")
+        node.data_type = "RGBA"
+        node.blend_type = "MIX"
+        node.clamp_factor = True
+        enabled = [s for s in node.inputs if s.enabled]
+        result = next(s for s in node.outputs if s.enabled)
+        return node, enabled[0], enabled[1], enabled[2], result
+    node = tree.nodes.new("CompositorNodeMixRGB")
+    node.blend_type = "MIX"
+    return node, node.inputs[0], node.inputs[1], node.inputs[2], node.outputs[0]
+
+
+def new_multiply_node(tree: Any) -> Any:
+    """A Math node that multiplies inputs[0] by inputs[1]."""
+    node = tree.nodes.new("ShaderNodeMath" if HAS_COMPOSITING_GROUP else "CompositorNodeMath")
+    node.operation = "MULTIPLY"
+    return node
+
+
+def new_fit_node(tree: Any) -> Any:
+    """A Scale node that fits inputs[0] into the render size, keeping its shape."""
+    node = tree.nodes.new("CompositorNodeScale")
+    if HAS_COMPOSITING_GROUP:
+        node.inputs["Type"].default_value = "Render Size"
+        node.inputs["Frame Type"].default_value = "Fit"
+    else:
+        node.space = "RENDER_SIZE"
+        node.frame_method = "FIT"
+    return node
+
+
+def set_png(settings: Any) -> None:
+    """8-bit RGB PNG as a scene's output format. RGB, so that holes come out black instead of divided by alpha."""
+    if hasattr(settings, "media_type"):
+        settings.media_type = "IMAGE"
+    settings.file_format = "PNG"
+    settings.color_mode = "RGB"
+    settings.color_depth = "8"
+    settings.compression = 15
+
+
+def set_image_colour(image: Any, encoding: str) -> None:
+    """States the encoding of an image's file: "linear" (Rec.709 primaries) or "srgb"."""
+    known = image.colorspace_settings.bl_rna.properties["name"].enum_items.keys()
+    wanted = ("Linear Rec.709", "Linear", "scene_linear") if encoding == "linear" else ("sRGB", "sRGB EOTF")
+    name = next((n for n in wanted if n in known), None)
+    if name is None:
+        raise ValueError(f"this Blender's colour configuration has none of {', '.join(wanted)}: use the standard one")
+    if image.colorspace_settings.name != name:
+        image.colorspace_settings.name = name
+
+
+def fcurves(datablock: Any) -> Iterator[Any]:
+    """The F-curves of a data-block's action, whether actions have layers (4.4 on) or not."""
+    data = datablock.animation_data
+    if data is None or data.action is None:
+        return
+    if hasattr(data.action, "layers") and data.action.layers:
+        for layer in data.action.layers:
+            for strip in layer.strips:
+                bag = strip.channelbag(data.action_slot)
+                if bag is not None:
+                    yield from bag.fcurves
+    elif hasattr(data.action, "fcurves"):
+        yield from data.action.fcurves

@@ -1,0 +1,292 @@
+"""The node group "Splannequin Freeze" in the scene's compositor: inserted before the output, updated, removed.
+
+Nothing else in the artist's tree is touched: the one link into the output is led through the group, and led back
+when the group is removed. The group reads the take's multilayer EXR files; scene frame n shows n.exr.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..torch_backend import contract
+from . import compat
+
+GROUP_NAME = "Splannequin Freeze"
+_TAG = "splannequin"
+_BEFORE = "splannequin_before"
+_GAP = 200.0
+
+
+@dataclass
+class Take:
+    """Frozen frames on disk, as the compositor reads them."""
+
+    folder: Path
+    """Folder of NNNNNN.exr."""
+    first: int
+    """First frame number there is."""
+    last: int
+    """Last frame number there is, inclusive."""
+    depth_scale: float = 1.0
+    """Scene units per solve unit: what the depth layer is multiplied by."""
+    size: tuple[int, int] = (0, 0)
+    """Width and height of the frames in pixels."""
+
+
+def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
+    """Puts the freeze group in front of the output of the scene's compositor, or updates the one that is there.
+
+    Args:
+        scene: the scene; given a minimal tree (plate, group, output) if it has none.
+        take: the frozen frames.
+        plate: first file of the undistorted plate, for the minimal tree.
+
+    Returns:
+        What was changed, one sentence each.
+    """
+    changes: list[str] = []
+    before = {"enabled": compat.compositor_enabled(scene), "made_tree": False}
+    tree = compat.compositor_tree(scene)
+    if tree is None or not len(tree.nodes):
+        tree = compat.new_compositor_tree(scene, "Splannequin Compositing")
+        before["made_tree"] = True
+        changes.append("The scene had no compositor tree: a minimal one was made.")
+    if not before["enabled"]:
+        compat.enable_compositor(scene)
+        if not before["made_tree"]:
+            changes.append("The compositor was switched on.")
+    node = group_node(tree)
+    if node is None:
+        node = _insert_node(tree, before)
+        changes.append(f'The node group "{GROUP_NAME}" was inserted before the output.')
+    else:
+        changes.append(f'The node group "{GROUP_NAME}" was updated.')
+    _fill_group(scene, node.node_tree, take)
+    if before["made_tree"] and plate is not None:
+        _add_plate(tree, node, plate, take)
+    return changes
+
+
+def group_node(tree: Any) -> Any | None:
+    """Our group's node in a compositor tree, or None."""
+    return next((n for n in tree.nodes if n.bl_idname == "CompositorNodeGroup" and _is_ours(n.node_tree)), None)
+
+
+def remove(scene: Any) -> bool:
+    """Takes the group out, leads the link back, deletes what only we used. True if there was one."""
+    tree = compat.compositor_tree(scene)
+    node = group_node(tree) if tree else None
+    if tree is None or node is None:
+        return False
+    group = node.node_tree
+    before = json.loads(group.get(_BEFORE, "{}"))
+    sources = [link.from_socket for link in node.inputs["Image"].links]
+    targets = [link.to_socket for link in node.outputs["Image"].links]
+    for target in targets:
+        if sources:
+            tree.links.new(sources[0], target)
+    images = [n.image for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image]
+    tree.nodes.remove(node)
+    bpy.data.node_groups.remove(group)
+    for ours in [n for n in tree.nodes if n.get(_TAG)]:
+        images += [ours.image] if getattr(ours, "image", None) else []
+        tree.nodes.remove(ours)
+    if before.get("made_tree") and not [n for n in tree.nodes if n.bl_idname not in _OUTPUTS]:
+        compat.drop_compositor_tree(scene)
+    elif not before.get("enabled", True):
+        compat.disable_compositor(scene)
+    for image in {i.name: i for i in images}.values():
+        if image.users == 0:
+            bpy.data.images.remove(image)
+    return True
+
+
+def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
+    """The take in a folder. FileNotFoundError if it holds no frozen frame."""
+    numbers = frame_numbers(folder)
+    if not numbers:
+        raise FileNotFoundError(f"{folder} holds no frozen frames (NNNNNN.exr)")
+    return Take(folder, numbers[0], numbers[-1], depth_scale, exr_size(frame_path(folder, numbers[0])))
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Width and height of an EXR from its header: Blender says 0 x 0 of a multilayer file. ValueError without one."""
+    with open(path, "rb") as source:
+        header = source.read(16384)
+    key = b"dataWindow\0box2i\0"
+    at = header.find(key)
+    if header[:4] != b"\x76\x2f\x31\x01" or at < 0:
+        raise ValueError(f"{path} is no OpenEXR file: render the take again")
+    left, top, right, bottom = struct.unpack_from("<4i", header, at + len(key) + 4)
+    return right - left + 1, bottom - top + 1
+
+
+def frame_numbers(folder: Path, suffix: str = ".exr") -> list[int]:
+    """Numbers of the frames in a folder, ascending; empty if there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(int(p.stem) for p in folder.iterdir() if p.suffix == suffix and p.stem.lstrip("-").isdigit())
+
+
+def frame_path(folder: Path, frame: int, suffix: str = ".exr") -> Path:
+    """Path of a frame in a folder of frames."""
+    return folder / contract.frame_file(frame, suffix)
+
+
+def load_sequence(path: Path, name: str, encoding: str) -> Any:
+    """An image sequence as a data-block, reused by path; `encoding` is "linear" or "srgb"."""
+    wanted = os.path.abspath(path)
+    for image in bpy.data.images:
+        if image.get(_TAG) and os.path.abspath(bpy.path.abspath(image.filepath)) == wanted:
+            image.reload()
+            return image
+    image = bpy.data.images.load(wanted)
+    image.name = name
+    image.source = "SEQUENCE"
+    image[_TAG] = True
+    compat.set_image_colour(image, encoding)
+    image.filepath = blend_path(path)
+    return image
+
+
+def blend_path(path: Path) -> str:
+    """`path` as a .blend should hold it: relative to the file if it is saved and on the same drive."""
+    absolute = os.path.abspath(path)
+    if not bpy.data.filepath:
+        return absolute
+    try:
+        return bpy.path.relpath(absolute)
+    except ValueError:  # another drive on Windows
+        return absolute
+
+
+def relative_images() -> None:
+    """Makes the paths of our images relative to the .blend, once it has a place."""
+    for image in bpy.data.images:
+        if image.get(_TAG):
+            image.filepath = blend_path(Path(bpy.path.abspath(image.filepath)))
+
+
+_OUTPUTS = ("CompositorNodeComposite", "NodeGroupOutput", "NodeGroupInput")
+
+
+def _is_ours(group: Any) -> bool:
+    return group is not None and bool(group.get(_TAG))
+
+
+def _insert_node(tree: Any, before: dict[str, bool]) -> Any:
+    group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
+    group[_TAG] = True
+    group[_BEFORE] = json.dumps(before)
+    face = group.interface
+    face.new_socket("Image", in_out="INPUT", socket_type="NodeSocketColor", description="Your stream, up to here")
+    mix = face.new_socket(
+        "Mix", in_out="INPUT", socket_type="NodeSocketFloat", description="0: your stream, 1: the frozen frame"
+    )
+    mix.default_value, mix.min_value, mix.max_value, mix.subtype = 1.0, 0.0, 1.0, "FACTOR"
+    outputs = (
+        ("Image", "NodeSocketColor", "Frozen frame, scene-linear"),
+        ("Depth", "NodeSocketFloat", "Distance along the camera's axis in scene units; 1e10 where there is nothing"),
+        ("Support", "NodeSocketFloat", "1 where the footage saw this at the frozen instant, 0 where it is a guess"),
+        ("Motion", "NodeSocketFloat", "1 where things move in the footage, 0 where they never do"),
+    )
+    for name, kind, text in outputs:
+        face.new_socket(name, in_out="OUTPUT", socket_type=kind, description=text)
+    target = compat.output_socket(tree) or compat.new_output_node(tree)
+    source = target.links[0].from_socket if target.is_linked else None
+    node = tree.nodes.new("CompositorNodeGroup")
+    node.node_tree = group
+    node.name = node.label = GROUP_NAME
+    node.width = 180.0
+    end = target.node
+    node.location = (end.location.x - node.width - 30.0, end.location.y - 160.0)
+    node.inputs["Mix"].default_value = 1.0
+    if source is not None:
+        tree.links.new(source, node.inputs["Image"])
+    tree.links.new(node.outputs["Image"], target)
+    return node
+
+
+def _fill_group(scene: Any, group: Any, take: Take) -> None:
+    """(Re)builds the inside of the group; its sockets, and so the links around it, stay."""
+    old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image}
+    group.nodes.clear()
+    enter = group.nodes.new("NodeGroupInput")
+    leave = group.nodes.new("NodeGroupOutput")
+    frozen = group.nodes.new("CompositorNodeImage")
+    image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
+    frozen.name = frozen.label = "Frozen"
+    show_sequence(frozen, image, take.first, take.last)
+    mix, factor, first, second, mixed = compat.new_mix_node(group)
+    depth = compat.new_multiply_node(group)
+    depth.name = depth.label = "Depth in scene units"
+    depth.inputs[1].default_value = take.depth_scale
+    enter.location, frozen.location = (-2 * _GAP, 150.0), (-3 * _GAP, -100.0)
+    mix.location, depth.location, leave.location = (_GAP, 150.0), (_GAP, -100.0), (2 * _GAP, 0.0)
+
+    fitted = _fitted(scene, group, take, frozen)
+    group.links.new(enter.outputs["Mix"], factor)
+    group.links.new(enter.outputs["Image"], first)
+    group.links.new(fitted["Combined"], second)
+    group.links.new(mixed, leave.inputs["Image"])
+    group.links.new(fitted["Depth"], depth.inputs[0])
+    group.links.new(depth.outputs[0], leave.inputs["Depth"])
+    group.links.new(fitted["Support"], leave.inputs["Support"])
+    group.links.new(fitted["Motion"], leave.inputs["Motion"])
+    for name in old - {image.name}:
+        stale = bpy.data.images.get(name)
+        if stale is not None and stale.users == 0:
+            bpy.data.images.remove(stale)
+
+
+def show_sequence(user: Any, image: Any, first: int, last: int) -> None:
+    """Makes an Image node (or an image user) show file n at scene frame n."""
+    if hasattr(user, "image"):
+        user.image = image
+    user.frame_duration = last - first + 1
+    user.frame_start = first
+    user.frame_offset = first - 1
+    user.use_auto_refresh = True
+
+
+def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
+    """The frozen layers' sockets; led through Scale nodes if the render size is not the frames' own."""
+    names = ("Combined", "Depth", "Support", "Motion")
+    missing = [n for n in names if n not in frozen.outputs]
+    if missing:
+        raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+    if take.size == render_size(scene):
+        return {n: frozen.outputs[n] for n in names}
+    sockets = {}
+    for row, name in enumerate(names):
+        node = compat.new_fit_node(group)
+        node.label = f"Fit {name}"
+        node.location = (-_GAP, 150.0 - 170.0 * row)
+        group.links.new(frozen.outputs[name], node.inputs[0])
+        sockets[name] = node.outputs[0]
+    return sockets
+
+
+def render_size(scene: Any) -> tuple[int, int]:
+    """Pixels that a render of the scene has."""
+    render = scene.render
+    share = render.resolution_percentage
+    return render.resolution_x * share // 100, render.resolution_y * share // 100
+
+
+def _add_plate(tree: Any, node: Any, plate: Path, take: Take) -> None:
+    """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
+    image_node = tree.nodes.new("CompositorNodeImage")
+    image_node[_TAG] = True
+    image_node.name = image_node.label = "Plate"
+    image = load_sequence(plate, f"Plate {plate.parent.parent.stem}", "srgb")
+    show_sequence(image_node, image, take.first, take.last)
+    image_node.location = (node.location.x - 2 * _GAP, node.location.y)
+    tree.links.new(image_node.outputs["Image"], node.inputs["Image"])

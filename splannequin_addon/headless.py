@@ -1,0 +1,348 @@
+"""The command line of the Blender side: the buttons' own code, blocking, with a console instead of a panel.
+
+    blender --background [FILE.blend] --command splannequin freeze CLIP --t-star 34 --output DIR
+    .venv-bpy-5.0/bin/python splannequin_addon/run_in_bpy.py bake --shot SHOT --take freeze --output DIR
+
+Exit codes are `contract.ExitCode`: 0 done, 2 wrong arguments, 3 footage, 4 solve, 5 train, 6 freeze, 7 bake, 8 disk,
+9 no backend, 130 cancelled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..torch_backend import contract
+from ..torch_backend.contract import ExitCode
+from . import backend, bake, cameras, compositor, jobs, scene_setup, shots, steps
+
+
+class Console:
+    """Prints what jobs say: lines for people, or events as JSON lines."""
+
+    def __init__(self, as_json: bool) -> None:
+        self.as_json = as_json
+        self._last = ("", 0.0)
+        self._seq = 0
+
+    def __call__(self, event: contract.Event) -> None:
+        if self.as_json:
+            print(json.dumps(dataclasses.asdict(event)), flush=True)
+        elif event.type == "progress":
+            self._progress(event)
+        elif event.type == "warning":
+            print(f"  note: {event.data['message']} {event.data['hint']}".rstrip(), flush=True)
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
+        """Progress of work that is Blender's own."""
+        data = {"stage": stage, "done": done, "total": total, "message": message, "eta_seconds": None}
+        self(contract.Event("progress", self._seq, time.time(), data))
+        self._seq += 1
+
+    def say(self, sentence: str) -> None:
+        """A sentence for people."""
+        if not self.as_json:
+            print(sentence, flush=True)
+
+    def _progress(self, event: contract.Event) -> None:
+        data = event.data
+        share = data["done"] / data["total"] if data["total"] else 0.0
+        stage, since = self._last
+        if data["stage"] == stage and share < 1.0 and event.time - since < 5.0:
+            return
+        self._last = (data["stage"], event.time)
+        eta = f", {data['eta_seconds']:.0f} s left" if data.get("eta_seconds") and share < 1.0 else ""
+        print(f"  {data['stage']:<22} {100 * share:3.0f}%  {data['message']}{eta}".rstrip(), flush=True)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs one command; returns an exit code. Ctrl-C and SIGTERM cancel the job at work with a checkpoint."""
+    before = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, signal.default_int_handler)
+    try:
+        args = parser().parse_args(list(argv))
+        return int(args.run(args, Console(args.json)))
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except (contract.Cancelled, KeyboardInterrupt):
+        print("Cancelled. Start the same command again to go on: finished work is kept.", file=sys.stderr)
+        return ExitCode.CANCELLED
+    except contract.JobError as error:
+        print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
+        return error.exit_code
+    except (ValueError, FileNotFoundError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return ExitCode.USAGE
+    except OSError as error:
+        print(f"Error: {error.strerror or error}: {error.filename or ''}", file=sys.stderr)
+        return ExitCode.DISK
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+# ------------------------------------------------------------------------------------------------- commands
+
+
+def import_clip(args: argparse.Namespace, console: Console) -> int:
+    """`import SHOT CLIP`."""
+    return _one_step(args, console, "footage", _import_params(args))
+
+
+def solve(args: argparse.Namespace, console: Console) -> int:
+    """`solve SHOT`."""
+    return _one_step(args, console, "camera", contract.SolveParams(camera_model=args.camera_model))
+
+
+def train(args: argparse.Namespace, console: Console) -> int:
+    """`train SHOT`."""
+    return _one_step(args, console, "train", _train_params(args))
+
+
+def freeze(args: argparse.Namespace, console: Console) -> int:
+    """`freeze CLIP`: import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
+    began = time.perf_counter()
+    output = Path(args.output).absolute()
+    output.mkdir(parents=True, exist_ok=True)
+    shot = output / (args.shot_name + shots.SHOT_SUFFIX)
+    scene, fresh = _scene(args.blend)
+    scene.splannequin.shot_path = str(shot)
+    requests = {
+        "footage": _import_params(args),
+        "camera": contract.SolveParams(camera_model=args.camera_model),
+        "train": _train_params(args),
+        "freeze": contract.FreezeParams(
+            run=args.run_name, take=args.take, t_star=args.t_star, query=args.freeze_query, width=args.freeze_width
+        ),
+    }
+    stages: dict[str, float] = {}
+    results: dict[str, Any] = {}
+    for step, params in requests.items():
+        since = time.perf_counter()
+        kind = steps.STEPS[step].kind
+        results[kind], notes = steps.run(scene, step, params, console)
+        stages[kind] = round(time.perf_counter() - since, 2)
+        for note in notes:
+            console.say(f"  {note}")
+    since = time.perf_counter()
+    baked = _bake(scene, fresh, shot, args.take, output, console)
+    stages["bake"] = round(time.perf_counter() - since, 2)
+    source = str(shots.read(shot).info.get("source", args.clip))
+    summary = contract.summarise(str(shot), source, results, stages, time.perf_counter() - began)
+    jobs.write_json(output / "summary.json", {**summary, **baked})
+    console.say(f"Composited frames: {baked['composited_dir']}")
+    return ExitCode.OK
+
+
+def bake_take(args: argparse.Namespace, console: Console) -> int:
+    """`bake --shot SHOT --take TAKE --output DIR`: a frozen take through the compositor."""
+    began = time.perf_counter()
+    shot, output = Path(args.shot).absolute(), Path(args.output).absolute()
+    if not shots.read(shot).info:
+        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+    output.mkdir(parents=True, exist_ok=True)
+    scene, fresh = _scene(args.blend)
+    scene.splannequin.shot_path = str(shot)
+    if not steps.complete(shot, args.take):
+        params = steps.take_params(shot, args.take) or contract.FreezeParams(take=args.take, only_missing=True)
+        steps.run(scene, "freeze", params, console)
+    if cameras.find(scene, shot, "CAMERA") is None and (shot / "solve" / "cameras.json").is_file():
+        steps.load_camera(scene, shot)
+    baked = _bake(scene, fresh, shot, args.take, output, console)
+    path = output / "summary.json"
+    summary = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
+    summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
+    jobs.write_json(path, {**summary, **baked})
+    console.say(f"Composited frames: {baked['composited_dir']}")
+    return ExitCode.OK
+
+
+def status(args: argparse.Namespace, console: Console) -> int:
+    """`status SHOT`: the newest job of each kind, one line each."""
+    shot = Path(args.shot).absolute()
+    if not shots.read(shot).info:
+        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+    for kind, job in jobs.latest(shot).items():
+        told = job.status or contract.Status(kind, "queued", 0, 0.0, 0.0, 0.0)
+        if console.as_json:
+            print(json.dumps({"job": job.folder.name, **dataclasses.asdict(told)}))
+        else:
+            share = f"{told.stage} {100 * told.fraction:.0f}%" if told.stage else ""
+            print(f"{job.folder.name}  {told.state:<9} {share}  {told.message}".rstrip())
+    return ExitCode.OK
+
+
+def doctor(args: argparse.Namespace, console: Console) -> int:
+    """`doctor`: this Blender, and what the backend's environment can do, as JSON."""
+    facts: dict[str, Any] = {"blender": bpy.app.version_string, "blender_python": sys.version.split()[0]}
+    facts["backend_python"] = backend.python()
+    facts["backend"] = json.loads(backend.doctor())
+    print(json.dumps(facts, indent=1))
+    return ExitCode.OK
+
+
+# ------------------------------------------------------------------------------------------------- inside
+
+
+def _one_step(args: argparse.Namespace, console: Console, step: str, params: Any) -> int:
+    scene = bpy.context.scene
+    scene.splannequin.shot_path = str(Path(args.shot).absolute())
+    job = steps.begin(scene, step, params)
+    result = jobs.wait(job, console)
+    if console.as_json:
+        print(json.dumps({"result": result}))
+    return ExitCode.OK
+
+
+def _scene(blend: str) -> tuple[Any, bool]:
+    """The scene to work in, and whether it is a new one: `blend`'s, or the file that Blender was started with."""
+    if blend:
+        path = Path(blend).absolute()
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist: --blend names a .blend file")
+        bpy.ops.wm.open_mainfile(filepath=str(path))
+    if bpy.data.filepath:
+        return bpy.context.scene, False
+    bpy.ops.wm.read_homefile(use_empty=True)
+    return bpy.context.scene, True
+
+
+def _bake(scene: Any, fresh: bool, shot: Path, take: str, output: Path, console: Console) -> dict[str, Any]:
+    """Compositor, render, shot.blend; returns what the summary tells of it."""
+    changes = bake.fit_take(scene, shot, take) if fresh or scene_setup.fitted(scene) else []
+    changes += steps.insert_freeze(scene, shot, take)
+    for change in changes:
+        console.say(f"  {change}")
+    folder = output / "composited"
+    blend = output / "shot.blend"
+    numbers = bake.render(scene, folder, fresh, lambda done, total: console.progress("baking", done, total))
+    _save(scene, blend, folder)
+    return {
+        "composited_dir": str(folder),
+        "composited_frames": len(numbers),
+        "blend": str(blend),
+        "blender_version": bpy.app.version_string,
+    }
+
+
+def _save(scene: Any, blend: Path, frames: Path) -> None:
+    """Saves the file with paths relative to it, so that its folder can be moved and rendered elsewhere."""
+    scene.splannequin.shot_path = os.path.abspath(bpy.path.abspath(scene.splannequin.shot_path))
+    try:
+        # The first save gives the file its place; what is relative to it is only known then.
+        bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
+        scene = bpy.context.scene
+        compositor.relative_images()
+        scene.render.filepath = compositor.blend_path(frames / bake.DIGITS)
+        scene.splannequin.shot_path = compositor.blend_path(Path(scene.splannequin.shot_path))
+        bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
+    except RuntimeError as error:
+        raise contract.JobError(
+            f"{blend} could not be saved: {str(error).strip()}", "Is the disk full?", ExitCode.BAKE
+        ) from error
+
+
+def _import_params(args: argparse.Namespace) -> contract.ImportParams:
+    clip = args.clip if "://" in args.clip else str(Path(args.clip).absolute())
+    return contract.ImportParams(clip, args.first, args.last, args.step, args.working_height)
+
+
+def _train_params(args: argparse.Namespace) -> contract.TrainParams:
+    return contract.TrainParams(
+        run=args.run_name,
+        preset=args.preset,
+        method=args.method,
+        supervision=args.supervision,
+        iterations=args.iterations,
+        width=args.width,
+        max_gaussians=args.max_gaussians,
+        holdout=args.holdout,
+        seed=args.seed,
+        device=args.device,
+        resume=not args.restart,
+    )
+
+
+def parser() -> argparse.ArgumentParser:
+    """The grammar of the command line."""
+    codes = "exit codes: " + ", ".join(f"{c.value} {c.name.lower()}" for c in ExitCode)
+    top = argparse.ArgumentParser(
+        prog="blender --background [FILE.blend] --command splannequin",
+        description="Freeze time in a handheld clip of people holding still.",
+        epilog=codes,
+    )
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(name: str, run: Any, text: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=text, description=text, epilog=codes)
+        command.add_argument("--json", action="store_true", help="print events as JSON lines instead of text")
+        command.set_defaults(run=run)
+        return command
+
+    one = add("import", import_clip, "Footage into a shot folder.")
+    one.add_argument("shot", help="shot folder, made if it is not there")
+    _add_import_flags(one)
+    one = add("solve", solve, "Cameras of a shot.")
+    one.add_argument("shot", help="shot folder")
+    _add_solve_flags(one)
+    one = add("train", train, "Train a run of a shot.")
+    one.add_argument("shot", help="shot folder")
+    _add_train_flags(one)
+    whole = add("freeze", freeze, "Clip to baked shot: import, solve, train, freeze, bake; writes OUTPUT/shot.blend.")
+    _add_import_flags(whole)
+    _add_solve_flags(whole)
+    _add_train_flags(whole)
+    whole.add_argument("--t-star", type=int, help="frame number at which time stands still (default: suggested)")
+    whole.add_argument("--take", default="freeze", help="name of the take")
+    whole.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"), help="see the user guide")
+    whole.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
+    whole.add_argument("--shot-name", default="shot", help="name of the shot folder in OUTPUT")
+    whole.add_argument("--output", default="output", metavar="DIR", help="folder for everything that comes out")
+    whole.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
+    one = add("bake", bake_take, "A frozen take through the compositor; writes DIR/composited and DIR/shot.blend.")
+    one.add_argument("--shot", required=True, help="shot folder")
+    one.add_argument("--take", default="freeze", help="name of the take")
+    one.add_argument("--output", required=True, metavar="DIR", help="folder for what comes out")
+    one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
+    one = add("status", status, "Jobs of a shot.")
+    one.add_argument("shot", help="shot folder")
+    add("doctor", doctor, "What this Blender and its backend can do, as JSON.")
+    return top
+
+
+def _add_import_flags(to: argparse.ArgumentParser) -> None:
+    to.add_argument("clip", help="video file, image sequence or pattern (shot.####.exr)")
+    to.add_argument("--first", type=int, help="first frame number")
+    to.add_argument("--last", type=int, help="last frame number, inclusive")
+    to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
+    to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
+
+
+def _add_solve_flags(to: argparse.ArgumentParser) -> None:
+    to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"), help="lens")
+
+
+def _add_train_flags(to: argparse.ArgumentParser) -> None:
+    # dest: `run` is the command's function.
+    to.add_argument("--run", dest="run_name", default="main", help="name of the run")
+    to.add_argument("--preset", default="preview", choices=("preview", "standard", "final"), help="how much to spend")
+    to.add_argument("--method", default="auto", choices=("auto", "hexplane", "static"), help="see the user guide")
+    to.add_argument("--supervision", default="support", choices=("support", "paper", "none"), help="see the user guide")
+    to.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
+    to.add_argument("--width", type=int, default=0, help="width of the training images in pixels (0: the preset's)")
+    to.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
+    to.add_argument("--holdout", type=int, default=-1, help="keep every n-th frame out for testing (0: none)")
+    to.add_argument("--seed", type=int, default=0, help="random seed")
+    to.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to train")
+    to.add_argument("--restart", action="store_true", help="do not go on from the run's checkpoint")

@@ -1,0 +1,332 @@
+"""Jobs of the backend as Blender sees them: start a detached child, follow its files, cancel it, find it again.
+
+No bpy here: the job folder is all the state there is, so that any Blender that opens the shot sees the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..torch_backend import contract
+
+_SCRUBBED = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "PYTHONEXECUTABLE", "__PYVENV_LAUNCHER__", "VIRTUAL_ENV")
+_START_SECONDS = 30.0
+"""A job without a status this long after it was made never started."""
+_LOG_LINES = 6
+_KILL_SECONDS = 20.0
+"""A job that has not ended this long after it was asked to is ended by force on a second request."""
+
+
+@dataclass
+class Job:
+    """A job that this Blender follows. Holds paths and what was read so far."""
+
+    folder: Path
+    """Job folder, shot/jobs/<id>."""
+    kind: str
+    """import, solve, train or freeze."""
+    params: dict[str, Any] = field(default_factory=dict)
+    """Parameters of the request."""
+    process: subprocess.Popen[bytes] | None = None
+    """The child, if this Blender started it."""
+    status: contract.Status | None = None
+    """Last status read."""
+    read_to: int = 0
+    """Bytes of events.jsonl read so far."""
+    warnings: list[tuple[str, str]] = field(default_factory=list)
+    """(sentence, hint) the job wants the artist to know."""
+    metrics: dict[str, Any] = field(default_factory=dict)
+    """Latest figures of the job, by name."""
+    images: dict[str, str] = field(default_factory=dict)
+    """Latest picture by label: path."""
+    result: Any = None
+    """What the job answered in its `done` event."""
+
+    @property
+    def shot(self) -> Path:
+        """Shot folder the job belongs to."""
+        return self.folder.parent.parent
+
+    @property
+    def ended(self) -> bool:
+        """True once the job will write nothing more and all it wrote is read."""
+        return self.status is not None and self.status.ended
+
+    @property
+    def state(self) -> str:
+        """queued, running, done, failed or cancelled."""
+        return self.status.state if self.status else "queued"
+
+
+def new_job(shot: Path, kind: str, params: Any) -> Job:
+    """Makes a job folder in `shot` with its request. `params` is the kind's dataclass of `contract.PARAMS`."""
+    if not isinstance(params, contract.PARAMS[kind]):
+        raise ValueError(f"a {kind} job takes {contract.PARAMS[kind].__name__}, not {type(params).__name__}")
+    folder = shot / "jobs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
+    folder.mkdir(parents=True)
+    values = dataclasses.asdict(params)
+    request = contract.JobRequest(kind=kind, shot=str(shot), params=values)
+    write_json(folder / contract.REQUEST_FILE, dataclasses.asdict(request))
+    return Job(folder, kind, values)
+
+
+def start(job: Job, python: str, package_root: Path) -> None:
+    """Starts the backend on a job, detached: it outlives this Blender.
+
+    Args:
+        job: a job made by `new_job`.
+        python: interpreter of the backend's environment.
+        package_root: folder that holds `torch_backend`.
+
+    Raises:
+        contract.JobError: the interpreter cannot be started.
+    """
+    command = [python, "-m", "torch_backend", "run-job", str(job.folder)]
+    detach: dict[str, Any] = {"start_new_session": True}
+    if sys.platform == "win32":
+        detach = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+    try:
+        with open(job.folder / contract.LOG_FILE, "ab") as log:
+            job.process = subprocess.Popen(
+                command,
+                cwd=package_root,
+                env=backend_environ(package_root),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                **detach,
+            )
+    except OSError as error:
+        raise contract.JobError(
+            f"The backend's Python could not be started: {python}: {error.strerror or error}.",
+            "Choose the Python of the backend's environment in the add-on's preferences.",
+            contract.ExitCode.ENVIRONMENT,
+        ) from error
+
+
+def backend_environ(package_root: Path) -> dict[str, str]:
+    """Environment variables of a backend process: this package importable, nothing of Blender's Python."""
+    environ = {k: v for k, v in os.environ.items() if k not in _SCRUBBED}
+    environ.update(
+        PYTHONPATH=str(package_root),
+        PYTHONUTF8="1",
+        PYTHONUNBUFFERED="1",
+        PYTHONNOUSERSITE="1",
+        PYTHONDONTWRITEBYTECODE="1",  # the extension's folder may be read-only, and is not ours to fill
+    )
+    return environ
+
+
+def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
+    """Reads what the job wrote since the last poll, for at most about `budget_seconds`; returns the new events.
+
+    A child that died without a last word is given one: its status is rewritten as failed, with the end of its log.
+    """
+    until = time.monotonic() + budget_seconds
+    status = _read_status(job.folder) or job.status
+    events, all_read = _read_events(job, until)
+    if status is not None and status.ended and not all_read:
+        return events  # ended, but not told yet: the next poll reads the rest
+    if (status is None or not status.ended) and not is_alive(job, status):
+        status = _read_status(job.folder) or status  # it may have ended between the two reads above
+        if status is None or not status.ended:
+            status = _declare_dead(job, status)
+        else:
+            events += _read_events(job, until + 1.0)[0]
+    job.status = status
+    return events
+
+
+def is_alive(job: Job, status: contract.Status | None) -> bool:
+    """True if the job's process still works on it, or may be about to."""
+    if job.process is not None:
+        return job.process.poll() is None
+    if status is None or not status.pid:
+        return time.time() - _made(job.folder) < _START_SECONDS
+    if status.process_started and sys.platform == "linux":
+        return contract.process_start(status.pid) == status.process_started
+    return time.time() - status.heartbeat < 10 * contract.HEARTBEAT_SECONDS
+
+
+def cancel(job: Job) -> None:
+    """Asks the job to stop with a checkpoint; asked again after `_KILL_SECONDS`, ends it by force."""
+    flag = job.folder / contract.CANCEL_FILE
+    if flag.exists() and time.time() - flag.stat().st_mtime > _KILL_SECONDS and is_alive(job, job.status):
+        _kill(job)
+        return
+    flag.touch()
+
+
+def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
+    """Blocks until the job has ended; returns its result. Ctrl-C asks it to stop and waits for its checkpoint.
+
+    Raises:
+        contract.JobError: it failed; the sentence, hint and exit code are the job's own.
+        contract.Cancelled: it was cancelled.
+    """
+    while not job.ended:
+        try:
+            for event in poll(job, 1.0):
+                if on_event:
+                    on_event(event)
+            time.sleep(0.0 if job.ended else 0.05)
+        except KeyboardInterrupt:
+            cancel(job)
+    raise_if_failed(job)
+    return job.result
+
+
+def raise_if_failed(job: Job) -> None:
+    """JobError or Cancelled if the ended job did not finish its work."""
+    status = job.status
+    if status is None or status.state == "done":
+        return
+    if status.state == "cancelled":
+        raise contract.Cancelled
+    code = status.exit_code if status.exit_code is not None else contract.ExitCode.INTERNAL
+    raise contract.JobError(status.message, status.hint, code)
+
+
+def open_job(folder: Path) -> Job | None:
+    """A job from its folder; None if its request cannot be read."""
+    try:
+        request = contract.from_dict(contract.JobRequest, contract.read_json(folder / contract.REQUEST_FILE))
+    except (OSError, ValueError):
+        return None
+    return Job(folder, request.kind, request.params)
+
+
+def latest(shot: Path) -> dict[str, Job]:
+    """The newest job of each kind in a shot, polled once: those that run are found again here."""
+    found: dict[str, Job] = {}
+    folders = sorted((shot / "jobs").glob("*/"), key=lambda p: p.name, reverse=True) if shot.is_dir() else []
+    for folder in folders:
+        kind = next((k for k in contract.PARAMS if f"-{k}-" in folder.name), None)
+        if kind is None or kind in found:
+            continue
+        job = open_job(folder)
+        if job is not None:
+            poll(job, 1.0)
+            found[kind] = job
+    return found
+
+
+def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
+    """Last lines of the job's log; empty if it has none."""
+    try:
+        with open(folder / contract.LOG_FILE, "rb") as log:
+            log.seek(0, os.SEEK_END)
+            log.seek(max(log.tell() - 8192, 0))
+            text = log.read().decode("utf-8", "replace")
+    except OSError:
+        return []
+    return [line for line in text.splitlines() if line.strip()][-lines:]
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Writes a JSON object beside `path`, fsyncs, renames over it: a reader never sees half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        with open(beside, "w", encoding="utf-8", newline="\n") as out:
+            out.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
+            out.flush()
+            os.fsync(out.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+
+
+def _read_status(folder: Path) -> contract.Status | None:
+    try:
+        data = contract.read_json(folder / contract.STATUS_FILE)
+        contract.check_version(data, "job status")
+        return contract.from_dict(contract.Status, data)
+    except OSError:
+        return None
+
+
+def _read_events(job: Job, until: float) -> tuple[list[contract.Event], bool]:
+    """New whole lines of events.jsonl, and whether they were all read."""
+    events: list[contract.Event] = []
+    try:
+        source = open(job.folder / contract.EVENTS_FILE, "rb")  # noqa: SIM115  (closed below; may not be there yet)
+    except OSError:
+        return events, True
+    with source:
+        source.seek(job.read_to)
+        for line in source:
+            if not line.endswith(b"\n"):
+                return events, True  # half written: the rest comes with the next poll
+            job.read_to += len(line)
+            event = contract.from_dict(contract.Event, json.loads(line))
+            _take_in(job, event)
+            events.append(event)
+            if time.monotonic() > until:
+                return events, False
+    return events, True
+
+
+def _take_in(job: Job, event: contract.Event) -> None:
+    if event.type == "warning":
+        job.warnings.append((event.data["message"], event.data["hint"]))
+    elif event.type == "metric":
+        job.metrics.update(event.data["values"])
+    elif event.type == "image":
+        job.images[event.data["label"]] = event.data["path"]
+    elif event.type == "done":
+        job.result = event.data["result"]
+
+
+def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
+    now = time.time()
+    status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
+    code = job.process.returncode if job.process else None
+    how = f" (exit code {code})" if code is not None else ""
+    last = log_tail(job.folder, 1)
+    status.state = "failed"
+    status.exit_code = code if code is not None and code > 0 else int(contract.ExitCode.INTERNAL)
+    status.message = f"The backend stopped without a word during {status.stage or 'the start'}{how}."
+    if last:
+        status.message += f" Last line of its log: {last[0].strip()[:200]}"
+    killed = code is not None and code < 0
+    status.hint = (
+        "It was killed, perhaps for want of memory: close other programs or choose a smaller preset, then start again."
+        if killed
+        else f"Start it again: finished work is kept. Its whole log is {job.folder / contract.LOG_FILE}"
+    )
+    write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
+    return status
+
+
+def _made(folder: Path) -> float:
+    try:
+        return (folder / contract.REQUEST_FILE).stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _kill(job: Job) -> None:
+    """Ends the job's process group. Only a process whose start time is the one in the status, or our own child."""
+    pid = job.process.pid if job.process else (job.status.pid if job.status else 0)
+    if not pid:
+        return
+    if sys.platform == "win32":
+        subprocess.run(["taskkill", "/F", "/T", "/PID", str(pid)], capture_output=True, check=False)
+        return
+    try:
+        os.killpg(pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return  # it ended by itself in the meantime

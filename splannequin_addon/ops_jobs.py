@@ -1,0 +1,55 @@
+"""Plumbing of running jobs: cancel, see the log."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.props import StringProperty
+
+from ..torch_backend import contract
+from . import jobs, steps, supervisor
+
+
+class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
+    """Stop this step. It saves what it has first; pressed again after 20 seconds, it is ended by force"""
+
+    bl_idname = "splannequin.cancel"
+    bl_label = "Cancel"
+    bl_options = {"REGISTER", "INTERNAL"}
+
+    step: StringProperty(name="Step", description="Name of the step to cancel", options={"SKIP_SAVE"})
+
+    def execute(self, context: Any) -> set[str]:
+        """Asks the job to stop."""
+        folder = steps.shot_folder(context.scene)
+        job = supervisor.watch_of(folder).jobs.get(self.step) if folder else None
+        if job is None or job.ended:
+            self.report({"WARNING"}, "Nothing is running")
+            return {"CANCELLED"}
+        jobs.cancel(job)
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
+    """Open the log of this step in the system's viewer"""
+
+    bl_idname = "splannequin.open_log"
+    bl_label = "Open Log"
+    bl_options = {"INTERNAL"}
+
+    step: StringProperty(name="Step", description="Name of the step", options={"SKIP_SAVE"})
+
+    def execute(self, context: Any) -> set[str]:
+        """Opens log.txt."""
+        folder = steps.shot_folder(context.scene)
+        job = supervisor.watch_of(folder).jobs.get(self.step) if folder else None
+        log = job.folder / contract.LOG_FILE if job else None
+        if log is None or not log.is_file():
+            self.report({"WARNING"}, "There is no log")
+            return {"CANCELLED"}
+        bpy.ops.wm.path_open(filepath=str(log))
+        return {"FINISHED"}
+
+
+CLASSES = (SPLANNEQUIN_OT_cancel, SPLANNEQUIN_OT_open_log)

@@ -1,0 +1,236 @@
+"""The five buttons. Headless, a button's `execute` blocks until the work is done; in a window the timer follows it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..torch_backend import contract
+from . import backend, bake, jobs, steps, supervisor
+
+
+class _StepOperator:
+    """What the five share: begin the job, then wait for it or have it followed."""
+
+    step = ""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off while a step of this shot runs."""
+        folder = steps.shot_folder(context.scene)
+        if folder is not None and supervisor.watch_of(folder).running():
+            cls.poll_message_set("A step of this shot is running")  # type: ignore[attr-defined]
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Runs the step."""
+        scene = context.scene
+        try:
+            job = steps.begin(scene, self.step)
+            supervisor.follow(self.step, job)
+            if not bpy.app.background:
+                return {"FINISHED"}
+            jobs.wait(job)
+            notes = self.after(scene, job)
+        except contract.Cancelled:
+            self.report({"WARNING"}, "Cancelled: finished work is kept")  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        except (contract.JobError, ValueError, OSError) as error:
+            folder = steps.shot_folder(scene)
+            sentence = getattr(error, "message", str(error))
+            if folder is not None:
+                supervisor.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
+            self.report({"ERROR"}, f"{sentence} {getattr(error, 'hint', '')}".strip())  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        for note in notes:
+            self.report({"INFO"}, note)  # type: ignore[attr-defined]
+        return {"FINISHED"}
+
+    def after(self, scene: Any, job: Any) -> list[str]:
+        """What follows the job when blocking; returns what changed, in words."""
+        return steps.finish(scene, self.step, job)
+
+
+class SPLANNEQUIN_OT_import_clip(_StepOperator, bpy.types.Operator):
+    """Take the clip's frames into the shot folder and check them"""
+
+    bl_idname = "splannequin.import_clip"
+    bl_label = "Import Clip"
+    bl_options = {"REGISTER"}
+    step = "footage"
+
+
+class SPLANNEQUIN_OT_solve_camera(_StepOperator, bpy.types.Operator):
+    """Find where the camera was on every frame, and bring it in as an animated camera with the plate behind it"""
+
+    bl_idname = "splannequin.solve_camera"
+    bl_label = "Solve Camera"
+    bl_options = {"REGISTER"}
+    step = "camera"
+
+
+class SPLANNEQUIN_OT_train(_StepOperator, bpy.types.Operator):
+    """Learn the scene and what moves in it from the clip"""
+
+    bl_idname = "splannequin.train"
+    bl_label = "Train"
+    bl_options = {"REGISTER"}
+    step = "train"
+
+
+class SPLANNEQUIN_OT_freeze(_StepOperator, bpy.types.Operator):
+    """Render every frame of the clip with time standing still at t*"""
+
+    bl_idname = "splannequin.freeze"
+    bl_label = "Freeze"
+    bl_options = {"REGISTER"}
+    step = "freeze"
+
+
+class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
+    """Render frames that are missing or stale, put the freeze before the output of the scene's compositor, and render
+    the scene's range to its output path"""
+
+    bl_idname = "splannequin.bake"
+    bl_label = "Bake and Render"
+    bl_options = {"REGISTER"}
+    step = "bake"
+
+    def execute(self, context: Any) -> set[str]:
+        """Bakes; a complete take needs no backend."""
+        folder = steps.shot_folder(context.scene)
+        take = context.scene.splannequin.take_name
+        if folder is None or backend.available() or not steps.complete(folder, take):
+            return super().execute(context)
+        outcome = _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take))
+        if outcome == {"FINISHED"}:
+            bpy.ops.splannequin.render("EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT")
+        return outcome
+
+    def after(self, scene: Any, job: Any) -> list[str]:
+        """Inserts the freeze, then renders."""
+        notes = super().after(scene, job)
+        notes += bake.choose_output(scene, job.shot, job.params["take"])
+        bpy.ops.render.render(animation=True, scene=scene.name)
+        return notes
+
+
+class SPLANNEQUIN_OT_render(bpy.types.Operator):
+    """Render the scene's range through the compositor to its output path"""
+
+    bl_idname = "splannequin.render"
+    bl_label = "Render Baked Shot"
+    bl_options = {"REGISTER"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Blocks until the frames are on disk."""
+        return self._render(context, "EXEC_DEFAULT")
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Renders in the background of the window, as Blender's own Render Animation does."""
+        return self._render(context, "INVOKE_DEFAULT")
+
+    def _render(self, context: Any, how: str) -> set[str]:
+        scene = context.scene
+        folder = steps.shot_folder(scene)
+        if folder is None:
+            self.report({"ERROR"}, "No shot is chosen: import a clip first")
+            return {"CANCELLED"}
+        notes = bake.choose_output(scene, folder, scene.splannequin.take_name)
+        supervisor.render_began(folder, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
+        bpy.ops.render.render(how, animation=True, scene=scene.name)
+        for note in notes:
+            self.report({"INFO"}, note)
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
+    """Bring the solved camera, its plate and the points into this scene, in place of an earlier solve of this shot"""
+
+    bl_idname = "splannequin.load_camera"
+    bl_label = "Load Camera"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Builds camera and points."""
+        return _edit(self, context, "camera", steps.load_camera)
+
+
+class SPLANNEQUIN_OT_insert_freeze(bpy.types.Operator):
+    """Put the frozen take before the output of the scene's compositor, or update it, without rendering"""
+
+    bl_idname = "splannequin.insert_freeze"
+    bl_label = "Insert Freeze in Compositor"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Inserts or updates the group."""
+        take = context.scene.splannequin.take_name
+        return _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take))
+
+
+class SPLANNEQUIN_OT_remove_shot(bpy.types.Operator):
+    """Take camera, points and the compositor group of this shot out of the file, and give the scene its own settings
+    back. The shot folder on disk stays"""
+
+    bl_idname = "splannequin.remove_shot"
+    bl_label = "Remove Shot from Scene"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Removes what Splannequin put into the file."""
+        return _edit(self, context, "bake", steps.remove_all)
+
+
+class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
+    """Let time stand still at the current frame"""
+
+    bl_idname = "splannequin.t_star_here"
+    bl_label = "Set t* from Current Frame"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Takes the current frame, held within the clip's range."""
+        scene = context.scene
+        folder = steps.shot_folder(scene)
+        frame = scene.frame_current
+        state = supervisor.watch_of(folder).state if folder else None
+        if state is not None and state.frames:
+            first, last = state.frame_range
+            frame = min(max(frame, first), last)
+        scene.splannequin.t_star = frame
+        scene.splannequin.choose_t_star = True
+        return {"FINISHED"}
+
+
+def _edit(operator: Any, context: Any, step: str, change: Any) -> set[str]:
+    """Runs a change of the scene; says what was done or why not."""
+    folder = steps.shot_folder(context.scene)
+    if folder is None:
+        operator.report({"ERROR"}, "No shot is chosen: import a clip first")
+        return {"CANCELLED"}
+    try:
+        notes = change(context.scene, folder)
+    except (contract.JobError, OSError, ValueError) as error:
+        operator.report({"ERROR"}, f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip())
+        return {"CANCELLED"}
+    supervisor.watch_of(folder).notes[step] = notes
+    for note in notes:
+        operator.report({"INFO"}, note)
+    return {"FINISHED"}
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_import_clip,
+    SPLANNEQUIN_OT_solve_camera,
+    SPLANNEQUIN_OT_train,
+    SPLANNEQUIN_OT_freeze,
+    SPLANNEQUIN_OT_bake,
+    SPLANNEQUIN_OT_render,
+    SPLANNEQUIN_OT_load_camera,
+    SPLANNEQUIN_OT_insert_freeze,
+    SPLANNEQUIN_OT_remove_shot,
+    SPLANNEQUIN_OT_t_star_here,
+)

@@ -1,0 +1,338 @@
+"""The sidebar tab "Splannequin" in the 3D view: five steps in order, each with its state and what comes next.
+
+Drawing only reads what the supervisor keeps; it never touches the disk beyond finding a shot the first time.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+
+from . import backend, cameras, compat, compositor, scene_setup, shots, steps, supervisor
+
+CATEGORY = "Splannequin"
+
+
+@dataclass
+class View:
+    """What one step shows."""
+
+    done: bool
+    """It has been done."""
+    ready: bool
+    """What it needs is there."""
+    state: list[str]
+    """What there is, a few short lines."""
+    advice: str
+    """One sentence: what comes next."""
+
+
+def view_footage(scene: Any, state: shots.ShotState | None) -> View:
+    """Footage: what was imported."""
+    if state is None or not state.frames:
+        chosen = bool(scene.splannequin.clip)
+        return View(False, True, [], "Import the clip." if chosen else "Choose a clip of people holding still.")
+    (width, height), (first, last) = state.size, state.frame_range
+    lines = [f"{state.frames} frames, {first} to {last}", f"{width} x {height}, {state.info.get('fps', 0):g} fps"]
+    return View(True, True, lines, "Next: solve the camera.")
+
+
+def view_camera(scene: Any, state: shots.ShotState | None) -> View:
+    """Camera: how good the solve is."""
+    if state is None or not state.frames:
+        return View(False, False, [], steps.STEPS["camera"].needs)
+    if not state.solve:
+        return View(False, True, [], "Find where the camera was on every frame.")
+    told = state.solve.get("result", state.solve)
+    lines = [told["quality"]] if told.get("quality") else []
+    if cameras.find(scene, state.folder, "CAMERA") is None:
+        return View(True, True, lines, "The solve is not in this scene: load it.")
+    return View(True, True, lines, "Look through the camera, then train.")
+
+
+def view_train(scene: Any, state: shots.ShotState | None) -> View:
+    """Train: how good the run is."""
+    if state is None or not state.solve:
+        return View(False, False, [], steps.STEPS["train"].needs)
+    run = state.runs.get(scene.splannequin.run_name)
+    if run is None:
+        return View(False, True, [], "Learn the scene and what moves in it.")
+    psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
+    quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
+    size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % move"
+    return View(True, True, [f"Run {scene.splannequin.run_name}: {quality}", size], "Next: freeze an instant.")
+
+
+def view_freeze(scene: Any, state: shots.ShotState | None) -> View:
+    """Freeze: which frames there are."""
+    if state is None or scene.splannequin.run_name not in state.runs:
+        return View(False, False, [], steps.STEPS["freeze"].needs)
+    take = state.takes.get(scene.splannequin.take_name)
+    if take is None:
+        return View(False, True, [], "Render the clip's move with time standing still.")
+    frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
+    instant = f"Time stands still at frame {take['t_star_frame']}"
+    return View(True, True, [frames, instant], "Next: bake it into your compositor.")
+
+
+def view_bake(scene: Any, state: shots.ShotState | None) -> View:
+    """Bake: whether the freeze is in the scene's compositor."""
+    if state is None or scene.splannequin.take_name not in state.takes:
+        return View(False, False, [], steps.STEPS["bake"].needs)
+    tree = compat.compositor_tree(scene)
+    if tree is None or compositor.group_node(tree) is None:
+        return View(False, True, [], "Put the freeze before your compositor's output and render.")
+    lines = ["The freeze is in your compositor."]
+    if not scene_setup.keeps_plate_colours(scene):
+        lines.append(f"The view transform {scene.view_settings.view_transform} changes the plate's colours.")
+    return View(True, True, lines, f"Frames go to {scene.render.filepath}")
+
+
+VIEWS = {"footage": view_footage, "camera": view_camera, "train": view_train, "freeze": view_freeze, "bake": view_bake}
+
+
+def wrap(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:
+    """A sentence in as many lines as the sidebar's width asks for."""
+    scale = context.preferences.system.ui_scale
+    room = context.region.width / scale - (75 if icon != "NONE" else 50)
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    for number, line in enumerate(textwrap.wrap(text, max(int(room / 6.2), 16)) or [""]):
+        column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+class _StepPanel:
+    """What the five panels share. State, settings, one button, progress with Cancel, what comes next."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = CATEGORY
+    step = ""
+    operator = ""
+
+    def _watch(self, context: Any) -> supervisor.Watch | None:
+        folder = steps.shot_folder(context.scene)
+        return supervisor.watch_of(folder) if folder else None
+
+    def _view(self, context: Any) -> View:
+        watch = self._watch(context)
+        return VIEWS[self.step](context.scene, watch.state if watch else None)
+
+    def draw_header(self, context: Any) -> None:
+        """An icon for the state: a tick, at work, failed, next, or not yet."""
+        watch = self._watch(context)
+        view = self._view(context)
+        job = watch.jobs.get(self.step) if watch else None
+        if watch and watch.running() == self.step:
+            icon = "SORTTIME"
+        elif watch and (self.step in watch.failures or (job and job.state == "failed")):
+            icon = "ERROR"
+        elif view.done:
+            icon = "CHECKMARK"
+        else:
+            icon = "RADIOBUT_ON" if view.ready else "RADIOBUT_OFF"
+        self.layout.label(text="", icon=icon)  # type: ignore[attr-defined]
+
+    def draw(self, context: Any) -> None:
+        """The step's body."""
+        layout = self.layout  # type: ignore[attr-defined]
+        watch, view = self._watch(context), self._view(context)
+        for line in view.state:
+            wrap(layout, context, line)
+        running = watch.running() if watch else None
+        settings = layout.column()
+        settings.enabled = view.ready and running is None
+        self.draw_settings(context, settings)
+        if watch and running == self.step:
+            self._progress(context, watch)
+            return
+        self._button(context, layout, view, running)
+        self._outcome(context, layout, watch)
+        wrap(layout, context, "Another step is running." if running else view.advice, "INFO")
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """The step's settings."""
+
+    def _button(self, context: Any, layout: Any, view: View, running: str | None) -> None:
+        row = layout.row()
+        row.scale_y = 1.4
+        row.enabled = view.ready and running is None
+        step = steps.STEPS[self.step]
+        row.operator(self.operator, text=step.again if view.done else step.button)
+
+    def _progress(self, context: Any, watch: supervisor.Watch) -> None:
+        layout = self.layout  # type: ignore[attr-defined]
+        if watch.rendered is not None:
+            done, total = watch.rendered
+            layout.progress(factor=done / max(total, 1), type="BAR", text=f"Rendering, frame {done} of {total}")
+            wrap(layout, context, "Press Esc in the render window to stop.", "INFO")
+            return
+        job = watch.jobs[self.step]
+        status = job.status
+        row = layout.row(align=True)
+        text = f"{status.stage.capitalize()} {100 * status.fraction:.0f} %" if status and status.stage else "Starting"
+        row.progress(factor=status.fraction if status else 0.0, type="BAR", text=text)
+        stop = row.row(align=True)
+        stop.alert = False
+        stop.operator("splannequin.cancel", text="Cancel", icon="X").step = self.step
+        detail = [status.message] if status and status.message else []
+        if status and status.eta_seconds is not None:
+            detail.append(f"about {minutes(status.eta_seconds)} left")
+        wrap(layout, context, ", ".join(detail) if detail else "The backend is starting.", "INFO")
+
+    def _outcome(self, context: Any, layout: Any, watch: supervisor.Watch | None) -> None:
+        """What went wrong, or what was changed."""
+        if watch is None:
+            return
+        job = watch.jobs.get(self.step)
+        failure = watch.failures.get(self.step)
+        if failure is None and job is not None and job.state == "failed" and job.status is not None:
+            failure = (job.status.message, job.status.hint)
+        if failure is not None:
+            box = layout.box()
+            box.alert = True
+            wrap(box, context, failure[0], "ERROR")
+            if failure[1]:
+                wrap(box, context, failure[1], "BLANK1")
+            if job is not None and (job.folder / "log.txt").is_file():
+                box.operator("splannequin.open_log", text="Open Log", icon="TEXT").step = self.step
+            return
+        if job is not None and job.state == "cancelled":
+            wrap(layout, context, "Cancelled. Finished work is kept: start it again to go on.", "CANCEL")
+        for message, hint in job.warnings if job is not None else []:
+            wrap(layout, context, f"{message} {hint}".strip(), "ERROR")
+        for note in watch.notes.get(self.step, []):
+            wrap(layout, context, note, "DOT")
+
+
+def minutes(seconds: float) -> str:
+    """A duration for people: "45 s", "3 min"."""
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
+    """Step 1: footage into a shot folder"""
+
+    bl_label = "1  Footage"
+    bl_idname = "SPLANNEQUIN_PT_footage"
+    step = "footage"
+    operator = "splannequin.import_clip"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """Clip, range, shot folder."""
+        props = context.scene.splannequin
+        layout.prop(props, "clip", text="")
+        row = layout.row(heading="Range")
+        row.prop(props, "use_range", text="")
+        span = row.row(align=True)
+        span.enabled = props.use_range
+        span.prop(props, "first", text="")
+        span.prop(props, "last", text="")
+        body = sub_panel(layout, "footage_more", "Advanced")
+        if body is not None:
+            body.prop(props, "shot_path", text="Folder")
+            body.prop(props, "set_up_scene")
+        if not backend.available():
+            box = layout.box()
+            box.alert = True
+            wrap(box, context, "The backend is not set up: choose its Python in the add-on's preferences.", "ERROR")
+
+
+class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
+    """Step 2: the camera"""
+
+    bl_label = "2  Camera"
+    bl_idname = "SPLANNEQUIN_PT_camera"
+    step = "camera"
+    operator = "splannequin.solve_camera"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """The lens."""
+        body = sub_panel(layout, "camera_more", "Advanced")
+        if body is not None:
+            body.prop(context.scene.splannequin, "camera_model")
+
+    def _button(self, context: Any, layout: Any, view: View, running: str | None) -> None:
+        watch = self._watch(context)
+        if view.done and watch and cameras.find(context.scene, watch.shot, "CAMERA") is None:
+            row = layout.row()
+            row.scale_y = 1.4
+            row.enabled = running is None
+            row.operator("splannequin.load_camera")
+            return
+        super()._button(context, layout, view, running)
+
+
+class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
+    """Step 3: training"""
+
+    bl_label = "3  Train"
+    bl_idname = "SPLANNEQUIN_PT_train"
+    step = "train"
+    operator = "splannequin.train"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """Preset and run."""
+        props = context.scene.splannequin
+        layout.row().prop(props, "preset", expand=True)
+        body = sub_panel(layout, "train_more", "Advanced")
+        if body is not None:
+            body.prop(props, "run_name")
+
+
+class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
+    """Step 4: the freeze"""
+
+    bl_label = "4  Freeze"
+    bl_idname = "SPLANNEQUIN_PT_freeze"
+    step = "freeze"
+    operator = "splannequin.freeze"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """t* and take."""
+        props = context.scene.splannequin
+        row = layout.row(heading="Frame t*")
+        row.prop(props, "choose_t_star", text="")
+        value = row.row(align=True)
+        value.enabled = props.choose_t_star
+        value.prop(props, "t_star", text="")
+        row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
+        body = sub_panel(layout, "freeze_more", "Advanced")
+        if body is not None:
+            body.prop(props, "take_name")
+
+
+class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
+    """Step 5: bake"""
+
+    bl_label = "5  Bake"
+    bl_idname = "SPLANNEQUIN_PT_bake"
+    step = "bake"
+    operator = "splannequin.bake"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """Colours, and the parts of the step one by one."""
+        body = sub_panel(layout, "bake_more", "Advanced")
+        if body is not None:
+            body.prop(context.scene.splannequin, "keep_colours")
+            body.operator("splannequin.insert_freeze", text="Insert in Compositor Only")
+            body.operator("splannequin.remove_shot")
+
+
+def sub_panel(layout: Any, name: str, label: str) -> Any | None:
+    """A part of a panel that is folded away at first; None while it is."""
+    header, body = layout.panel(f"splannequin_{name}", default_closed=True)
+    header.label(text=label)
+    return body
+
+
+CLASSES = (
+    SPLANNEQUIN_PT_footage,
+    SPLANNEQUIN_PT_camera,
+    SPLANNEQUIN_PT_train,
+    SPLANNEQUIN_PT_freeze,
+    SPLANNEQUIN_PT_bake,
+)

@@ -1,0 +1,85 @@
+"""What the artist sets, kept in the scene: it travels with the .blend."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+
+PRESETS = [
+    ("preview", "Preview", "Small and quick: to see whether the shot holds, minutes on a laptop"),
+    ("standard", "Standard", "For most shots"),
+    ("final", "Final", "Largest pictures and most Gaussians: takes longest"),
+]
+
+
+class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
+    """One shot of the scene and what is to be done with it."""
+
+    clip: StringProperty(
+        name="Clip",
+        description="Video file, or one image of a numbered sequence, of people holding still",
+        subtype="FILE_PATH",
+        options=set(),
+    )
+    shot_path: StringProperty(
+        name="Shot Folder",
+        description="Folder that keeps everything of this shot; empty: made beside the clip",
+        subtype="DIR_PATH",
+        options=set(),
+    )
+    use_range: BoolProperty(
+        name="Only a Range", description="Import a part of the clip instead of all of it", default=False, options=set()
+    )
+    first: IntProperty(name="First", description="First frame number of the clip to import", default=1, options=set())
+    last: IntProperty(name="Last", description="Last frame number to import, inclusive", default=250, options=set())
+    camera_model: EnumProperty(
+        name="Lens",
+        description="How the lens bends straight lines",
+        items=[
+            ("SIMPLE_RADIAL", "Ordinary", "One coefficient: phones, most cameras"),
+            ("OPENCV", "Strong", "Four coefficients: action cameras, very wide lenses"),
+        ],
+        options=set(),
+    )
+    preset: EnumProperty(name="Preset", description="How much to spend on training", items=PRESETS, options=set())
+    run_name: StringProperty(
+        name="Run", description="Name of the training run; a new name keeps the old", default="main", options=set()
+    )
+    choose_t_star: BoolProperty(
+        name="Choose the Instant",
+        description="Set the frame at which time stands still yourself; off: the best supported one is taken",
+        default=False,
+        options=set(),
+    )
+    t_star: IntProperty(
+        name="t*", description="Frame number of the clip at which time stands still", default=1, options=set()
+    )
+    take_name: StringProperty(
+        name="Take", description="Name of the frozen frames; a new name keeps the old", default="freeze", options=set()
+    )
+    set_up_scene: BoolProperty(
+        name="Fit Scene to Clip",
+        description="Set resolution, frame rate and frame range of the scene to the clip's. "
+        "Off: only a new scene is set up, one you have worked in is left alone",
+        default=False,
+        options=set(),
+    )
+    keep_colours: BoolProperty(
+        name="Keep Plate Colours",
+        description="Set the view transform to Standard and dither to 0, so that pictures leave with the colours they "
+        "came in with. Blender's default view changes them",
+        default=True,
+        options=set(),
+    )
+
+
+def register() -> None:
+    """Registers the property group and hangs it on the scene."""
+    bpy.utils.register_class(SPLANNEQUIN_PG_scene)
+    bpy.types.Scene.splannequin = PointerProperty(type=SPLANNEQUIN_PG_scene)
+
+
+def unregister() -> None:
+    """Undoes `register`."""
+    del bpy.types.Scene.splannequin
+    bpy.utils.unregister_class(SPLANNEQUIN_PG_scene)

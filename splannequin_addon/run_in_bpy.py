@@ -1,0 +1,60 @@
+"""Runs the Blender side of Splannequin where the extension is not installed: under a `bpy` wheel, or a bare Blender.
+
+    .venv-bpy-5.0/bin/python splannequin_addon/run_in_bpy.py bake --shot SHOT --take TAKE --output DIR
+    blender --background --factory-startup --python splannequin_addon/run_in_bpy.py -- bake --shot SHOT ...
+
+The package is loaded from this file's repository under the name that Blender gives an installed extension, so that
+relative imports, preferences and operators are the same in both. Nothing is installed and no preference is written.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import types
+from pathlib import Path
+
+PACKAGE = "bl_ext.user_default.splannequin"
+
+
+def load_package() -> types.ModuleType:
+    """The extension package under its Blender name; loaded once, not registered."""
+    import bpy  # noqa: F401  -- makes `bl_ext` where Blender has it
+
+    if PACKAGE in sys.modules:
+        return sys.modules[PACKAGE]
+    root = Path(__file__).resolve().parent.parent
+    for parent in ("bl_ext", "bl_ext.user_default"):
+        if parent not in sys.modules:
+            try:
+                importlib.import_module(parent)
+            except ImportError:
+                module = types.ModuleType(parent)
+                module.__path__ = []
+                sys.modules[parent] = module
+    spec = importlib.util.spec_from_file_location(PACKAGE, root / "__init__.py", submodule_search_locations=[str(root)])
+    if spec is None or spec.loader is None:
+        raise FileNotFoundError(f"{root} holds no __init__.py: it is not the Splannequin package")
+    package = importlib.util.module_from_spec(spec)
+    sys.modules[PACKAGE] = package
+    spec.loader.exec_module(package)
+    return package
+
+
+def main() -> int:
+    """Registers the package and runs the command line that `blender --command splannequin` runs."""
+    arguments = sys.argv[1:]
+    if "--" in arguments:
+        arguments = arguments[arguments.index("--") + 1 :]
+    package = load_package()
+    package.register()
+    headless = importlib.import_module(PACKAGE + ".splannequin_addon.headless")
+    return headless.main(arguments)
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    sys.exit(code)

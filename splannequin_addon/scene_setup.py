@@ -1,0 +1,117 @@
+"""Settings of the scene that a shot needs, changed only with consent, said in words, and taken back on removal."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from . import cameras
+
+_BEFORE = "splannequin_settings_before"
+_VIEW = {"view_transform": "Standard", "look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False}
+
+
+def untouched(scene: Any) -> bool:
+    """True if size, rate and range of the scene are those of a new file: nothing of the artist's would be lost."""
+    render = scene.render
+    size = (render.resolution_x, render.resolution_y) == (1920, 1080)
+    return size and render.fps == 24 and (scene.frame_start, scene.frame_end) == (1, 250)
+
+
+def fitted(scene: Any) -> bool:
+    """True if `fit_clip` has changed the scene before: it is ours to fit again."""
+    before = json.loads(scene.get(_BEFORE, "{}"))
+    return "resolution_x" in before.get("render", {}) or "frame_start" in before.get("scene", {})
+
+
+def fit_clip(
+    scene: Any,
+    size: tuple[int, int],
+    fps: float,
+    frames: tuple[int, int],
+    k: tuple[float, float, float, float] | None = None,
+) -> list[str]:
+    """Gives the scene the clip's size, rate and range; returns what was changed, in words.
+
+    Args:
+        scene: the scene.
+        size: width and height in pixels.
+        fps: frames per second; 0 leaves the scene's.
+        frames: first and last frame, inclusive.
+        k: fx, fy, cx, cy, for the pixel aspect; None leaves it.
+    """
+    render = scene.render
+    changes = []
+    aspect = cameras.pixel_aspect(k) if k else (render.pixel_aspect_x, render.pixel_aspect_y)
+    now = (render.resolution_x, render.resolution_y, render.resolution_percentage)
+    if now != (*size, 100):
+        _remember(scene, "render", ("resolution_x", "resolution_y", "resolution_percentage"))
+        render.resolution_x, render.resolution_y, render.resolution_percentage = *size, 100
+        changes.append(f"Resolution set to {size[0]} x {size[1]}.")
+    if (render.pixel_aspect_x, render.pixel_aspect_y) != aspect:
+        _remember(scene, "render", ("pixel_aspect_x", "pixel_aspect_y"))
+        render.pixel_aspect_x, render.pixel_aspect_y = aspect
+        changes.append("Pixel aspect set to the lens's.")
+    if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4:
+        _remember(scene, "render", ("fps", "fps_base"))
+        render.fps = max(round(fps), 1)
+        render.fps_base = render.fps / fps
+        changes.append(f"Frame rate set to {fps:g}.")
+    if (scene.frame_start, scene.frame_end) != frames:
+        _remember(scene, "scene", ("frame_start", "frame_end"))
+        scene.frame_start, scene.frame_end = frames
+        changes.append(f"Frame range set to {frames[0]} to {frames[1]}.")
+    if not frames[0] <= scene.frame_current <= frames[1]:
+        scene.frame_set(frames[0])
+    return changes
+
+
+def keep_plate_colours(scene: Any) -> list[str]:
+    """Sets the view transform so that pictures leave as they came in; returns what was changed, in words.
+
+    Blender's default view (AgX) is made for renders and would change every plate. Dithering is noise on the last bit.
+    """
+    view = scene.view_settings
+    changes = []
+    different = [name for name, value in _VIEW.items() if getattr(view, name) != value]
+    if different:
+        was = view.view_transform
+        _remember(scene, "view", tuple(_VIEW))
+        for name, value in _VIEW.items():
+            setattr(view, name, value)
+        changes.append(f"View transform set from {was} to Standard, so that the plate keeps its colours.")
+    if scene.render.dither_intensity:
+        _remember(scene, "render", ("dither_intensity",))
+        scene.render.dither_intensity = 0.0
+        changes.append("Dither set to 0, so that pixels stay exact.")
+    return changes
+
+
+def keeps_plate_colours(scene: Any) -> bool:
+    """True if pictures leave the scene with the colours they came in with."""
+    return all(getattr(scene.view_settings, name) == value for name, value in _VIEW.items())
+
+
+def restore(scene: Any) -> bool:
+    """Takes back every setting that was changed here. True if there was one."""
+    stored = scene.get(_BEFORE)
+    if not stored:
+        return False
+    for owner, values in json.loads(stored).items():
+        for name, value in values.items():
+            setattr(_owner(scene, owner), name, value)
+    del scene[_BEFORE]
+    return True
+
+
+def _owner(scene: Any, name: str) -> Any:
+    return {"scene": scene, "render": scene.render, "view": scene.view_settings}[name]
+
+
+def _remember(scene: Any, owner: str, names: tuple[str, ...]) -> None:
+    """Keeps the present values in the scene, unless older ones are kept already."""
+    before = json.loads(scene.get(_BEFORE, "{}"))
+    values = before.setdefault(owner, {})
+    for name in names:
+        values.setdefault(name, getattr(_owner(scene, owner), name))
+    scene[_BEFORE] = json.dumps(before)

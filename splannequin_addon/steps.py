@@ -1,0 +1,208 @@
+"""The five steps as plain functions: what a button asks of the backend, and what its answer changes in the scene.
+
+The same functions serve the buttons, the timer and the command line.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..torch_backend import contract
+from . import backend, bake, cameras, jobs, scene_setup, shots
+
+
+@dataclass(frozen=True)
+class Step:
+    """One of the five."""
+
+    name: str
+    """Identifier: footage, camera, train, freeze or bake."""
+    label: str
+    """Name on the panel."""
+    kind: str
+    """Kind of the job behind it."""
+    button: str
+    """What the button says."""
+    again: str
+    """What the button says once the step is done."""
+    needs: str
+    """What to do before, in a sentence; empty if nothing."""
+
+
+STEPS = {
+    s.name: s
+    for s in (
+        Step("footage", "Footage", "import", "Import Clip", "Import Again", ""),
+        Step("camera", "Camera", "solve", "Solve Camera", "Solve Again", "Import the clip first."),
+        Step("train", "Train", "train", "Train", "Train On", "Solve the camera first."),
+        Step("freeze", "Freeze", "freeze", "Freeze", "Freeze Again", "Train first."),
+        Step("bake", "Bake", "freeze", "Bake and Render", "Bake Again", "Freeze first."),
+    )
+}
+"""The steps in order."""
+
+
+def shot_folder(scene: Any) -> Path | None:
+    """Folder of the scene's shot; None while neither it nor a clip is chosen."""
+    props = scene.splannequin
+    if props.shot_path:
+        return Path(os.path.abspath(bpy.path.abspath(props.shot_path)))
+    if not props.clip:
+        return None
+    clip = Path(os.path.abspath(bpy.path.abspath(props.clip)))
+    return clip.with_name(clip.stem + shots.SHOT_SUFFIX)
+
+
+def scenes_of(shot: Path) -> list[Any]:
+    """Scenes of the file that work on a shot."""
+    return [s for s in bpy.data.scenes if shot_folder(s) == shot]
+
+
+def params_of(scene: Any, step: str) -> Any:
+    """The backend's parameters for a step, from what the artist set. JobError names what is missing."""
+    props = scene.splannequin
+    if step == "footage":
+        if not props.clip:
+            raise contract.JobError("No clip is chosen.", "Choose a video or image sequence.", contract.ExitCode.USAGE)
+        span = (props.first, props.last) if props.use_range else (None, None)
+        return contract.ImportParams(os.path.abspath(bpy.path.abspath(props.clip)), *span)
+    if step == "camera":
+        return contract.SolveParams(camera_model=props.camera_model)
+    if step == "train":
+        return contract.TrainParams(run=props.run_name, preset=props.preset)
+    t_star = props.t_star if props.choose_t_star else None
+    params = contract.FreezeParams(run=props.run_name, take=props.take_name, t_star=t_star)
+    folder = shot_folder(scene)
+    if step == "bake" and folder is not None:
+        params = take_params(folder, props.take_name, t_star) or params
+        params.only_missing = True
+    return params
+
+
+def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.FreezeParams | None:
+    """What a take was asked for with, from its take.json, to render what it lacks; None if it was never finished."""
+    facts = shots.read(shot).takes.get(take)
+    if facts is None:
+        return None
+    return contract.FreezeParams(
+        run=facts["run"],
+        take=take,
+        t_star=facts["t_star_frame"] if t_star is None else t_star,
+        query=facts["query"],
+        width=facts["width"],
+        only_missing=True,
+    )
+
+
+def complete(shot: Path, take: str) -> bool:
+    """True if every frame of a finished take is on disk: it can be baked without a backend."""
+    facts = shots.read(shot).takes.get(take)
+    return facts is not None and not bake.missing_frames(shot, take, facts["first"], facts["last"])
+
+
+def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
+    """Starts the job behind a step on the scene's shot, detached.
+
+    Raises:
+        contract.JobError: nothing to work on, no backend, or the shot cannot be written.
+    """
+    params = params or params_of(scene, step)
+    folder = shot_folder(scene)
+    if folder is None:
+        raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
+    backend.python()  # before anything is written: without a backend there is nothing to start
+    try:
+        if step == "footage":
+            shots.create(folder)
+        elif not (folder / "shot.json").is_file():
+            raise contract.JobError(f"{folder} is no shot folder.", STEPS[step].needs, contract.ExitCode.USAGE)
+        job = jobs.new_job(folder, STEPS[step].kind, params)
+    except OSError as error:
+        raise contract.JobError(
+            f"Cannot write to {folder}: {error.strerror or error}.",
+            "Choose another shot folder.",
+            contract.ExitCode.DISK,
+        ) from error
+    if not scene.splannequin.shot_path:
+        scene.splannequin.shot_path = str(folder)
+    backend.start(job)
+    return job
+
+
+def finish(scene: Any, step: str, job: jobs.Job) -> list[str]:
+    """What a finished job changes in the scene; returns it in words."""
+    shot = job.shot
+    if step == "footage":
+        return imported(scene, shot)
+    if step == "camera":
+        return load_camera(scene, shot)
+    if step == "freeze" and not scene.splannequin.choose_t_star:
+        scene.splannequin.t_star = int(job.result["t_star_frame"])
+    if step == "bake":
+        return insert_freeze(scene, shot, job.params["take"])
+    return []
+
+
+def imported(scene: Any, shot: Path) -> list[str]:
+    """After the import: the scene takes the clip's size, rate and range if it is new or the artist consents."""
+    state = shots.read(shot)
+    props = scene.splannequin
+    first, last = state.frame_range
+    if not first <= props.t_star <= last:
+        props.t_star = (first + last) // 2
+    return _fit(scene, state)
+
+
+def load_camera(scene: Any, shot: Path) -> list[str]:
+    """Brings the solve into the scene. FileNotFoundError if there is none."""
+    changes = _fit(scene, shots.read(shot), force_k=True)
+    camera = cameras.build(scene, shot)
+    return [f"{camera.name} is the scene's camera, with the plate behind it.", *changes]
+
+
+def insert_freeze(scene: Any, shot: Path, take: str) -> list[str]:
+    """Puts a take into the scene's compositor, and keeps the plate's colours if the artist consents."""
+    changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
+    return bake.insert(scene, shot, take) + changes
+
+
+def remove_all(scene: Any, shot: Path) -> list[str]:
+    """Takes everything of a shot out of the file; its folder on disk stays. Returns what was done, in words."""
+    done = []
+    if bake.remove(scene):
+        done.append("The freeze left the compositor.")
+    if cameras.remove(scene, shot):
+        done.append("Camera and points were removed.")
+    if scene_setup.restore(scene):
+        done.append("The scene's settings are as they were.")
+    return done
+
+
+def run(
+    scene: Any, step: str, params: Any = None, on_event: Callable[[contract.Event], None] | None = None
+) -> tuple[Any, list[str]]:
+    """A whole step, blocking: for scripts and the command line. Returns the job's result and what changed, in words.
+
+    Raises:
+        contract.JobError, contract.Cancelled: as the job ended.
+    """
+    job = begin(scene, step, params)
+    result = jobs.wait(job, on_event)
+    return result, finish(scene, step, job)
+
+
+def _fit(scene: Any, state: shots.ShotState, force_k: bool = False) -> list[str]:
+    if not (scene.splannequin.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
+        return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]
+    size, k = state.size, None
+    if force_k:
+        path = contract.CameraPath.load(state.folder / "solve" / "cameras.json")
+        size = (path.width, path.height)
+        k = (path.frames[0].K[0], path.frames[0].K[1], path.frames[0].K[2], path.frames[0].K[3])
+    return scene_setup.fit_clip(scene, size, float(state.info.get("fps", 0.0)), state.frame_range, k)

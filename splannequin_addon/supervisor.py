@@ -1,0 +1,193 @@
+"""Follows running jobs from one persistent timer, within a time budget per tick, and keeps what the panel shows.
+
+Jobs outlive undo, file load and Blender itself: nothing of bpy is kept here, only shot folders and job folders, and
+the jobs of a shot that is opened are found again in its folder.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..torch_backend import contract
+from . import jobs, shots, steps
+
+TICK_SECONDS = 0.25
+BUDGET_SECONDS = 0.01
+_LOOK_SECONDS = 1.0
+"""How often the shot folder is looked at for changes."""
+
+
+@dataclass
+class Watch:
+    """What is known of one shot folder."""
+
+    shot: Path
+    """Shot folder."""
+    jobs: dict[str, jobs.Job] = field(default_factory=dict)
+    """Newest job of each step, by the step's name."""
+    state: shots.ShotState | None = None
+    """What the folder holds."""
+    stamp: tuple[float, ...] = ()
+    """Of the folder when `state` was read."""
+    looked: float = 0.0
+    """When the folder was last looked at, monotonic seconds."""
+    notes: dict[str, list[str]] = field(default_factory=dict)
+    """What a finished step changed in the scene, or why it could not, by the step's name."""
+    failures: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """(sentence, hint) of what failed on Blender's side, by the step's name."""
+    rendered: tuple[int, int] | None = None
+    """(frames done, frames in all) of a render that runs."""
+
+    def running(self) -> str | None:
+        """Name of the step at work, if any."""
+        if self.rendered is not None:
+            return "bake"
+        return next((step for step, job in self.jobs.items() if not job.ended), None)
+
+
+_watches: dict[Path, Watch] = {}
+
+
+def watch_of(shot: Path) -> Watch:
+    """What is known of a shot; its jobs are found again the first time it is asked for."""
+    watch = _watches.get(shot)
+    if watch is None:
+        watch = _watches[shot] = Watch(shot)
+        steps_of_kind = {"import": "footage", "solve": "camera", "train": "train", "freeze": "freeze"}
+        watch.jobs = {steps_of_kind[kind]: job for kind, job in jobs.latest(shot).items()}
+    if watch.state is None:
+        refresh(watch)
+    return watch
+
+
+def follow(step: str, job: jobs.Job) -> None:
+    """Watches a job that was just started."""
+    watch = watch_of(job.shot)
+    watch.jobs[step] = job
+    watch.notes.pop(step, None)
+    watch.failures.pop(step, None)
+
+
+def refresh(watch: Watch) -> bool:
+    """Reads the shot folder again if something in it changed. True if it did."""
+    watch.looked = time.monotonic()
+    stamp = shots.stamp(watch.shot)
+    if stamp == watch.stamp and watch.state is not None:
+        return False
+    try:
+        watch.state = shots.read(watch.shot)
+    except (OSError, ValueError, KeyError) as error:
+        watch.state = shots.ShotState(watch.shot)
+        watch.failures["footage"] = (f"The shot folder cannot be read: {error}", "")
+    watch.stamp = stamp
+    return True
+
+
+def tick() -> float:
+    """One turn of the timer: reads what jobs wrote, applies those that ended, redraws what shows them."""
+    until = time.monotonic() + BUDGET_SECONDS
+    changed = False
+    for watch in list(_watches.values()):
+        for step, job in list(watch.jobs.items()):
+            if job.ended or time.monotonic() > until:
+                continue
+            changed = True
+            try:
+                jobs.poll(job, max(until - time.monotonic(), 0.001))
+            except (OSError, ValueError, KeyError) as error:
+                watch.failures[step] = (f"The job in {job.folder} cannot be read: {error}", "")
+                del watch.jobs[step]
+                continue
+            if job.ended:
+                refresh(watch)
+                _apply(watch, step, job)
+        if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
+            changed |= refresh(watch)
+    if changed:
+        redraw()
+    return TICK_SECONDS
+
+
+def redraw() -> None:
+    """Draws every 3D view again, so that the panel shows what is new."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
+    """Lets a job that ended well change the scenes that work on its shot: in a window, as one undo step each."""
+    if job.state != "done":
+        return
+    for scene in steps.scenes_of(watch.shot):
+        window = next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
+        try:
+            if window is None:
+                watch.notes[step] = steps.finish(scene, step, job)
+                continue
+            with bpy.context.temp_override(window=window, scene=scene):
+                watch.notes[step] = steps.finish(scene, step, job)
+                if watch.notes[step]:
+                    bpy.ops.ed.undo_push(message=f"Splannequin {steps.STEPS[step].label}")
+                if step == "bake":
+                    bpy.ops.splannequin.render("INVOKE_DEFAULT")
+        except (contract.JobError, OSError, ValueError, RuntimeError) as error:
+            watch.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
+
+
+@persistent
+def _on_load(*_: Any) -> None:
+    """Another file: its shots are looked at afresh; running jobs go on and are found again."""
+    for shot in [s for s, w in _watches.items() if w.running() is None]:
+        del _watches[shot]
+    for watch in _watches.values():
+        watch.rendered = None
+
+
+def render_began(shot: Path, frames: int) -> None:
+    """A render of a baked shot begins."""
+    watch_of(shot).rendered = (0, frames)
+
+
+@persistent
+def _on_frame(*_: Any) -> None:
+    for watch in _watches.values():
+        if watch.rendered is not None:
+            watch.rendered = (watch.rendered[0] + 1, watch.rendered[1])
+
+
+@persistent
+def _on_render_end(*_: Any) -> None:
+    for watch in _watches.values():
+        if watch.rendered is not None:
+            done, total = watch.rendered
+            watch.rendered = None
+            watch.notes["bake"] = [f"{done} of {total} frames rendered."]
+
+
+def register() -> None:
+    """Starts the timer (in a window: headless Blender has none) and listens to file loads and renders."""
+    bpy.app.handlers.load_post.append(_on_load)
+    bpy.app.handlers.render_write.append(_on_frame)
+    bpy.app.handlers.render_complete.append(_on_render_end)
+    bpy.app.handlers.render_cancel.append(_on_render_end)
+    if not bpy.app.background:
+        bpy.app.timers.register(tick, first_interval=TICK_SECONDS, persistent=True)
+
+
+def unregister() -> None:
+    """Undoes `register`. Running jobs go on."""
+    if bpy.app.timers.is_registered(tick):
+        bpy.app.timers.unregister(tick)
+    bpy.app.handlers.render_cancel.remove(_on_render_end)
+    bpy.app.handlers.render_complete.remove(_on_render_end)
+    bpy.app.handlers.render_write.remove(_on_frame)
+    bpy.app.handlers.load_post.remove(_on_load)
+    _watches.clear()
