@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .color import srgb_to_linear
-from .images import resize
 
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """Rec. 709 weights, for luma of encoded values and for luminance of linear ones."""
@@ -52,7 +51,7 @@ def measure(frame: int, pixels: NDArray) -> FrameMeasures:
     luma = (pixels @ LUMA) * np.float32(scale)
     inner = luma[1:-1, 1:-1]
     laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4.0 * inner
-    thumb = resize(pixels, THUMB_WIDTH, THUMB_HEIGHT).astype(np.float32) * np.float32(scale)
+    thumb = thumbnail(pixels) * np.float32(scale)
     luminance = float((srgb_to_linear(thumb) @ LUMA).mean())
     flags = ["blank"] if float(luma.std()) < BLANK_DEVIATION else []
     return FrameMeasures(
@@ -63,6 +62,16 @@ def measure(frame: int, pixels: NDArray) -> FrameMeasures:
         thumb=thumb,
         luma=np.ascontiguousarray(luma[::2, ::2]),
     )
+
+
+def thumbnail(pixels: NDArray) -> NDArray[np.float32]:
+    """[H, W, 3] to [36, 64, 3] block means in the units of the pixels; a smaller picture gives a smaller one."""
+    sums = pixels.astype(np.float32)
+    for axis, wanted in ((0, THUMB_HEIGHT), (1, THUMB_WIDTH)):
+        edges = np.linspace(0, sums.shape[axis], min(wanted, sums.shape[axis]) + 1).astype(int)
+        shape = [-1 if i == axis else 1 for i in range(3)]
+        sums = np.add.reduceat(sums, edges[:-1], axis=axis) / np.diff(edges).reshape(shape)
+    return sums.astype(np.float32)
 
 
 def flag_duplicate(current: FrameMeasures, last_distinct: FrameMeasures | None) -> bool:

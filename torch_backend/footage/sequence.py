@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from fileseq.filesequence import FileSequence
 from fileseq.exceptions import FileSeqException
+from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
 from .color import linear_to_srgb

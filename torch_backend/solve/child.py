@@ -31,6 +31,8 @@ def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
     environment = dict(os.environ)
     # A caller's folder must be found by the child as well, whatever this process was started from.
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(package_root), environment.get("PYTHONPATH", "")]))
+    # Threads that spin while they wait take the core from whoever shares it.
+    environment.setdefault("OMP_WAIT_POLICY", "passive")
     with open(log, "wb") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "torch_backend.solve.worker", str(request)],

@@ -20,7 +20,7 @@ from ..footage.images import read_png, write_png
 from ..shot import Shot, atomic_path, content_key, write_json
 from .child import run_worker
 from .poses import camera_centre, fill_poses
-from .undistort import warp
+from .undistort import Undistorter
 
 SOLVE_VERSION = 1
 CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV")
@@ -273,10 +273,11 @@ def filter_points(points: dict[str, NDArray], centres: NDArray) -> dict[str, NDA
 
 def _undistort_all(shot: Shot, frames: dict[str, Any], where: NDArray, report: Reporter) -> None:
     listed = frames["frames"]
+    undistort = Undistorter(where)
 
     def one(frame: dict[str, Any]) -> int:
         pixels = read_png(shot.frames / frame["file"])
-        write_png(shot.frames / frame_file(frame["frame"], ".png"), warp(pixels, where))
+        write_png(shot.frames / frame_file(frame["frame"], ".png"), undistort(pixels))
         return frame["frame"]
 
     with ThreadPoolExecutor(_WRITERS) as pool:
