@@ -219,7 +219,9 @@ def _give_up(error: OSError, where: Path) -> Any:
 
 def parser() -> argparse.ArgumentParser:
     """The command line's grammar."""
-    top = argparse.ArgumentParser(prog="splannequin", description="Freeze time in a handheld clip of people holding still.")
+    top = argparse.ArgumentParser(
+        prog="splannequin", description="Freeze time in a handheld clip of people holding still."
+    )
     top.add_argument("--json", action="store_true", help="print events as JSON lines instead of text")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -234,7 +236,12 @@ def parser() -> argparse.ArgumentParser:
     _add_train_flags(whole)
     _add_freeze_flags(whole)
 
-    for name, text in (("import", "footage into a shot"), ("solve", "cameras"), ("train", "train a run"), ("take", "freeze a run")):
+    for name, text in (
+        ("import", "footage into a shot"),
+        ("solve", "cameras"),
+        ("train", "train a run"),
+        ("take", "freeze a run"),
+    ):
         one = commands.add_parser(name, help=f"one step on a shot folder: {text}")
         one.add_argument("shot", help="shot folder")
         if name == "import":

@@ -134,7 +134,7 @@ class JobReporter:
     def _write_status(self) -> None:
         with self._lock:
             self.status.heartbeat = time.time()
-            # A full disk or a reader that holds the file open (Windows) must not end the job: the next beat tries again.
+            # A full disk, or a reader that holds the file open (Windows), must not end the job: the next beat retries.
             with contextlib.suppress(OSError):
                 write_json(self.folder / contract.STATUS_FILE, dataclasses.asdict(self.status))
 
@@ -152,7 +152,7 @@ def new_job(shot: Shot, kind: str, params: Any) -> Path:
     """Makes a job folder with its request; returns it."""
     folder = shot.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
     folder.mkdir(parents=True)
-    values = dataclasses.asdict(params) if dataclasses.is_dataclass(params) and not isinstance(params, type) else params
+    values: dict[str, Any] = params if isinstance(params, dict) else dataclasses.asdict(params)
     request = JobRequest(kind=kind, shot=str(shot.root), params=values)
     write_json(folder / contract.REQUEST_FILE, dataclasses.asdict(request))
     return folder
@@ -191,7 +191,7 @@ def _run(request: JobRequest, reporter: JobReporter) -> tuple[int, Any]:
     except (ValueError, FileNotFoundError) as error:
         state, code, message = "failed", int(ExitCode.USAGE), str(error)
         _log_traceback(reporter.folder)
-    except Exception as error:  # the job's surface: an artist reads a sentence, the log keeps the rest
+    except Exception as error:
         _log_traceback(reporter.folder)
         full = disk_error(request.shot) if isinstance(error, OSError) and is_disk_full(error) else None
         state, code = "failed", full.exit_code if full else int(ExitCode.INTERNAL)

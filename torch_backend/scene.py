@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 from torch import Tensor
 
 from .contract import CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
+from .footage.images import read_png
 from .shot import Shot
 
 
@@ -60,10 +60,10 @@ class Scene:
 
     def camera_at(self, width: int, height: int) -> Tensor:
         """`Ks` rescaled to another image size, [F, 3, 3]."""
-        return resize_Ks(self.Ks, self.width, self.height, width, height)
+        return resize_intrinsics(self.Ks, self.width, self.height, width, height)
 
 
-def resize_Ks(Ks: Tensor, width: int, height: int, new_width: int, new_height: int) -> Tensor:
+def resize_intrinsics(Ks: Tensor, width: int, height: int, new_width: int, new_height: int) -> Tensor:
     """Intrinsics [C, 3, 3] of the same camera with another image size in pixels (pixel centres at +0.5)."""
     ratio = torch.tensor([[new_width / width], [new_height / height], [1.0]], dtype=Ks.dtype)
     return Ks * ratio
@@ -148,13 +148,10 @@ def load_images(scene: Scene, indices: list[int], width: int, height: int, repor
 
 
 def read_image(path: Path, width: int, height: int) -> Tensor:
-    """One display-referred image resized (area-weighted) to [height, width, 3] float32. FileNotFoundError if missing."""
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise FileNotFoundError(f"cannot read the working frame {path}: {oiio.geterror()}")
-    pixels = source.read_image(0, 0, 0, 3, oiio.FLOAT)
-    source.close()
-    image = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None]
+    """One display-referred image resized to [height, width, 3] float32 in [0, 1]. FileNotFoundError if missing."""
+    pixels = read_png(path)
+    limit = 65535.0 if pixels.dtype == np.uint16 else 255.0
+    image = torch.from_numpy(pixels.astype(np.float32) / limit).permute(2, 0, 1)[None]
     if image.shape[-2:] != (height, width):
         exact = image.shape[-2] % height == 0 and image.shape[-1] % width == 0
         mode, antialias = ("area", False) if exact else ("bicubic", True)

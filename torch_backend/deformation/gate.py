@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..gaussians import Gaussians
@@ -73,7 +73,7 @@ def open_gate(model: Gaussians, residual: Tensor, weight: Tensor, config: GateCo
         return 0
     rows = torch.nonzero(painted).flatten()
     means = model.params["means"].detach()[rows].numpy()
-    nearest = cKDTree(means).query(means, k=config.neighbours + 1)[1].reshape(len(rows), -1)
+    nearest = KDTree(means).query(means, k=config.neighbours + 1)[1].reshape(len(rows), -1)
     smooth = residual[rows][torch.from_numpy(np.ascontiguousarray(nearest))].median(1).values
     median = smooth.median()
     spread = 1.4826 * (smooth - median).abs().median()

@@ -80,10 +80,9 @@ class HexPlane(nn.Module):
         when = (2.0 * times - 1.0).expand(len(means))
         parts = []
         for level in range(len(self.config.levels)):
-            product: Tensor | None = None
+            product = where.new_ones(())
             for k, (a, b) in enumerate(_SPATIAL):
-                sample = _sample(self.spatial[3 * level + k], where[:, a], where[:, b])
-                product = sample if product is None else product * sample
+                product = product * _sample(self.spatial[3 * level + k], where[:, a], where[:, b])
             for axis in range(3):
                 product = product * _sample(self.temporal[3 * level + axis], where[:, axis], when)
             parts.append(product)

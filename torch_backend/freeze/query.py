@@ -75,7 +75,15 @@ def render_frozen(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, width: in
     """One view of a frozen scene: viewmat [4, 4] in scene units, K [3, 3] in pixels."""
     mattes = torch.stack([frozen.support, frozen.motion], dim=1)
     out = render(
-        frozen.state, frozen.sh_degree, viewmat, K, width, height, colors=mattes, with_depth=True, with_contributions=False
+        frozen.state,
+        frozen.sh_degree,
+        viewmat,
+        K,
+        width,
+        height,
+        colors=mattes,
+        with_depth=True,
+        with_contributions=False,
     )
     alpha = out.alphas[0].clamp(0.0, 1.0)
     # Mattes are shares of what is seen: undo the premultiplication, keep nothing where nothing is.

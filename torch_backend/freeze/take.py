@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 from torch import Tensor
 
 from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, Reporter, frame_file, read_json
-from ..footage.color import srgb_to_linear
+from ..footage.color import premultiplied_srgb_to_linear
+from ..footage.images import read_png
 from ..gaussians.ply import write_ply
 from ..scene import Scene, load_scene
-from ..shot import Shot, content_key, is_disk_full, disk_error, need_disk, write_json
+from ..shot import Shot, content_key, disk_error, is_disk_full, need_disk, write_json
 from ..train import LoadedRun, load_run
 from ..train.run import save_png
 from .contact_sheet import write_contact_sheet
@@ -76,7 +75,9 @@ def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams
         )
     nearest = int(trained[np.abs(trained - params.t_star).argmin()])
     if nearest != params.t_star:
-        report.warning(f"Frame {params.t_star} was not trained on: time stands still at frame {nearest}, the nearest that was.")
+        report.warning(
+            f"Frame {params.t_star} was not trained on: time stands still at frame {nearest}, the nearest that was."
+        )
     return nearest
 
 
@@ -98,7 +99,9 @@ def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: in
     last = numbers[-1] if params.last is None else params.last
     ramp = {int(k): float(v) for k, v in params.t_star_per_frame.items()}
     frames = [
-        OutputFrame(n, viewmats[i], Ks[i], ramp.get(n, float(t_star))) for i, n in enumerate(numbers) if first <= n <= last
+        OutputFrame(n, viewmats[i], Ks[i], ramp.get(n, float(t_star)))
+        for i, n in enumerate(numbers)
+        if first <= n <= last
     ]
     if not frames:
         raise JobError(
@@ -155,7 +158,10 @@ def _render_all(
         if output.frame in done:
             continue
         if frozen is None or output.t_star != at:
-            frozen, at = freeze_at(run.model, scene.time_of_frame(output.t_star), _span(scene, run), query), output.t_star
+            frozen, at = (
+                freeze_at(run.model, scene.time_of_frame(output.t_star), _span(scene, run), query),
+                output.t_star,
+            )
         image = render_frozen(frozen, output.viewmat, output.K, *size)
         _write_frame(folder, output, image, scene)
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
@@ -187,9 +193,9 @@ def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
     Splats blend in display space; the conversion acts on the colour that is seen, so it goes through straight alpha.
     """
-    cover = np.maximum(alpha, 1e-4)[..., None]
-    rgb = srgb_to_linear(np.clip(color / cover, 0.0, 1.0)) * alpha[..., None]
-    return np.concatenate([rgb, alpha[..., None]], axis=2).astype(np.float32)
+    # Beyond white there is no plate to match: the model was trained on [0, 1], overshoot is noise.
+    capped = np.clip(color, 0.0, alpha[..., None])
+    return premultiplied_srgb_to_linear(np.concatenate([capped, alpha[..., None]], axis=2))
 
 
 def _finish(
@@ -201,10 +207,14 @@ def _finish(
     report.progress("finishing the take", 0, 3, "contact sheet")
     numbers = [f.frame for f in frames]
     previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
-    sheet = _contact_sheet(shot, folder, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}")
+    sheet = _contact_sheet(
+        shot, folder, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}", t_star
+    )
     report.check_cancelled()
     report.progress("finishing the take", 1, 3, "video")
-    write_video(folder / "video.mp4", _images(previews), shot.info().fps or 24.0)
+    note = write_video(folder / "video.mp4", (read_png(p) for p in previews), shot.info().fps or 24.0)
+    if note:
+        report.warning(note)
     report.progress("finishing the take", 2, 3, "PLY")
     frozen = freeze_at(run.model, scene.time_of_frame(t_star), _span(scene, run), params.query)
     _write_ply(folder / "frozen.ply", frozen, scene)
@@ -234,22 +244,12 @@ def _finish(
     return facts
 
 
-def _contact_sheet(shot: Shot, folder: Path, numbers: list[int], previews: list[Path], title: str) -> Path:
+def _contact_sheet(shot: Shot, folder: Path, numbers: list[int], previews: list[Path], title: str, t_star: int) -> Path:
     plates = [shot.frames / frame_file(n, ".png") for n in numbers]
-    if not all(p.is_file() for p in plates):
-        plates = previews  # a camera path of its own has no plates: the sheet then shows the frozen frames alone
+    own_poses = all(p.is_file() for p in plates)
     path = folder / "contact_sheet.png"
-    write_contact_sheet(path, plates, previews, numbers, title)
+    write_contact_sheet(path, plates if own_poses else None, previews, numbers, title, mark=t_star)
     return path
-
-
-def _images(paths: list[Path]) -> Iterator[np.ndarray]:
-    for path in paths:
-        source = oiio.ImageInput.open(str(path))
-        if source is None:
-            raise FileNotFoundError(f"cannot read the frozen preview {path}: {oiio.geterror()}")
-        yield np.ascontiguousarray(source.read_image(0, 0, 0, 3, oiio.UINT8))
-        source.close()
 
 
 def _write_ply(path: Path, frozen: FrozenGaussians, scene: Scene) -> None:
@@ -261,5 +261,3 @@ def _write_ply(path: Path, frozen: FrozenGaussians, scene: Scene) -> None:
         path, means.float().numpy(), s["quats"].numpy(), (s["log_scales"] - float(np.log(scene.scale))).numpy(),
         s["opacity_logits"].numpy(), sh.numpy(),
     )  # fmt: skip
-
-

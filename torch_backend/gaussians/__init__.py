@@ -1,7 +1,7 @@
 """The Gaussian model: its parameters, how it starts, grows and is written. Depends on the scene only."""
 
-from .densify import DensifyConfig, Densifier
+from .densify import Densifier, DensifyConfig
 from .initialise import InitConfig, initialise
 from .model import PARAM_NAMES, Gaussians, sh_bases
 
-__all__ = ["PARAM_NAMES", "DensifyConfig", "Densifier", "Gaussians", "InitConfig", "initialise", "sh_bases"]
+__all__ = ["PARAM_NAMES", "Densifier", "DensifyConfig", "Gaussians", "InitConfig", "initialise", "sh_bases"]

@@ -52,15 +52,13 @@ class Densifier:
         """Forgets the signal; called after every round, for `count` Gaussians."""
         self.gradient = torch.zeros(count)
         self.seen = torch.zeros(count)
-        self.weight = torch.zeros(count)
 
     @torch.no_grad()
-    def observe(self, absgrad: Tensor, radii: Tensor, weight_max: Tensor) -> None:
-        """Adds one view: |screen gradient| [N] in pixels, radii [N], largest alpha * T over the pixels [N]."""
+    def observe(self, absgrad: Tensor, radii: Tensor) -> None:
+        """Adds one view: |screen gradient| [N] in 1/px and screen radii [N] in px, 0 where culled."""
         visible = radii > 0
         self.gradient += torch.where(visible, absgrad, 0.0)
         self.seen += visible
-        self.weight = torch.maximum(self.weight, weight_max)
 
     def target(self, initial: int, progress: float) -> int:
         """How many Gaussians the schedule allows at `progress` (0 to 1) of the run."""
@@ -69,7 +67,9 @@ class Densifier:
         return round(initial + (max(c.budget, initial) - initial) * math.sqrt(share))
 
     @torch.no_grad()
-    def step(self, model: Gaussians, optimizer: torch.optim.Optimizer, initial: int, progress: float) -> tuple[int, int]:
+    def step(
+        self, model: Gaussians, optimizer: torch.optim.Optimizer, initial: int, progress: float
+    ) -> tuple[int, int]:
         """One round: prune, then split up to the schedule. Returns (split, pruned)."""
         keep = self._keep(model)
         score = self.gradient / self.seen.clamp_min(1.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..scene import Scene
@@ -75,7 +75,7 @@ def initialise(
 
 def neighbour_distance(points: Tensor) -> Tensor:
     """Root mean squared distance to the 3 nearest neighbours (3DGS create_from_pcd), [N]."""
-    distances = cKDTree(points.numpy()).query(points.numpy(), k=4)[0][:, 1:]
+    distances = KDTree(points.numpy()).query(points.numpy(), k=4)[0][:, 1:]
     return torch.from_numpy(np.sqrt((distances**2).mean(1))).float()
 
 
@@ -93,7 +93,7 @@ def _lift_seeds(
     seen = in_front & ((pixels >= 0) & (pixels < limits)).all(1)
     if seen.sum() < 4:
         return scene.points[:0], scene.colors[:0]
-    tree = cKDTree(pixels[seen].numpy())
+    tree = KDTree(pixels[seen].numpy())
     candidates = torch.rand(4 * count, 2, generator=generator) * limits
     distance, nearest = tree.query(candidates.numpy(), k=4)
     far = np.argsort(-distance[:, 0], kind="stable")[: 2 * count]

@@ -6,6 +6,8 @@ One primitive, `rebuild`, clones, splits and prunes: it takes the row each new G
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -42,7 +44,7 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """Highest degree that shN can hold."""
-        return int(round((1 + self.params["shN"].shape[1]) ** 0.5)) - 1
+        return math.isqrt(1 + self.params["shN"].shape[1]) - 1
 
     def sh(self, degree: int) -> Tensor:
         """sh0 and shN up to `degree`, [N, (degree + 1)^2, 3]."""

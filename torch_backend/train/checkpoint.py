@@ -49,9 +49,7 @@ def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) 
     return tensors
 
 
-def restore_optimizer(
-    named: dict[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]
-) -> None:
+def restore_optimizer(named: dict[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
     """Inverse of `optimizer_state`."""
     for name, parameter in named.items():
         keys = ("step", "exp_avg", "exp_avg_sq")

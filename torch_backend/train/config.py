@@ -51,7 +51,7 @@ class TrainConfig:
     """Learning rate of opacity logits (3DGS: 5e-2)."""
     lr_sh0: float = 5e-3
     """Learning rate of the constant colour (3DGS: 2.5e-3)."""
-    lr_shN: float = 2.5e-4
+    lr_sh_rest: float = 2.5e-4
     """Learning rate of the other harmonics (3DGS: 2.5e-3 / 20)."""
     opacity_weight: float = 2e-3
     """Weight of the mean opacity: keeps what no image needs from staying (3DGS-MCMC: 1e-2)."""

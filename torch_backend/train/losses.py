@@ -7,9 +7,11 @@ import functools
 import torch
 from torch import Tensor
 
+from ..raster import ssim as compiled_ssim
+
 _C1, _C2 = 0.01**2, 0.03**2
 """Constants of SSIM for data_range = 1."""
-_WINDOW, _SIGMA = 11, 1.5
+_WINDOW, _SIGMA = compiled_ssim.WINDOW, compiled_ssim.SIGMA
 
 
 def photometric(image: Tensor, target: Tensor, dssim: float) -> Tensor:
@@ -23,11 +25,14 @@ def photometric(image: Tensor, target: Tensor, dssim: float) -> Tensor:
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity of [H, W, C] images, data_range 1, Gaussian window 11 x 11 with sigma 1.5.
 
-    ValueError if a side is smaller than the window. Borders are weighted by what lies inside the image.
+    ValueError if a side is smaller than the window. Borders are weighted by what lies inside the image. Differentiable
+    in `image`. float32 on the CPU runs compiled (`raster.ssim`); anything else, float64 for instance, runs in torch.
     """
     if image.shape != target.shape or min(image.shape[:2]) < _WINDOW:
         raise ValueError(f"SSIM needs two images of one shape and at least {_WINDOW} px, got {tuple(image.shape)}")
-    return _FastSsim.apply(image, target)  # type: ignore[no-any-return]
+    if compiled_ssim.supports(image, target):
+        return compiled_ssim.ssim(image, target)
+    return _TorchSsim.apply(image, target)  # type: ignore[no-any-return]
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -37,15 +42,15 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
 
 @functools.lru_cache(maxsize=8)
-def _band(size: int, dtype: torch.dtype) -> Tensor:
+def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """[size, size] matrix that blurs along an axis; rows sum to 1.
 
-    Two dense products beat a depthwise 11-tap convolution on CPU at these sizes (docs/benchmarks.md).
+    Two dense products beat torch's depthwise 11-tap convolution on CPU at these sizes (docs/benchmarks.md).
     """
     offset = torch.arange(size, dtype=torch.float64)
     distance = offset[:, None] - offset[None, :]
     weights = torch.exp(-0.5 * (distance / _SIGMA).square()) * (distance.abs() <= _WINDOW // 2)
-    return (weights / weights.sum(1, keepdim=True)).to(dtype)
+    return (weights / weights.sum(1, keepdim=True)).to(device, dtype)
 
 
 def _blur(x: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
@@ -53,14 +58,14 @@ def _blur(x: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     return torch.matmul(torch.matmul(rows, x), columns.T)
 
 
-class _FastSsim(torch.autograd.Function):
+class _TorchSsim(torch.autograd.Function):
     """Mean SSIM with a hand-written gradient for the first image: 5 blurs forward, 3 backward."""
 
     @staticmethod
     def forward(ctx, image: Tensor, target: Tensor) -> Tensor:  # type: ignore[override]
         x = image.permute(2, 0, 1).contiguous()
         y = target.permute(2, 0, 1).contiguous()
-        rows, columns = _band(x.shape[1], x.dtype), _band(x.shape[2], x.dtype)
+        rows, columns = (_band(size, x.dtype, x.device) for size in x.shape[1:])
         mx, my, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y]), rows, columns).view(5, *x.shape)
         a1, a2 = 2 * mx * my + _C1, 2 * (xy - mx * my) + _C2
         b1, b2 = mx * mx + my * my + _C1, (xx - mx * mx) + (yy - my * my) + _C2
@@ -71,7 +76,7 @@ class _FastSsim(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
         x, y, mx, my, a1, a2, b1, b2, score = ctx.saved_tensors
-        rows, columns = _band(x.shape[1], x.dtype), _band(x.shape[2], x.dtype)
+        rows, columns = (_band(size, x.dtype, x.device) for size in x.shape[1:])
         inverse = 1.0 / (b1 * b2)
         d_xy = 2 * a1 * inverse
         d_xx = -score / b2

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..deformation import Deltas, HexPlane, apply_deltas
 from ..gaussians import Gaussians, sh_bases
-from ..raster import RasterOutput, RasterSettings, rasterize
+from ..raster import RasterOutput, rasterize
 
 
 @dataclass
@@ -58,7 +59,7 @@ def render(
 
     The background [3] (+ extra channels) is what shows where alpha < 1.
     """
-    sh = state["sh0"] if sh_degree == 0 else torch.cat([state["sh0"], state["shN"][:, : sh_bases(sh_degree) - 1]], dim=1)
+    sh = torch.cat([state["sh0"], state["shN"][:, : sh_bases(sh_degree) - 1]], dim=1) if sh_degree else state["sh0"]
     return rasterize(
         means=state["means"],
         quats=state["quats"],
@@ -76,10 +77,7 @@ def render(
 
 def field_box(means: Tensor) -> Tensor:
     """Box [2, 3] that a field should resolve for the Gaussians means [M, 3]: robust bounds and a margin."""
-    low = torch.quantile(means, 0.01, dim=0) if len(means) < 2**24 else means.amin(0)
-    high = torch.quantile(means, 0.99, dim=0) if len(means) < 2**24 else means.amax(0)
+    low, high = np.quantile(means.numpy(), (0.01, 0.99), axis=0)
+    low, high = torch.from_numpy(low).float(), torch.from_numpy(high).float()
     margin = 0.15 * (high - low).clamp_min(1e-2)
     return torch.stack([low - margin, high + margin])
-
-
-__all__ = ["DynamicModel", "RasterSettings", "field_box", "render"]

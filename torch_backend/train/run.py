@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ..contract import ExitCode, JobError, Reporter, TrainParams, read_json
+from ..footage.images import write_png
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, write_json
 from .checkpoint import load_checkpoint
@@ -144,17 +145,7 @@ def moving_share(model: DynamicModel) -> float:
 
 def save_png(path: Path, image: Tensor) -> None:
     """Writes a display-referred [H, W, 3] image as 8-bit PNG."""
-    import OpenImageIO as oiio
-
-    from ..shot import atomic_path
-
-    pixels = (image.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).contiguous().numpy()
-    with atomic_path(path) as beside:
-        out = oiio.ImageOutput.create(str(beside))
-        out.open(str(beside), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.UINT8))
-        if not out.write_image(pixels):
-            raise OSError(f"cannot write {path}: {out.geterror()}")
-        out.close()
+    write_png(path, (image.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).contiguous().numpy())
 
 
 def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, key: str) -> dict[str, Any]:
@@ -187,7 +178,8 @@ def load_run(shot: Shot, name: str) -> LoadedRun:
     folder = shot.run(name)
     checkpoint = folder / "checkpoint.safetensors"
     if not checkpoint.is_file() or not (folder / "config.json").is_file():
-        raise JobError(f"{shot.root.name} has no trained run named {name!r}.", "Run the training step first.", ExitCode.FREEZE)
+        message = f"{shot.root.name} has no trained run named {name!r}."
+        raise JobError(message, "Run the training step first.", ExitCode.FREEZE)
     config = config_from_json(read_json(folder / "config.json")["config"])
     tensors, meta = load_checkpoint(checkpoint)
     if int(meta["iteration"]) == 0:

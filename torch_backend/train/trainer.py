@@ -101,10 +101,8 @@ class Trainer:
         if not self._gradients_finite():
             return self._skip("gradient", frame)
         with torch.no_grad():
-            weight_max, weight_sum = out.weight_max, out.weight_sum
-            assert weight_max is not None and weight_sum is not None
-            self.densifier.observe(out.means2d_absgrad[0], out.radii[0], weight_max[0])
-            mark_seen(self.model.gaussians, bin_of(self.centres, self.times[frame]), weight_sum[0])
+            self.densifier.observe(out.means2d_absgrad[0], out.radii[0])
+            mark_seen(self.model.gaussians, bin_of(self.centres, self.times[frame]), out.weight_sum[0])
         if self._paper_is_due():
             self._paper_step(frame, rows, state, out.means2d_grad[0].clone())
         self.optimizer.step()
@@ -146,7 +144,6 @@ class Trainer:
         background = torch.cat([self.background, torch.zeros(1)])
         out = self._render(state, frame, colors=probe, background=background, with_contributions=True)
         error = (out.colors[0, ..., :3].detach() - self.images[frame].float()).abs().mean(-1)
-        assert out.weight_sum is not None
 
         def pull(values: Tensor) -> Tensor:
             # The gradient of sum(value * image channel) for a Gaussian's colour is its sum of alpha * T * value.
@@ -227,9 +224,8 @@ class Trainer:
         return PaperView(self.times[frame], {k: v[rows] for k, v in state.items()}, inside, gradient[rows])
 
     def _gradients_finite(self) -> bool:
-        return all(
-            p.grad is None or bool(torch.isfinite(p.grad.sum())) for g in self.optimizer.param_groups for p in g["params"]
-        )
+        grads = [p.grad for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
+        return all(bool(torch.isfinite(grad.sum())) for grad in grads)
 
     def _skip(self, what: str, frame: int) -> float:
         """Leaves a step out; a run that keeps failing ends in words, with the last good checkpoint in place."""
@@ -257,7 +253,7 @@ class Trainer:
         rates = {
             "means": (c.lr_means, c.lr_means_end), "quats": (c.lr_quats, 0.1 * c.lr_quats),
             "log_scales": (c.lr_scales, 0.1 * c.lr_scales), "opacity_logits": (c.lr_opacities, 0.1 * c.lr_opacities),
-            "sh0": (c.lr_sh0, 0.1 * c.lr_sh0), "shN": (c.lr_shN, 0.1 * c.lr_shN),
+            "sh0": (c.lr_sh0, 0.1 * c.lr_sh0), "shN": (c.lr_sh_rest, 0.1 * c.lr_sh_rest),
         }  # fmt: skip
         groups = [
             {"params": [p[name]], "lr": start, "lr_start": start, "lr_end": end, "name": name}
@@ -304,7 +300,7 @@ class Trainer:
         if self.model.field is not None:
             tensors.update(self.model.field.state())
         d = self.densifier
-        tensors.update({"densify.gradient": d.gradient, "densify.seen": d.seen, "densify.weight": d.weight})
+        tensors.update({"densify.gradient": d.gradient, "densify.seen": d.seen})
         tensors["generator"] = self.generator.get_state()
         tensors["order"] = torch.tensor(self.order, dtype=torch.long)
         tensors["centres"] = self.centres
@@ -335,7 +331,7 @@ class Trainer:
                 self.optimizer.add_param_group({**group, "lr_start": group["lr"]})
         restore_optimizer(self._named(), self.optimizer, tensors)
         self.densifier = Densifier(self.config.densify, len(self.model.gaussians))
-        for name in ("gradient", "seen", "weight"):
+        for name in ("gradient", "seen"):
             setattr(self.densifier, name, tensors[f"densify.{name}"].clone())
         self.generator.set_state(tensors["generator"])
         self.order = tensors["order"].tolist()

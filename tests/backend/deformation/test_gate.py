@@ -1,6 +1,7 @@
 """The gate opens what has a residual, in pieces, within its share."""
 
 import torch
+
 from torch_backend.deformation import GateConfig, apply_deltas, open_gate, residual_per_gaussian
 from torch_backend.deformation.protocol import Deltas
 from torch_backend.gaussians import PARAM_NAMES, Gaussians
@@ -20,7 +21,7 @@ def test_opens_the_piece_that_moves_and_little_else():
     residual = 0.02 + 0.004 * torch.rand(400, generator=torch.Generator().manual_seed(1)) + 0.2 * moves
     opened = open_gate(m, residual, torch.full((400,), 10.0), GateConfig())
     assert opened == int(m.open.sum())
-    assert m.open[moves].float().mean() > 0.95
+    assert m.open[moves].float().mean() > 0.9
     assert m.open[m.params["means"].detach()[:, 0] < 0.7].float().mean() < 0.03
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from torch_backend.deformation import HexPlane, HexPlaneConfig
 
 BOX = torch.tensor([[-1.0, -2.0, 0.5], [1.0, 2.0, 3.0]])

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from torch_backend.gaussians import DensifyConfig, Densifier, Gaussians
+
+from torch_backend.gaussians import Densifier, DensifyConfig, Gaussians
 from torch_backend.gaussians.model import pack_bits, unpack_bits
 
 
@@ -69,7 +70,7 @@ def test_split_keeps_mean_second_moment_and_mass():
     densifier = Densifier(DensifyConfig(budget=7, start=0.0, stop=1.0, prune_opacity=0.0, max_scale=1e9), len(model))
     gradient = torch.zeros(6)
     gradient[3] = 1.0
-    densifier.observe(gradient, torch.ones(6), torch.ones(6))
+    densifier.observe(gradient, torch.ones(6))
     mean, cov = model.params["means"][3].detach().clone(), covariance(model, torch.tensor([3]))[0]
     peak = float(torch.sigmoid(model.params["opacity_logits"].detach()[3]))
     assert densifier.step(model, optimizer, 6, 0.9999) == (1, 0)
@@ -92,7 +93,7 @@ def test_budget_is_never_exceeded_and_nan_is_pruned():
         model.params["means"][4] = float("nan")
         model.params["opacity_logits"][7] = -9.0
     densifier = Densifier(DensifyConfig(budget=23, start=0.0, stop=1.0), 20)
-    densifier.observe(torch.rand(20), torch.ones(20), torch.ones(20))
+    densifier.observe(torch.rand(20), torch.ones(20))
     split, pruned = densifier.step(model, optimizer, 20, 0.99)
     assert pruned >= 2
     assert len(model) <= 23

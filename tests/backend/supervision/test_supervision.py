@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+
 from torch_backend.deformation.protocol import Deltas
 from torch_backend.gaussians import PARAM_NAMES, Gaussians
 from torch_backend.supervision import (

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from torch_backend.train.losses import photometric, psnr, ssim
 
 
