@@ -28,6 +28,10 @@ class FrozenGaussians:
     """[N] in 0..1: how well each Gaussian is known at the instant."""
     motion: Tensor
     """[N] in 0..1: 1 for Gaussians that move in the clip."""
+    gain: Tensor
+    """[3] exposure of the instant: gain of display-referred colour."""
+    offset: Tensor
+    """[3] exposure of the instant: offset of display-referred colour."""
 
 
 @dataclass
@@ -67,7 +71,8 @@ def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "ne
     moving = torch.zeros(len(gaussians))
     moving[rows] = 1.0
     support = support_confidence(gaussians.support, moving > 0, model.centres, time, SUPPORT_SECONDS / seconds)
-    return FrozenGaussians({k: v.detach() for k, v in state.items()}, model.sh_degree, support, moving)
+    gain, offset = model.exposure.at(time)
+    return FrozenGaussians({k: v.detach() for k, v in state.items()}, model.sh_degree, support, moving, gain, offset)
 
 
 @torch.no_grad()
@@ -92,7 +97,8 @@ def render_frozen(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, width: in
     depth = out.depth_median
     if depth is None:
         raise RuntimeError("the rasteriser returned no depth")
-    return FrozenImage(out.colors[0, ..., :3].clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1])
+    color = out.colors[0, ..., :3] * frozen.gain + frozen.offset * alpha[..., None]
+    return FrozenImage(color.clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1])
 
 
 def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> int:

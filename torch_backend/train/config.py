@@ -11,6 +11,7 @@ from ..contract import TrainParams
 from ..deformation import GateConfig, HexPlaneConfig
 from ..gaussians import DensifyConfig, InitConfig
 from ..supervision import SupervisionConfig
+from .exposure import ExposureConfig
 
 
 @dataclass
@@ -73,6 +74,8 @@ class TrainConfig:
     """Which Gaussians move."""
     supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
     """Anchoring."""
+    exposure: ExposureConfig = field(default_factory=ExposureConfig)
+    """Brightness and tint that drift along the clip."""
 
 
 def _preview() -> TrainConfig:
@@ -140,7 +143,7 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     """Inverse of `config_to_json`; ValueError names an unknown field."""
     nested = {
         "init": InitConfig, "densify": DensifyConfig, "hexplane": HexPlaneConfig,
-        "gate": GateConfig, "supervision": SupervisionConfig,
+        "gate": GateConfig, "supervision": SupervisionConfig, "exposure": ExposureConfig,
     }  # fmt: skip
     values = dict(data)
     try:

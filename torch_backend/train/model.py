@@ -12,6 +12,7 @@ from torch import Tensor
 from ..deformation import Deltas, HexPlane, apply_deltas
 from ..gaussians import Gaussians, sh_bases
 from ..raster import RasterOutput, rasterize
+from .exposure import Exposure
 
 
 @dataclass
@@ -26,6 +27,8 @@ class DynamicModel:
     """[B] normalised times of the support bins."""
     sh_degree: int
     """SH degree in use."""
+    exposure: Exposure
+    """How the camera exposed each frame; the Gaussians' colours are those of no correction."""
 
     def open_rows(self) -> Tensor:
         """Rows of the Gaussians that the field moves, int64 [M]."""

@@ -18,6 +18,7 @@ from ..scene import Scene
 from ..supervision import PaperView, bin_of, bin_times, mark_seen, paper_loss, support_loss
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig
+from .exposure import Exposure
 from .losses import photometric, psnr
 from .model import DynamicModel, field_box, render
 
@@ -45,7 +46,7 @@ class Trainer:
         self.centres = bin_times(scene.times[train])
         config.hexplane.time_nodes = max(4, round(len(train) / 2))
         gaussians = initialise(scene, images, train, len(self.centres), config.init, self.generator)
-        self.model = DynamicModel(gaussians, None, self.centres, 0)
+        self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
         self.initial = len(gaussians)
         self.iteration = 0
         self.trained_seconds = 0.0
@@ -92,7 +93,8 @@ class Trainer:
         deltas = self.model.deltas(rows, torch.tensor([self.times[frame]]))
         state = apply_deltas(self.model.gaussians, rows, deltas)
         out = self._render(state, frame)
-        loss = photometric(out.colors[0], self.images[frame].float(), self.config.dssim)
+        exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
+        loss = photometric(exposed, self.images[frame].float(), self.config.dssim)
         total = loss + self._regularisers(rows)
         self.optimizer.zero_grad(set_to_none=True)
         if not bool(torch.isfinite(total)):
@@ -143,7 +145,8 @@ class Trainer:
         probe = torch.zeros(len(self.model.gaussians), 1, requires_grad=True)
         background = torch.cat([self.background, torch.zeros(1)])
         out = self._render(state, frame, colors=probe, background=background, with_contributions=True)
-        error = (out.colors[0, ..., :3].detach() - self.images[frame].float()).abs().mean(-1)
+        exposed = self.model.exposure.apply(out.colors[0, ..., :3], self.times[frame]).detach()
+        error = (exposed - self.images[frame].float()).abs().mean(-1)
 
         def pull(values: Tensor) -> Tensor:
             # The gradient of sum(value * image channel) for a Gaussian's colour is its sum of alpha * T * value.
@@ -183,7 +186,7 @@ class Trainer:
     def _regularisers(self, rows: Tensor) -> Tensor:
         c, p = self.config, self.model.gaussians.params
         total = c.opacity_weight * torch.sigmoid(p["opacity_logits"]).mean()
-        total = total + c.scale_weight * p["log_scales"].exp().mean()
+        total = total + c.scale_weight * p["log_scales"].exp().mean() + self.model.exposure.regularisation()
         field = self.model.field
         if field is None or not len(rows):
             return total
@@ -208,7 +211,8 @@ class Trainer:
             return
         other_state = self.model.state_at(self.times[other])
         out = self._render(other_state, other)
-        photometric(out.colors[0], self.images[other].float(), self.config.dssim).backward(retain_graph=True)
+        exposed = self.model.exposure.apply(out.colors[0], self.times[other])
+        photometric(exposed, self.images[other].float(), self.config.dssim).backward(retain_graph=True)
         views = [
             self._paper_view(self.model.state_at(self.times[frame]), frame, rows, gradient),
             self._paper_view(other_state, other, rows, out.means2d_grad[0]),
@@ -259,6 +263,10 @@ class Trainer:
             {"params": [p[name]], "lr": start, "lr_start": start, "lr_end": end, "name": name}
             for name, (start, end) in rates.items()
         ]
+        e = self.model.exposure
+        groups.append(
+            {"params": [e.values], "lr": c.exposure.lr, "lr_start": c.exposure.lr, "lr_end": 0.1 * c.exposure.lr}
+        )
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def _schedule(self) -> None:
@@ -277,7 +285,7 @@ class Trainer:
             state, self.model.sh_degree, self.scene.viewmats[index], self.Ks[index], self.width, self.height,
             background=self.background, with_depth=False, with_contributions=False,
         )  # fmt: skip
-        return out.colors[0]
+        return self.model.exposure.apply(out.colors[0], float(self.scene.times[index]))
 
     def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
         """Mean PSNR in dB over held-out frames at their own times; None if there are none."""
@@ -289,7 +297,7 @@ class Trainer:
     # ------------------------------------------------------------------ checkpoints
 
     def _named(self) -> dict[str, Tensor]:
-        named: dict[str, Tensor] = dict(self.model.gaussians.params)
+        named: dict[str, Tensor] = {**self.model.gaussians.params, "exposure": self.model.exposure.values}
         if self.model.field is not None:
             named.update({f"field.{n}": p for n, p in self.model.field.named_parameters()})
         return named
@@ -304,6 +312,7 @@ class Trainer:
         tensors["generator"] = self.generator.get_state()
         tensors["order"] = torch.tensor(self.order, dtype=torch.long)
         tensors["centres"] = self.centres
+        tensors["exposure"] = self.model.exposure.values
         meta = {
             "iteration": self.iteration,
             "initial": self.initial,
@@ -347,7 +356,9 @@ def restore_model(tensors: dict[str, Tensor], meta: dict[str, Any], config: Trai
     if "field.box" in tensors:
         field = HexPlane(config.hexplane, tensors["field.box"], torch.Generator().manual_seed(0))
         field.load_state(tensors)
-    return DynamicModel(gaussians, field, centres, int(meta["sh_degree"]))
+    exposure = Exposure(centres, config.exposure)
+    exposure.values.data.copy_(tensors["exposure"])
+    return DynamicModel(gaussians, field, centres, int(meta["sh_degree"]), exposure)
 
 
 def inside_frustum(means: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:

@@ -1,0 +1,62 @@
+"""Exposure that drifts along the clip: a gain and an offset per channel and trained frame, smooth in time.
+
+A camera on automatic changes by several percent within a second (measured on the bundled clip: docs/benchmarks.md).
+Left alone, the gate would open for it and the field would learn it as motion; so it is fitted from the first step on,
+long before the gate opens (design: hard-cases, "Exposure drift").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass
+class ExposureConfig:
+    """How freely the exposure may follow the clip."""
+
+    on: bool = True
+    """Fit it at all."""
+    lr: float = 2e-3
+    """Learning rate of log-gains and offsets."""
+    smooth: float = 0.05
+    """Weight of the squared difference between neighbouring frames."""
+    small: float = 0.01
+    """Weight of the squared values: without need, no correction."""
+
+
+class Exposure:
+    """image -> exp(log_gain) * image + offset, per channel, interpolated between the trained frames' times.
+
+    times: [B] ascending normalised times; values: [B, 2, 3] log-gains and offsets of display-referred colour.
+    """
+
+    def __init__(self, times: Tensor, config: ExposureConfig) -> None:
+        self.times, self.config = times, config
+        self.values = torch.nn.Parameter(torch.zeros(len(times), 2, 3))
+
+    def at(self, time: float) -> tuple[Tensor, Tensor]:
+        """(gain [3], offset [3]) at a normalised time; held constant beyond the ends."""
+        right = int(torch.searchsorted(self.times, torch.tensor(time)).clamp(0, len(self.times) - 1))
+        left = max(right - 1, 0)
+        span = float(self.times[right] - self.times[left])
+        share = min(max((time - float(self.times[left])) / span, 0.0), 1.0) if span > 0 else 0.0
+        log_gain, offset = torch.lerp(self.values[left], self.values[right], share)
+        return log_gain.exp(), offset
+
+    def apply(self, color: Tensor, time: float, alpha: Tensor | None = None) -> Tensor:
+        """Exposes display-referred colour [H, W, 3] as the camera did at `time`; with alpha [H, W], premultiplied."""
+        if not self.config.on:
+            return color
+        gain, offset = self.at(time)
+        return color * gain + (offset if alpha is None else offset * alpha[..., None])
+
+    def regularisation(self) -> Tensor:
+        """Smooth in time, and no larger than needed."""
+        steps = self.values[1:] - self.values[:-1]
+        return (
+            self.config.smooth * steps.square().sum() / len(self.times)
+            + self.config.small * self.values.square().mean()
+        )
