@@ -1,0 +1,82 @@
+"""Tiny real clips and a reporter that keeps what it is told."""
+
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from torch_backend.contract import Cancelled
+
+
+class Recorder:
+    """Keeps events; cancels once `cancel_after` checks have passed."""
+
+    def __init__(self, cancel_after=None):
+        self.warnings, self.steps, self.checks, self.cancel_after = [], [], 0, cancel_after
+
+    def progress(self, stage, done, total, message=""):
+        self.steps.append((stage, done, total))
+
+    def metric(self, stage, values):
+        pass
+
+    def image(self, label, path):
+        pass
+
+    def warning(self, message, hint=""):
+        self.warnings.append(message)
+
+    def check_cancelled(self):
+        self.checks += 1
+        if self.cancel_after is not None and self.checks > self.cancel_after:
+            raise Cancelled
+
+
+@pytest.fixture
+def recorder():
+    return Recorder
+
+
+@pytest.fixture
+def pan():
+    """pan(count, height, width, seed, speed): uint8 frames of a camera that pans over a random texture."""
+
+    def make(count, height=48, width=64, seed=0, speed=2):
+        rng = np.random.default_rng(seed)
+        wide = gaussian_filter(rng.random((height, width + count * speed + 8, 3)), (2.0, 2.0, 0))
+        wide = (wide - wide.min()) / (wide.max() - wide.min())
+        tint = rng.random(3) * 0.6 + 0.4
+        wide = np.rint(wide * tint * 255).astype(np.uint8)
+        return [np.ascontiguousarray(wide[:, i * speed : i * speed + width]) for i in range(count)]
+
+    return make
+
+
+@pytest.fixture
+def write_video():
+    """write_video(path, frames, ...): a lossless H.264 file in YCbCr 4:4:4."""
+
+    def write(path, frames, rate=24, rotation=None, aspect=None, milliseconds=None, codec="libx264", **context):
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream(codec, rate=rate)
+            stream.height, stream.width = frames[0].shape[:2]
+            stream.pix_fmt = context.pop("pix_fmt", "yuv444p")
+            if codec == "libx264":
+                stream.options = {"crf": "0", "preset": "ultrafast", **context}
+            if aspect:
+                stream.codec_context.sample_aspect_ratio = aspect
+            if rotation:
+                stream.set_display_rotation(rotation)
+            if milliseconds:
+                stream.codec_context.time_base = Fraction(1, 1000)
+            kind = "rgb48le" if frames[0].dtype == np.uint16 else "rgb24"
+            for i, pixels in enumerate(frames):
+                frame = av.VideoFrame.from_ndarray(pixels, kind)
+                if milliseconds:
+                    frame.pts, frame.time_base = milliseconds[i], Fraction(1, 1000)
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+
+    return write

@@ -1,0 +1,189 @@
+"""The import as a whole: the folder it leaves, what it refuses, and what an interruption leaves behind."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from torch_backend import shot as shot_module
+from torch_backend.contract import Cancelled, ExitCode, JobError
+from torch_backend.footage import FootageConfig, import_footage, load_frames
+from torch_backend.footage.images import read_png
+from torch_backend.shot import Shot
+
+
+@pytest.fixture
+def shot(tmp_path):
+    return Shot.create(tmp_path / "a.splannequin")
+
+
+@pytest.fixture
+def clip(tmp_path, pan, write_video):
+    write_video(tmp_path / "clip.mp4", pan(20), rate=10)
+    return str(tmp_path / "clip.mp4")
+
+
+def files(folder):
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+
+
+def test_every_frame_of_the_range_is_there_and_the_step_thins_only_the_solve(shot, clip, recorder):
+    result = import_footage(shot, clip, FootageConfig(first=3, last=18, step=2), recorder())
+    record = load_frames(shot)
+    assert [f["frame"] for f in record["frames"]] == list(range(3, 19))
+    assert [f["frame"] for f in record["frames"] if f["solve"]] == [3, 5, 7, 9, 11, 13, 15, 17, 18]
+    assert np.allclose([f["seconds"] for f in record["frames"]], np.arange(16) / 10)
+    assert all((shot.frames / f["file"]).is_file() for f in record["frames"])
+    assert read_png(shot.frames / "raw/000003.png").shape == (48, 64, 3)
+    assert (result["frames"], result["solved_frames"], result["step"]) == (16, 9, 2)
+    info = shot.info()
+    assert (info.first, info.last, info.step, info.fps, info.width, info.height) == (3, 18, 2, 10.0, 64, 48)
+    assert (info.source, info.colour) == (clip, "srgb")
+
+
+def test_frames_are_reduced_to_the_working_height(shot, clip, recorder):
+    import_footage(shot, clip, FootageConfig(working_height=24), recorder())
+    record = load_frames(shot)
+    assert (record["width"], record["height"]) == (32, 24)
+    assert read_png(shot.frames / "raw/000001.png").shape == (24, 32, 3)
+
+
+def test_frames_are_never_enlarged(shot, clip, recorder):
+    report = recorder()
+    import_footage(shot, clip, FootageConfig(working_height=96), report)
+    assert load_frames(shot)["height"] == 48
+    assert report.warnings == ["The clip is 48 pixels high: the working frames stay that high."]
+
+
+def test_a_second_import_of_the_same_does_nothing(shot, clip, recorder):
+    first = import_footage(shot, clip, FootageConfig(), recorder())
+    before = {p: p.stat().st_mtime_ns for p in shot.frames.rglob("*.png")}
+    assert import_footage(shot, clip, FootageConfig(), recorder()) == first
+    assert {p: p.stat().st_mtime_ns for p in shot.frames.rglob("*.png")} == before
+
+
+def test_another_import_replaces_frames_and_the_solve_made_from_them(shot, clip, recorder):
+    import_footage(shot, clip, FootageConfig(), recorder())
+    shot.solve.mkdir()
+    (shot.solve / "solve.json").write_text("{}")
+    shutil.copy(shot.frames / "raw/000001.png", shot.frames / "000001.png")
+    import_footage(shot, clip, FootageConfig(first=6, last=15), recorder())
+    expected = ["frames.json", *(f"raw/{n:06d}.png" for n in range(6, 16))]
+    assert files(shot.frames) == sorted(expected)
+    assert not shot.solve.exists()
+
+
+def test_a_lost_frame_is_imported_again(shot, clip, recorder):
+    import_footage(shot, clip, FootageConfig(), recorder())
+    (shot.frames / "raw/000007.png").unlink()
+    import_footage(shot, clip, FootageConfig(), recorder())
+    assert (shot.frames / "raw/000007.png").is_file()
+
+
+def test_a_cancelled_import_leaves_what_was_there(shot, clip, recorder):
+    import_footage(shot, clip, FootageConfig(), recorder())
+    before = files(shot.root)
+    with pytest.raises(Cancelled):
+        import_footage(shot, clip, FootageConfig(first=2), recorder(cancel_after=8))
+    assert files(shot.root) == before
+    assert load_frames(shot)["frames"][0]["frame"] == 1
+
+
+def test_progress_reaches_its_total(shot, clip, recorder):
+    report = recorder()
+    import_footage(shot, clip, FootageConfig(), report)
+    assert report.steps[-1] == ("import", 20, 20)
+
+
+def test_repeated_and_blank_frames_are_kept_but_not_solved(shot, tmp_path, pan, write_video, recorder):
+    frames = pan(20)
+    frames[5] = frames[4]
+    frames[10] = np.zeros_like(frames[0])
+    write_video(tmp_path / "b.mp4", frames)
+    report = recorder()
+    import_footage(shot, str(tmp_path / "b.mp4"), FootageConfig(step=1), report)
+    record = {f["frame"]: f for f in load_frames(shot)["frames"]}
+    assert len(record) == 20
+    assert (record[6]["flags"], record[11]["flags"]) == (["duplicate"], ["blank"])
+    assert [n for n, f in record.items() if not f["solve"]] == [6, 11]
+    assert len(report.warnings) == 2
+
+
+def test_changing_exposure_is_said(shot, tmp_path, pan, write_video, recorder):
+    frames = [np.rint(f * (1.0 if i < 10 else 0.55)).astype(np.uint8) for i, f in enumerate(pan(20))]
+    write_video(tmp_path / "b.mp4", frames)
+    report = recorder()
+    import_footage(shot, str(tmp_path / "b.mp4"), FootageConfig(), report)
+    assert any(w.startswith("The exposure changes by 1.") for w in report.warnings)
+
+
+def refused(shot, recorder, source, config=None):
+    before = files(shot.root)
+    with pytest.raises(JobError) as error:
+        import_footage(shot, str(source), config or FootageConfig(), recorder())
+    assert files(shot.root) == before
+    return error.value
+
+
+def test_a_hard_cut_is_refused_with_the_ranges_to_choose(shot, tmp_path, pan, write_video, recorder):
+    write_video(tmp_path / "b.mp4", pan(14, seed=1) + pan(10, seed=2))
+    error = refused(shot, recorder, tmp_path / "b.mp4")
+    assert error.message == "The clip has a hard cut at frame 15: a freeze needs one continuous take."
+    assert "1 to 14, 15 to 24" in error.hint and "--first 1 --last 14" in error.hint
+    assert error.exit_code == ExitCode.FOOTAGE
+    import_footage(shot, str(tmp_path / "b.mp4"), FootageConfig(first=15), recorder())
+
+
+def test_three_frames_are_refused(shot, tmp_path, pan, write_video, recorder):
+    write_video(tmp_path / "b.mp4", pan(3))
+    error = refused(shot, recorder, tmp_path / "b.mp4")
+    assert error.message == "The clip has only 3 frames: a freeze needs at least 8."
+    assert error.exit_code == ExitCode.FOOTAGE
+
+
+def test_a_still_is_refused(shot, tmp_path, pan, write_video, recorder):
+    write_video(tmp_path / "b.mp4", pan(1) * 20)
+    assert refused(shot, recorder, tmp_path / "b.mp4").message == (
+        "The picture does not change in 19 of 20 frames: the camera stands still."
+    )
+
+
+def test_a_range_outside_of_the_clip_is_refused(shot, clip, recorder):
+    error = refused(shot, recorder, clip, FootageConfig(first=30, last=60))
+    assert error.message == "Frames 30 to 60 lie outside of the clip, which has 1 to 20."
+
+
+def test_a_range_of_too_few_frames_is_refused(shot, clip, recorder):
+    assert "too few" in refused(shot, recorder, clip, FootageConfig(first=4, last=9)).message
+    assert "only 3 frames" in refused(shot, recorder, clip, FootageConfig(first=18)).message
+
+
+def test_a_step_that_leaves_too_few_is_refused(shot, clip, recorder):
+    error = refused(shot, recorder, clip, FootageConfig(step=10))
+    assert error.message == "A step of 10 leaves 3 frames to solve, at least 8 are needed."
+
+
+def test_negative_settings_name_their_values(shot, clip, recorder):
+    with pytest.raises(ValueError, match="-2"):
+        import_footage(shot, clip, FootageConfig(step=-2), recorder())
+
+
+def test_a_full_disk_is_told_before_the_work(shot, clip, recorder, monkeypatch):
+    usage = shutil.disk_usage(shot.root)._replace(free=1 << 20)
+    monkeypatch.setattr(shot_module.shutil, "disk_usage", lambda _: usage)
+    error = refused(shot, recorder, clip)
+    assert error.exit_code == ExitCode.DISK
+    assert error.message.startswith("No space left in")
+
+
+def test_a_shot_without_frames_says_to_import(shot):
+    with pytest.raises(JobError, match="has no frames yet"):
+        load_frames(shot)
+
+
+def test_frames_json_is_plain(shot, clip, recorder):
+    import_footage(shot, clip, FootageConfig(), recorder())
+    record = json.loads((shot.frames / "frames.json").read_text())
+    assert record["version"] == 1
+    assert set(record["frames"][0]) == {"frame", "seconds", "file", "solve", "sharpness", "exposure", "flags"}

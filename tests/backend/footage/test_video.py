@@ -1,0 +1,151 @@
+"""Videos: real files written by the tests, decoded to the pixels and times that went in."""
+
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+from torch_backend.contract import ExitCode, JobError
+from torch_backend.footage.sources import open_source
+
+
+def decoded(path, first=None, last=None):
+    source = open_source(str(path))
+    return source, list(source.frames(first, last))
+
+
+def close(a, b, steps=3):
+    return np.abs(a.astype(int) - b.astype(int)).mean() < steps
+
+
+def test_pixels_numbers_and_times(tmp_path, pan, write_video):
+    frames = pan(12)
+    write_video(tmp_path / "a.mp4", frames, rate=25)
+    source, got = decoded(tmp_path / "a.mp4")
+    assert [f.number for f in got] == list(range(1, 13))
+    assert np.allclose([f.seconds for f in got], np.arange(12) / 25)
+    assert (source.info.width, source.info.height, source.info.fps, source.info.last) == (64, 48, 25.0, 12)
+    assert all(close(f.pixels, frame, 2) for f, frame in zip(got, frames))
+
+
+def test_a_range_keeps_the_clips_numbers(tmp_path, pan, write_video):
+    frames = pan(12)
+    write_video(tmp_path / "a.mp4", frames)
+    _, got = decoded(tmp_path / "a.mp4", 4, 6)
+    assert [f.number for f in got] == [4, 5, 6]
+    assert close(got[0].pixels, frames[3], 2)
+
+
+def test_variable_rate_has_real_timestamps(tmp_path, pan, write_video):
+    at = [0, 40, 100, 140, 300, 340, 400, 460, 500, 900]
+    write_video(tmp_path / "a.mp4", pan(10), milliseconds=at)
+    _, got = decoded(tmp_path / "a.mp4")
+    assert np.allclose([f.seconds for f in got], np.array(at) / 1000)
+
+
+@pytest.mark.parametrize(("degrees", "turns"), [(90, 1), (-90, 3), (180, 2)])
+def test_rotation_metadata_is_applied(tmp_path, pan, write_video, degrees, turns):
+    frames = pan(8)
+    write_video(tmp_path / "a.mp4", frames, rotation=degrees)
+    source, got = decoded(tmp_path / "a.mp4")
+    upright = np.rot90(frames[0], turns)  # display matrices turn counterclockwise, as does rot90
+    assert (source.info.height, source.info.width) == upright.shape[:2]
+    assert close(got[0].pixels, upright, 2)
+
+
+def test_anamorphic_pixels_become_square(tmp_path, pan, write_video):
+    write_video(tmp_path / "a.mp4", pan(8), aspect=Fraction(2, 1))
+    source, got = decoded(tmp_path / "a.mp4")
+    assert (source.info.width, source.info.height) == (128, 48)
+    assert got[0].pixels.shape == (48, 128, 3)
+
+
+def test_odd_sizes(tmp_path, pan, write_video):
+    frames = pan(8, height=47, width=63)
+    write_video(tmp_path / "a.mp4", frames)
+    _, got = decoded(tmp_path / "a.mp4")
+    assert got[0].pixels.shape == (47, 63, 3)
+    assert close(got[0].pixels, frames[0], 2)
+
+
+def test_ten_bit_video_keeps_its_depth(tmp_path, write_video):
+    ramp = np.linspace(8000, 56000, 64).astype(np.uint16)
+    frames = [np.tile(np.roll(ramp, i)[None, :, None], (48, 1, 3)) for i in range(8)]
+    write_video(tmp_path / "a.mkv", frames, codec="ffv1", pix_fmt="yuv444p10le")
+    source, got = decoded(tmp_path / "a.mkv")
+    assert source.info.deep
+    assert got[0].pixels.dtype == np.uint16
+    # 10 bits: one step is 64 of 65535; 8 bits would err by up to 128.
+    assert np.abs(got[0].pixels.astype(int) - frames[0].astype(int)).mean() < 64
+
+
+@pytest.mark.parametrize(("matrix", "tag"), [("bt709", 1), ("smpte170m", 6)])
+def test_the_tagged_colour_matrix_is_used(tmp_path, matrix, tag):
+    colour = np.array([200, 40, 90])
+    kr, kb = {1: (0.2126, 0.0722), 6: (0.299, 0.114)}[tag]
+    y = colour @ [kr, 1 - kr - kb, kb]
+    cb, cr = (colour[2] - y) / (2 * (1 - kb)), (colour[0] - y) / (2 * (1 - kr))
+    planes = [16 + y * 219 / 255, 128 + cb * 224 / 255, 128 + cr * 224 / 255]
+    raw = np.stack([np.full((48, 64), round(p), np.uint8) for p in planes])
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
+        stream.options = {"crf": "0", "colormatrix": matrix}
+        stream.codec_context.colorspace = tag
+        for _ in range(8):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(raw, "yuv444p", channel_last=False)))
+        container.mux(stream.encode())
+    _, got = decoded(tmp_path / "a.mp4")
+    assert np.abs(got[0].pixels[24, 32].astype(int) - colour).max() <= 3
+
+
+def test_damaged_packets_are_skipped_with_a_warning_and_keep_their_numbers(tmp_path, pan, write_video):
+    write_video(tmp_path / "a.mkv", pan(12), codec="mjpeg", pix_fmt="yuvj444p")
+    damaged = tmp_path / "b.mkv"
+    with av.open(str(tmp_path / "a.mkv")) as source, av.open(str(damaged), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for i, packet in enumerate(p for p in source.demux(video=0) if p.size):
+            if i == 5:
+                broken = av.Packet(b"\x00" * 200)
+                broken.pts, broken.dts, broken.time_base = packet.pts, packet.dts, packet.time_base
+                packet = broken
+            packet.stream = stream
+            target.mux(packet)
+    source, got = decoded(damaged)
+    assert [f.number for f in got] == [1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]
+    assert source.warnings[0][0] == "Frame 6 could not be decoded and is left out."
+
+
+def test_a_file_that_breaks_off_gives_what_it_has(tmp_path, pan, write_video):
+    write_video(tmp_path / "a.mkv", pan(24), codec="ffv1", pix_fmt="yuv444p")
+    whole = (tmp_path / "a.mkv").read_bytes()
+    (tmp_path / "b.mkv").write_bytes(whole[: len(whole) * 2 // 3])
+    _, got = decoded(tmp_path / "b.mkv")
+    assert 8 <= len(got) < 24
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "noise.mp4", "empty.mov", "list.m3u8"])
+def test_what_is_no_video_is_refused_in_one_sentence(tmp_path, name):
+    content = {
+        "notes.txt": b"hello world\n" * 50,
+        "noise.mp4": bytes(range(256)) * 20,
+        "empty.mov": b"",
+        "list.m3u8": b"#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1:9/a.ts\n#EXT-X-ENDLIST\n",
+    }
+    (tmp_path / name).write_bytes(content[name])
+    with pytest.raises(JobError) as error:
+        open_source(str(tmp_path / name))
+    assert error.value.message == f"{name} is not a video that can be read."
+    assert error.value.exit_code == ExitCode.FOOTAGE
+    assert error.value.hint
+
+
+def test_sound_alone_is_no_video(tmp_path):
+    with av.open(str(tmp_path / "a.wav"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+    with pytest.raises(JobError, match="not a video"):
+        open_source(str(tmp_path / "a.wav"))
