@@ -559,6 +559,31 @@ def run_child(command: Sequence[str], cwd: Path | None = None, **environ: str) -
         raise
 
 
+BLENDERS_OWN = re.compile(
+    r"\d\d:\d\d\.\d+ |Info: |Fra:|Saved: |Blender \d|Read blend: | ?Time: |\s*$|.*RuntimeWarning: |    "
+)
+"""Lines of Blender's that are no news to an artist; they go to the log."""
+
+
+def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
+    """`run_child` for Blender: all that it prints goes to `log`, what the add-on says also to the screen."""
+    child = start_child(command, child_environ(**environ), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        with open(log, "w", encoding="utf-8") as stream:
+            for raw in child.stdout or ():
+                line = raw.decode("utf-8", "replace").rstrip()
+                stream.write(line + "\n")
+                if line.startswith("Error: "):
+                    print(line, file=sys.stderr, flush=True)
+                elif not BLENDERS_OWN.match(line):
+                    say(line)
+        return child.wait()
+    except KeyboardInterrupt:
+        say("\nCancelling; Ctrl-C again stops at once.")
+        stop_child(child)
+        raise
+
+
 # ------------------------------------------------------------------------------------------------------ summary
 
 
@@ -597,7 +622,7 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     baking = time.monotonic()
     take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output)]
     bake = blender.running(ROOT / "splannequin_addon" / "run_in_bpy.py", "bake", *take)
-    code = run_child(bake, SPLANNEQUIN_BACKEND_PYTHON=backend.python)
+    code = run_blender(bake, output / "blender.log", SPLANNEQUIN_BACKEND_PYTHON=backend.python)
     if code:
         return code
     summary = read_summary(output)

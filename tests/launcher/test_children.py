@@ -94,3 +94,19 @@ def test_a_child_that_ignores_ctrl_c_is_ended_with_its_own_children(tmp_path: Pa
             return
         time.sleep(0.05)
     raise AssertionError("the grandchild lives on")
+
+
+def test_blenders_own_lines_go_to_the_log_alone(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    lines = [
+        "00:01.3  render | Saved: 'x.png'",
+        "  baking  4%",
+        "Info: Saved as x",
+        "Fra:1 Mem:2M",
+        "Error: no. Do so.",
+    ]
+    code = splannequin.run_blender([sys.executable, "-c", f"print({chr(10).join(lines)!r})"], tmp_path / "blender.log")
+    out, err = capfd.readouterr()
+    assert code == 0
+    assert out.splitlines() == ["  baking  4%"]
+    assert err.splitlines() == ["Error: no. Do so."]
+    assert (tmp_path / "blender.log").read_text().splitlines() == lines
