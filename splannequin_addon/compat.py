@@ -14,6 +14,9 @@ import bpy
 HAS_COMPOSITING_GROUP = bpy.app.version >= (5, 0, 0)
 """True where the compositor is a node group of the scene (5.0 on)."""
 
+PATH_OPTIONS: set[str] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+"""Options of a path property that may hold a path relative to the .blend (`//`); said aloud since 4.5."""
+
 
 def compositor_tree(scene: Any) -> Any | None:
     """The scene's compositor tree, or None if it has none."""

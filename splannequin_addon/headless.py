@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import os
 import signal
 import sys
 import time
@@ -238,19 +237,23 @@ def _bake(scene: Any, fresh: bool, shot: Path, take: str, output: Path, console:
 
 def _save(scene: Any, blend: Path, frames: Path) -> None:
     """Saves the file with paths relative to it, so that its folder can be moved and rendered elsewhere."""
-    scene.splannequin.shot_path = os.path.abspath(bpy.path.abspath(scene.splannequin.shot_path))
+    files = bpy.context.preferences.filepaths
+    backups = files.save_version
     try:
         # The first save gives the file its place; what is relative to it is only known then.
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
+        files.save_version = 0
         scene = bpy.context.scene
         compositor.relative_images()
         scene.render.filepath = compositor.blend_path(frames / bake.DIGITS)
-        scene.splannequin.shot_path = compositor.blend_path(Path(scene.splannequin.shot_path))
+        scene.splannequin.shot_path = compositor.blend_path(Path(bpy.path.abspath(scene.splannequin.shot_path)))
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
     except RuntimeError as error:
         raise contract.JobError(
             f"{blend} could not be saved: {str(error).strip()}", "Is the disk full?", ExitCode.BAKE
         ) from error
+    finally:
+        files.save_version = backups
 
 
 def _import_params(args: argparse.Namespace) -> contract.ImportParams:

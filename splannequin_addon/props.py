@@ -5,6 +5,8 @@ from __future__ import annotations
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
+from . import compat
+
 PRESETS = [
     ("preview", "Preview", "Small and quick: to see whether the shot holds, minutes on a laptop"),
     ("standard", "Standard", "For most shots"),
@@ -19,13 +21,13 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
         name="Clip",
         description="Video file, or one image of a numbered sequence, of people holding still",
         subtype="FILE_PATH",
-        options=set(),
+        options=compat.PATH_OPTIONS,
     )
     shot_path: StringProperty(
         name="Shot Folder",
         description="Folder that keeps everything of this shot; empty: made beside the clip",
         subtype="DIR_PATH",
-        options=set(),
+        options=compat.PATH_OPTIONS,
     )
     use_range: BoolProperty(
         name="Only a Range", description="Import a part of the clip instead of all of it", default=False, options=set()

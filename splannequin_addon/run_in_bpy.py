@@ -50,7 +50,11 @@ def main() -> int:
     package = load_package()
     package.register()
     headless = importlib.import_module(PACKAGE + ".splannequin_addon.headless")
-    return headless.main(arguments)
+    try:
+        return headless.main(arguments)
+    finally:
+        # bpy 4.x as a module frees what is registered after Python has ended, and crashes over panels.
+        package.unregister()
 
 
 if __name__ == "__main__":
