@@ -76,11 +76,11 @@ def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: 
     """Splat N Gaussians into C pinhole views.
 
     means [N, 3] world; quats [N, 4] wxyz of any non-zero norm; log_scales [N, 3] natural logs of world units;
-    opacity_logits [N]; colors [N, D] any channels, and/or sh [N, K, 3], K = (degree + 1)^2 with degree 0 to 3: colour =
-    harmonics at the direction from camera to mean + 0.5, floored at 0 (gradient passes the floor when it would raise the
-    colour), no ceiling. With both, the output has the 3 channels of `sh` first, then those of `colors`. `sh_degree` uses
-    the first bands only. viewmats [C, 4, 4] world to camera, OpenCV axes; Ks [C, 3, 3] px, pixel centres at +0.5, no
-    skew; background [D] or None for black.
+    opacity_logits [N]; colors [N, D] any channels, and/or sh [N, K, 3], K = (degree + 1)^2 with degree 0 to 3: colour
+    = harmonics at the direction from camera to mean + 0.5, floored at 0 (a gradient passes the floor when it would
+    raise the colour), no ceiling. With both, the output has the 3 channels of `sh` first, then those of `colors`.
+    `sh_degree` uses the first bands only. viewmats [C, 4, 4] world to camera, OpenCV axes; Ks [C, 3, 3] px, pixel
+    centres at +0.5, no skew; background [D] or None for black.
 
     Returns a RasterOutput; its attributes give shapes and units. Gradients flow from colors, alphas and depth_expected
     to means, quats, log_scales, opacity_logits, colors, sh, viewmats and background. `constants.py` states the rules of
@@ -90,21 +90,26 @@ def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: 
     the device of `means`. Raises ValueError for arguments that do not fit, NotImplementedError for a device without a
     body.
 
-    Source: Kerbl et al. 2023, "3D Gaussian Splatting"; Zwicker et al. 2001, "EWA Volume Splatting"; opacity compensation:
-    Yu et al. 2024, "Mip-Splatting"; |gradient|: Ye et al. 2024, "AbsGS".
+    Source: Kerbl et al. 2023, "3D Gaussian Splatting"; Zwicker et al. 2001, "EWA Volume Splatting"; opacity
+    compensation: Yu et al. 2024, "Mip-Splatting"; |gradient|: Ye et al. 2024, "AbsGS".
     """
     _check_camera(viewmats, Ks, width, height)
     degree = _sh_degree(sh, sh_degree)
     body = _body(backend, means)
     dtype = means.dtype if body == "reference" else torch.float32
 
-    def ready(value: Tensor | None) -> Tensor | None:
-        return None if value is None else value.to(device=means.device, dtype=dtype).contiguous()
+    def ready(value: Tensor) -> Tensor:
+        return value.to(device=means.device, dtype=dtype).contiguous()
 
-    tensors = [ready(v) for v in (means, quats, log_scales, opacity_logits, colors, sh, viewmats, background)]
-    scene = Scene(*tensors[:7], Ks.detach().to("cpu", torch.float64), tensors[7], width, height, degree,  # type: ignore[arg-type]
-                  settings or RasterSettings(), with_depth, with_contributions)
+    scene = Scene(
+        means=ready(means), quats=ready(quats), log_scales=ready(log_scales), opacity_logits=ready(opacity_logits),
+        colors=None if colors is None else ready(colors), sh=None if sh is None else ready(sh),
+        viewmats=ready(viewmats), Ks=Ks.detach().to("cpu", torch.float64),
+        background=None if background is None else ready(background), width=width, height=height, sh_degree=degree,
+        settings=settings or RasterSettings(), with_depth=with_depth, with_contributions=with_contributions)
     _check_gaussians(scene)
+    if not scene.settings.near > 0:
+        raise ValueError(f"settings.near must be positive, not {scene.settings.near}")
     if scene.settings.threads < 1:
         raise ValueError(f"settings.threads must be at least 1, not {scene.settings.threads}")
     if body == "reference":

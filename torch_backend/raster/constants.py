@@ -1,7 +1,7 @@
 """The rules that every rasteriser body obeys, stated once.
 
 Culling (per Gaussian and camera); every test is phrased so that NaN fails it:
-  finite parameters; ``log_scales <= LOG_SCALE_MAX``; squared quaternion norm > ``QUAT_NORM2_MIN``; camera depth > near;
+  finite parameters; ``log_scales <= LOG_SCALE_MAX``; largest quaternion component > ``QUAT_MIN``; camera depth > near;
   trace of the projected covariance < ``VARIANCE_MAX``; effective opacity > ``ALPHA_MIN``; the box of the ellipse
   ``alpha >= ALPHA_MIN`` holds the centre of at least one pixel of the image's rectangle.
 Blending (per pixel, front to back by camera depth, ties by index):
@@ -23,8 +23,8 @@ LOW_PASS = 0.3
 """Variance in px^2 added to both diagonal entries of every projected covariance."""
 FRUSTUM_MARGIN = 0.3
 """Widening of the frustum for the Jacobian's clamp, as a share of tan(fov / 2): 1.3 in all when centred."""
-QUAT_NORM2_MIN = 1e-12
-"""Quaternions whose squared norm is not above this are culled."""
+QUAT_MIN = 1e-6
+"""Quaternions whose largest component is not above this in magnitude are culled."""
 LOG_SCALE_MIN = -30.0
 """Log-scales are clamped here from below; exp(-30) is no extent at all."""
 LOG_SCALE_MAX = 30.0

@@ -184,8 +184,8 @@ def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) ->
     _workers(stages, block, source.PROJECT, threads)
     stages(address, source.SORT, 0)
     if block.hits > _HITS_MAX:
-        raise RuntimeError(f"{block.visible} Gaussians cover {block.hits} tiles of a {block.width}x{block.height} image, "
-                           f"more than the {_HITS_MAX} that fit; their scales are far too large")
+        raise RuntimeError(f"{block.visible} Gaussians cover {block.hits} tiles of a {block.width}x{block.height} "
+                           f"image, more than the {_HITS_MAX} that fit; their scales are far too large")
     workspace.need("hit_slot", block.hits)
     workspace.need("hit_place", block.hits)
     if block.want_weights:
@@ -223,7 +223,8 @@ class _Rasterize(torch.autograd.Function):
                    weight_sum=weights[0, c], weight_max=weights[1, c])
             _forward_camera(lease.workspace, scene, channels)
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, behind)
+            ctx.save_for_backward(means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha,
+                                  behind)
             ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
         ctx.mark_non_differentiable(median, radii, means2d, weights)
         ctx.set_materialize_grads(False)
@@ -249,8 +250,9 @@ class _Rasterize(torch.autograd.Function):
             workspace.need("hit_grad", block.hits * block.grad_stride)
             partial = torch.zeros(max(1, block.chunks), 12)
             _point(block, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh,
-                   background=behind, image=image[c], alpha=alpha[c], grad_image=grad_image[c], grad_alpha=grad_alpha[c],
-                   grad_view=partial, grad_norm=ctx.norms[0][c], grad_abs=ctx.norms[1][c], **out)
+                   background=behind, image=image[c], alpha=alpha[c], grad_image=grad_image[c],
+                   grad_alpha=grad_alpha[c], grad_view=partial, grad_norm=ctx.norms[0][c], grad_abs=ctx.norms[1][c],
+                   **out)
             _workers(blend, block, source.BLEND_BACKWARD, scene.settings.threads)
             _workers(stages, block, source.PROJECT_BACKWARD, scene.settings.threads)
             grad_view[c, :3] = partial.double().sum(0).reshape(3, 4).float()

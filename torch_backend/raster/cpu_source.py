@@ -24,7 +24,8 @@ CHUNK = 1024
 HEAD = 8
 """Floats of a record before its channels."""
 MOMENTS = 8
-"""Floats of a hit's gradient before its channels: v, v dx, v dy, v dx^2, v dx dy, v dy^2, |v_x|, |v_y|."""
+"""Floats of a hit's gradient before its channels: sums of v, v e, v dy, v e^2, v e dy, v dy^2 with e = dx - k dy and
+v = d loss / d log alpha, then of |d loss / d mean x|, |d loss / d mean y|."""
 
 _F, _I, _P = ctypes.c_float, ctypes.c_int64, ctypes.c_uint64
 _FIELDS: list[tuple[str, type, str]] = [
@@ -123,8 +124,10 @@ F px = V[0] * X + V[1] * Y + V[2] * Z + V[3], py = V[4] * X + V[5] * Y + V[6] * 
 F iz = 1.f / pz, xn = px * iz, yn = py * iz;
 F u = vmin(vmax(xn, (F)P.x_low), (F)P.x_high), v = vmin(vmax(yn, (F)P.y_low), (F)P.y_high);
 F mx = P.fx * xn + P.cx, my = P.fy * yn + P.cy;
-F q2 = qw * qw + qx * qx + qy * qy + qz * qz, iq = 1.f / vsqrt(q2);
-F w = qw * iq, x = qx * iq, y = qy * iq, z = qz * iq;
+// Largest component first, so that the squares neither vanish nor overflow.
+F qmax = vmax(vmax(vabs(qw), vabs(qx)), vmax(vabs(qy), vabs(qz))), iq = 1.f / qmax;
+F w = qw * iq, x = qx * iq, y = qy * iq, z = qz * iq, unit = 1.f / vsqrt(w * w + x * x + y * y + z * z);
+w *= unit; x *= unit; y *= unit; z *= unit; iq *= unit;
 F Q[9] = {1.f - 2.f * (y * y + z * z), 2.f * (x * y - w * z), 2.f * (x * z + w * y),
           2.f * (x * y + w * z), 1.f - 2.f * (x * x + z * z), 2.f * (y * z - w * x),
           2.f * (x * z - w * y), 2.f * (y * z + w * x), 1.f - 2.f * (x * x + y * y)};
@@ -178,10 +181,12 @@ auto harmonics = FN(F x, F y, F z, F* Y, F (*dY)[16]) -> void {
     if (dY) {
         dY[0][9] = C3[0] * 6.f * x * y; dY[1][9] = C3[0] * 3.f * (xx - yy);
         dY[0][10] = C3[1] * y * z; dY[1][10] = C3[1] * x * z; dY[2][10] = C3[1] * x * y;
-        dY[0][11] = C3[2] * -2.f * x * y; dY[1][11] = C3[2] * (4.f * zz - xx - 3.f * yy); dY[2][11] = C3[2] * 8.f * y * z;
+        dY[0][11] = C3[2] * -2.f * x * y; dY[1][11] = C3[2] * (4.f * zz - xx - 3.f * yy);
+        dY[2][11] = C3[2] * 8.f * y * z;
         dY[0][12] = C3[3] * -6.f * x * z; dY[1][12] = C3[3] * -6.f * y * z;
         dY[2][12] = C3[3] * (6.f * zz - 3.f * xx - 3.f * yy);
-        dY[0][13] = C3[4] * (4.f * zz - 3.f * xx - yy); dY[1][13] = C3[4] * -2.f * x * y; dY[2][13] = C3[4] * 8.f * x * z;
+        dY[0][13] = C3[4] * (4.f * zz - 3.f * xx - yy); dY[1][13] = C3[4] * -2.f * x * y;
+        dY[2][13] = C3[4] * 8.f * x * z;
         dY[0][14] = C3[5] * 2.f * x * z; dY[1][14] = C3[5] * -2.f * y * z; dY[2][14] = C3[5] * (xx - yy);
         dY[0][15] = C3[6] * 3.f * (xx - yy); dY[1][15] = C3[6] * -6.f * x * y; } };
 float shv[48][16];
@@ -237,7 +242,7 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
         if (P.antialiased) lop += 0.5f * log2v(vmax(dr / det, (F)@COMPENSATION2_MIN@f));
         F level = vmax(lop - PMIN, (F)0.f) * (2.f * LN2);
         F hx = vsqrt(level * xx), hy = vsqrt(level * yy);
-        ok &= (q2 > (F)@QUAT_NORM2_MIN@f) & (level > 0.f) & (xx + yy < @VARIANCE_MAX@f);
+        ok &= (qmax > (F)@QUAT_MIN@f) & (level > 0.f) & (xx + yy < @VARIANCE_MAX@f);
         ok &= (mx + hx >= 0.5f) & (mx - hx <= (float)P.width - 0.5f);
         ok &= (my + hy >= 0.5f) & (my - hy <= (float)P.height - 0.5f);
         if (!any(ok)) continue;
@@ -340,7 +345,8 @@ _STAGE_PREFIX = r"""
 int at = 0; long long tiles = P.tiles_x * P.tiles_y;
 for (long long t = 0; t < tiles; t++) {
     P.tile_start[t] = at;
-    for (long long w = 0; w < P.workers; w++) { int c = P.histogram[w * tiles + t]; P.histogram[w * tiles + t] = at; at += c; }
+    for (long long w = 0; w < P.workers; w++) {
+        int c = P.histogram[w * tiles + t]; P.histogram[w * tiles + t] = at; at += c; }
 }
 P.tile_start[tiles] = at;
 """
@@ -395,24 +401,25 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
         F r0 = load(gather[7]), r1 = load(gather[8]), r2 = load(gather[9]), logit = load(gather[10]);
         F l0 = vmax(r0, (F)@LOG_SCALE_MIN@f), l1 = vmax(r1, (F)@LOG_SCALE_MIN@f), l2 = vmax(r2, (F)@LOG_SCALE_MIN@f);
 """ + _PROJECT + r"""
-        F m0 = load(g[0]), sx = load(g[1]), sy = load(g[2]), sxx = load(g[3]), sxy = load(g[4]), syy = load(g[5]);
-        F id_ = 1.f / det, qa = yy * id_, qb = -xy * id_, qc = xx * id_;
-        F gmx = qa * sx + qb * sy, gmy = qb * sx + qc * sy;
-        // d loss / d covariance = Q S Q / 2, with S the second moments.
-        F t00 = qa * sxx + qb * sxy, t01 = qa * sxy + qb * syy, t10 = qb * sxx + qc * sxy, t11 = qb * sxy + qc * syy;
-        F gxx = 0.5f * (t00 * qa + t01 * qb), gxy = 0.5f * (t00 * qb + t01 * qc), gyy = 0.5f * (t10 * qb + t11 * qc);
+        F m0 = load(g[0]);
+        // log alpha = log opacity - (e^2 / xc + dy^2 / yy) / 2 with e = dx - k dy, k = xy / yy, xc = det / yy: gradients
+        // by way of xc, yy and k lose no digits on long thin Gaussians, those by way of the conic do.
+        F kk = xy / yy, ic = yy / det, iy = 1.f / yy;
+        F gmx = load(g[1]) * ic, gmy = load(g[2]) * iy - kk * gmx;
+        F g2c = load(g[3]) * ic * ic, gk = load(g[4]) * ic * iy, g2y = load(g[5]) * iy * iy;
         F ga0[3] = {}, ga1[3] = {};
         if (P.antialiased) {
-            I free = dr * id_ > (F)@COMPENSATION2_MIN@f;
+            I free = dr > @COMPENSATION2_MIN@f * det;
             F h = free ? m0 : (F)0.f, over = free ? h / dr : (F)0.f;
-            gxx -= 0.5f * h * qa; gxy -= 0.5f * h * qb; gyy -= 0.5f * h * qc;
+            g2c -= h * ic; g2y -= h * iy;
             F e0 = over * n0, e1 = over * n1, e2 = over * n2;
             ga0[0] = B1[1] * e2 - B1[2] * e1; ga0[1] = B1[2] * e0 - B1[0] * e2; ga0[2] = B1[0] * e1 - B1[1] * e0;
             ga1[0] = e1 * B0[2] - e2 * B0[1]; ga1[1] = e2 * B0[0] - e0 * B0[2]; ga1[2] = e0 * B0[1] - e1 * B0[0];
         }
         F gT0[3] = {}, gT1[3] = {}, gQ[9], gs[3];
         for (int j = 0; j < 3; j++) {
-            F gB0 = 2.f * (gxx * B0[j] + gxy * B1[j]) + ga0[j], gB1 = 2.f * (gxy * B0[j] + gyy * B1[j]) + ga1[j];
+            F across = B0[j] - kk * B1[j], gB0 = g2c * across + gk * B1[j], gB1 = g2y * B1[j] + gk * across - kk * gB0;
+            gB0 += ga0[j]; gB1 += ga1[j];
             F total = (F)0.f;
             for (int i = 0; i < 3; i++) {
                 F gM = T0[i] * gB0 + T1[i] * gB1, M = Q[3 * i + j] * s[j];
@@ -480,7 +487,8 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
             for (int c = 0; c < 3; c++) P.grad_log_scales[3 * i + c] += flat[7 + c][l];
             P.grad_logits[i] += flat[10][l];
             P.grad_norm[i] = flat[11][l]; P.grad_abs[i] = flat[12][l];
-            if (P.n_sh) { float* to = P.grad_sh + i * P.sh_stride; for (int c = 0; c < bands * 3; c++) to[c] += shv[c][l]; }
+            float* to = P.grad_sh + i * P.sh_stride;
+            if (P.n_sh) for (int c = 0; c < bands * 3; c++) to[c] += shv[c][l];
             for (int c = 0; c < P.n_colors; c++) P.grad_colors[i * P.n_colors + c] += g[@MOMENTS@ + P.n_sh + c][l];
         }
         I use = load(live) > 0.f;
@@ -600,29 +608,28 @@ for (long long tile; (tile = take()) < tiles;) {
     }
     for (long long h = start; h < stop; h++) {
 """ + _HIT + r"""
-        F v0 = (F)0.f, v1 = (F)0.f, v2 = (F)0.f, ax = (F)0.f, ay = (F)0.f, gc[NCH];
+        F out[(@MOMENTS@ + NCH + 15) / 16 * 16];
+        F s0 = (F)0.f, s1 = s0, s2 = s0, s3 = s0, s4 = s0, s5 = s0, ax = s0, ay = s0, gc[NCH];
         for (int c = 0; c < NCH; c++) gc[c] = (F)0.f;
         float qa = -2.f * LN2 * A, qc = -2.f * LN2 * R;
         for (int row = row0; row <= row1; row++) {
 """ + _ALPHA + r"""
             F along = (F)0.f;
-            for (int c = 0; c < NCH; c++) { along = fma(G[c][row], (F)r[@HEAD@ + c], along); gc[c] = fma(w, G[c][row], gc[c]); }
+            for (int c = 0; c < NCH; c++) {
+                along = fma(G[c][row], (F)r[@HEAD@ + c], along); gc[c] = fma(w, G[c][row], gc[c]); }
             F seen = w * along;
             left[row] -= seen;
             T[row] = fma(-al, T[row], T[row]);
             // d loss / d log alpha; nothing passes the clamp.
             F v = seen - al / (1.f - al) * left[row];
             v = raw <= ALPHA_MAX ? v : (F)0.f;
-            v0 += v; v1 = fma(v, (F)dy, v1); v2 = fma(v, (F)(dy * dy), v2);
-            if (want_abs) {
-                F across = qa * e;
-                ax += vabs(v * across); ay += vabs(v * (qc * dy - kk * across)); }
+            F ve = v * e;
+            s0 += v; s1 += ve; s2 = fma(v, (F)dy, s2);
+            s3 = fma(ve, e, s3); s4 = fma(ve, (F)dy, s4); s5 = fma(v, (F)(dy * dy), s5);
+            if (want_abs) { ax += vabs(ve); ay += vabs(fma(v, (F)(qc * dy), ve * -(kk * qa))); }
         }
-        F dx = LANE + (0.5f - mx);
         float* to = P.hit_grad + P.hit_place[h] * GS;
-        F out[(@MOMENTS@ + NCH + 15) / 16 * 16];
-        out[0] = v0; out[1] = v0 * dx; out[2] = v1; out[3] = v0 * dx * dx; out[4] = v1 * dx; out[5] = v2;
-        out[6] = ax; out[7] = ay;
+        out[0] = s0; out[1] = s1; out[2] = s2; out[3] = s3; out[4] = s4; out[5] = s5; out[6] = qa * ax; out[7] = ay;
         for (int c = 0; c < NCH; c++) out[@MOMENTS@ + c] = gc[c];
         for (int c = @MOMENTS@ + NCH; c < (int)(sizeof(out) / sizeof(F)); c++) out[c] = (F)0.f;
         for (int c = 0; c < (int)(sizeof(out) / sizeof(F)); c += 16) store(to + c, sums16(out + c));

@@ -46,6 +46,7 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations [N, 3, 3] of quaternions [N, 4] wxyz of any non-zero norm."""
+    quats = quats / quats.detach().abs().amax(-1, keepdim=True)  # the norm's squares neither vanish nor overflow
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     return torch.stack((
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -69,7 +70,7 @@ class _Projected:
 
 def _finite_inputs(scene: Scene) -> Tensor:
     """Mask [N] of Gaussians whose parameters all obey the rules that need no camera."""
-    ok = scene.means.isfinite().all(-1) & (scene.quats.square().sum(-1) > k.QUAT_NORM2_MIN)
+    ok = scene.means.isfinite().all(-1) & (scene.quats.abs().amax(-1) > k.QUAT_MIN)
     ok &= scene.quats.isfinite().all(-1) & (scene.log_scales <= k.LOG_SCALE_MAX).all(-1)
     ok &= ~scene.opacity_logits.isnan()
     if scene.colors is not None:

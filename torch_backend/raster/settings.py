@@ -17,9 +17,9 @@ class RasterSettings:
     """How to rasterise; everything that is not scene or camera."""
 
     near: float = 0.01
-    """Gaussians at or nearer than this camera depth are culled (units of the scene, normalised to unit camera extent)."""
+    """Gaussians at or nearer than this camera depth are culled (units of a scene of unit camera extent)."""
     antialiased: bool = False
-    """Scale each opacity by sqrt(det / det_blurred), so that the low-pass does not thicken what is thinner than a pixel."""
+    """Scale opacities by sqrt(det / det_blurred), so that the low-pass does not thicken thin Gaussians."""
     absgrad: bool = True
     """Also gather the sum over pixels of |d loss / d mean2d| in the backward pass (RasterOutput.means2d_absgrad)."""
     threads: int = field(default_factory=default_threads)
@@ -51,8 +51,8 @@ class RasterOutput:
     means2d_grad: Tensor
     """[C, N]: |d loss / d mean2d| in 1/px. Zeros until a backward pass writes it in place; each pass overwrites."""
     means2d_absgrad: Tensor
-    """[C, N]: norm of (sum over pixels |d loss / d x|, sum |d loss / d y|), 1/px; as above. Zeros if settings.absgrad is
-    off."""
+    """[C, N]: norm of (sum over pixels |d loss / d x|, sum |d loss / d y|), 1/px; as above. Zeros if settings.absgrad
+    is off."""
 
 
 @dataclass

@@ -1,0 +1,156 @@
+"""The compiled CPU body against the float64 oracle."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from torch_backend.raster import RasterSettings
+
+
+def assert_gradients(cpu, reference, relative, bound):
+    assert all(torch.isfinite(grad).all() for grad in cpu.values())
+    errors = {name: relative(cpu[name], truth) for name, truth in reference.items()}
+    assert max(errors.values()) <= bound, errors
+
+
+def test_room_matches_the_oracle(small_room, tools):
+    # A pixel at the alpha cut may fall on either side of it. Few do, and gradients are compared on the others.
+    with torch.no_grad():
+        same = (small_room.run("cpu").alphas - small_room.run("reference").alphas).abs() < 3e-5
+    assert same.float().mean() > 0.998
+    cpu, cpu_grads = small_room.gradients("cpu", same, with_contributions=True)
+    ref, ref_grads = small_room.gradients("reference", same, with_contributions=True)
+    assert tools.psnr(cpu.colors, ref.colors) >= 95
+    assert_gradients(cpu_grads, ref_grads, tools.relative, 1e-4)
+    assert (cpu.radii != ref.radii).sum() <= 1
+    assert tools.relative(cpu.means2d, ref.means2d) < 1e-6
+    assert tools.relative(cpu.weight_sum, ref.weight_sum) < 1e-4
+    assert (cpu.weight_max - ref.weight_max).abs().max() < 5e-3
+    assert tools.relative(cpu.means2d_grad, ref.means2d_grad) < 1e-4
+    assert tools.relative(cpu.means2d_absgrad, ref.means2d_absgrad) < 1e-4
+    # Every unit of alpha in the image belongs to some Gaussian.
+    assert cpu.weight_sum.double().sum().item() == pytest.approx(cpu.alphas.double().sum().item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_depth_and_pose(tools, degree, antialiased):
+    scene = tools.cloud(300, 50, 41, seed=degree, channels=5, degree=degree, with_depth=True, with_contributions=True,
+                        settings=RasterSettings(threads=2, antialiased=antialiased))
+    cpu, cpu_grads = scene.gradients("cpu")
+    ref, ref_grads = scene.gradients("reference")
+    assert tools.psnr(cpu.colors, ref.colors) >= 90
+    assert_gradients(cpu_grads, ref_grads, tools.relative, 1e-3)
+    solid = ref.alphas > 0.05
+    assert ((cpu.depth_expected - ref.depth_expected).abs()[solid] < 1e-3).all()
+    assert ((cpu.depth_median - ref.depth_median).abs() > 1e-3).float().mean() < 2e-3
+    assert ((cpu.depth_median == 1e10) == (cpu.alphas == 0)).all()
+    assert ((cpu.depth_expected == 1e10) == (cpu.alphas == 0)).all()
+
+
+@pytest.mark.parametrize("channels", [1, 8, 21])
+def test_any_number_of_channels(tools, channels):
+    scene = tools.cloud(120, 33, 20, seed=channels, channels=channels)
+    cpu, cpu_grads = scene.gradients("cpu")
+    ref, ref_grads = scene.gradients("reference")
+    assert cpu.colors.shape == (1, 20, 33, channels)
+    assert tools.psnr(cpu.colors, ref.colors) >= 90
+    assert_gradients(cpu_grads, ref_grads, tools.relative, 1e-3)
+
+
+def test_cameras_of_a_batch_are_independent_and_their_gradients_add(tools):
+    scene = tools.cloud(80, 30, 22, seed=4, with_contributions=True)
+    other = scene.tensors["viewmats"].clone()
+    other[0, :3, 3] += torch.tensor([0.3, 0.1, 0.2])
+    views = torch.cat([scene.tensors["viewmats"], other])
+    Ks = torch.cat([scene.Ks, tools.camera(30, 22, 35.0, 12.0, 13.0)])
+    both = tools.Scene(scene.tensors | {"viewmats": views}, Ks, 30, 22, scene.options)
+    out, grads = both.gradients("cpu")
+    ref, ref_grads = both.gradients("reference")
+    assert tools.psnr(out.colors, ref.colors) >= 90
+    assert_gradients(grads, ref_grads, tools.relative, 1e-3)
+    assert tools.relative(out.means2d_grad, ref.means2d_grad) < 1e-3
+    for c in range(2):
+        alone = tools.Scene(scene.tensors | {"viewmats": views[c:c + 1]}, Ks[c:c + 1], 30, 22, scene.options).run("cpu")
+        for name in ("colors", "alphas", "radii", "weight_sum", "weight_max"):
+            assert torch.equal(getattr(out, name)[c], getattr(alone, name)[0]), name
+
+
+def test_sh_degree_uses_the_first_bands_only(tools):
+    scene = tools.cloud(60, 24, 17, degree=2)
+    low, grads = scene.gradients("cpu", sh_degree=1)
+    scene.tensors["sh"] = scene.tensors["sh"][:, :4]
+    assert torch.equal(low.colors, scene.run("cpu").colors)
+    assert (grads["sh"][:, 4:] == 0).all()
+    assert (grads["sh"][:, :4] != 0).any()
+
+
+def test_one_thread_and_many_agree_bitwise(tools):
+    scene = tools.cloud(3000, 130, 70, degree=1, with_depth=True, with_contributions=True)
+    one, one_grads = scene.gradients("cpu", settings=RasterSettings(threads=1))
+    for threads in (2, 5):
+        many, many_grads = scene.gradients("cpu", settings=RasterSettings(threads=threads))
+        for name, value in vars(one).items():
+            assert torch.equal(value, getattr(many, name)), name
+        for name, grad in one_grads.items():
+            assert torch.equal(grad, many_grads[name]), name
+
+
+def test_workspace_reuse_leaves_no_trace(tools):
+    scene = tools.cloud(200, 40, 30, with_contributions=True)
+    first, first_grads = scene.gradients("cpu")
+    tools.cloud(2000, 100, 90, seed=9, degree=3, channels=5, with_depth=True).gradients("cpu")
+    again, again_grads = scene.gradients("cpu")
+    for name in ("colors", "weight_sum", "weight_max", "means2d_grad", "means2d_absgrad"):
+        assert torch.equal(getattr(first, name), getattr(again, name)), name
+    assert all(torch.equal(grad, again_grads[name]) for name, grad in first_grads.items())
+
+
+def test_interleaved_forward_passes_keep_their_own_state(tools):
+    a, b = tools.cloud(150, 40, 30, seed=1), tools.cloud(170, 44, 36, seed=2)
+    alone = {}
+    for scene in (a, b):
+        leaves = scene.leaves()
+        scene.run("cpu", leaves).colors.square().sum().backward()
+        alone[id(scene)] = leaves
+    la, lb = a.leaves(), b.leaves()
+    out_a, out_b = a.run("cpu", la), b.run("cpu", lb)
+    out_a.colors.square().sum().backward()
+    out_b.colors.square().sum().backward()
+    for scene, leaves in ((a, la), (b, lb)):
+        assert all(torch.equal(leaf.grad, alone[id(scene)][name].grad) for name, leaf in leaves.items())
+
+
+def test_absgrad_can_be_left_out(tools):
+    scene = tools.cloud(60, 24, 17)
+    out, grads = scene.gradients("cpu", settings=RasterSettings(threads=1, absgrad=False))
+    full, full_grads = scene.gradients("cpu", settings=RasterSettings(threads=1))
+    assert (out.means2d_absgrad == 0).all()
+    assert (full.means2d_absgrad >= full.means2d_grad * 0.999).all()
+    assert torch.equal(out.means2d_grad, full.means2d_grad)
+    assert all(torch.equal(grad, full_grads[name]) for name, grad in grads.items())
+
+
+def test_no_grad_mode_and_other_float_types(tools):
+    scene = tools.cloud(60, 24, 17)
+    with torch.no_grad():
+        out = scene.run("cpu")
+    assert not out.colors.requires_grad
+    leaves = scene.leaves(torch.float64)
+    wide = scene.run("cpu", leaves)
+    assert torch.equal(wide.colors, out.colors)
+    wide.colors.sum().backward()
+    assert leaves["means"].grad.dtype == torch.float64
+
+
+def test_nothing_is_written_to_the_terminal(tmp_path):
+    code = ("import torch; from torch_backend.raster import rasterize as r; e=torch.eye(4)[None]; "
+            "r(torch.tensor([[0.,0.,2.]]), torch.ones(1,4), torch.zeros(1,3), torch.zeros(1), torch.ones(1,1), "
+            "viewmats=e, Ks=e[:,:3,:3], width=3, height=2)")
+    env = {**__import__("os").environ, "WARP_CACHE_PATH": str(tmp_path)}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, timeout=300, check=True)
+    assert run.stdout == ""
+    assert run.stderr == ""
+    assert list(tmp_path.iterdir()), "the kernels were compiled elsewhere"
