@@ -52,8 +52,9 @@ def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -
         width: image width in pixels.
         height: image height in pixels.
     """
-    fx, _, cx, cy = k
-    return fx * SENSOR_MM / width, (width / 2 - cx) / width, (cy - height / 2) / width
+    fx, fy, cx, cy = k
+    # Shift is counted in widths of the picture, also down, where a pixel that is not square is fx / fy high.
+    return fx * SENSOR_MM / width, (width / 2 - cx) / width, (cy - height / 2) * (fx / fy) / width
 
 
 def k_from_lens(

@@ -172,6 +172,11 @@ def _on_render_end(*_: Any) -> None:
             watch.notes["bake"] = [f"{done} of {total} frames rendered."]
 
 
+def forget() -> None:
+    """Drops all that is known; the shots' folders tell it again when asked."""
+    _watches.clear()
+
+
 def register() -> None:
     """Starts the timer (in a window: headless Blender has none) and listens to file loads and renders."""
     bpy.app.handlers.load_post.append(_on_load)
@@ -190,4 +195,4 @@ def unregister() -> None:
     bpy.app.handlers.render_complete.remove(_on_render_end)
     bpy.app.handlers.render_write.remove(_on_frame)
     bpy.app.handlers.load_post.remove(_on_load)
-    _watches.clear()
+    forget()

@@ -1,0 +1,45 @@
+"""The frozen frames of the add-on's tests: three files of 16 x 12 pixels whose every value can be computed again.
+
+    python tests/addon/data/make_frames.py      (with the backend's Python: it uses the backend's own EXR writer)
+
+All values are exact in half floats. Frame numbers 5, 6, 7.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+WIDTH, HEIGHT = 16, 12
+FRAMES = (5, 6, 7)
+NO_DEPTH = 1e10
+
+
+def layers(frame: int) -> dict[str, np.ndarray]:
+    """rgba [H, W, 4] scene-linear premultiplied, depth, support and motion [H, W], top row first."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    alpha = np.where(x == 0, 0.5, 1.0)
+    alpha[0, 0] = 0.0
+    rgb = np.stack([(x * 4 + frame) % 65, (y * 5 + frame * 3) % 65, (x + y * 2 + frame * 7) % 65], axis=2) / 64.0
+    depth = np.where(alpha > 0, frame + x / 16.0 + y, NO_DEPTH)
+    return {
+        "rgba": np.concatenate([rgb * alpha[..., None], alpha[..., None]], axis=2).astype(np.float32),
+        "depth": depth.astype(np.float32),
+        "support": ((x % 5) / 4.0).astype(np.float32),
+        "motion": ((y % 5) / 4.0).astype(np.float32),
+    }
+
+
+def main() -> None:
+    """Writes the files beside this one."""
+    from torch_backend.freeze.exr import FrameMetadata, write_frozen_exr
+
+    k = np.array([[20.0, 0.0, 8.0], [0.0, 20.0, 6.0], [0.0, 0.0, 1.0]], np.float32)
+    for frame in FRAMES:
+        data = layers(frame)
+        about = FrameMetadata(frame, 6.0, np.eye(4, dtype=np.float32), k)
+        path = Path(__file__).with_name(f"{frame:06d}.exr")
+        write_frozen_exr(path, data["rgba"], data["depth"], data["support"], data["motion"], about)
+
+
+if __name__ == "__main__":
+    main()

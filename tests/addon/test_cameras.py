@@ -1,0 +1,236 @@
+"""Axes, lens and keys of the solved camera: against values worked out by hand, and against a render."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+
+
+def project(viewmat: np.ndarray, k: list[float], points: np.ndarray) -> np.ndarray:
+    """Pixels [P, 2] of world points [P, 3], OpenCV pinhole, pixel centres at +0.5."""
+    seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    return np.stack([k[0] * seen[:, 0] / seen[:, 2] + k[2], k[1] * seen[:, 1] / seen[:, 2] + k[3]], axis=1)
+
+
+def poses_of(shot: Path) -> tuple[list[dict], int, int]:
+    path = json.loads((shot / "solve" / "cameras.json").read_text())
+    return path["frames"], path["width"], path["height"]
+
+
+def test_identity_camera_looks_along_z_with_y_down(addon):
+    matrix = addon("cameras").camera_to_world(np.eye(4))
+    # Blender's camera looks along its -z and has y up: in OpenCV's world that is +z and -y.
+    np.testing.assert_allclose(matrix @ [0, 0, -1, 0], [0, 0, 1, 0])
+    np.testing.assert_allclose(matrix @ [0, 1, 0, 0], [0, -1, 0, 0])
+    np.testing.assert_allclose(matrix @ [1, 0, 0, 0], [1, 0, 0, 0])
+
+
+def test_translation_moves_the_camera_the_other_way(addon):
+    viewmat = np.eye(4)
+    viewmat[:3, 3] = (1, 2, 3)
+    np.testing.assert_allclose(addon("cameras").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
+
+
+def test_axes_round_trip_and_ignore_scale(addon):
+    cameras = addon("cameras")
+    turn = np.array([[0, 0, 1, 0.4], [1, 0, 0, -2.0], [0, 1, 0, 7.0], [0, 0, 0, 1]], dtype=np.float64)
+    matrix = cameras.camera_to_world(turn)
+    np.testing.assert_allclose(cameras.viewmat_from_camera(matrix), turn, atol=1e-12)
+    scaled = matrix.copy()
+    scaled[:3, :3] *= 2.5
+    np.testing.assert_allclose(cameras.viewmat_from_camera(scaled), turn, atol=1e-12)
+
+
+def test_lens_of_a_centred_and_a_shifted_principal_point(addon):
+    cameras = addon("cameras")
+    assert cameras.lens_from_k((640, 640, 320, 240), 640, 480) == (36.0, 0.0, 0.0)
+    lens, shift_x, shift_y = cameras.lens_from_k((1280, 1280, 330, 220), 640, 480)
+    assert (lens, shift_x, shift_y) == (72.0, -10 / 640, -20 / 640)
+    np.testing.assert_allclose(cameras.k_from_lens(lens, shift_x, shift_y, 36.0, 640, 480), (1280, 1280, 330, 220))
+
+
+@pytest.mark.parametrize(
+    ("k", "aspect"), [((500, 500, 0, 0), (1, 1)), ((500, 400, 0, 0), (1, 1.25)), ((400, 500, 0, 0), (1.25, 1))]
+)
+def test_pixel_aspect_stays_above_one(addon, k, aspect):
+    np.testing.assert_allclose(addon("cameras").pixel_aspect(k), aspect)
+
+
+@pytest.mark.parametrize("fy", [20.0, 16.0, 25.0])
+def test_points_fall_where_the_solve_says(addon, scene, shot, fy):
+    poses, width, height = poses_of(shot)
+    for pose in poses:
+        pose["K"][1] = fy
+    path = {"version": 1, "width": width, "height": height, "frames": poses}
+    (shot / "solve" / "cameras.json").write_text(json.dumps(path))
+    addon("steps").load_camera(scene, shot)
+    root = addon("cameras").find(scene, shot, "EMPTY")
+    points = np.load(shot / "solve" / "points.npz")["xyz"].astype(np.float64)
+    for pose in poses:
+        scene.frame_set(pose["frame"])
+        expected = project(np.reshape(pose["viewmat"], (4, 4)), pose["K"], points)
+        for point, (u, v) in zip(points, expected, strict=True):
+            there = root.matrix_world @ Vector(point)
+            x, y, _ = world_to_camera_view(scene, scene.camera, there)
+            assert (x * width, (1 - y) * height) == pytest.approx((u, v), abs=2e-3)
+
+
+def test_keys_lie_on_the_clips_frames_and_are_straight(addon, scene, shot):
+    camera = addon("cameras").build(scene, shot)
+    curves = list(addon("compat").fcurves(camera))
+    assert len(curves) == 7
+    for curve in curves:
+        assert [key.co[0] for key in curve.keyframe_points] == [5, 6, 7]
+        assert {key.interpolation for key in curve.keyframe_points} == {"LINEAR"}
+    assert not list(addon("compat").fcurves(camera.data)), "a lens that does not change needs no keys"
+
+
+def test_lens_is_keyed_where_it_changes(addon, scene, shot):
+    poses, width, height = poses_of(shot)
+    poses[2]["K"] = [30.0, 30.0, 9.0, 5.0]
+    path = {"version": 1, "width": width, "height": height, "frames": poses}
+    (shot / "solve" / "cameras.json").write_text(json.dumps(path))
+    camera = addon("cameras").build(scene, shot)
+    scene.frame_set(5)
+    assert camera.data.lens == pytest.approx(20 * 36 / 16)
+    scene.frame_set(7)
+    assert camera.data.lens == pytest.approx(30 * 36 / 16)
+
+
+def test_quaternions_take_the_short_way(addon, scene, shot):
+    poses, width, height = poses_of(shot)
+    frames = []
+    for n in range(40):  # a full turn: somewhere the decomposition flips its sign
+        angle = 2 * np.pi * n / 39
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        frames.append({"frame": n, "viewmat": viewmat.ravel().tolist(), "K": poses[0]["K"]})
+    path = {"version": 1, "width": width, "height": height, "frames": frames}
+    (shot / "solve" / "cameras.json").write_text(json.dumps(path))
+    camera = addon("cameras").build(scene, shot)
+    keys = np.array(
+        [[k.co[1] for k in c.keyframe_points] for c in addon("compat").fcurves(camera) if "quat" in c.data_path]
+    )
+    assert keys.shape == (4, 40)
+    assert (np.sum(keys[:, 1:] * keys[:, :-1], axis=0) > 0.9).all()
+
+
+def test_plate_fits_the_sensor_and_follows_the_frame_numbers(addon, scene, shot):
+    camera = addon("cameras").build(scene, shot)
+    background = camera.data.background_images[0]
+    user = background.image_user
+    assert camera.data.show_background_images and background.frame_method == "FIT"
+    assert background.image.source == "SEQUENCE" and background.image.colorspace_settings.name == "sRGB"
+    assert bpy.path.abspath(background.image.filepath) == str(shot / "frames" / "000005.png")
+    assert (user.frame_start, user.frame_offset, user.frame_duration) == (5, 4, 3)
+
+
+def test_points_keep_their_colours(addon, scene, shot):
+    addon("cameras").build(scene, shot)
+    cloud = addon("cameras").find(scene, shot, "MESH")
+    stored = np.load(shot / "solve" / "points.npz")
+    colour = cloud.data.color_attributes["Col"]
+    assert colour.domain == "POINT" and cloud.hide_render
+    rgba = np.empty(len(stored["rgb"]) * 4, np.float32)
+    colour.data.foreach_get("color_srgb", rgba)
+    np.testing.assert_allclose(rgba.reshape(-1, 4)[:, :3] * 255, stored["rgb"], atol=0.51)
+    co = np.empty(len(stored["xyz"]) * 3, np.float32)
+    cloud.data.vertices.foreach_get("co", co)
+    np.testing.assert_array_equal(co.reshape(-1, 3), stored["xyz"])
+
+
+def test_second_build_replaces_and_keeps_the_roots_place(addon, scene, shot):
+    cameras = addon("cameras")
+    cameras.build(scene, shot)
+    root = cameras.find(scene, shot, "EMPTY")
+    root.scale = (2.0, 2.0, 2.0)
+    root.location = (1.0, 2.0, 3.0)
+    bpy.context.view_layer.update()
+    counts = [len(x) for x in (bpy.data.objects, bpy.data.cameras, bpy.data.meshes, bpy.data.images, bpy.data.actions)]
+    cameras.build(scene, shot)
+    assert counts == [
+        len(x) for x in (bpy.data.objects, bpy.data.cameras, bpy.data.meshes, bpy.data.images, bpy.data.actions)
+    ]
+    assert tuple(cameras.find(scene, shot, "EMPTY").location) == (1.0, 2.0, 3.0)
+    bpy.context.view_layer.update()
+    assert cameras.depth_scale(scene, shot) == pytest.approx(2.0)
+
+
+def test_remove_leaves_nothing(addon, scene, shot):
+    names = {
+        kind: set(getattr(bpy.data, kind).keys())
+        for kind in ("objects", "cameras", "meshes", "images", "actions", "collections")
+    }
+    addon("cameras").build(scene, shot)
+    assert addon("cameras").remove(scene, shot)
+    assert names == {kind: set(getattr(bpy.data, kind).keys()) for kind in names}
+
+
+def test_scene_is_upright(addon, scene, shot):
+    cameras = addon("cameras")
+    camera = cameras.build(scene, shot)
+    ups = []
+    for frame in (5, 6, 7):
+        scene.frame_set(frame)
+        ups.append(np.array(camera.matrix_world)[:3, 1])
+    mean = np.mean(ups, axis=0)
+    np.testing.assert_allclose(mean / np.linalg.norm(mean), (0, 0, 1), atol=1e-5)
+
+
+@pytest.mark.parametrize(("fit", "size"), [("HORIZONTAL", (64, 48)), ("VERTICAL", (64, 48)), ("AUTO", (48, 64))])
+def test_any_blender_camera_becomes_a_path(addon, scene, shot, fit, size):
+    cameras = addon("cameras")
+    cameras.build(scene, shot)
+    root = cameras.find(scene, shot, "EMPTY")
+    root.scale = (3.0, 3.0, 3.0)
+    scene.render.resolution_x, scene.render.resolution_y = size
+    data = bpy.data.cameras.new("free")
+    data.sensor_fit, data.sensor_width, data.sensor_height, data.lens = fit, 30.0, 20.0, 40.0
+    data.shift_x, data.shift_y = 0.1, -0.05
+    camera = bpy.data.objects.new("free", data)
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (1.0, -8.0, 3.0), (1.2, 0.1, 0.2)
+    bpy.context.view_layer.update()
+    path = cameras.path_from_camera(scene, "free", shot, range(5, 7))
+    assert [f.frame for f in path.frames] == [5, 6] and (path.width, path.height) == size
+    point = np.array([[0.2, 0.1, -0.4]])
+    u, v = project(np.reshape(path.frames[0].viewmat, (4, 4)), path.frames[0].K, point)[0]
+    x, y, _ = world_to_camera_view(scene, camera, root.matrix_world @ Vector(point[0]))
+    assert (u, v) == pytest.approx((x * size[0], (1 - y) * size[1]), abs=1e-3)
+
+
+def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_path, pictures):
+    for item in list(scene.objects):
+        bpy.data.objects.remove(item)
+    addon("steps").load_camera(scene, shot)
+    poses, width, height = poses_of(shot)
+    scale = 6  # a picture of 96 x 72, so that a centroid is worth a tenth of a pixel
+    scene.render.resolution_x, scene.render.resolution_y = width * scale, height * scale
+    root = addon("cameras").find(scene, shot, "EMPTY")
+    point = np.array([[-0.5, 0.2, 0.3]])
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=0.05, location=root.matrix_world @ Vector(point[0]))
+    glow = bpy.data.materials.new("glow")
+    glow.use_nodes = True
+    glow.node_tree.nodes.clear()
+    emit, out = glow.node_tree.nodes.new("ShaderNodeEmission"), glow.node_tree.nodes.new("ShaderNodeOutputMaterial")
+    glow.node_tree.links.new(emit.outputs[0], out.inputs[0])
+    bpy.context.object.data.materials.append(glow)
+    scene.world = None
+    scene.render.engine = "CYCLES"
+    scene.cycles.device, scene.cycles.samples, scene.cycles.use_denoising = "CPU", 8, False
+    addon("compat").set_png(scene.render.image_settings)
+    scene.frame_set(6)
+    scene.render.filepath = str(tmp_path / "ball.png")
+    bpy.ops.render.render(write_still=True)
+    weight = pictures.read(tmp_path / "ball.png").mean(axis=2)
+    weight = np.where(weight > 0.2, weight, 0.0)  # the dark is dithered
+    assert weight.max() > 0.5, "the ball is in the picture"
+    rows, columns = np.mgrid[0 : height * scale, 0 : width * scale] + 0.5
+    found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum() / scale
+    pose = next(p for p in poses if p["frame"] == 6)
+    expected = project(np.reshape(pose["viewmat"], (4, 4)), pose["K"], point)[0]
+    np.testing.assert_allclose(found, expected, atol=0.1)

@@ -1,0 +1,203 @@
+"""The freeze in the scene's compositor: nothing of the artist's is touched, and the pixels are the backend's."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def take(addon, shot):
+    return addon("compositor").take_of(shot / "takes" / "freeze")
+
+
+@pytest.fixture
+def artists_tree(addon, scene):
+    """A tree with a few nodes, links and values of the artist's own; its output shows a constant colour, blurred."""
+    compat = addon("compat")
+    tree = compat.new_compositor_tree(scene, "Artist")
+    colour = tree.nodes.new("CompositorNodeRGB")
+    colour.outputs[0].default_value = (0.25, 0.5, 0.75, 1.0)
+    blur = tree.nodes.new("CompositorNodeBlur")
+    multiply = compat.new_multiply_node(tree)
+    multiply.inputs[1].default_value = 0.125
+    tree.links.new(colour.outputs[0], blur.inputs["Image"])
+    tree.links.new(blur.outputs["Image"], compat.output_socket(tree))
+    tree.links.new(colour.outputs[0], multiply.inputs[0])
+    return tree
+
+
+def snapshot(tree, without: str = "") -> tuple[dict, set]:
+    """Nodes with their places and unlinked values, and links, of a tree, but those of a node."""
+    nodes = {}
+    for node in tree.nodes:
+        if node.name == without:
+            continue
+        values = [_plain(s.default_value) for s in node.inputs if hasattr(s, "default_value") and not s.is_linked]
+        nodes[node.name] = (node.bl_idname, tuple(node.location), node.mute, node.label, tuple(values))
+    links = set()
+    for link in tree.links:
+        if without not in (link.from_node.name, link.to_node.name):
+            ends = (link.from_node.name, link.from_socket.identifier, link.to_node.name, link.to_socket.identifier)
+            links.add(ends)
+    return nodes, links
+
+
+def _plain(value):
+    return tuple(value) if hasattr(value, "__len__") and not isinstance(value, str) else value
+
+
+def test_artists_nodes_and_links_stay_identical(addon, scene, artists_tree, take):
+    compositor = addon("compositor")
+    nodes, links = snapshot(artists_tree)
+    compositor.insert(scene, take)
+    after_nodes, after_links = snapshot(artists_tree, compositor.GROUP_NAME)
+    output = addon("compat").output_socket(artists_tree)
+    lost = {link for link in links if link[2:] == (output.node.name, output.identifier)}
+    assert after_nodes == nodes
+    assert after_links == links - lost and len(lost) == 1
+    group = compositor.group_node(artists_tree)
+    assert group.inputs["Image"].links[0].from_node.bl_idname == "CompositorNodeBlur"
+    assert output.links[0].from_socket == group.outputs["Image"]
+
+
+def test_second_bake_updates_the_group(addon, scene, artists_tree, take, shot, new_take):
+    compositor = addon("compositor")
+    compositor.insert(scene, take)
+    group = compositor.group_node(artists_tree)
+    group.inputs["Mix"].default_value = 0.25
+    before = snapshot(artists_tree)
+    counts = len(bpy.data.node_groups), len(bpy.data.images)
+    other = compositor.take_of(new_take(shot, "second"), depth_scale=3.0)
+    said = compositor.insert(scene, other)
+    assert snapshot(artists_tree) == before, "Mix and every link around the group stay"
+    assert (len(bpy.data.node_groups), len(bpy.data.images)) == counts
+    frozen = compositor.group_node(artists_tree).node_tree.nodes["Frozen"]
+    assert Path(bpy.path.abspath(frozen.image.filepath)).parent == other.folder
+    assert compositor.group_node(artists_tree).node_tree.nodes["Depth in scene units"].inputs[1].default_value == 3.0
+    assert said == [f'The node group "{compositor.GROUP_NAME}" was updated.']
+
+
+def test_removal_restores_the_tree(addon, scene, artists_tree, take):
+    before = snapshot(artists_tree)
+    images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
+    addon("compositor").insert(scene, take)
+    assert addon("compositor").remove(scene)
+    assert snapshot(artists_tree) == before
+    assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
+    assert not addon("compositor").remove(scene)
+
+
+def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene, take, shot):
+    compositor, compat = addon("compositor"), addon("compat")
+    plate = shot / "frames" / "000005.png"
+    said = compositor.insert(scene, take, plate)
+    tree = compat.compositor_tree(scene)
+    assert compat.compositor_enabled(scene)
+    assert "minimal one was made" in said[0]
+    assert sorted(
+        n.bl_idname for n in tree.nodes if "Output" not in n.bl_idname and "Composite" not in n.bl_idname[-9:]
+    ) == [
+        "CompositorNodeGroup",
+        "CompositorNodeImage",
+    ]
+    compositor.insert(scene, take, plate)
+    assert len([n for n in tree.nodes if n.bl_idname == "CompositorNodeImage"]) == 1
+    compositor.remove(scene)
+    assert not compat.compositor_enabled(scene)
+    assert not bpy.data.node_groups and not [i for i in bpy.data.images if i.source == "SEQUENCE"]
+
+
+def test_compositor_that_was_off_is_said_and_put_back(addon, scene, artists_tree, take):
+    compat = addon("compat")
+    compat.disable_compositor(scene)
+    said = addon("compositor").insert(scene, take)
+    assert compat.compositor_enabled(scene) and "The compositor was switched on." in said
+    addon("compositor").remove(scene)
+    assert not compat.compositor_enabled(scene)
+
+
+def test_group_offers_what_a_compositor_needs(addon, scene, take):
+    addon("compositor").insert(scene, take)
+    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    assert [s.name for s in node.inputs] == ["Image", "Mix"]
+    assert [s.name for s in node.outputs] == ["Image", "Depth", "Support", "Motion"]
+    assert node.inputs["Mix"].default_value == 1.0
+
+
+def test_take_without_frames_is_refused_in_words(addon, scene, shot, contract):
+    (shot / "takes" / "empty").mkdir()
+    with pytest.raises(contract.JobError, match="'empty' .* holds no frozen frames"):
+        addon("bake").insert(scene, shot, "empty")
+
+
+def test_size_comes_from_the_exr_header(addon, shot, tmp_path):
+    compositor = addon("compositor")
+    assert compositor.exr_size(shot / "takes" / "freeze" / "000006.exr") == (16, 12)
+    wrong = tmp_path / "wrong.exr"
+    wrong.write_bytes(b"no picture")
+    with pytest.raises(ValueError, match="no OpenEXR file"):
+        compositor.exr_size(wrong)
+
+
+def render(addon, scene, folder: Path) -> None:
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 16, 12, 100
+    scene.frame_start, scene.frame_end = 5, 7
+    addon("scene_setup").keep_plate_colours(scene)
+    addon("bake").render(scene, folder)
+
+
+def test_rendered_frames_equal_the_exr_within_one_of_255(addon, scene, take, tmp_path, layers, pictures):
+    addon("compositor").insert(scene, take)
+    render(addon, scene, tmp_path / "out")
+    render(addon, scene, tmp_path / "out")  # the second render finds files and settings of the first
+    for frame in (5, 6, 7):
+        expected = pictures.srgb(layers(frame)["rgba"][..., :3])
+        found = pictures.read(tmp_path / "out" / f"{frame:06d}.png")
+        assert np.abs(found - expected).max() * 255 < 0.6, f"frame {frame}: rounding to 8 bits and nothing else"
+
+
+def test_mix_fades_between_plate_and_freeze(addon, scene, take, shot, tmp_path, layers, pictures):
+    plate = shot / "frames" / "000005.png"
+    addon("compositor").insert(scene, take, plate)
+    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    node.inputs["Mix"].default_value = 0.0
+    scene.render.resolution_x, scene.render.resolution_y = 16, 12
+    render(addon, scene, tmp_path / "plate")
+    for frame in (5, 6, 7):
+        found = pictures.read(tmp_path / "plate" / f"{frame:06d}.png")
+        source = pictures.read(shot / "frames" / f"{frame:06d}.png")
+        assert np.abs(found - source).max() * 255 < 0.6, "the plate leaves as it came in"
+
+
+@pytest.mark.parametrize("output", ["Depth", "Support", "Motion"])
+def test_data_layers_arrive_on_the_groups_outputs(addon, scene, take, tmp_path, layers, pictures, output):
+    compositor, compat = addon("compositor"), addon("compat")
+    scaled = compositor.take_of(take.folder, depth_scale=1.0 / 32.0)
+    compositor.insert(scene, scaled)
+    tree = compat.compositor_tree(scene)
+    target = compat.output_socket(tree)
+    tree.links.new(compositor.group_node(tree).outputs[output], target)
+    render(addon, scene, tmp_path)
+    for frame in (5, 7):
+        value = layers(frame)[output.lower()]
+        expected = value / 32.0 if output == "Depth" else value
+        found = pictures.read(tmp_path / f"{frame:06d}.png")[..., 0]
+        np.testing.assert_allclose(found, pictures.srgb(expected), atol=0.6 / 255)
+
+
+def test_frames_of_another_size_are_fitted(addon, scene, take, tmp_path, layers, pictures):
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 32, 24, 100
+    addon("scene_setup").keep_plate_colours(scene)
+    addon("compositor").insert(scene, take)
+    scene.frame_start = scene.frame_end = 6
+    addon("bake").render(scene, tmp_path)
+    found = pictures.read(tmp_path / "000006.png")
+    assert found.shape == (24, 32, 3)
+    expected = pictures.srgb(layers(6)["motion"][..., None] * 0 + layers(6)["rgba"][..., :3])
+    # Bars of the picture must lie where they lay: each quarter of it has the mean it had.
+    for rows in (slice(0, 12), slice(12, 24)):
+        for columns in (slice(0, 16), slice(16, 32)):
+            small = expected[rows.start // 2 : rows.stop // 2, columns.start // 2 : columns.stop // 2]
+            assert found[rows, columns].mean() == pytest.approx(small.mean(), abs=0.06)
