@@ -66,8 +66,9 @@ const float LOG2E = 1.44269504088896f, LN2 = 0.693147180559945f, PMIN = @LOG2_AL
 const float ALPHA_MAX = @ALPHA_MAX@f, T_STOP = @T_STOP@f, LOW_PASS = @LOW_PASS@f;
 auto load = FN(const float* p) -> F { F v; __builtin_memcpy(&v, p, 64); return v; };
 auto store = FN(float* p, F v) -> void { __builtin_memcpy(p, &v, 64); };
-auto vmin = FN(F a, F b) -> F { return __builtin_elementwise_min(a, b); };
-auto vmax = FN(F a, F b) -> F { return __builtin_elementwise_max(a, b); };
+// The second operand where the first is NaN, as in one vminps or vmaxps.
+auto vmin = FN(F a, F b) -> F { return a < b ? a : b; };
+auto vmax = FN(F a, F b) -> F { return a > b ? a : b; };
 auto vabs = FN(F a) -> F { return __builtin_elementwise_abs(a); };
 auto vsqrt = FN(F a) -> F { return __builtin_elementwise_sqrt(a); };
 auto fma = FN(F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
@@ -94,21 +95,23 @@ auto log2v = FN(F x) -> F {
     q = fma(q, t2, (F)1.f);
     return fma(t * q, (F)2.88539008177793f, __builtin_convertvector(e, F)); };
 const F LANE = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-// Sums of sixteen vectors as one vector (lane i = sum of v[i]), by fifteen pairwise folds.
-auto sums16 = FN(F* v) -> F {
-#define FOLD(a, b, ...) (__builtin_shufflevector(a, b, __VA_ARGS__))
+// Sixteen vectors to one: lane i of the result is v[i] folded over its lanes. Every step is one cheap shuffle a side.
+#define FOLD(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+auto fold16 = FN(F* v, auto&& join) -> F {
     for (int i = 0; i < 8; i++)
-        v[i] = FOLD(v[i], v[i + 8], 0,1,2,3,4,5,6,7,16,17,18,19,20,21,22,23)
-             + FOLD(v[i], v[i + 8], 8,9,10,11,12,13,14,15,24,25,26,27,28,29,30,31);
+        v[i] = join(FOLD(v[i], v[i + 8], 0,1,2,3,4,5,6,7,16,17,18,19,20,21,22,23),
+                    FOLD(v[i], v[i + 8], 8,9,10,11,12,13,14,15,24,25,26,27,28,29,30,31));
     for (int i = 0; i < 4; i++)
-        v[i] = FOLD(v[i], v[i + 4], 0,1,2,3,16,17,18,19,8,9,10,11,24,25,26,27)
-             + FOLD(v[i], v[i + 4], 4,5,6,7,20,21,22,23,12,13,14,15,28,29,30,31);
+        v[i] = join(FOLD(v[i], v[i + 4], 0,1,2,3,8,9,10,11,16,17,18,19,24,25,26,27),
+                    FOLD(v[i], v[i + 4], 4,5,6,7,12,13,14,15,20,21,22,23,28,29,30,31));
     for (int i = 0; i < 2; i++)
-        v[i] = FOLD(v[i], v[i + 2], 0,1,16,17,4,5,20,21,8,9,24,25,12,13,28,29)
-             + FOLD(v[i], v[i + 2], 2,3,18,19,6,7,22,23,10,11,26,27,14,15,30,31);
-    return FOLD(v[0], v[1], 0,16,2,18,4,20,6,22,8,24,10,26,12,28,14,30)
-         + FOLD(v[0], v[1], 1,17,3,19,5,21,7,23,9,25,11,27,13,29,15,31);
+        v[i] = join(FOLD(v[i], v[i + 2], 0,1,16,17,4,5,20,21,8,9,24,25,12,13,28,29),
+                    FOLD(v[i], v[i + 2], 2,3,18,19,6,7,22,23,10,11,26,27,14,15,30,31));
+    F r = join(FOLD(v[0], v[1], 0,2,16,18,4,6,20,22,8,10,24,26,12,14,28,30),
+               FOLD(v[0], v[1], 1,3,17,19,5,7,21,23,9,11,25,27,13,15,29,31));
+    return FOLD(r, r, 0,2,1,3,8,10,9,11,4,6,5,7,12,14,13,15);
 };
+auto add = FN(F a, F b) -> F { return a + b; };
 auto sum = FN(F v) -> float {
     float a[16]; store(a, v);
     float b0 = (a[0] + a[8]) + (a[4] + a[12]), b1 = (a[1] + a[9]) + (a[5] + a[13]);
@@ -236,7 +239,8 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
         ok &= (r0 <= (F)@LOG_SCALE_MAX@f) & (r1 <= (F)@LOG_SCALE_MAX@f) & (r2 <= (F)@LOG_SCALE_MAX@f);
         ok &= (LANE < (F)(float)(end - i0));
         if (!any(ok)) continue;
-        F l0 = vmax(r0, (F)@LOG_SCALE_MIN@f), l1 = vmax(r1, (F)@LOG_SCALE_MIN@f), l2 = vmax(r2, (F)@LOG_SCALE_MIN@f);
+        const F low = (F)@LOG_SCALE_MIN@f;
+        F l0 = vmax(r0, low), l1 = vmax(r1, low), l2 = vmax(r2, low);
 """ + _PROJECT + r"""
         F lop = -log2v(1.f + expv(-vmin(vmax(logit, (F)-80.f), (F)80.f)));
         if (P.antialiased) lop += 0.5f * log2v(vmax(dr / det, (F)@COMPENSATION2_MIN@f));
@@ -399,7 +403,8 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
         F X = load(gather[0]), Y = load(gather[1]), Z = load(gather[2]);
         F qw = load(gather[3]), qx = load(gather[4]), qy = load(gather[5]), qz = load(gather[6]);
         F r0 = load(gather[7]), r1 = load(gather[8]), r2 = load(gather[9]), logit = load(gather[10]);
-        F l0 = vmax(r0, (F)@LOG_SCALE_MIN@f), l1 = vmax(r1, (F)@LOG_SCALE_MIN@f), l2 = vmax(r2, (F)@LOG_SCALE_MIN@f);
+        const F low = (F)@LOG_SCALE_MIN@f;
+        F l0 = vmax(r0, low), l1 = vmax(r1, low), l2 = vmax(r2, low);
 """ + _PROJECT + r"""
         F m0 = load(g[0]);
         // log alpha = log opacity - (e^2 / xc + dy^2 / yy) / 2 with e = dx - k dy, k = xy / yy, xc = det / yy: gradients
@@ -515,22 +520,46 @@ const long long RS = P.record_stride, W = P.width, H = P.height, tiles = P.tiles
 typedef float Row __attribute__((ext_vector_type(16)));
 """
 
-# One (Gaussian, tile) pair: place within the tile and the rows that the ellipse can reach.
+# Sixteen hits at a time: place within the tile, and the rows in which the ellipse meets the tile's columns. Solves
+# A (x - k dy)^2 + R dy^2 = L for dy at the column nearest to the ellipse's top and bottom points.
+_BATCH = r"""
+        int slots[16], first[16], last[16], m = stop - b < 16 ? (int)(stop - b) : 16;
+        float fields[6][16];
+        for (int l = 0; l < 16; l++) {
+            slots[l] = P.hit_slot[b + (l < m ? l : m - 1)];
+            const float* r = P.record + slots[l] * RS;
+            for (int c = 0; c < 6; c++) fields[c][l] = r[c];
+        }
+        {
+            F mx = load(fields[0]) - x0, my = load(fields[1]) - y0, kk = load(fields[3]);
+            F A = -load(fields[2]), R = -load(fields[4]), L = load(fields[5]) - PMIN;
+            F q = A * kk * kk + R, tip = kk * vsqrt(L / R);
+            F xu = vmin(vmax(tip, 0.5f - mx), 15.5f - mx), xd = vmin(vmax(-tip, 0.5f - mx), 15.5f - mx);
+            F hi = A * kk * xu + vsqrt(vmax(L * q - A * R * xu * xu, (F)0.f));
+            F lo = A * kk * xd - vsqrt(vmax(L * q - A * R * xd * xd, (F)0.f));
+            // A hair of slack against rounding: rows too many cost time, rows too few cost pixels.
+            F from = vmin(vmax(my - 0.502f + lo / q, (F)0.f), (F)16.f);
+            F to = vmin(vmax(my + 0.502f + hi / q, (F)0.f), (F)16.f);
+            I t = __builtin_convertvector(from, I), u = __builtin_convertvector(to, I) - 1;
+            t -= __builtin_convertvector(t, F) < from;
+            __builtin_memcpy(first, &t, 64); __builtin_memcpy(last, &u, 64);
+            store(fields[0], 0.5f - mx); store(fields[1], my);
+        }
+"""
 _HIT = r"""
-        const float* r = P.record + P.hit_slot[h] * RS;
-        __builtin_prefetch(P.record + P.hit_slot[h + 4 < stop ? h + 4 : h] * RS);
-        float mx = r[0] - x0, my = r[1] - y0, A = r[2], kk = r[3], R = r[4], lop = r[5];
-        int row0 = first_at(r[6] - (y0 + 0.5f), 16.f), row1 = last_at(r[7] - (y0 + 0.5f), 15.f);
+            const float* channel = P.record + slots[l] * RS + @HEAD@;
+            float left_edge = fields[0][l], my = fields[1][l], A = fields[2][l], kk = fields[3][l], R = fields[4][l];
+            float lop = fields[5][l];
 """
 _ALPHA = r"""
-            float dy = row + 0.5f - my;
-            F e = LANE + (0.5f - mx - kk * dy);
-            F p = fma(A * e, e, (F)(lop + R * dy * dy));
-            I m = (p >= PMIN) & (T[row] > T_STOP);
-            if (!any(m)) continue;
-            F raw = exp2v(p), al = vmin(raw, (F)ALPHA_MAX);
-            al = m ? al : (F)0.f;
-            F w = al * T[row];
+                float dy = row + 0.5f - my;
+                F e = LANE + (left_edge - kk * dy);
+                F p = fma(A * e, e, (F)(lop + R * dy * dy));
+                I lit = (p >= PMIN) & (T[row] > T_STOP);
+                if (!any(lit)) continue;
+                F raw = exp2v(p), al = vmin(raw, (F)ALPHA_MAX);
+                al = lit ? al : (F)0.f;
+                F w = al * T[row];
 """
 
 # Blend stage 0: forward. Parallel over tiles.
@@ -545,36 +574,44 @@ for (long long tile; (tile = take()) < tiles;) {
         T[i] = LANE < (F)(i < rows ? (float)columns : 0.f) ? (F)1.f : (F)0.f;
         best[i] = (F)0.f; median[i] = (F)@DEPTH_EMPTY@f;
         for (int c = 0; c < NCH; c++) C[c][i] = (F)0.f; }
-    long long h = start;
-    for (; h < stop; h++) {
-        if (((h - start) & 7) == 7) {
-            F top = T[0];
-            for (int i = 1; i < 16; i++) top = vmax(top, T[i]);
-            if (!any(top > T_STOP)) break;
-        }
+    long long b = start;
+    for (; b < stop; b += 16) {
+        F most = T[0];
+        for (int i = 1; i < 16; i++) most = vmax(most, T[i]);
+        if (!any(most > T_STOP)) break;
+""" + _BATCH + r"""
+        F totals[16], peaks[16];
+        for (int l = m; l < 16; l++) { totals[l] = (F)0.f; peaks[l] = (F)0.f; }
+        for (int l = 0; l < m; l++) {
 """ + _HIT + r"""
-        F total = (F)0.f, largest = (F)0.f;
-        for (int row = row0; row <= row1; row++) {
+            F total = (F)0.f, peak = (F)0.f;
+            for (int row = first[l]; row <= last[l]; row++) {
 """ + _ALPHA + r"""
-            T[row] = fma(-al, T[row], T[row]);
-            for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)r[@HEAD@ + c], C[c][row]);
-            total += w; largest = vmax(largest, w);
-            if (P.want_depth) {
-                // T before > 0.5 and T after <= 0.5: crossed here. Until then, the largest so far.
-                I open = T[row] + w > 0.5f;
-                I pick = open & ((T[row] <= 0.5f) | (w > best[row])) & m;
-                median[row] = pick ? (F)P.aux[4 * (long long)P.hit_slot[h] + 3] : median[row];
-                best[row] = vmax(best[row], w);
+                T[row] = fma(-al, T[row], T[row]);
+                for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)channel[c], C[c][row]);
+                total += w; peak = vmax(peak, w);
+                if (P.want_depth) {
+                    // T before > 0.5 and T after <= 0.5: crossed here. Until then, the largest so far.
+                    I open = T[row] + w > 0.5f;
+                    I pick = open & ((T[row] <= 0.5f) | (w > best[row])) & lit;
+                    median[row] = pick ? (F)P.aux[4 * (long long)slots[l] + 3] : median[row];
+                    best[row] = vmax(best[row], w);
+                }
             }
+            totals[l] = total; peaks[l] = peak;
         }
         if (P.want_weights) {
-            float* to = P.hit_weight + 2 * (long long)P.hit_place[h];
-            to[0] = sum(total); to[1] = __builtin_reduce_max(largest);
+            float sums[16], tops[16];
+            store(sums, fold16(totals, add)); store(tops, fold16(peaks, vmax));
+            for (int l = 0; l < m; l++) {
+                float* to = P.hit_weight + 2 * (long long)P.hit_place[b + l];
+                to[0] = sums[l]; to[1] = tops[l]; }
         }
     }
-    P.tile_end[tile] = (int)h;
-    if (P.want_weights) for (; h < stop; h++) {
-        float* to = P.hit_weight + 2 * (long long)P.hit_place[h]; to[0] = 0.f; to[1] = 0.f; }
+    b = b < stop ? b : stop;
+    P.tile_end[tile] = (int)b;
+    if (P.want_weights) for (; b < stop; b++) {
+        float* to = P.hit_weight + 2 * (long long)P.hit_place[b]; to[0] = 0.f; to[1] = 0.f; }
     for (int i = 0; i < rows; i++) {
         long long at = (ty * 16 + i) * W + tx * 16;
         for (int l = 0; l < columns; l++) {
@@ -606,36 +643,39 @@ for (long long tile; (tile = take()) < tiles;) {
                 G[c][i][l] = value; all += value * P.image[(at + l) * NCH + c]; }
             T[i][l] = 1.f; left[i][l] = all; }
     }
-    for (long long h = start; h < stop; h++) {
+    for (long long b = start; b < stop; b += 16) {
+""" + _BATCH + r"""
+        for (int l = 0; l < m; l++) {
 """ + _HIT + r"""
-        F out[(@MOMENTS@ + NCH + 15) / 16 * 16];
-        F s0 = (F)0.f, s1 = s0, s2 = s0, s3 = s0, s4 = s0, s5 = s0, ax = s0, ay = s0, gc[NCH];
-        for (int c = 0; c < NCH; c++) gc[c] = (F)0.f;
-        float qa = -2.f * LN2 * A, qc = -2.f * LN2 * R;
-        for (int row = row0; row <= row1; row++) {
+            F out[(@MOMENTS@ + NCH + 15) / 16 * 16];
+            F s0 = (F)0.f, s1 = s0, s2 = s0, s3 = s0, s4 = s0, s5 = s0, ax = s0, ay = s0, gc[NCH];
+            for (int c = 0; c < NCH; c++) gc[c] = (F)0.f;
+            float qa = -2.f * LN2 * A, qc = -2.f * LN2 * R;
+            for (int row = first[l]; row <= last[l]; row++) {
 """ + _ALPHA + r"""
-            F along = (F)0.f;
-            for (int c = 0; c < NCH; c++) {
-                along = fma(G[c][row], (F)r[@HEAD@ + c], along); gc[c] = fma(w, G[c][row], gc[c]); }
-            F seen = w * along;
-            left[row] -= seen;
-            T[row] = fma(-al, T[row], T[row]);
-            // d loss / d log alpha; nothing passes the clamp.
-            F v = seen - al / (1.f - al) * left[row];
-            v = raw <= ALPHA_MAX ? v : (F)0.f;
-            F ve = v * e;
-            s0 += v; s1 += ve; s2 = fma(v, (F)dy, s2);
-            s3 = fma(ve, e, s3); s4 = fma(ve, (F)dy, s4); s5 = fma(v, (F)(dy * dy), s5);
-            if (want_abs) { ax += vabs(ve); ay += vabs(fma(v, (F)(qc * dy), ve * -(kk * qa))); }
+                F along = (F)0.f;
+                for (int c = 0; c < NCH; c++) {
+                    along = fma(G[c][row], (F)channel[c], along); gc[c] = fma(w, G[c][row], gc[c]); }
+                F seen = w * along, behind = left[row] - seen;
+                left[row] = behind;
+                T[row] = fma(-al, T[row], T[row]);
+                // d loss / d log alpha; nothing passes the clamp.
+                F v = seen - al / (1.f - al) * behind;
+                v = raw <= ALPHA_MAX ? v : (F)0.f;
+                F ve = v * e;
+                s0 += v; s1 += ve; s2 = fma(v, (F)dy, s2);
+                s3 = fma(ve, e, s3); s4 = fma(ve, (F)dy, s4); s5 = fma(v, (F)(dy * dy), s5);
+                if (want_abs) { ax += vabs(ve); ay += vabs(fma(v, (F)(qc * dy), ve * -(kk * qa))); }
+            }
+            float* to = P.hit_grad + P.hit_place[b + l] * GS;
+            out[0] = s0; out[1] = s1; out[2] = s2; out[3] = s3; out[4] = s4; out[5] = s5; out[6] = qa * ax; out[7] = ay;
+            for (int c = 0; c < NCH; c++) out[@MOMENTS@ + c] = gc[c];
+            for (int c = @MOMENTS@ + NCH; c < (int)(sizeof(out) / sizeof(F)); c++) out[c] = (F)0.f;
+            for (int c = 0; c < (int)(sizeof(out) / sizeof(F)); c += 16) store(to + c, fold16(out + c, add));
         }
-        float* to = P.hit_grad + P.hit_place[h] * GS;
-        out[0] = s0; out[1] = s1; out[2] = s2; out[3] = s3; out[4] = s4; out[5] = s5; out[6] = qa * ax; out[7] = ay;
-        for (int c = 0; c < NCH; c++) out[@MOMENTS@ + c] = gc[c];
-        for (int c = @MOMENTS@ + NCH; c < (int)(sizeof(out) / sizeof(F)); c++) out[c] = (F)0.f;
-        for (int c = 0; c < (int)(sizeof(out) / sizeof(F)); c += 16) store(to + c, sums16(out + c));
     }
     for (long long h = stop; h < P.tile_start[tile + 1]; h++)
-        for (long long c = 0; c < GS; c++) P.hit_grad[P.hit_place[h] * GS + c] = 0.f;
+        for (long long c = 0; c < GS; c += 16) store(P.hit_grad + P.hit_place[h] * GS + c, (F)0.f);
 }
 """
 
