@@ -76,7 +76,7 @@ def truth_centres(truth: Path, times: Path, frames: list[int]) -> NDArray[np.flo
 
 
 def rmse(errors: NDArray) -> float:
-    return round(float(np.sqrt((errors**2).mean())), 3) if errors.size else float("nan")
+    return float(np.sqrt((errors**2).mean())) if errors.size else float("nan")
 
 
 def rotation_degrees(a: NDArray, b: NDArray) -> float:

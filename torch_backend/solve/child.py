@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from ..contract import ExitCode, JobError, Reporter
+from ..shot import need_disk
 
 _POLL_SECONDS = 0.2
 _LAST_LINES = 3
+_FULL_BYTES = 16 << 20
 _COUNT = re.compile(rb"Process(?:ed|ing) \w+ \[(\d+)/(\d+)\]")
 """How COLMAP's log counts images and blocks of pairs. (Its database must not be looked into meanwhile: a second copy of
 SQLite in one process breaks the first one's locks.)"""
@@ -24,8 +26,8 @@ SQLite in one process breaks the first one's locks.)"""
 def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
     """Runs `worker.py` on a request file; returns its last message ({"result"} or {"failure"}).
 
-    The worker is killed on cancellation and on any other exception here. JobError (SOLVE) if it dies by itself, with
-    the end of COLMAP's log, which is kept in `log`.
+    The worker is killed on cancellation and on any other exception here. JobError (SOLVE, or DISK if
+    that is full) if it dies by itself, with the end of COLMAP's log, which is kept in `log`.
     """
     package_root = Path(__file__).resolve().parents[2]
     environment = dict(os.environ)
@@ -52,9 +54,10 @@ def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
                 if pipe:
                     pipe.close()
     if answer is None or code != 0:
+        need_disk(log.parent, _FULL_BYTES, "The camera solve")
         raise JobError(
             f"The camera solve broke off (COLMAP ended with code {code}): {_tail(log)}",
-            "Try again with a shorter range or a smaller working height; if it stays, please report it with the log.",
+            f"Try again with a shorter range or a smaller working height; if it stays, please report it with {log}.",
             ExitCode.SOLVE,
         )
     return answer

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
 from ..footage import load_frames
 from ..footage.images import read_png, write_png
-from ..shot import Shot, atomic_path, content_key, write_json
+from ..shot import Shot, atomic_path, content_key, need_disk, write_json
 from .child import run_worker
 from .poses import camera_centre, fill_poses
 from .undistort import Undistorter
@@ -94,6 +94,9 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter) -> SolveResult
         return done["result"]
     for name in ("solve.json", "cameras.json"):
         (shot.solve / name).unlink(missing_ok=True)
+    # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
+    size = sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
+    need_disk(shot.root, 1.2 * size + (len(frames["frames"]) << 20), "The camera solve")
     scratch = shot.solve / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
@@ -140,7 +143,6 @@ def _ask_worker(
     names = {True: [], False: []}
     for frame in frames["frames"]:
         names[bool(frame["solve"])].append(Path(frame["file"]).name)
-    # Blank frames have nothing to be placed by.
     request = {
         "images": str(shot.frames / "raw"),
         "solved": names[True],
@@ -163,9 +165,12 @@ def _failure(answer: dict[str, Any]) -> JobError:
     if answer["failure"] == "still":
         message = f"The camera does not move: features shift by at most {flow:.1f} px over the clip."
         return JobError(message, STILL_HINT, ExitCode.SOLVE)
+    if answer["failure"] == "turning":
+        message = "The camera only turns on the spot: there is nothing to tell depth by."
+        return JobError(message, STILL_HINT, ExitCode.SOLVE)
     return JobError(
         "No two frames show enough of the same scene from different places to start a camera solve.",
-        f"{STILL_HINT} Blur, bare walls and a camera that only turns give no parallax.",
+        f"{STILL_HINT} Blur and bare walls give nothing to match.",
         ExitCode.SOLVE,
     )
 

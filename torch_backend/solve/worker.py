@@ -28,6 +28,8 @@ from numpy.typing import NDArray
 SEED = 0
 STILL_SHARE = 0.008
 """Largest median flow between any two frames, as a share of the image width, below which the camera stands still."""
+TURNING_SHARE = 0.8
+"""Share of image pairs explained by a homography above which a failed solve is put down to a turning camera."""
 LOCALISE_MAX_ERROR_PX = 4.0
 LOCALISE_LEAST_INLIERS = 24
 LOCALISE_LEAST_RATIO = 0.4
@@ -70,7 +72,7 @@ def main(path: str) -> int:
         return 0
     models = build(request)
     if not models:
-        say(failure="no_pair", flow_px=flow)
+        say(failure="turning" if turning_share(request) > TURNING_SHARE else "no_pair", flow_px=flow)
         return 0
     sizes = sorted((m.num_reg_images() for m in models), reverse=True)
     # The first model that the mapper writes is often a fragment: the largest is meant.
@@ -155,6 +157,16 @@ def median_flow(request: Request) -> tuple[float, int]:
             shift = np.linalg.norm(keypoints[a][matches[:, 0]] - keypoints[b][matches[:, 1]], axis=1)
             largest = max(largest, float(np.median(shift)))
     return largest, width
+
+
+def turning_share(request: Request) -> float:
+    """Share of matched image pairs that a homography explains: a camera that turns on the spot, or a bare wall."""
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    with closing_database(request) as database:
+        _, geometries = database.read_two_view_geometries()
+    flat = {kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC}
+    found = [kinds(g.config) in flat for g in geometries if len(g.inlier_matches)]
+    return float(np.mean(found)) if found else 0.0
 
 
 def build(request: Request) -> list[pycolmap.Reconstruction]:

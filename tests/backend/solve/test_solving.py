@@ -1,0 +1,219 @@
+"""The whole solve, by COLMAP, of a rendered room: against the cameras it was rendered from."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torch_backend.contract import CameraPath, Cancelled, ExitCode, JobError, read_json
+from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.footage.images import read_png
+from torch_backend.shot import Shot
+from torch_backend.solve import SolveConfig, load_points, solve_shot
+from torch_backend.solve.child import run_worker
+from torch_backend.solve.poses import camera_centre
+from torch_backend.solve.solving import filter_points, quality_words, spans
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def cameras(shot):
+    return CameraPath.load(shot.solve / "cameras.json")
+
+
+def align(viewmats, truths):
+    """Scale, rotation, translation from the solve's world to the true one: the rotation from all orientations."""
+    u, _, vt = np.linalg.svd(sum(true[:3, :3].T @ got[:3, :3] for got, true in zip(viewmats, truths)))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    source, target = (np.array([camera_centre(v) for v in group]) for group in (viewmats, truths))
+    turned = (source - source.mean(0)) @ rotation.T
+    scale = ((target - target.mean(0)) * turned).sum() / (turned**2).sum()
+    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
+
+
+def test_every_frame_has_a_camera_and_a_picture(solved):
+    path = cameras(solved.shot)
+    assert [f.frame for f in path.frames] == list(range(101, 122))
+    assert (path.width, path.height) == (320, 240)
+    sources = [f.source for f in path.frames]
+    assert sources[0::2] == ["registered"] * 11
+    assert sources[1::2] == ["localised"] * 10
+    assert all(read_png(solved.shot.frames / f"{f.frame:06d}.png").shape == (240, 320, 3) for f in path.frames)
+
+
+def test_cameras_are_those_it_was_rendered_from(solved):
+    path = cameras(solved.shot)
+    viewmats = np.array([np.reshape(f.viewmat, (4, 4)) for f in path.frames])
+    scale, rotation, shift = align(viewmats, solved.poses)
+    centres = scale * np.array([camera_centre(v) for v in viewmats]) @ rotation.T + shift
+    # The path is 1.5 long.
+    assert np.abs(centres - [camera_centre(v) for v in solved.poses]).max() < 0.01
+    for viewmat, true in zip(viewmats, solved.poses):
+        between = viewmat[:3, :3] @ rotation.T @ true[:3, :3].T
+        assert np.degrees(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1))) < 0.2
+
+
+def test_the_lens_is_found(solved):
+    record = read_json(solved.shot.solve / "solve.json")
+    assert record["focal_px"] == pytest.approx(300.0, rel=0.01)
+    assert record["distortion"] == [pytest.approx(-0.06, abs=0.01)]
+    assert record["camera_model"] == "SIMPLE_RADIAL"
+
+
+def test_undistorted_frames_are_what_a_pinhole_sees(solved, tools):
+    def rms(a, b):
+        return np.sqrt(((a.astype(float) - b) ** 2).mean())
+
+    path = cameras(solved.shot)
+    # A sideways path trades a little focal length for depth: the lens that made the pictures is what they show.
+    bias = 300.0 / read_json(solved.shot.solve / "solve.json")["focal_px"]
+    for i in (0, 7, 20):
+        fx, fy, cx, cy = np.array(path.frames[i].K) * [bias, bias, 1.0, 1.0]
+        ideal = tools.room().render(solved.poses[i], (fx, fy, cx, cy))
+        half_a_pixel = rms(tools.room().render(solved.poses[i], (fx, fy, cx + 0.5, cy)), ideal)
+        assert rms(read_png(solved.shot.frames / f"{path.frames[i].frame:06d}.png"), ideal) < half_a_pixel
+        assert rms(read_png(solved.shot.frames / f"raw/{path.frames[i].frame:06d}.png"), ideal) > half_a_pixel
+
+
+def test_points_lie_on_the_walls(solved):
+    path, points = cameras(solved.shot), load_points(solved.shot)
+    scale, rotation, shift = align([np.reshape(f.viewmat, (4, 4)) for f in path.frames], solved.poses)
+    xyz = scale * points["xyz"] @ rotation.T + shift
+    walls = np.minimum(np.abs(xyz - [-2.0, -1.5, -1.0]), np.abs(xyz - [2.0, 1.5, 5.0])).min(1)
+    block = np.minimum(np.abs(xyz - [-0.9, 0.1, 1.8]), np.abs(xyz - [0.1, 1.5, 2.8])).min(1)
+    assert len(xyz) > 300
+    assert np.median(np.minimum(walls, block)) < 0.03
+    assert (points["error"] < 2).all() and (points["track"] >= 3).all()
+    kinds = {name: str(points[name].dtype) for name in points}
+    assert kinds == {"xyz": "float32", "rgb": "uint8", "error": "float32", "track": "uint16"}
+
+
+def test_solve_json_says_how_good_it_is(solved):
+    record = read_json(solved.shot.solve / "solve.json")
+    assert (record["registered"], record["solved_frames"], record["total_frames"]) == (11, 11, 21)
+    assert record["reprojection_error_px"] < 1.0
+    assert record["quality"] == f"Good: 11 of 11 frames registered, {record['reprojection_error_px']:.2f} px."
+    assert record["points"] == len(load_points(solved.shot)["xyz"])
+    assert record["warnings"] == []
+    assert solved.result == record["result"]
+
+
+def test_the_model_is_kept_and_the_scratch_is_not(solved):
+    names = {p.name for p in solved.shot.solve.iterdir()}
+    assert names == {"cameras.json", "points.npz", "solve.json", "colmap", "colmap.log"}
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in (solved.shot.solve / "colmap").iterdir()}
+
+
+def test_progress_names_the_stages_in_order(solved):
+    stages = list(dict.fromkeys(stage for stage, _, _ in solved.report.steps))
+    assert [s.removeprefix("solve: ") for s in stages] == [
+        "import",
+        "features",
+        "matches",
+        "cameras",
+        "features of other frames",
+        "matches of other frames",
+        "undistort",
+    ]
+    assert all(0 <= done <= total for _, done, total in solved.report.steps)
+
+
+def test_a_solved_shot_is_left_alone(solved, tools):
+    before = {p: p.stat().st_mtime_ns for p in solved.shot.root.rglob("*") if p.is_file()}
+    report = tools.recorder()
+    assert solve_shot(solved.shot, SolveConfig(features=1500), report) == solved.result
+    assert {p: p.stat().st_mtime_ns for p in solved.shot.root.rglob("*") if p.is_file()} == before
+
+
+def imported(tmp_path, tools, poses, **options):
+    shot = Shot.create(tmp_path / "a.splannequin")
+    clip = tools.write_clip(tmp_path, poses, **options)
+    import_footage(shot, str(clip), FootageConfig(step=1), tools.recorder())
+    return shot
+
+
+def refused(shot, tools):
+    with pytest.raises(JobError) as error:
+        solve_shot(shot, SolveConfig(features=1000), tools.recorder())
+    assert error.value.exit_code == ExitCode.SOLVE
+    assert error.value.hint
+    assert not (shot.solve / "cameras.json").exists()
+    assert not (shot.solve / "scratch").exists()
+    return error.value.message
+
+
+def test_a_still_camera_is_refused(tmp_path, tools):
+    shot = imported(tmp_path, tools, [tools.look([0, 0, 0])] * 9, noise=4.0)
+    assert refused(shot, tools).startswith("The camera does not move: features shift by at most")
+
+
+def test_a_camera_that_only_turns_is_refused(tmp_path, tools):
+    shot = imported(tmp_path, tools, [tools.look([0, 0, 0], yaw=0.03 * i) for i in range(9)])
+    assert refused(shot, tools) == "The camera only turns on the spot: there is nothing to tell depth by."
+
+
+def test_cancelling_kills_the_worker_and_leaves_nothing_half_done(tmp_path, tools):
+    shot = imported(tmp_path, tools, [tools.look([0.1 * i, 0, 0]) for i in range(9)])
+    with pytest.raises(Cancelled):
+        solve_shot(shot, SolveConfig(features=1000), tools.recorder(cancel_at="solve: features"))
+    assert {p.name for p in shot.solve.iterdir()} == {"colmap.log"}
+    assert not list(shot.frames.glob("*.png"))
+
+
+def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, tools):
+    (tmp_path / "request.json").write_text(json.dumps({"images": str(tmp_path)}))
+    with pytest.raises(JobError, match="The camera solve broke off") as error:
+        run_worker(tmp_path / "request.json", tmp_path / "log.txt", tools.recorder())
+    assert error.value.exit_code == ExitCode.SOLVE
+    assert "KeyError" in error.value.message
+
+
+def test_a_worker_ends_with_its_parent(tmp_path):
+    code = "import time\nfrom torch_backend.solve.worker import _die_with_parent\n_die_with_parent()\ntime.sleep(60)"
+    worker = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, cwd=ROOT)
+    assert worker.poll() is None
+    worker.stdin.close()
+    assert worker.wait(timeout=50) == 1
+
+
+def test_solving_before_importing_says_so(tmp_path, tools):
+    with pytest.raises(JobError, match="has no frames yet"):
+        solve_shot(Shot.create(tmp_path / "a.splannequin"), SolveConfig(), tools.recorder())
+
+
+@pytest.mark.parametrize("config", [SolveConfig(camera_model="FISHEYE"), SolveConfig(overlap=0)])
+def test_settings_that_make_no_sense_name_their_values(tmp_path, tools, config):
+    with pytest.raises(ValueError, match=r"FISHEYE|got 0"):
+        solve_shot(Shot.create(tmp_path / "a.splannequin"), config, tools.recorder())
+
+
+def test_points_are_filtered():
+    points = {
+        "xyz": np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, 4], [0, 0, 5], [0, 0, 200]], np.float32),
+        "rgb": np.zeros((6, 3), np.uint8),
+        "error": np.array([0.5, 2.5, 0.5, 0.5, 0.5, 0.5], np.float32),
+        "track": np.array([3, 9, 2, 9, 9, 9], np.uint16),
+        "depth": np.array([1, 1, 1, -1, 1, 1], np.float32),
+    }
+    kept = filter_points(points, np.zeros((4, 3)))
+    assert kept["xyz"][:, 2].tolist() == [1, 5]
+
+
+@pytest.mark.parametrize(
+    ("registered", "error", "expected"),
+    [
+        (74, 0.8, "Good: 74 of 74 frames registered, 0.80 px."),
+        (62, 0.8, "Fair: 62 of 74 frames registered, 0.80 px."),
+        (74, 1.5, "Fair: 74 of 74 frames registered, 1.50 px."),
+        (40, 0.8, "Poor: 40 of 74 frames registered, 0.80 px."),
+    ],
+)
+def test_quality_in_words(registered, error, expected):
+    assert quality_words(registered, 74, error) == expected
+
+
+def test_spans():
+    assert spans([3, 4, 5, 9, 11, 12]) == "3-5, 9, 11-12"
