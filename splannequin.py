@@ -40,6 +40,7 @@ REQUIREMENTS = ROOT / "requirements"
 DEMO_CLIP = ROOT / "examples" / "sitting.mp4"
 NEEDED_PYTHON = (3, 11)
 WINDOWS = os.name == "nt"
+LINUX = sys.platform.startswith("linux")
 
 BPY_WHEELS = {"5.0": (3, 11), "5.2": (3, 13), "4.5": (3, 11), "4.2": (3, 11)}
 """Blender series with a pinned wheel in requirements/, the Python each one needs, in order of preference."""
@@ -53,6 +54,19 @@ HEARTBEAT_SECONDS = 15.0
 """A set-up that has printed nothing for this long says that it is still at work."""
 GRACE_SECONDS = 30.0
 """How long a cancelled child may take for its checkpoint before it is terminated."""
+
+BLENDER_LIBRARIES = {
+    "libX11.so.6": "libx11-6",
+    "libXrender.so.1": "libxrender1",
+    "libXxf86vm.so.1": "libxxf86vm1",
+    "libXfixes.so.3": "libxfixes3",
+    "libXi.so.6": "libxi6",
+    "libxkbcommon.so.0": "libxkbcommon0",
+    "libSM.so.6": "libsm6",
+    "libICE.so.6": "libice6",
+    "libGL.so.1": "libgl1",
+}
+"""What Blender opens on Linux and a bare server lacks: file, Debian package."""
 
 WARP_DRIVER = 580
 """Oldest NVIDIA driver branch for the CUDA 13 builds of Warp and torch pinned here."""
@@ -130,7 +144,7 @@ def hand_over_to_newer_python() -> int:
 if __name__ == "__main__" and sys.version_info[:2] < NEEDED_PYTHON:
     sys.exit(hand_over_to_newer_python())
 
-from torch_backend.contract import ExitCode  # noqa: E402  (needs 3.11)
+from torch_backend.contract import ExitCode, read_json  # noqa: E402  (needs 3.11)
 from torch_backend.shot import is_disk_full, write_json  # noqa: E402
 
 
@@ -556,7 +570,7 @@ def run_child(command: Sequence[str], cwd: Path | None = None, **environ: str) -
     except KeyboardInterrupt:
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
-        raise
+        raise KeyboardInterrupt("the child has said so") from None
 
 
 BLENDERS_OWN = re.compile(
@@ -581,7 +595,7 @@ def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
     except KeyboardInterrupt:
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
-        raise
+        raise KeyboardInterrupt("the child has said so") from None
 
 
 # ------------------------------------------------------------------------------------------------------ summary
@@ -590,9 +604,18 @@ def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
 def read_summary(output: Path) -> dict[str, Any]:
     """DIR/summary.json, {} if there is none."""
     try:
-        return json.loads((output / "summary.json").read_text(encoding="utf-8"))
+        return read_json(output / "summary.json")
     except (OSError, ValueError):
         return {}
+
+
+def failed_job(output: Path) -> str:
+    """The sentence of the newest job of the shots in `output`, if it failed; else nothing."""
+    statuses = sorted(output.glob("*.splannequin/jobs/*/status.json"), key=lambda path: path.stat().st_mtime)
+    if not statuses:
+        return ""
+    status = read_json(statuses[-1])
+    return f"{status['message']} {status['hint']}".strip() if status.get("state") == "failed" else ""
 
 
 # ----------------------------------------------------------------------------------------------------- commands
@@ -901,15 +924,29 @@ def backend_findings(backend: Environment, facts: dict[str, Any]) -> Iterator[Fi
     yield Finding("H.264", "ok" if h264 else "note", "libx264" if h264 else "no encoder in PyAV: reinstall .venv")
 
 
+def opens(library: str) -> bool:
+    """True if the system finds this shared library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
 def blender_findings() -> Iterator[Finding]:
-    """The bpy wheels that are set up or can be, and a Blender on the PATH."""
+    """The bpy wheels that are set up or can be, the libraries they open, and a Blender on the PATH."""
+    found = find_blender()
+    packages = [package for name, package in BLENDER_LIBRARIES.items() if not opens(name)] if LINUX else []
+    if packages:
+        advice = f"install them (Debian and Ubuntu: apt install {' '.join(packages)})"
+        state = "note" if found else "missing"
+        yield Finding("libraries", state, f"a bpy wheel opens libraries that are not here: {advice}")
     ready = [s for s in BPY_WHEELS if bpy_environment(s).ready()]
     if ready:
         yield Finding("bpy", "ok", f"wheel(s) {', '.join(ready)} set up")
     wheels = [] if ready else choose_wheels()
     if wheels:
         yield Finding("bpy", "note", f"not made yet: `python3 splannequin.py setup` installs bpy {wheels[0][0]}")
-    found = find_blender()
     if found:
         yield Finding("blender", "ok", f"{found[1]} at {found[0]}")
     elif ready or wheels:
@@ -971,16 +1008,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = dispatch(args, rest, output)
     except LauncherError as refused:
         error, code = str(refused), refused.exit_code
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         error, code = "Cancelled.", ExitCode.CANCELLED
+        if not interrupt.args:
+            print("Cancelled. Start the same command again to go on.", file=sys.stderr, flush=True)
     except OSError as failed:
         full = is_disk_full(failed)
         error = f"Cannot write to {output}: {failed.strerror or failed}. Choose another --output folder."
         code = ExitCode.DISK if full else ExitCode.USAGE
     if code and not error:
-        error = f"{args.command} ended with exit code {code}; its own message stands in its output."
-    elif error:
-        print(f"Error: {error}" if code != ExitCode.CANCELLED else error, file=sys.stderr, flush=True)
+        error = failed_job(output) or f"{args.command} ended with exit code {code}: see what it printed."
+    elif error and code != ExitCode.CANCELLED:
+        print(f"Error: {error}", file=sys.stderr, flush=True)
     if code:
         with contextlib.suppress(OSError):
             failure = {"command": args.command, "exit_code": code, "error": error}
