@@ -5,12 +5,13 @@ the calling thread and releases the GIL, so workers are Python threads. The envi
 should be set before torch is imported (`torch_backend/__init__.py` does): spinning OpenMP threads would take the cores.
 """
 
+import contextlib
 import ctypes
 import os
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
@@ -29,28 +30,35 @@ _idle: list["_Workspace"] = []
 _IDLE_MAX = 4
 
 
-def _import_warp():
-    """Import and initialise Warp without a word on the terminal; anything but its notice of a missing GPU is passed on.
-
-    The notice is written by C code to file descriptor 2, so the descriptor itself is redirected meanwhile.
-    """
-    import warp as wp
-
-    if _kernels:
-        return wp
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as notice:
+@contextlib.contextmanager
+def _without_notice() -> Iterator[None]:
+    """Hold back what C code writes to standard error meanwhile; pass on all but Warp's notice of a missing GPU."""
+    try:
         saved = os.dup(2)
+    except OSError:  # a detached process may have no standard error at all
+        yield
+        return
+    with tempfile.TemporaryFile() as notice:
         os.dup2(notice.fileno(), 2)
         try:
-            wp.init()
+            yield
         finally:
             os.dup2(saved, 2)
             os.close(saved)
             notice.seek(0)
             lines = notice.read().decode(errors="replace").splitlines(keepends=True)
-    sys.stderr.writelines(line for line in lines if "CUDA driver" not in line)
+            if sys.stderr is not None:
+                sys.stderr.writelines(line for line in lines if "CUDA driver" not in line)
+
+
+def _import_warp():
+    """Import and initialise Warp without a word on the terminal."""
+    import warp as wp
+
+    if not _kernels:
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+        with _without_notice():
+            wp.init()
     return wp
 
 
@@ -92,9 +100,10 @@ def warm_up(channels: int = 3) -> None:
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
-    if threads not in _pools:
-        _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="raster")
-    return _pools[threads]
+    with _lock:
+        if threads not in _pools:
+            _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="raster")
+        return _pools[threads]
 
 
 if hasattr(os, "register_at_fork"):
@@ -103,7 +112,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def _workers(run: Callable[[int, int, int], None], block: source.Block, stage: int, workers: int) -> None:
-    """Run one stage on `workers` threads, the calling one among them."""
+    """Run one stage on `workers` threads, the calling one among them; 1 at least."""
     block.counter = 0
     address = ctypes.addressof(block)
     waiting = [_pool(workers - 1).submit(run, address, stage, w) for w in range(1, workers)] if workers > 1 else []
@@ -159,7 +168,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.grad_stride = -(-(source.MOMENTS + image_channels) // 16) * 16
     block.antialiased, block.want_depth = int(scene.settings.antialiased), int(scene.with_depth)
     block.want_weights, block.want_abs = int(scene.with_contributions), int(scene.settings.absgrad)
-    block.workers = scene.settings.threads
+    block.workers = max(1, min(scene.settings.threads, block.chunks))
     block.view[:] = scene.viewmats[camera, :3].reshape(-1).tolist()
     K = scene.Ks[camera]
     block.fx, block.fy, block.cx, block.cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
@@ -168,9 +177,10 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.near = scene.settings.near
     slots = block.chunks * source.CHUNK
     for name, each in (("record", block.record_stride), ("aux", 4), ("index", 1), ("hit_count", 1), ("hit_start", 1),
-                       ("order", 1), ("order2", 1), ("key", 1), ("key2", 1)):
+                       ("order", 1), ("order2", 1), ("key", 1), ("key2", 1), ("span_start", 1), ("span_count", 1)):
         workspace.need(name, slots * each)
     tiles = block.tiles_x * block.tiles_y
+    workspace.need("span", 2 * source.SPANS * block.chunks)
     for name, count in (("chunk_count", block.chunks), ("histogram", tiles * block.workers),
                         ("tile_start", tiles + 1), ("tile_end", tiles)):
         workspace.need(name, count)
@@ -181,7 +191,8 @@ def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) ->
     block, threads = workspace.block, scene.settings.threads
     stages, blend = _compile(0), _compile(image_channels)
     address = ctypes.addressof(block)
-    _workers(stages, block, source.PROJECT, threads)
+    by_chunk, by_tile = min(threads, block.chunks), min(threads, block.tiles_x * block.tiles_y)
+    _workers(stages, block, source.PROJECT, by_chunk)
     stages(address, source.SORT, 0)
     if block.hits > _HITS_MAX:
         raise RuntimeError(f"{block.visible} Gaussians cover {block.hits} tiles of a {block.width}x{block.height} "
@@ -190,12 +201,12 @@ def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) ->
     workspace.need("hit_place", block.hits)
     if block.want_weights:
         workspace.need("hit_weight", 2 * block.hits)
-    _workers(stages, block, source.COUNT, threads)
+    _workers(stages, block, source.COUNT, block.workers)
     stages(address, source.PREFIX, 0)
-    _workers(stages, block, source.EMIT, threads)
-    _workers(blend, block, source.BLEND, threads)
+    _workers(stages, block, source.EMIT, block.workers)
+    _workers(blend, block, source.BLEND, by_tile)
     if block.want_weights:
-        _workers(stages, block, source.WEIGHTS, threads)
+        _workers(stages, block, source.WEIGHTS, by_chunk)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -253,8 +264,9 @@ class _Rasterize(torch.autograd.Function):
                    background=behind, image=image[c], alpha=alpha[c], grad_image=grad_image[c],
                    grad_alpha=grad_alpha[c], grad_view=partial, grad_norm=ctx.norms[0][c], grad_abs=ctx.norms[1][c],
                    **out)
-            _workers(blend, block, source.BLEND_BACKWARD, scene.settings.threads)
-            _workers(stages, block, source.PROJECT_BACKWARD, scene.settings.threads)
+            threads = scene.settings.threads
+            _workers(blend, block, source.BLEND_BACKWARD, min(threads, block.tiles_x * block.tiles_y))
+            _workers(stages, block, source.PROJECT_BACKWARD, min(threads, block.chunks))
             grad_view[c, :3] = partial.double().sum(0).reshape(3, 4).float()
         grad_background = None
         if background is not None and ctx.needs_input_grad[9]:

@@ -21,6 +21,8 @@ from . import constants as k
 
 CHUNK = 1024
 """Gaussians per unit of work of the projection."""
+SPANS = 4 * CHUNK
+"""Tile spans that are remembered per chunk; those beyond are worked out again when needed."""
 HEAD = 8
 """Floats of a record before its channels."""
 MOMENTS = 8
@@ -37,7 +39,7 @@ _FIELDS: list[tuple[str, type, str]] = [
         "grad_norm", "grad_abs")],
     *[(n, _P, "int*") for n in (
         "index", "hit_count", "hit_start", "chunk_count", "order", "order2", "key", "key2", "histogram", "tile_start",
-        "tile_end", "hit_slot", "hit_place", "radii")],
+        "tile_end", "hit_slot", "hit_place", "radii", "span", "span_start", "span_count")],
     *[(n, _I, "long long") for n in (
         "n", "width", "height", "tiles_x", "tiles_y", "chunks", "visible", "hits", "workers", "n_colors", "n_sh",
         "sh_degree", "sh_stride", "channels", "record_stride", "grad_stride", "antialiased", "want_depth",
@@ -218,6 +220,15 @@ auto spans = FN(long long slot, auto&& visit) -> void {
     } };
 """
 
+# The same from memory, where it was kept: pairs (tile row, first column | last column << 16).
+_KEPT_SPANS = _SPANS + r"""
+auto kept_spans = FN(int slot, auto&& visit) -> void {
+    if (P.span_start[slot] < 0) { spans(slot, visit); return; }
+    const int* s = P.span + 2 * (long long)P.span_start[slot];
+    for (int i = 0; i < P.span_count[slot]; i++) visit(s[2 * i], s[2 * i + 1] & 0xffff, s[2 * i + 1] >> 16);
+};
+"""
+
 # Stage 0: project, cull, compact into slots, colour, count tile hits. Parallel over chunks.
 _STAGE_PROJECT = _GATHER + _SPANS + r"""
 const long long RS = P.record_stride;
@@ -268,6 +279,7 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
         }
     }
     P.chunk_count[chunk] = count;
+    long long kept = chunk * @SPANS@, full = kept + @SPANS@;
     for (int b = 0; b < count; b += 16) {
         int id[16], m = count - b < 16 ? count - b : 16;
         for (int l = 0; l < 16; l++) id[l] = P.index[base + b + (l < m ? l : m - 1)];
@@ -299,10 +311,16 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
                 r[c] = value;
             }
             if (P.want_depth) r[P.n_colors] = P.aux[slot * 4 + 3];
-            int hits = 0;
-            if (good) spans(slot, FN(int, int c0, int c1) -> void { hits += c1 - c0 + 1; });
+            int hits = 0, rows = 0;
+            if (good) spans(slot, FN(int ty, int c0, int c1) -> void {
+                hits += c1 - c0 + 1;
+                if (kept + rows < full) { int* to = P.span + 2 * (kept + rows); to[0] = ty; to[1] = c0 | c1 << 16; }
+                rows++; });
             else { P.radii[i] = 0; P.means2d[2 * i] = 0; P.means2d[2 * i + 1] = 0; }
-            P.hit_count[slot] = hits;
+            P.hit_count[slot] = hits; P.span_count[slot] = rows;
+            bool fits = kept + rows <= full;
+            P.span_start[slot] = fits ? (int)kept : -1;
+            kept += fits ? rows : 0;
         }
     }
 }
@@ -339,10 +357,10 @@ long long tiles = P.tiles_x * P.tiles_y;
 long long from = P.visible * worker / P.workers, to = P.visible * (worker + 1) / P.workers;
 int* mine = P.histogram + worker * tiles;
 """
-_STAGE_COUNT = _SPANS + _STRETCH + r"""
+_STAGE_COUNT = _KEPT_SPANS + _STRETCH + r"""
 for (long long t = 0; t < tiles; t++) mine[t] = 0;
 for (long long rank = from; rank < to; rank++)
-    spans(P.order2[rank], FN(int ty, int c0, int c1) -> void {
+    kept_spans(P.order2[rank], FN(int ty, int c0, int c1) -> void {
         for (int c = c0; c <= c1; c++) mine[ty * P.tiles_x + c]++; });
 """
 _STAGE_PREFIX = r"""
@@ -354,10 +372,10 @@ for (long long t = 0; t < tiles; t++) {
 }
 P.tile_start[tiles] = at;
 """
-_STAGE_EMIT = _SPANS + _STRETCH + r"""
+_STAGE_EMIT = _KEPT_SPANS + _STRETCH + r"""
 for (long long rank = from; rank < to; rank++) {
     int slot = P.order2[rank], place = P.hit_start[slot];
-    spans(slot, FN(int ty, int c0, int c1) -> void {
+    kept_spans(slot, FN(int ty, int c0, int c1) -> void {
         for (int c = c0; c <= c1; c++) {
             int at = mine[ty * P.tiles_x + c]++;
             P.hit_slot[at] = slot; P.hit_place[at] = place++;
@@ -407,8 +425,8 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
         F l0 = vmax(r0, low), l1 = vmax(r1, low), l2 = vmax(r2, low);
 """ + _PROJECT + r"""
         F m0 = load(g[0]);
-        // log alpha = log opacity - (e^2 / xc + dy^2 / yy) / 2 with e = dx - k dy, k = xy / yy, xc = det / yy: gradients
-        // by way of xc, yy and k lose no digits on long thin Gaussians, those by way of the conic do.
+        // log alpha = log opacity - (e^2 / xc + dy^2 / yy) / 2 with e = dx - k dy, k = xy / yy, xc = det / yy.
+        // Gradients by way of xc, yy and k lose no digits on long thin Gaussians; by way of the conic they do.
         F kk = xy / yy, ic = yy / det, iy = 1.f / yy;
         F gmx = load(g[1]) * ic, gmy = load(g[2]) * iy - kk * gmx;
         F g2c = load(g[3]) * ic * ic, gk = load(g[4]) * ic * iy, g2y = load(g[5]) * iy * iy;
@@ -686,7 +704,7 @@ BLEND, BLEND_BACKWARD = range(2)
 def _assemble(stages: list[str], extra: dict[str, object]) -> str:
     """One snippet that switches over `stages`, with the constants of `constants.py` put in."""
     values = {name: getattr(k, name) for name in dir(k) if name.isupper() or name.startswith("SH_")}
-    values |= {"CHUNK": CHUNK, "HEAD": HEAD, "MOMENTS": MOMENTS} | extra
+    values |= {"CHUNK": CHUNK, "SPANS": SPANS, "HEAD": HEAD, "MOMENTS": MOMENTS} | extra
     text = _block_text() + _COMMON
     for number, stage in enumerate(stages):
         text += f"if (stage == {number}) {{\n{stage}\n}}\n"

@@ -8,8 +8,9 @@ from torch import Tensor
 
 
 def default_threads() -> int:
-    """Number of worker threads used unless told otherwise: all cores, at most 32."""
-    return max(1, min(os.cpu_count() or 1, 32))
+    """Number of worker threads used unless told otherwise: all cores that this process may use, at most 16."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores, 16))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,9 @@
 """The compiled CPU body against the float64 oracle."""
 
+import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -145,11 +147,42 @@ def test_no_grad_mode_and_other_float_types(tools):
     assert leaves["means"].grad.dtype == torch.float64
 
 
+def test_concurrent_callers_do_not_disturb_each_other(tools):
+    scenes = [tools.cloud(400 + 50 * i, 60 + i, 50, seed=i) for i in range(3)]
+    alone = [scene.gradients("cpu") for scene in scenes]
+    with ThreadPoolExecutor(3) as pool:
+        together = list(pool.map(lambda i: scenes[i % 3].gradients("cpu"), range(24)))
+    for i, (out, grads) in enumerate(together):
+        assert torch.equal(out.colors, alone[i % 3][0].colors)
+        assert all(torch.equal(grad, alone[i % 3][1][name]) for name, grad in grads.items())
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_child_makes_its_own_threads():
+    code = """
+import os, torch
+from torch_backend.raster import RasterSettings, rasterize
+torch.set_num_threads(1)
+def run():
+    e = torch.eye(4)[None]
+    return rasterize(torch.rand(3000, 3) + 1, torch.ones(3000, 4), torch.full((3000, 3), -3.), torch.zeros(3000),
+                     torch.ones(3000, 1), viewmats=e, Ks=e[:, :3, :3] * 30, width=90, height=70,
+                     settings=RasterSettings(threads=3))
+run()
+child = os.fork()
+if child == 0:
+    run()
+    os._exit(7)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], timeout=120, check=True)
+
+
 def test_nothing_is_written_to_the_terminal(tmp_path):
     code = ("import torch; from torch_backend.raster import rasterize as r; e=torch.eye(4)[None]; "
             "r(torch.tensor([[0.,0.,2.]]), torch.ones(1,4), torch.zeros(1,3), torch.zeros(1), torch.ones(1,1), "
             "viewmats=e, Ks=e[:,:3,:3], width=3, height=2)")
-    env = {**__import__("os").environ, "WARP_CACHE_PATH": str(tmp_path)}
+    env = {**os.environ, "WARP_CACHE_PATH": str(tmp_path)}
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, timeout=300, check=True)
     assert run.stdout == ""
     assert run.stderr == ""
