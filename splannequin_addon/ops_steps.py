@@ -155,7 +155,10 @@ class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Builds camera and points."""
-        return _edit(self, context, "camera", steps.load_camera)
+        outcome = _edit(self, context, "camera", steps.load_camera)
+        if outcome == {"FINISHED"} and context.window is not None:
+            supervisor.look_through_camera(context.window)
+        return outcome
 
 
 class SPLANNEQUIN_OT_insert_freeze(bpy.types.Operator):

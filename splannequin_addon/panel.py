@@ -148,17 +148,25 @@ class _StepPanel:
         self.draw_settings(context, settings)
         if watch and running == self.step:
             self._progress(context, watch)
-            return
-        self._button(context, layout, view, running)
-        self._outcome(context, layout, watch)
-        wrap(layout, context, "Another step is running." if running else view.advice, "INFO")
+        else:
+            self._button(context, layout, view, running)
+            self._outcome(context, layout, watch)
+            if running is None:
+                wrap(layout, context, view.advice, "INFO")
+        body = sub_panel(layout, f"{self.step}_more", "Advanced")
+        if body is not None:
+            body.enabled = running is None
+            self.draw_advanced(context, body)
 
     def draw_settings(self, context: Any, layout: Any) -> None:
-        """The step's settings."""
+        """The settings that an artist needs."""
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """The settings that need no touching."""
 
     def _button(self, context: Any, layout: Any, view: View, running: str | None) -> None:
         row = layout.row()
-        row.scale_y = 1.4
+        row.scale_y = 1.0 if view.done else 1.4
         row.enabled = view.ready and running is None
         step = steps.STEPS[self.step]
         row.operator(self.operator, text=step.again if view.done else step.button)
@@ -172,12 +180,10 @@ class _StepPanel:
             return
         job = watch.jobs[self.step]
         status = job.status
-        row = layout.row(align=True)
+        row = layout.split(factor=0.7, align=True)
         text = f"{status.stage.capitalize()} {100 * status.fraction:.0f} %" if status and status.stage else "Starting"
         row.progress(factor=status.fraction if status else 0.0, type="BAR", text=text)
-        stop = row.row(align=True)
-        stop.alert = False
-        stop.operator("splannequin.cancel", text="Cancel", icon="X").step = self.step
+        row.operator("splannequin.cancel", text="Cancel").step = self.step
         detail = [status.message] if status and status.message else []
         if status and status.eta_seconds is not None:
             detail.append(f"about {minutes(status.eta_seconds)} left")
@@ -231,14 +237,15 @@ class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
         span.enabled = props.use_range
         span.prop(props, "first", text="")
         span.prop(props, "last", text="")
-        body = sub_panel(layout, "footage_more", "Advanced")
-        if body is not None:
-            body.prop(props, "shot_path", text="Folder")
-            body.prop(props, "set_up_scene")
         if not backend.available():
             box = layout.box()
             box.alert = True
             wrap(box, context, "The backend is not set up: choose its Python in the add-on's preferences.", "ERROR")
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """Shot folder, consent to set the scene up."""
+        layout.prop(context.scene.splannequin, "shot_path", text="Folder")
+        layout.prop(context.scene.splannequin, "set_up_scene")
 
 
 class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
@@ -249,11 +256,9 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
     step = "camera"
     operator = "splannequin.solve_camera"
 
-    def draw_settings(self, context: Any, layout: Any) -> None:
+    def draw_advanced(self, context: Any, layout: Any) -> None:
         """The lens."""
-        body = sub_panel(layout, "camera_more", "Advanced")
-        if body is not None:
-            body.prop(context.scene.splannequin, "camera_model")
+        layout.prop(context.scene.splannequin, "camera_model")
 
     def _button(self, context: Any, layout: Any, view: View, running: str | None) -> None:
         watch = self._watch(context)
@@ -275,12 +280,12 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
     operator = "splannequin.train"
 
     def draw_settings(self, context: Any, layout: Any) -> None:
-        """Preset and run."""
-        props = context.scene.splannequin
-        layout.row().prop(props, "preset", expand=True)
-        body = sub_panel(layout, "train_more", "Advanced")
-        if body is not None:
-            body.prop(props, "run_name")
+        """The preset."""
+        layout.row().prop(context.scene.splannequin, "preset", expand=True)
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """The run's name."""
+        layout.prop(context.scene.splannequin, "run_name")
 
 
 class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
@@ -292,7 +297,7 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
     operator = "splannequin.freeze"
 
     def draw_settings(self, context: Any, layout: Any) -> None:
-        """t* and take."""
+        """The instant."""
         props = context.scene.splannequin
         row = layout.row(heading="Frame t*")
         row.prop(props, "choose_t_star", text="")
@@ -300,9 +305,10 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         value.enabled = props.choose_t_star
         value.prop(props, "t_star", text="")
         row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
-        body = sub_panel(layout, "freeze_more", "Advanced")
-        if body is not None:
-            body.prop(props, "take_name")
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """The take's name."""
+        layout.prop(context.scene.splannequin, "take_name")
 
 
 class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
@@ -313,13 +319,11 @@ class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
     step = "bake"
     operator = "splannequin.bake"
 
-    def draw_settings(self, context: Any, layout: Any) -> None:
+    def draw_advanced(self, context: Any, layout: Any) -> None:
         """Colours, and the parts of the step one by one."""
-        body = sub_panel(layout, "bake_more", "Advanced")
-        if body is not None:
-            body.prop(context.scene.splannequin, "keep_colours")
-            body.operator("splannequin.insert_freeze", text="Insert in Compositor Only")
-            body.operator("splannequin.remove_shot")
+        layout.prop(context.scene.splannequin, "keep_colours")
+        layout.operator("splannequin.insert_freeze", text="Insert in Compositor Only")
+        layout.operator("splannequin.remove_shot")
 
 
 def sub_panel(layout: Any, name: str, label: str) -> Any | None:

@@ -70,7 +70,7 @@ def follow(step: str, job: jobs.Job) -> None:
     """Watches a job that was just started."""
     watch = watch_of(job.shot)
     watch.jobs[step] = job
-    watch.notes.pop(step, None)
+    watch.notes.clear()  # what earlier steps said has been read
     watch.failures.pop(step, None)
 
 
@@ -122,6 +122,14 @@ def redraw() -> None:
                 area.tag_redraw()
 
 
+def look_through_camera(window: Any) -> None:
+    """Turns the window's first 3D view to the scene's camera, where the plate is."""
+    for area in window.screen.areas:
+        if area.type == "VIEW_3D":
+            area.spaces.active.region_3d.view_perspective = "CAMERA"
+            return
+
+
 def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
     """Lets a job that ended well change the scenes that work on its shot: in a window, as one undo step each."""
     if job.state != "done":
@@ -134,6 +142,8 @@ def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
                 continue
             with bpy.context.temp_override(window=window, scene=scene):
                 watch.notes[step] = steps.finish(scene, step, job)
+                if step == "camera":
+                    look_through_camera(window)
                 if watch.notes[step]:
                     bpy.ops.ed.undo_push(message=f"Splannequin {steps.STEPS[step].label}")
                 if step == "bake":

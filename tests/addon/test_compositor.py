@@ -128,7 +128,7 @@ def test_group_offers_what_a_compositor_needs(addon, scene, take):
 
 def test_take_without_frames_is_refused_in_words(addon, scene, shot, contract):
     (shot / "takes" / "empty").mkdir()
-    with pytest.raises(contract.JobError, match="'empty' .* holds no frozen frames"):
+    with pytest.raises(contract.JobError, match=r"'empty' .* holds no frozen frames"):
         addon("bake").insert(scene, shot, "empty")
 
 

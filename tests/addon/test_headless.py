@@ -1,0 +1,132 @@
+"""The command line of the Blender side, in this process: exit codes, what it leaves, and a baked file that renders."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def run(addon, capfd):
+    """run(*arguments) is (exit code, standard output, standard error)."""
+
+    def call(*arguments) -> tuple[int, str, str]:
+        capfd.readouterr()
+        code = addon("headless").main([str(a) for a in arguments])
+        out, err = capfd.readouterr()
+        return code, out, err
+
+    return call
+
+
+def test_bake_leaves_frames_a_file_and_a_summary(run, shot, tmp_path, pictures, layers, addon, scene):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "summary.json").write_text('{"version": 1, "registered": 3, "wall_seconds_by_stage": {"train": 2.0}}')
+    code, said, _ = run("bake", "--shot", shot, "--take", "freeze", "--output", out)
+    assert code == 0 and "View transform set from AgX to Standard" in said
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["composited_dir"] == str(out / "composited") and summary["composited_frames"] == 3
+    assert summary["registered"] == 3 and set(summary["wall_seconds_by_stage"]) == {"train", "bake"}
+    for frame in (5, 6, 7):
+        found = pictures.read(out / "composited" / f"{frame:06d}.png")
+        assert np.abs(found - pictures.srgb(layers(frame)["rgba"][..., :3])).max() * 255 < 0.6
+    assert sorted(p.name for p in out.iterdir()) == ["composited", "shot.blend", "summary.json"]
+
+
+def test_a_baked_file_renders_again_after_its_folder_moved(run, shot, tmp_path, pictures, layers, package, addon):
+    out = shot.parent / "out"
+    assert run("bake", "--shot", shot, "--output", out)[0] == 0
+    moved = tmp_path.with_name(tmp_path.name + "-moved")
+    tmp_path.rename(moved)
+    for picture in (moved / "out" / "composited").iterdir():
+        picture.unlink()
+    package.unregister()  # a machine without the add-on
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(moved / "out" / "shot.blend"))
+        bpy.ops.render.render(animation=True)
+    finally:
+        package.register()
+    for frame in (5, 7):
+        found = pictures.read(moved / "out" / "composited" / f"{frame:06d}.png")
+        assert np.abs(found - pictures.srgb(layers(frame)["rgba"][..., :3])).max() * 255 < 0.6
+
+
+def test_bake_into_an_artists_file_keeps_its_settings(run, shot, tmp_path, addon):
+    scene = bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y, scene.frame_start, scene.frame_end = 40, 30, 6, 7
+    scene.render.image_settings.file_format = "TIFF"
+    tree = addon("compat").new_compositor_tree(scene, "Mine")
+    colour = tree.nodes.new("CompositorNodeRGB")
+    tree.links.new(colour.outputs[0], addon("compat").output_socket(tree))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "artist.blend"))
+    before = (tmp_path / "artist.blend").read_bytes()
+    assert run("bake", "--shot", shot, "--output", tmp_path / "out", "--blend", tmp_path / "artist.blend")[0] == 0
+    assert (tmp_path / "artist.blend").read_bytes() == before, "the artist's file is not written"
+    assert sorted(p.name for p in (tmp_path / "out" / "composited").iterdir()) == ["000006.tif", "000007.tif"]
+    scene = bpy.context.scene
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (40, 30)
+    names = {n.bl_idname for n in addon("compat").compositor_tree(scene).nodes}
+    assert {"CompositorNodeRGB", "CompositorNodeGroup"} <= names
+
+
+def test_camera_points_and_plate_are_in_the_baked_file(run, shot, tmp_path):
+    assert run("bake", "--shot", shot, "--output", tmp_path / "out")[0] == 0
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "shot.blend"))
+    scene = bpy.context.scene
+    assert scene.camera.animation_data and scene.camera.data.background_images[0].image
+    assert {o.type for o in scene.objects} == {"EMPTY", "CAMERA", "MESH"}
+    assert (scene.frame_start, scene.frame_end) == (5, 7)
+    assert scene.render.filepath.startswith("//")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        ((), 2, "required"),
+        (("bake",), 2, "--shot"),
+        (("bake", "--shot", "nowhere", "--output", "out"), 2, "is no shot folder"),
+        (("status", "nowhere"), 2, "is no shot folder"),
+        (("solve", "nowhere"), 2, "is no shot folder"),
+        (("freeze", "no-such-clip.mp4", "--output", "out"), 3, "no-such-clip.mp4"),
+        (("freeze", "clip.mp4", "--preset", "best"), 2, "invalid choice"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence_and_an_exit_code(run, tmp_path, monkeypatch, arguments, code, words):
+    monkeypatch.chdir(tmp_path)
+    found, _, said = run(*arguments)
+    assert found == code and words in said
+    assert "Traceback" not in said
+    if code != 2:
+        assert said.startswith("Error: ") and said.strip().count("\n") == 0
+
+
+def test_missing_take_without_a_run_is_a_freeze_error(run, shot, tmp_path):
+    code, _, said = run("bake", "--shot", shot, "--take", "other", "--output", tmp_path / "out")
+    assert code in (2, 6) and said.startswith("Error: ")
+    assert not (tmp_path / "out" / "shot.blend").exists()
+
+
+def test_help_lists_commands_and_exit_codes(run):
+    code, said, _ = run("--help")
+    assert code == 0
+    for word in ("import", "solve", "train", "freeze", "bake", "status", "doctor", "130 cancelled"):
+        assert word in said
+
+
+def test_import_and_status(run, clip, tmp_path: Path):
+    shot = tmp_path / "s.splannequin"
+    assert run("import", shot, clip, "--first", 1, "--last", 8)[0] == 0
+    code, said, _ = run("status", shot)
+    assert code == 0 and "-import-" in said and "done" in said
+    code, said, _ = run("import", shot, clip, "--first", 1, "--last", 8, "--json")
+    events = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    assert events[-2]["type"] == "done" and events[-1]["result"] is not None
+
+
+def test_doctor_tells_both_sides(run):
+    code, said, _ = run("doctor")
+    facts = json.loads(said)
+    assert code == 0 and facts["blender"] == bpy.app.version_string and facts["backend"]["packages"]["torch"]

@@ -1,0 +1,187 @@
+"""Jobs as the add-on sees them, on real backend processes: followed, cancelled, found again, missed when they die."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def python(addon) -> str:
+    """The backend's Python. These tests need one: no backend is a failure, not a reason to skip."""
+    return addon("backend").python()
+
+
+@pytest.fixture
+def empty_shot(addon, tmp_path: Path) -> Path:
+    folder = tmp_path / "ünï shot.splannequin"
+    addon("shots").create(folder)
+    return folder
+
+
+@pytest.fixture
+def start_import(addon, contract, empty_shot, python, root):
+    """start_import(source, first, last) is a started import job."""
+    started = []
+
+    def start(source: Path, first: int | None = None, last: int | None = None):
+        jobs = addon("jobs")
+        job = jobs.new_job(empty_shot, "import", contract.ImportParams(str(source), first, last))
+        jobs.start(job, python, root)
+        started.append(job)
+        return job
+
+    yield start
+    for job in started:
+        if job.process is not None and job.process.poll() is None:
+            job.process.kill()
+        if job.process is not None:
+            job.process.wait()
+
+
+def test_a_job_is_followed_to_its_end(addon, start_import, clip):
+    jobs = addon("jobs")
+    seen = []
+    job = start_import(clip, 3, 10)
+    result = jobs.wait(job, seen.append)
+    assert job.state == "done" and result is not None
+    assert [e.seq for e in seen] == list(range(len(seen))), "every event once, in order"
+    assert seen[-1].type == "done" and {e.type for e in seen} >= {"progress", "done"}
+    state = addon("shots").read(job.shot)
+    assert (state.frames, state.frame_range) == (8, (3, 10))
+
+
+def test_a_child_runs_in_its_own_process_group(addon, start_import, clip):
+    if sys.platform == "win32":
+        pytest.skip("process groups are POSIX")
+    job = start_import(clip, 1, 8)
+    assert os.getpgid(job.process.pid) == job.process.pid != os.getpgid(0)
+    addon("jobs").wait(job)
+
+
+def test_a_failure_keeps_its_sentence_and_exit_code(addon, contract, start_import, tmp_path):
+    wrong = tmp_path / "note.mp4"
+    wrong.write_text("this is no video")
+    job = start_import(wrong)
+    with pytest.raises(contract.JobError) as caught:
+        addon("jobs").wait(job)
+    assert caught.value.exit_code == contract.ExitCode.FOOTAGE
+    assert "note.mp4" in caught.value.message and caught.value.message.count("\n") == 0
+    assert job.state == "failed" and not (job.shot / "frames" / "frames.json").exists()
+
+
+def test_cancel_ends_a_job(addon, contract, start_import, clip):
+    jobs = addon("jobs")
+    job = start_import(clip)
+    jobs.cancel(job)
+    with pytest.raises(contract.Cancelled):
+        jobs.wait(job)
+    assert job.status.exit_code == contract.ExitCode.CANCELLED
+
+
+def test_a_killed_child_leaves_a_status_that_says_so(addon, contract, start_import, clip):
+    if sys.platform == "win32":
+        pytest.skip("SIGKILL is POSIX")
+    jobs = addon("jobs")
+    job = start_import(clip)
+    while jobs.poll(job, 0.5) == [] and not job.ended:
+        time.sleep(0.02)
+    os.kill(job.process.pid, signal.SIGKILL)
+    with pytest.raises(contract.JobError, match="stopped without a word"):
+        jobs.wait(job)
+    told = json.loads((job.folder / "status.json").read_text())
+    assert told["state"] == "failed" and "memory" in told["hint"]
+    again = jobs.open_job(job.folder)
+    jobs.poll(again)
+    assert again.state == "failed", "another Blender reads the same"
+
+
+def test_another_blender_finds_a_running_job_and_its_end(addon, start_import, clip):
+    jobs = addon("jobs")
+    job = start_import(clip, 1, 10)
+    while jobs.poll(job, 0.5) == [] and not job.ended:
+        time.sleep(0.02)
+    found = jobs.latest(job.shot)["import"]
+    assert found.folder == job.folder and found.process is None
+    assert not found.ended and jobs.is_alive(found, found.status)
+    jobs.wait(job)
+    assert jobs.wait(found) == job.result
+
+
+def test_a_job_of_a_dead_machine_is_not_believed(addon, contract, empty_shot):
+    jobs = addon("jobs")
+    job = jobs.new_job(empty_shot, "train", contract.TrainParams())
+    ended = subprocess.Popen([sys.executable, "-c", "pass"])
+    ended.wait()
+    now = time.time()
+    status = contract.Status("train", "running", ended.pid, now - 900, 12345.0, now - 600, stage="training")
+    jobs.write_json(job.folder / "status.json", dataclasses.asdict(status))
+    (job.folder / "log.txt").write_text("first\nMemoryError: no room\n")
+    found = jobs.latest(empty_shot)["train"]
+    assert found.state == "failed"
+    assert "during training" in found.status.message and "MemoryError: no room" in found.status.message
+    assert str(job.folder / "log.txt") in found.status.hint
+
+
+def test_events_half_written_are_read_later(addon, contract, empty_shot):
+    jobs = addon("jobs")
+    job = jobs.new_job(empty_shot, "train", contract.TrainParams())
+    event = contract.Event("metric", 0, time.time(), {"stage": "train", "values": {"psnr_db": 20.5}})
+    line = json.dumps(dataclasses.asdict(event)) + "\n"
+    events = job.folder / "events.jsonl"
+    events.write_text(line[:30])
+    assert jobs.poll(job) == []
+    events.write_text(line)
+    assert [e.type for e in jobs.poll(job)] == ["metric"]
+    assert job.metrics == {"psnr_db": 20.5} and jobs.poll(job) == []
+
+
+def test_poll_keeps_its_budget_and_loses_nothing(addon, contract, empty_shot):
+    jobs = addon("jobs")
+    job = jobs.new_job(empty_shot, "train", contract.TrainParams())
+    event = contract.Event("warning", 0, 0.0, {"message": "m", "hint": ""})
+    lines = [json.dumps({**dataclasses.asdict(event), "seq": n}) for n in range(5000)]
+    (job.folder / "events.jsonl").write_text("\n".join(lines) + "\n")
+    first = jobs.poll(job, 0.0)
+    assert len(first) == 1, "at least one event per turn, and no more than the budget allows"
+    rest = []
+    while len(first) + len(rest) < 5000:
+        rest += jobs.poll(job, 0.01)
+    assert [e.seq for e in first + rest] == list(range(5000)) and len(job.warnings) == 5000
+
+
+def test_the_childs_environment_is_free_of_blenders_python(addon, monkeypatch, root):
+    monkeypatch.setenv("PYTHONHOME", "/of/blender")
+    monkeypatch.setenv("PYTHONPATH", "/of/blender")
+    environ = addon("jobs").backend_environ(root)
+    assert "PYTHONHOME" not in environ and environ["PYTHONPATH"] == str(root)
+
+
+def test_a_python_that_does_not_start_is_an_environment_error(addon, contract, empty_shot, root):
+    jobs = addon("jobs")
+    job = jobs.new_job(empty_shot, "import", contract.ImportParams("x.mp4"))
+    with pytest.raises(contract.JobError) as caught:
+        jobs.start(job, str(root / "no" / "python"), root)
+    assert caught.value.exit_code == contract.ExitCode.ENVIRONMENT and "no/python" in caught.value.message.replace(
+        "\\", "/"
+    )
+
+
+def test_new_job_refuses_the_parameters_of_another_kind(addon, contract, empty_shot):
+    with pytest.raises(ValueError, match="a train job takes TrainParams, not SolveParams"):
+        addon("jobs").new_job(empty_shot, "train", contract.SolveParams())
+
+
+def test_a_broken_write_leaves_what_was_there(addon, tmp_path):
+    jobs = addon("jobs")
+    target = tmp_path / "a.json"
+    jobs.write_json(target, {"a": 1})
+    with pytest.raises(ValueError):
+        jobs.write_json(target, {"a": float("nan")})
+    assert json.loads(target.read_text()) == {"a": 1} and [p.name for p in tmp_path.iterdir()] == ["a.json"]

@@ -1,0 +1,193 @@
+"""The five steps and their buttons, run headless on real jobs, and what they change in the scene."""
+
+from pathlib import Path
+
+import bpy
+import pytest
+
+
+@pytest.fixture
+def with_shot(scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    return scene
+
+
+def test_the_import_button_brings_the_clip_in(addon, scene, clip, tmp_path):
+    props = scene.splannequin
+    props.clip, props.shot_path = str(clip), str(tmp_path / "s.splannequin")
+    props.use_range, props.first, props.last = True, 2, 9
+    assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
+    state = addon("shots").read(tmp_path / "s.splannequin")
+    assert state.frames == 8 and state.frame_range == (2, 9)
+    assert (scene.frame_start, scene.frame_end) == (2, 9), "a new scene takes the clip's range"
+    assert (scene.render.resolution_x, scene.render.resolution_y) == state.size
+    assert scene.render.fps / scene.render.fps_base == pytest.approx(state.info["fps"])
+    assert 2 <= props.t_star <= 9
+
+
+def test_a_scene_in_use_is_left_alone_without_consent(addon, scene, shot):
+    scene.render.resolution_x, scene.frame_end = 4096, 99
+    said = addon("steps").imported(scene, shot)
+    assert (scene.render.resolution_x, scene.frame_end) == (4096, 99) and "left alone" in said[0]
+    scene.splannequin.set_up_scene = True
+    addon("steps").imported(scene, shot)
+    assert (scene.render.resolution_x, scene.frame_end) == (16, 7)
+
+
+def test_a_button_says_what_is_wrong(addon, scene, tmp_path):
+    wrong = tmp_path / "text.mp4"
+    wrong.write_text("no video")
+    scene.splannequin.clip = str(wrong)
+    with pytest.raises(RuntimeError, match=r"text\.mp4"):
+        bpy.ops.splannequin.import_clip()
+    watch = addon("supervisor").watch_of(tmp_path / "text.splannequin")
+    assert watch.jobs["footage"].state == "failed"
+
+
+def test_no_clip_is_said_in_words(scene):
+    with pytest.raises(RuntimeError, match=r"No clip is chosen\. Choose a video or image sequence\."):
+        bpy.ops.splannequin.import_clip()
+
+
+def test_no_backend_writes_nothing(addon, scene, clip, tmp_path, monkeypatch):
+    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))
+    scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(tmp_path / "s.splannequin")
+    with pytest.raises(RuntimeError, match="SPLANNEQUIN_BACKEND_PYTHON does not exist"):
+        bpy.ops.splannequin.import_clip()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_no_shot_is_refused(scene, tmp_path):
+    scene.splannequin.shot_path = str(tmp_path)
+    with pytest.raises(RuntimeError, match="is no shot folder"):
+        bpy.ops.splannequin.solve_camera()
+
+
+def test_the_shot_folder_stands_beside_the_clip(addon, scene, tmp_path):
+    scene.splannequin.clip = str(tmp_path / "a clip.mov")
+    assert addon("steps").shot_folder(scene) == tmp_path / "a clip.splannequin"
+
+
+def test_relative_paths_follow_the_blend(addon, scene, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.context.scene.splannequin.shot_path = "//x.splannequin"
+    assert addon("steps").shot_folder(bpy.context.scene) == tmp_path / "x.splannequin"
+
+
+def test_load_camera_is_one_undo_step(with_shot, shot, addon):
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.splannequin.load_camera("EXEC_DEFAULT", True) == {"FINISHED"}
+    assert addon("cameras").find(bpy.context.scene, shot, "CAMERA")
+    bpy.ops.ed.undo()
+    assert addon("cameras").find(bpy.context.scene, shot, "CAMERA") is None
+    assert bpy.context.scene.render.resolution_x == 1920, "the scene's own size came back with it"
+
+
+def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, shot):
+    scene = with_shot
+    kinds = ("objects", "cameras", "meshes", "images", "actions", "collections", "node_groups")
+    names = {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds}
+    settings = (scene.view_settings.view_transform, scene.render.dither_intensity, scene.render.resolution_x)
+    bpy.ops.splannequin.load_camera()
+    bpy.ops.splannequin.insert_freeze()
+    assert scene.view_settings.view_transform == "Standard" and scene.render.dither_intensity == 0.0
+    assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
+    assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == names
+    assert settings == (scene.view_settings.view_transform, scene.render.dither_intensity, scene.render.resolution_x)
+    assert not any(map(lambda key: key.startswith("splannequin_"), scene.keys()))
+
+
+def test_colours_are_left_alone_without_consent(with_shot):
+    with_shot.splannequin.keep_colours = False
+    bpy.ops.splannequin.insert_freeze()
+    assert with_shot.view_settings.view_transform == "AgX"
+
+
+def test_bake_without_a_backend_renders_a_complete_take(
+    addon, with_shot, shot, monkeypatch, tmp_path, pictures, layers
+):
+    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))
+    scene = with_shot
+    bpy.ops.splannequin.load_camera()
+    assert bpy.ops.splannequin.bake() == {"FINISHED"}
+    out = shot / "bake" / "freeze"
+    assert sorted(p.name for p in out.iterdir()) == ["000005.png", "000006.png", "000007.png"]
+    assert scene.view_settings.view_transform == "Standard"
+    expected = pictures.srgb(layers(6)["rgba"][1:, 1:, :3])
+    assert abs(pictures.read(out / "000006.png")[1:, 1:] - expected).max() * 255 < 0.6
+
+
+def test_the_artists_output_path_is_kept(addon, with_shot, shot, tmp_path):
+    with_shot.render.filepath = str(tmp_path / "mine_")
+    assert addon("bake").choose_output(with_shot, shot, "freeze") == []
+    assert with_shot.render.filepath == str(tmp_path / "mine_")
+
+
+def test_t_star_is_held_within_the_clip(with_shot):
+    with_shot.frame_set(200)
+    bpy.ops.splannequin.t_star_here()
+    assert with_shot.splannequin.t_star == 7 and with_shot.splannequin.choose_t_star
+
+
+def test_bake_asks_for_the_take_as_it_was_made(addon, with_shot):
+    params = addon("steps").params_of(with_shot, "bake")
+    assert (params.run, params.take, params.t_star, params.width, params.only_missing) == (
+        "main",
+        "freeze",
+        6,
+        16,
+        True,
+    )
+    with_shot.splannequin.choose_t_star, with_shot.splannequin.t_star = True, 7
+    assert addon("steps").params_of(with_shot, "bake").t_star == 7
+
+
+def test_the_timer_applies_a_job_that_ended_and_gives_each_step_its_words(addon, scene, clip, tmp_path):
+    props = scene.splannequin
+    props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
+    props.use_range, props.first, props.last = True, 1, 8
+    job = addon("steps").begin(scene, "footage")
+    supervisor = addon("supervisor")
+    supervisor.follow("footage", job)
+    watch = supervisor.watch_of(job.shot)
+    assert watch.running() == "footage"
+    job.process.wait()
+    while watch.running():
+        assert supervisor.tick() == supervisor.TICK_SECONDS
+    assert watch.state.frames == 8
+    assert "Frame range set to 1 to 8." in watch.notes["footage"] and scene.frame_end == 8
+
+
+@pytest.mark.parametrize("step", ["footage", "camera", "train", "freeze", "bake"])
+def test_each_step_says_what_comes_next(addon, scene, step):
+    view = addon("panel").VIEWS[step](scene, None)
+    assert view.advice.endswith(".") and not view.done
+    assert view.ready == (step == "footage")
+
+
+def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
+    panel, state = addon("panel"), addon("shots").read(shot)
+    shown = {step: view(with_shot, state) for step, view in panel.VIEWS.items()}
+    assert shown["footage"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
+    assert shown["camera"].state == ["A good solve."] and "load it" in shown["camera"].advice
+    assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % move"]
+    assert shown["freeze"].state == ["Take freeze: 3 frames, 16 x 12", "Time stands still at frame 6"]
+    assert not shown["bake"].done and shown["bake"].ready
+
+
+def test_every_button_and_setting_has_a_tooltip(addon):
+    for cls in (*addon("ops_steps").CLASSES, *addon("ops_jobs").CLASSES):
+        kind = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type()
+        assert len(kind.description) > 10 and not kind.description.endswith("."), cls
+        for prop in kind.properties:
+            assert prop.identifier == "rna_type" or prop.description, (cls, prop.identifier)
+    for prop in bpy.types.Scene.bl_rna.properties["splannequin"].fixed_type.properties:
+        assert prop.identifier in ("rna_type", "name") or prop.description, prop.identifier
+
+
+def test_a_newer_shot_is_refused_in_words(addon, contract, tmp_path: Path):
+    (tmp_path / "shot.json").write_text('{"version": 99, "name": "x"}')
+    with pytest.raises(ValueError, match="version 99"):
+        addon("shots").read(tmp_path)
+    watch = addon("supervisor").watch_of(tmp_path)
+    assert "version 99" in watch.failures["footage"][0], "the panel shows it instead of breaking"

@@ -1,0 +1,263 @@
+"""Presses the five buttons of the panel in a real Blender window, in order, on a small clip; a picture of each state.
+
+    python tests/addon/window/press_steps.py --blender BLENDER [--clip CLIP] [--last 24] [--output docs/images]
+
+BLENDER is a Blender that has the extension installed (`--command extension install-file -r user_default -e ZIP`). Needs
+Xvfb, xwd (x11-apps) and convert (imagemagick). The same file is the script that runs inside Blender: it moves the mouse
+over the sidebar with simulated events until the button it looks for is under it, and clicks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+STEPS = (
+    ("1-footage", "splannequin.import_clip"),
+    ("2-camera", "splannequin.solve_camera"),
+    ("3-train", "splannequin.train"),
+    ("4-freeze", "splannequin.freeze"),
+    ("5-bake", "splannequin.bake"),
+)
+WINDOW = (1600, 1000)
+PLAN = "SPLANNEQUIN_PRESS_PLAN"
+"""Environment variable: JSON of what the script inside Blender shall do."""
+
+
+def main() -> int:
+    """The host's side: a display, Blender on it, photographs when asked for. Exit status 0 if all five steps ended."""
+    args = _arguments()
+    output = Path(args.output).absolute()
+    output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="splannequin-window-") as work:
+        plan = {"clip": str(Path(args.clip).absolute()), "last": args.last, "work": work, "t_star": args.t_star}
+        plan |= {"stop_train": args.cancel_once}
+        environ = {**os.environ, "DISPLAY": args.display, PLAN: json.dumps(plan)}
+        screen = subprocess.Popen(["Xvfb", args.display, "-screen", "0", f"{WINDOW[0]}x{WINDOW[1]}x24"])
+        try:
+            time.sleep(2.0)
+            command = [args.blender, "--gpu-backend", "opengl", "--enable-event-simulate"]
+            command += ["--window-geometry", "0", "0", str(WINDOW[0]), str(WINDOW[1]), "--python", __file__]
+            blender = subprocess.Popen(command, env=environ)
+            _serve(blender, Path(work), output, environ, args.limit)
+        finally:
+            screen.terminate()
+            screen.wait()
+        told = Path(work) / "told.json"
+        if not told.is_file():
+            print("Error: Blender ended without telling how the steps went.", file=sys.stderr)
+            return 1
+        results = json.loads(told.read_text())
+        print(json.dumps(results, indent=1))
+        return 0 if results["ended"] == [name for name, _ in STEPS] else 1
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--blender", required=True, help="Blender with the extension installed")
+    root = Path(__file__).resolve().parents[3]
+    parser.add_argument("--clip", default=str(root / "examples" / "sitting.mp4"))
+    parser.add_argument("--last", type=int, default=24, help="last frame of the clip to use")
+    parser.add_argument("--t-star", type=int, default=12)
+    parser.add_argument("--output", default=str(root / "docs" / "images"), help="folder for the pictures")
+    parser.add_argument("--display", default=":99", help="X display to open")
+    parser.add_argument("--limit", type=float, default=1500.0, help="seconds until Blender is ended")
+    parser.add_argument("--cancel-once", action="store_true", help="cancel the training once before it may finish")
+    return parser.parse_args()
+
+
+def _serve(blender: subprocess.Popen[bytes], work: Path, output: Path, environ: dict[str, str], limit: float) -> None:
+    """Takes the pictures that the script inside asks for, until Blender ends."""
+    until = time.monotonic() + limit
+    while blender.poll() is None and time.monotonic() < until:
+        for request in sorted(work.glob("*.shoot")):
+            picture = output / f"{request.stem}.png"
+            dump = subprocess.run(["xwd", "-root", "-silent"], env=environ, capture_output=True, check=True).stdout
+            subprocess.run(["convert", "xwd:-", "-strip", str(picture)], input=dump, check=True)
+            request.unlink()
+        time.sleep(0.1)
+    if blender.poll() is None:
+        blender.kill()
+
+
+# ------------------------------------------------------------------------------------------------- inside Blender
+
+
+def inside() -> None:
+    """Starts the script as a timer that walks through `_play`."""
+    import bpy
+
+    plan = json.loads(os.environ[PLAN])
+    play = _play(plan)
+
+    def turn() -> float | None:
+        try:
+            return next(play)
+        except StopIteration:
+            bpy.ops.wm.quit_blender()
+            return None
+
+    bpy.app.timers.register(turn, first_interval=2.0, persistent=True)
+
+
+def _play(plan: dict) -> Iterator[float]:
+    """The artist: yields seconds to wait between what it does."""
+    import bpy
+
+    work = Path(plan["work"])
+    told: dict = {"blender": bpy.app.version_string, "ended": [], "longest_stall_ms": 0.0}
+    yield from _arrange()
+    scene = bpy.context.scene
+    props = scene.splannequin
+    yield from _shoot(work, "0-start")
+    props.clip = plan["clip"]
+    props.shot_path = str(work / "sitting.splannequin")
+    props.use_range, props.first, props.last = True, 1, plan["last"]
+    yield 0.5
+    for name, operator in STEPS:
+        if name == "4-freeze":
+            bpy.context.scene.splannequin.choose_t_star = True
+            bpy.context.scene.splannequin.t_star = plan["t_star"]
+            yield 0.5
+        for attempt in range(2 if plan["stop_train"] and name == "3-train" else 1):
+            yield from _click(operator)
+            yield from _watch(work, name, told, cancel=plan["stop_train"] and name == "3-train" and attempt == 0)
+        (work / "told.json").write_text(json.dumps(told))
+        if told["ended"][-1:] != [name]:
+            return
+    yield 1.0
+
+
+def _arrange() -> Iterator[float]:
+    """A 3D view with the sidebar open on our tab; the splash gone."""
+    import bpy
+
+    window = bpy.context.window_manager.windows[0]
+    bpy.context.preferences.view.show_splash = False
+    _move(window, 300, 500)
+    window.event_simulate(type="ESC", value="PRESS", x=300, y=500)
+    window.event_simulate(type="ESC", value="RELEASE", x=300, y=500)
+    yield 0.5
+    area = _view(window)
+    area.spaces.active.show_region_ui = True
+    yield 0.5
+    region = _sidebar(area)
+    region.active_panel_category = "Splannequin"
+    region.tag_redraw()
+    yield 1.0
+
+
+def _view(window):
+    return next(a for a in window.screen.areas if a.type == "VIEW_3D")
+
+
+def _sidebar(area):
+    return next(r for r in area.regions if r.type == "UI")
+
+
+def _move(window, x: int, y: int) -> None:
+    window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=x, y=y)
+
+
+def _click(operator: str) -> Iterator[float]:
+    """Finds the operator's button under the mouse, scrolling the sidebar if need be, and clicks it."""
+    import bpy
+
+    window = bpy.context.window_manager.windows[0]
+    wanted = f"bpy.ops.{operator}("
+    for _ in range(6):
+        area = _view(window)
+        region = _sidebar(area)
+        x = region.x + region.width // 3
+        for y in range(region.y + region.height - 8, region.y + 4, -9):
+            _move(window, x + (y % 2), y)
+            yield 0.03
+            if not _under_mouse(window, area, region).startswith(wanted):
+                continue
+            window.event_simulate(type="LEFTMOUSE", value="PRESS", x=x, y=y)
+            window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=x, y=y)
+            yield 0.5
+            _move(window, region.x - 200, y)
+            yield 0.3
+            return
+        for _ in range(4):
+            window.event_simulate(type="WHEELDOWNMOUSE", value="PRESS", x=x, y=region.y + region.height // 2)
+        yield 0.5
+    raise RuntimeError(f"no button of {operator} was found in the sidebar")
+
+
+def _under_mouse(window, area, region) -> str:
+    """Python of the operator button under the mouse, as Ctrl-C over it copies; empty over anything else."""
+    import bpy
+
+    manager = bpy.context.window_manager
+    manager.clipboard = ""
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        if bpy.ops.ui.copy_python_command_button.poll():
+            bpy.ops.ui.copy_python_command_button()
+    return manager.clipboard
+
+
+def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
+    """Waits for the step to end; a picture while it runs and one after. Notes in `told` how it ended."""
+    import bpy
+
+    watch = _supervisor().watch_of(work / "sitting.splannequin")
+    began, taken = time.monotonic(), False
+    stage = "training" if name == "3-train" else ""
+    yield 1.0
+    while watch.running() is not None:
+        job = next((j for j in watch.jobs.values() if not j.ended), None)
+        status = job.status if job is not None else None
+        far = status is not None and status.fraction > 0.3 and status.stage.startswith(stage)
+        if not taken and far:
+            yield from _shoot(work, f"{name}-running")
+            taken = True
+            if cancel:
+                yield from _click("splannequin.cancel")
+        before = time.monotonic()
+        yield 0.2
+        told["longest_stall_ms"] = max(told["longest_stall_ms"], 1000 * (time.monotonic() - before - 0.2))
+    yield 1.5
+    yield from _shoot(work, f"{name}-{'cancelled' if cancel else 'done'}")
+    if cancel:
+        return
+    bad = [j.status.message for j in watch.jobs.values() if j.state != "done" and j.status is not None]
+    failures = [sentence for sentence, _ in watch.failures.values()]
+    if bad or failures:
+        told.setdefault("failed", []).extend([*bad, *failures])
+    else:
+        told["ended"].append(name)
+    told.setdefault("seconds", {})[name] = round(time.monotonic() - began, 1)
+    told["frame"] = bpy.context.scene.frame_current
+
+
+def _supervisor():
+    found = [m for n, m in sys.modules.items() if n.endswith(".splannequin.splannequin_addon.supervisor")]
+    if not found:
+        raise RuntimeError("the extension is not enabled in this Blender")
+    return found[0]
+
+
+def _shoot(work: Path, name: str) -> Iterator[float]:
+    """Asks the host for a picture and waits until it is taken."""
+    request = work / f"{name}.shoot"
+    request.touch()
+    for _ in range(100):
+        yield 0.2
+        if not request.exists():
+            return
+
+
+if __name__ == "__main__":
+    if PLAN in os.environ and "bpy" in sys.modules:
+        inside()
+    else:
+        sys.exit(main())
