@@ -17,6 +17,9 @@ from torch import Tensor
 from ..scene import Scene
 from .model import SH_C0, Gaussians, sh_bases
 
+_PIXELS_PER_SEED = 100
+"""A small picture needs no more seeds than one per so many pixels of a frame."""
+
 
 @dataclass
 class InitConfig:
@@ -51,7 +54,7 @@ def initialise(
     opacity = torch.full((len(points),), config.opacity)
     if config.seeds > 0:
         picked = np.unique(np.linspace(0, len(indices) - 1, min(config.frames, len(indices))).round().astype(int))
-        each = config.seeds // len(picked)
+        each = min(config.seeds // len(picked), images.shape[1] * images.shape[2] // _PIXELS_PER_SEED)
         seeds = [_lift_seeds(scene, images[n], indices[n], each, generator) for n in picked]
         points = torch.cat([points, *(s[0] for s in seeds)])
         colors = torch.cat([colors, *(s[1] for s in seeds)])

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..contract import ExitCode, JobError, Reporter, TrainParams, read_json
 from ..footage.images import write_png
+from ..raster.cpu import warm_up
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, write_json
 from .checkpoint import load_checkpoint
@@ -47,6 +48,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     config = config_from_params(params)
     config.device = pick_device(params.device)
     torch.set_num_threads(os.cpu_count() or 1)
+    warm_up()  # kernels compile from the main thread, before the clock of the first step
     folder = shot.run(params.run)
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)

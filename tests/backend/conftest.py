@@ -1,0 +1,148 @@
+"""A shot with known truth: a textured wall of Gaussians, a patch on it that moves, a camera that travels."""
+
+from __future__ import annotations
+
+import math
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torch_backend.contract import CameraFrame, CameraPath
+from torch_backend.footage.images import write_png
+from torch_backend.raster import rasterize
+from torch_backend.shot import Shot, write_json
+
+WIDTH, HEIGHT, FRAMES = 64, 48, 16
+FIRST = 101
+
+
+class Quiet:
+    """A reporter that remembers."""
+
+    def __init__(self, cancel_at: tuple[str, float] | None = None):
+        self.events: list[tuple] = []
+        self.cancel_at = cancel_at
+        self.cancelled = False
+
+    def progress(self, stage, done, total, message=""):
+        self.events.append(("progress", stage, done, total, message))
+        if self.cancel_at and stage == self.cancel_at[0] and done / total >= self.cancel_at[1]:
+            self.cancelled = True
+
+    def metric(self, stage, values):
+        self.events.append(("metric", stage, dict(values)))
+
+    def image(self, label, path):
+        self.events.append(("image", label, str(path)))
+
+    def warning(self, message, hint=""):
+        self.events.append(("warning", message, hint))
+
+    def check_cancelled(self):
+        from torch_backend.contract import Cancelled
+
+        if self.cancelled:
+            raise Cancelled
+
+
+@dataclass
+class World:
+    """The truth behind the tiny shot."""
+
+    shot: Shot
+    viewmats: torch.Tensor
+    K: torch.Tensor
+    state: dict[str, torch.Tensor]
+    moving: torch.Tensor
+
+    def at(self, time: float) -> dict[str, torch.Tensor]:
+        """The Gaussians at a time in [0, 1]: the patch sways by 0.2 units.
+
+        A steady drift would not do: with a steady camera it looks like a patch at another depth.
+        """
+        means = self.state["means"].clone()
+        means[self.moving, 0] += 0.2 * math.sin(2 * math.pi * time)
+        return {**self.state, "means": means}
+
+    def image(self, frame: int, time: float) -> torch.Tensor:
+        """[H, W, 3] from the pose of a frame, at a time."""
+        out = rasterize(**self.at(time), viewmats=self.viewmats[frame : frame + 1], Ks=self.K[None], width=WIDTH,
+                        height=HEIGHT, background=torch.full((3,), 0.5))  # fmt: skip
+        return out.colors[0].clamp(0, 1)
+
+
+def build_world(root: Path) -> World:
+    g = torch.Generator().manual_seed(7)
+    grid = torch.stack(torch.meshgrid(torch.linspace(-2.6, 2.6, 30), torch.linspace(-2, 2, 24), indexing="ij"), -1)
+    wall = torch.cat([grid.reshape(-1, 2), torch.full((720, 1), 4.0)], dim=1)
+    patch = torch.tensor([-0.3, 0.0, 3.2]) + (torch.rand(90, 3, generator=g) - 0.5) * torch.tensor([0.8, 0.8, 0.05])
+    means = torch.cat([wall, patch])
+    colors = torch.rand(len(means), 3, generator=g)
+    colors[:720] = 0.5 + 0.3 * torch.sin(2.5 * wall)
+    colors[720:] = torch.tensor([0.9, 0.15, 0.1]) + 0.2 * (colors[720:] - 0.5)
+    quats = torch.zeros(len(means), 4)
+    quats[:, 0] = 1
+    scales = torch.full((len(means), 3), 0.11)
+    scales[720:] = 0.07
+    state = {"means": means, "quats": quats, "log_scales": scales.log(), "opacity_logits": torch.full((len(means),), 3.0),
+             "colors": colors}  # fmt: skip
+    moving = torch.zeros(len(means), dtype=torch.bool)
+    moving[720:] = True
+    viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
+    viewmats[:, 0, 3] = torch.linspace(0.6, -0.6, FRAMES)
+    viewmats[:, 1, 3] = 0.1 * torch.sin(torch.linspace(0, 6, FRAMES))
+    K = torch.tensor([[60.0, 0, 32.0], [0, 60.0, 24.0], [0, 0, 1]])
+    world = World(Shot.create(root / "tiny.splannequin"), viewmats, K, state, moving)
+    _write(world)
+    return world
+
+
+def _write(world: World) -> None:
+    shot, rows, cameras = world.shot, [], []
+    for n in range(FRAMES):
+        pixels = (world.image(n, n / (FRAMES - 1)) * 255 + 0.5).to(torch.uint8).numpy()
+        write_png(shot.frames / f"{FIRST + n:06d}.png", pixels)
+        rows.append({"frame": FIRST + n, "seconds": n / 10, "file": f"raw/{FIRST + n:06d}.png", "solve": True,
+                     "sharpness": 1.0, "exposure": 0.0, "flags": []})  # fmt: skip
+        K = world.K
+        cameras.append(CameraFrame(FIRST + n, world.viewmats[n].flatten().tolist(),
+                                   [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]))  # fmt: skip
+    write_json(shot.frames / "frames.json",
+               {"version": 1, "width": WIDTH, "height": HEIGHT, "fps": 10.0, "colour": "srgb", "frames": rows})  # fmt: skip
+    write_json(shot.solve / "cameras.json", CameraPath(WIDTH, HEIGHT, cameras).to_json())
+    pick = torch.cat([torch.arange(0, 720, 3), torch.arange(720, 810, 3)])
+    xyz = world.state["means"][pick]
+    rgb = (world.state["colors"][pick].clamp(0, 1) * 255).to(torch.uint8)
+    np.savez(shot.solve / "points.npz", xyz=xyz.numpy(), rgb=rgb.numpy(), error=np.zeros(len(pick), np.float32),
+             track=np.full(len(pick), 5, np.uint16))  # fmt: skip
+    shot.update(first=FIRST, last=FIRST + FRAMES - 1, fps=10.0, width=WIDTH, height=HEIGHT)
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory) -> World:
+    """The solved tiny shot and its truth; tests must not change it."""
+    return build_world(tmp_path_factory.mktemp("world"))
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """The tiny shot with one finished run `main` (auto, support); tests may add takes, not change the run."""
+    from torch_backend.contract import TrainParams
+    from torch_backend.train import train_shot
+
+    world = build_world(tmp_path_factory.mktemp("trained"))
+    summary = train_shot(world.shot, TrainParams(iterations=900, holdout=8, max_gaussians=1500), Quiet())
+    return world, summary
+
+
+@pytest.fixture(scope="session")
+def quiet():
+    """The class of a reporter that remembers."""
+    return Quiet

@@ -1,0 +1,160 @@
+"""Frozen frames of the tiny world against its truth: pixels, mattes, depth, stale frames, cancellation."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from torch_backend.contract import NO_DEPTH, CameraFrame, CameraPath, Cancelled, FreezeParams, JobError
+from torch_backend.footage.color import linear_to_srgb
+from torch_backend.footage.images import read_png
+from torch_backend.freeze import freeze_at, freeze_shot
+from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.gaussians.ply import read_ply
+from torch_backend.shot import write_json
+from torch_backend.train import load_run
+
+
+@pytest.fixture(scope="module")
+def takes(trained, quiet):
+    world, _ = trained
+    return {t: freeze_shot(world.shot, FreezeParams(take=f"t{t}", t_star=t), quiet()) for t in (105, 112)}
+
+
+def frozen(world, t_star, frame):
+    return read_frozen_exr(world.shot.take(f"t{t_star}") / f"{frame:06d}.exr")
+
+
+def psnr(a, b):
+    return -10 * np.log10(np.mean((np.asarray(a, float) - np.asarray(b, float)) ** 2))
+
+
+def test_every_pose_shows_the_world_at_t_star(trained, takes):
+    world, _ = trained
+    for t_star in (105, 112):
+        scores = []
+        for n in (1, 6, 12, 14):
+            image = frozen(world, t_star, 101 + n)
+            scores.append(psnr(linear_to_srgb(image.rgba[..., :3]), world.image(n, (t_star - 101) / 15).numpy()))
+        assert min(scores) > 18.0
+        assert np.mean(scores) > 21.0
+
+
+def test_two_instants_differ_where_the_patch_moved_and_nowhere_else(trained, takes):
+    world, _ = trained
+    early, late = frozen(world, 105, 108), frozen(world, 112, 108)
+    difference = np.abs(early.rgba[..., :3] - late.rgba[..., :3]).mean(-1)
+    truth = (world.image(7, 4 / 15) - world.image(7, 11 / 15)).abs().mean(-1).numpy()
+    moved = truth > 0.1
+    still = truth < 0.002
+    assert difference[moved].mean() > 0.05
+    assert difference[still].mean() < 0.012
+    assert early.motion[moved].mean() > 0.4 > 0.15 > early.motion[still].mean()
+
+
+def test_depth_is_in_solve_units_and_empty_is_1e10(trained, takes):
+    world, _ = trained
+    image = frozen(world, 105, 105)
+    centre = np.median(image.depth[4:44, 4:14])
+    assert centre == pytest.approx(4.0, rel=0.05)
+    assert (image.depth[image.rgba[..., 3] == 0] == np.float32(NO_DEPTH)).all()
+    assert image.metadata.t_star_frame == 105
+    np.testing.assert_allclose(image.metadata.viewmat, world.viewmats[4].numpy(), atol=1e-4)
+
+
+def test_support_is_high_where_everything_was_seen(trained, takes):
+    world, _ = trained
+    assert frozen(world, 105, 103).support[8:40, 8:56].mean() > 0.9
+
+
+def test_what_a_take_leaves(trained, takes):
+    world, _ = trained
+    folder = world.shot.take("t105")
+    facts = json.loads((folder / "take.json").read_text())
+    assert facts["frames"] == 16
+    assert facts["t_star_frame"] == 105
+    assert (folder / "contact_sheet.png").stat().st_size > 1000
+    assert (folder / "video.mp4").stat().st_size > 500
+    assert read_png(folder / "preview" / "000101.png").shape == (48, 64, 3)
+    ply = read_ply(folder / "frozen.ply")
+    assert len(ply.means) == len(load_run(world.shot, "main").model.gaussians)
+    assert np.median(ply.means[:, 2]) == pytest.approx(4.0, rel=0.1)
+
+
+def test_query_nearest_is_the_plain_one_where_everything_is_supported(trained):
+    world, _ = trained
+    model = load_run(world.shot, "main").model
+    model.gaussians.support[:] = True
+    time = float(model.centres[4])
+    plain, nearest = freeze_at(model, time, 1.5, "plain"), freeze_at(model, time, 1.5, "nearest")
+    for name, value in plain.state.items():
+        torch.testing.assert_close(value, nearest.state[name])
+    with pytest.raises(ValueError, match="query"):
+        freeze_at(model, time, 1.5, "best")
+
+
+def test_only_missing_frames_are_rendered_again(trained, quiet):
+    world, _ = trained
+    freeze_shot(world.shot, FreezeParams(take="again", t_star=104), quiet())
+    folder = world.shot.take("again")
+    (folder / "000103.exr").unlink()
+    before = {p.name: p.stat().st_mtime_ns for p in folder.glob("*.exr")}
+    freeze_shot(world.shot, FreezeParams(take="again", t_star=104, only_missing=True), quiet())
+    after = {p.name: p.stat().st_mtime_ns for p in folder.glob("*.exr")}
+    assert {n for n in after if after[n] != before.get(n)} == {"000103.exr"}
+    freeze_shot(world.shot, FreezeParams(take="again", t_star=110, only_missing=True), quiet())
+    assert all(p.stat().st_mtime_ns != after[p.name] for p in folder.glob("*.exr"))
+
+
+def test_cancelled_take_goes_on(trained, quiet):
+    world, _ = trained
+    with pytest.raises(Cancelled):
+        freeze_shot(world.shot, FreezeParams(take="cut", t_star=104), quiet(cancel_at=("freezing", 0.5)))
+    folder = world.shot.take("cut")
+    done = {p.name: p.stat().st_mtime_ns for p in folder.glob("*.exr")}
+    assert 0 < len(done) < 16
+    assert not list(folder.glob(".*"))
+    freeze_shot(world.shot, FreezeParams(take="cut", t_star=104, only_missing=True), quiet())
+    assert len(list(folder.glob("*.exr"))) == 16
+    assert all((folder / n).stat().st_mtime_ns == t for n, t in done.items())
+
+
+def test_ramp_changes_the_instant_per_frame(trained, quiet):
+    world, _ = trained
+    ramp = {str(101 + n): 101.0 + n for n in range(16)}
+    freeze_shot(world.shot, FreezeParams(take="ramp", t_star_per_frame=ramp), quiet())
+    for n in (2, 13):
+        image = read_frozen_exr(world.shot.take("ramp") / f"{101 + n:06d}.exr")
+        assert image.metadata.t_star_frame == 101 + n
+        assert psnr(linear_to_srgb(image.rgba[..., :3]), world.image(n, n / 15).numpy()) > 20
+
+
+def test_camera_path_of_its_own_size(trained, quiet, tmp_path):
+    world, _ = trained
+    viewmat = world.viewmats[7].clone()
+    viewmat[2, 3] = 0.3
+    path = CameraPath(128, 96, [CameraFrame(1, viewmat.flatten().tolist(), [120.0, 120.0, 64.0, 48.0], "blender")])
+    write_json(tmp_path / "path.json", path.to_json())
+    params = FreezeParams(take="path", t_star=108, camera_path=str(tmp_path / "path.json"), width=128)
+    assert freeze_shot(world.shot, params, quiet())["frames"] == 1
+    image = read_frozen_exr(world.shot.take("path") / "000001.exr")
+    assert image.rgba.shape == (96, 128, 4)
+    assert np.median(image.depth[30:60, 100:120]) == pytest.approx(4.3, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("params", "word"),
+    [({"t_star": 7}, "frames 101 to 116"), ({"run": "nobody"}, "no trained run"), ({"first": 300}, "No frame lies")],
+)
+def test_wrong_requests_are_sentences(trained, quiet, params, word):
+    world, _ = trained
+    with pytest.raises(JobError, match=word):
+        freeze_shot(world.shot, FreezeParams(take="wrong", **params), quiet())
+
+
+def test_t_star_snaps_to_a_trained_frame_and_says_so(trained, quiet):
+    world, _ = trained
+    report = quiet()
+    assert freeze_shot(world.shot, FreezeParams(take="snap", t_star=109), report)["t_star_frame"] in (108, 110)
+    assert any(e[0] == "warning" and "109" in e[1] for e in report.events)
