@@ -73,8 +73,14 @@ class World:
 
     def image(self, frame: int, time: float) -> torch.Tensor:
         """[H, W, 3] from the pose of a frame, at a time."""
-        out = rasterize(**self.at(time), viewmats=self.viewmats[frame : frame + 1], Ks=self.K[None], width=WIDTH,
-                        height=HEIGHT, background=torch.full((3,), 0.5))  # fmt: skip
+        out = rasterize(
+            **self.at(time),
+            viewmats=self.viewmats[frame : frame + 1],
+            Ks=self.K[None],
+            width=WIDTH,
+            height=HEIGHT,
+            background=torch.full((3,), 0.5),
+        )
         return out.colors[0].clamp(0, 1)
 
 
@@ -91,8 +97,13 @@ def build_world(root: Path) -> World:
     quats[:, 0] = 1
     scales = torch.full((len(means), 3), 0.11)
     scales[720:] = 0.07
-    state = {"means": means, "quats": quats, "log_scales": scales.log(), "opacity_logits": torch.full((len(means),), 3.0),
-             "colors": colors}  # fmt: skip
+    state = {
+        "means": means,
+        "quats": quats,
+        "log_scales": scales.log(),
+        "opacity_logits": torch.full((len(means),), 3.0),
+        "colors": colors,
+    }
     moving = torch.zeros(len(means), dtype=torch.bool)
     moving[720:] = True
     viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
@@ -109,19 +120,40 @@ def _write(world: World) -> None:
     for n in range(FRAMES):
         pixels = (world.image(n, n / (FRAMES - 1)) * 255 + 0.5).to(torch.uint8).numpy()
         write_png(shot.frames / f"{FIRST + n:06d}.png", pixels)
-        rows.append({"frame": FIRST + n, "seconds": n / 10, "file": f"raw/{FIRST + n:06d}.png", "solve": True,
-                     "sharpness": 1.0, "exposure": 0.0, "flags": []})  # fmt: skip
+        rows.append(
+            {
+                "frame": FIRST + n,
+                "seconds": n / 10,
+                "file": f"raw/{FIRST + n:06d}.png",
+                "solve": True,
+                "sharpness": 1.0,
+                "exposure": 0.0,
+                "flags": [],
+            }
+        )
         K = world.K
-        cameras.append(CameraFrame(FIRST + n, world.viewmats[n].flatten().tolist(),
-                                   [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]))  # fmt: skip
-    write_json(shot.frames / "frames.json",
-               {"version": 1, "width": WIDTH, "height": HEIGHT, "fps": 10.0, "colour": "srgb", "frames": rows})  # fmt: skip
+        cameras.append(
+            CameraFrame(
+                FIRST + n,
+                world.viewmats[n].flatten().tolist(),
+                [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+            )
+        )
+    write_json(
+        shot.frames / "frames.json",
+        {"version": 1, "width": WIDTH, "height": HEIGHT, "fps": 10.0, "colour": "srgb", "frames": rows},
+    )
     write_json(shot.solve / "cameras.json", CameraPath(WIDTH, HEIGHT, cameras).to_json())
     pick = torch.cat([torch.arange(0, 720, 3), torch.arange(720, 810, 3)])
     xyz = world.state["means"][pick]
     rgb = (world.state["colors"][pick].clamp(0, 1) * 255).to(torch.uint8)
-    np.savez(shot.solve / "points.npz", xyz=xyz.numpy(), rgb=rgb.numpy(), error=np.zeros(len(pick), np.float32),
-             track=np.full(len(pick), 5, np.uint16))  # fmt: skip
+    np.savez(
+        shot.solve / "points.npz",
+        xyz=xyz.numpy(),
+        rgb=rgb.numpy(),
+        error=np.zeros(len(pick), np.float32),
+        track=np.full(len(pick), 5, np.uint16),
+    )
     shot.update(first=FIRST, last=FIRST + FRAMES - 1, fps=10.0, width=WIDTH, height=HEIGHT)
 
 
