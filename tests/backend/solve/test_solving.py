@@ -128,6 +128,14 @@ def test_a_solved_shot_is_left_alone(solved, tools):
     assert {p: p.stat().st_mtime_ns for p in solved.shot.root.rglob("*") if p.is_file()} == before
 
 
+def test_the_same_frames_give_the_same_cameras(solved, tools, tmp_path):
+    shot = Shot.create(tmp_path / "again.splannequin")
+    import_footage(shot, solved.shot.info().source, FootageConfig(step=2), tools.recorder())
+    solve_shot(shot, SolveConfig(features=1500), tools.recorder())
+    for name in ("cameras.json", "points.npz"):
+        assert (shot.solve / name).read_bytes() == (solved.shot.solve / name).read_bytes()
+
+
 def imported(tmp_path, tools, poses, **options):
     shot = Shot.create(tmp_path / "a.splannequin")
     clip = tools.write_clip(tmp_path, poses, **options)
