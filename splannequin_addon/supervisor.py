@@ -43,6 +43,8 @@ class Watch:
     """(sentence, hint) of what failed on Blender's side, by the step's name."""
     rendered: tuple[int, int] | None = None
     """(frames done, frames in all) of a render that runs."""
+    redraw: bool = False
+    """Something changed outside the timer: draw at its next turn."""
 
     def running(self) -> str | None:
         """Name of the step at work, if any."""
@@ -94,6 +96,7 @@ def tick() -> float:
     until = time.monotonic() + BUDGET_SECONDS
     changed = False
     for watch in list(_watches.values()):
+        changed, watch.redraw = changed or watch.redraw, False
         for step, job in list(watch.jobs.items()):
             if job.ended or time.monotonic() > until:
                 continue
@@ -171,6 +174,7 @@ def _on_frame(*_: Any) -> None:
     for watch in _watches.values():
         if watch.rendered is not None:
             watch.rendered = (watch.rendered[0] + 1, watch.rendered[1])
+            watch.redraw = True
 
 
 @persistent
@@ -179,7 +183,8 @@ def _on_render_end(*_: Any) -> None:
         if watch.rendered is not None:
             done, total = watch.rendered
             watch.rendered = None
-            watch.notes["bake"] = [f"{done} of {total} frames rendered."]
+            watch.redraw = True
+            watch.notes.setdefault("bake", []).append(f"{done} of {total} frames rendered.")
 
 
 def forget() -> None:

@@ -132,7 +132,25 @@ def _play(plan: dict) -> Iterator[float]:
         (work / "told.json").write_text(json.dumps(told))
         if told["ended"][-1:] != [name]:
             return
-    yield 1.0
+    yield from _show_results(work)
+
+
+def _show_results(work: Path) -> Iterator[float]:
+    """What an artist looks at afterwards: the compositor's nodes, and the picture."""
+    import bpy
+
+    window = bpy.context.window_manager.windows[0]
+    window.workspace = bpy.data.workspaces["Compositing"]
+    yield 2.0
+    area = next(a for a in window.screen.areas if a.type == "NODE_EDITOR")
+    region = next(r for r in area.regions if r.type == "WINDOW")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.node.view_all()
+    yield 1.5
+    yield from _shoot(work, "6-compositor")
+    window.workspace = bpy.data.workspaces["Rendering"]
+    yield 2.0
+    yield from _shoot(work, "7-result")
 
 
 def _arrange() -> Iterator[float]:
@@ -140,7 +158,11 @@ def _arrange() -> Iterator[float]:
     import bpy
 
     window = bpy.context.window_manager.windows[0]
-    bpy.context.preferences.view.show_splash = False
+    preferences = bpy.context.preferences
+    preferences.use_preferences_save = False
+    preferences.view.show_splash = False
+    preferences.view.render_display_type = "NONE"  # its window would cover the panel
+    bpy.data.objects.remove(bpy.data.objects["Cube"])
     _move(window, 300, 500)
     window.event_simulate(type="ESC", value="PRESS", x=300, y=500)
     window.event_simulate(type="ESC", value="RELEASE", x=300, y=500)
