@@ -1,6 +1,6 @@
 """The sidebar tab "Splannequin" in the 3D view: five steps in order, each with its state and what comes next.
 
-Drawing only reads what the supervisor keeps; it never touches the disk beyond finding a shot the first time.
+Drawing only reads what the supervisor keeps; it touches the disk when a shot is met for the first time.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 import bpy
 
-from . import backend, cameras, compat, compositor, scene_setup, shots, steps, supervisor
+from . import cameras, compat, compositor, scene_setup, shots, steps, supervisor
 
 CATEGORY = "Splannequin"
 
@@ -203,7 +203,7 @@ class _StepPanel:
             wrap(box, context, failure[0], "ERROR")
             if failure[1]:
                 wrap(box, context, failure[1], "BLANK1")
-            if job is not None and (job.folder / "log.txt").is_file():
+            if job is not None:
                 box.operator("splannequin.open_log", text="Open Log", icon="TEXT").step = self.step
             return
         if job is not None and job.state == "cancelled":
@@ -237,7 +237,7 @@ class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
         span.enabled = props.use_range
         span.prop(props, "first", text="")
         span.prop(props, "last", text="")
-        if not backend.available():
+        if not supervisor.backend_found():
             box = layout.box()
             box.alert = True
             wrap(box, context, "The backend is not set up: choose its Python in the add-on's preferences.", "ERROR")

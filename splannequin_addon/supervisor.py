@@ -15,7 +15,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import jobs, shots, steps
+from . import backend, jobs, shots, steps
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
@@ -54,6 +54,8 @@ class Watch:
 
 
 _watches: dict[Path, Watch] = {}
+_backend = (False, 0.0)
+"""Whether a backend was found, and when that was looked up, monotonic seconds."""
 
 
 def watch_of(shot: Path) -> Watch:
@@ -66,6 +68,14 @@ def watch_of(shot: Path) -> Watch:
     if watch.state is None:
         refresh(watch)
     return watch
+
+
+def backend_found() -> bool:
+    """True if there is a Python for the backend; looked up every few seconds, as drawing asks all the time."""
+    global _backend
+    if not _backend[1] or time.monotonic() - _backend[1] > 5 * _LOOK_SECONDS:
+        _backend = (backend.available(), time.monotonic())
+    return _backend[0]
 
 
 def follow(step: str, job: jobs.Job) -> None:
@@ -111,6 +121,9 @@ def tick() -> float:
                 refresh(watch)
                 _apply(watch, step, job)
         if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
+            if watch.running() is None and not steps.scenes_of(watch.shot):
+                del _watches[watch.shot]  # a path that was typed and left again
+                continue
             changed |= refresh(watch)
     if changed:
         redraw()
