@@ -15,7 +15,7 @@ from ..contract import Reporter, frame_file, read_json
 from ..shot import Shot, content_key, need_disk, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import resize, working_size, write_png
-from .sources import Source, SourceFrame, footage_error, open_source
+from .sources import Source, SourceFrame, footage_error, frame_words, open_source
 
 FRAMES_VERSION = 1
 FRAMES_FILE = "frames.json"
@@ -240,10 +240,10 @@ def _remarks(extracted: _Extracted) -> list[tuple[str, str]]:
         )
     if len(measures) > MANY_FRAMES:
         remarks.append((f"The clip has {len(measures)} frames, which will take long.", "Take a shorter range."))
-    for flag, words in (("duplicate", "repeat the one before"), ("blank", "are blank"), ("corrupt", "are damaged")):
-        count = sum(flag in m.flags for m in measures)
-        if count:
-            remarks.append((f"{count} of {len(measures)} frames {words} and are neither solved nor trained on.", ""))
+    for flag, words in (("duplicate", "repeats"), ("blank", "blank"), ("corrupt", "damaged")):
+        numbers = [m.frame for m in measures if flag in m.flags]
+        if numbers:
+            remarks.append((f"Neither solved nor trained on, for being {words}: {frame_words(numbers)}.", ""))
     return remarks
 
 

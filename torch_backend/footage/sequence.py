@@ -12,7 +12,7 @@ from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
 from .color import linear_to_srgb
-from .sources import SourceFrame, SourceInfo, footage_error
+from .sources import SourceFrame, SourceInfo, footage_error, frame_words
 
 PICTURES = {".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd"}
 DEFAULT_FPS = 24.0
@@ -99,7 +99,9 @@ class SequenceSource:
             n for n in range(max(first, self.info.first), min(last, max(self._files)) + 1) if n not in self._files
         ]
         if missing:
-            self.warnings.append((f"The sequence lacks {_some(missing)}.", "Those frames are left out of the shot."))
+            self.warnings.append(
+                (f"The sequence lacks {frame_words(missing)}.", "Those frames are left out of the shot.")
+            )
         unreadable = []
         for number in sorted(n for n in self._files if first <= n <= last):
             try:
@@ -109,9 +111,8 @@ class SequenceSource:
                 continue
             yield SourceFrame(number, (number - self.info.first) / self.info.fps, pixels, clipped=clipped)
         if unreadable:
-            self.warnings.append(
-                (f"{_some(unreadable).capitalize()} cannot be read and is left out.", "Render or copy it again.")
-            )
+            words = frame_words(unreadable).capitalize()
+            self.warnings.append((f"{words} cannot be read: left out of the shot.", "Render or copy it again."))
 
     def _first_readable(self) -> tuple[Path, oiio.ImageSpec]:
         for file in self._files.values():
@@ -174,10 +175,3 @@ def _rgb_channels(spec: oiio.ImageSpec) -> list[int]:
         if all(w in names for w in wanted):
             return [names.index(w) for w in wanted]
     return [0, 1, 2] if spec.nchannels >= 3 else [0, 0, 0]
-
-
-def _some(numbers: list[int]) -> str:
-    """'frame 12' or '3 frames, the first of them frame 12'."""
-    return (
-        f"frame {numbers[0]}" if len(numbers) == 1 else f"{len(numbers)} frames, the first of them frame {numbers[0]}"
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -64,6 +64,19 @@ class Source(Protocol):
 def footage_error(message: str, hint: str = "") -> JobError:
     """An error about the footage, as the artist reads it."""
     return JobError(message, hint, ExitCode.FOOTAGE)
+
+
+def frame_words(numbers: Sequence[int]) -> str:
+    """'frame 4', or 'frames 3-5, 9' for 3, 4, 5 and 9; at most eight spans are listed. `numbers` ascend."""
+    spans: list[list[int]] = []
+    for number in numbers:
+        if spans and number == spans[-1][1] + 1:
+            spans[-1][1] = number
+        else:
+            spans.append([number, number])
+    listed = [f"{a}" if a == b else f"{a}-{b}" for a, b in spans]
+    more = f" and {len(listed) - 8} more spans" if len(listed) > 8 else ""
+    return ("frame " if len(numbers) == 1 else "frames ") + ", ".join(listed[:8]) + more
 
 
 def open_source(source: str, fps: float = 0.0) -> Source:

@@ -14,7 +14,7 @@ from av.video.reformatter import Colorspace, Interpolation
 from numpy.typing import NDArray
 
 from .images import resize
-from .sources import SourceFrame, SourceInfo, footage_error
+from .sources import SourceFrame, SourceInfo, footage_error, frame_words
 
 NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
 """FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
@@ -72,11 +72,13 @@ class VideoSource:
                     yield SourceFrame(number, float(seconds), self._upright(frame), bool(frame.is_corrupt))
         lost = [n for n in lost if (first is None or n >= first) and (last is None or n <= last)]
         if lost:
-            noun = (
-                "Frame" if len(lost) == 1 else f"{len(lost)} frames could not be decoded and are left out, first frame"
+            words = frame_words(lost).capitalize()
+            self.warnings.append(
+                (
+                    f"{words} cannot be decoded: left out of the shot.",
+                    "The file is damaged there: copy or export it again.",
+                )
             )
-            tail = " could not be decoded and is left out." if len(lost) == 1 else "."
-            self.warnings.append((f"{noun} {lost[0]}{tail}", "The file is damaged there: copy or export it again."))
 
     def _open(self) -> Any:
         try:

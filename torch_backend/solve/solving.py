@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
 from ..footage import load_frames
 from ..footage.images import read_png, write_png
+from ..footage.sources import frame_words
 from ..shot import Shot, atomic_path, content_key, need_disk, write_json
 from .child import run_worker
 from .poses import camera_centre, fill_poses
@@ -175,7 +175,7 @@ def _failure(answer: dict[str, Any]) -> JobError:
     )
 
 
-def _refuse_poor(answer: dict[str, Any], solved: int) -> None:
+def refuse_poor(answer: dict[str, Any], solved: int) -> None:
     """JobError for a model that nothing could be trained on."""
     registered, angle = answer["registered"], answer["triangulation_angle_deg"]
     if registered < min(LEAST_REGISTERED, solved) or registered < REFUSED_SHARE * solved:
@@ -186,11 +186,15 @@ def _refuse_poor(answer: dict[str, Any], solved: int) -> None:
             "Choose a range without fast pans or blur, or a smaller step.",
             ExitCode.SOLVE,
         )
-    if angle < LEAST_ANGLE_DEG or answer["points"] < LEAST_POINTS:
+    if angle < LEAST_ANGLE_DEG:
+        message = (
+            f"The camera moves too little for depth: half of the points are seen under {angle:.1f} degrees or less."
+        )
+        raise JobError(message, STILL_HINT, ExitCode.SOLVE)
+    if answer["points"] < LEAST_POINTS:
         raise JobError(
-            f"The camera moves too little for depth: points are seen under {angle:.1f} degrees, "
-            f"{answer['points']} of them.",
-            STILL_HINT,
+            f"Only {answer['points']} points of the scene could be placed: the clip is too blurred or too bare.",
+            "Choose a sharper range, or film with more light and texture in view.",
             ExitCode.SOLVE,
         )
 
@@ -206,7 +210,7 @@ def _finish(
 ) -> SolveResult:
     """Checks the worker's answer and writes the solve's files, solve.json last."""
     solved = sum(f["solve"] for f in frames["frames"])
-    _refuse_poor(answer, solved)
+    refuse_poor(answer, solved)
     poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
     with np.load(scratch / "undistort.npz", allow_pickle=False) as data:
         pinhole, where = data["pinhole"], data["where"]
@@ -333,7 +337,7 @@ def _warnings(frames: dict[str, Any], path: CameraPath, result: SolveResult) -> 
     if lost:
         warnings.append(
             (
-                f"{len(lost)} solved frames were not registered: {spans(lost)}.",
+                f"The mapper did not register {len(lost)} solved frames: {frame_words(lost)}.",
                 "Their cameras are placed from their neighbours.",
             )
         )
@@ -343,21 +347,10 @@ def _warnings(frames: dict[str, Any], path: CameraPath, result: SolveResult) -> 
     if held:
         warnings.append(
             (
-                f"The camera holds its pose in frames {spans(held)}, beyond the last frame that was placed.",
+                f"The camera holds its pose in {frame_words(held)}, beyond the last frame that was placed.",
                 "Cut them off.",
             )
         )
     if result["reprojection_error_px"] > 1.5 * GOOD_ERROR_PX:
         warnings.append(("The reprojection error is high: the picture will be soft.", "Try the OPENCV camera model."))
     return warnings
-
-
-def spans(numbers: Sequence[int]) -> str:
-    """'3-5, 9' for 3, 4, 5, 9."""
-    parts: list[list[int]] = []
-    for number in numbers:
-        if parts and number == parts[-1][1] + 1:
-            parts[-1][1] = number
-        else:
-            parts.append([number, number])
-    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in parts)

@@ -114,7 +114,7 @@ def extract(request: Request, names: list[str], camera_id: int | None) -> None:
     with closing_database(request):
         pass  # makes the file
     pycolmap.import_images(request.database, request.images, pycolmap.CameraMode.SINGLE, names, reader)
-    say(stage="features" if camera_id is None else "features of other frames")
+    say(stage="features" if camera_id is None else "other features")
     pycolmap.extract_features(
         request.database,
         request.images,
@@ -252,7 +252,7 @@ def _match_pairs(request: Request, pairs: dict[str, list[str]]) -> None:
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listing
     pairing.block_size = 4 * request.neighbours  # COLMAP counts its progress in blocks
-    say(stage="matches of other frames")
+    say(stage="other matches")
     pycolmap.match_image_pairs(request.database, options, pairing, geometry, device=pycolmap.Device.cpu)
 
 

@@ -107,7 +107,10 @@ def test_repeated_and_blank_frames_are_kept_but_not_solved(shot, tmp_path, pan, 
     assert len(record) == 20
     assert (record[6]["flags"], record[11]["flags"]) == (["duplicate"], ["blank"])
     assert [n for n, f in record.items() if not f["solve"]] == [6, 11]
-    assert len(report.warnings) == 2
+    assert report.warnings == [
+        "Neither solved nor trained on, for being repeats: frame 6.",
+        "Neither solved nor trained on, for being blank: frame 11.",
+    ]
 
 
 def test_changing_exposure_is_said(shot, tmp_path, pan, write_video, recorder):

@@ -109,7 +109,7 @@ def test_gaps_and_unreadable_files_are_named(exrs):
     assert numbers == [1001, 1002, 1004, 1006, 1007, 1008, 1009, 1010]
     assert [w[0] for w in source.warnings] == [
         "The sequence lacks frame 1003.",
-        "Frame 1005 cannot be read and is left out.",
+        "Frame 1005 cannot be read: left out of the shot.",
     ]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torch_backend.contract import ExitCode, JobError
-from torch_backend.footage.sources import open_source
+from torch_backend.footage.sources import frame_words, open_source
 
 
 def decoded(path, first=None, last=None):
@@ -114,7 +114,7 @@ def test_damaged_packets_are_skipped_with_a_warning_and_keep_their_numbers(tmp_p
             target.mux(packet)
     source, got = decoded(damaged)
     assert [f.number for f in got] == [1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]
-    assert source.warnings[0][0] == "Frame 6 could not be decoded and is left out."
+    assert source.warnings[0][0] == "Frame 6 cannot be decoded: left out of the shot."
 
 
 def test_a_file_that_breaks_off_gives_what_it_has(tmp_path, pan, write_video):
@@ -149,3 +149,9 @@ def test_sound_alone_is_no_video(tmp_path):
         container.mux(stream.encode(frame))
     with pytest.raises(JobError, match="not a video"):
         open_source(str(tmp_path / "a.wav"))
+
+
+def test_frames_in_words():
+    assert frame_words([7]) == "frame 7"
+    assert frame_words([3, 4, 5, 9, 11, 12]) == "frames 3-5, 9, 11-12"
+    assert frame_words(range(1, 40, 2)).endswith(", 13, 15 and 12 more spans")

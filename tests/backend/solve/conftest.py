@@ -118,12 +118,14 @@ def handheld(count=COUNT):
     return poses
 
 
-def write_clip(folder, poses, noise=1.0):
-    """Renders PNG frames 101, 102, ... into `folder`, with sensor noise."""
+def write_clip(folder, poses, noise=1.0, blurred=()):
+    """Renders PNG frames 101, 102, ... into `folder`, with sensor noise; `blurred` frames show next to nothing."""
     room, rng = the_room(), np.random.default_rng(1)
     K = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     for i, viewmat in enumerate(poses):
         clean = room.render(viewmat, K, RADIAL)
+        if 101 + i in blurred:
+            clean = gaussian_filter(clean, (8, 8, 0))
         noisy = np.clip(np.rint(clean + rng.normal(0.0, noise, clean.shape)), 0, 255).astype(np.uint8)
         write_png(folder / f"f.{101 + i}.png", noisy)
     return folder

@@ -15,7 +15,7 @@ from torch_backend.shot import Shot
 from torch_backend.solve import SolveConfig, load_points, solve_shot
 from torch_backend.solve.child import run_worker
 from torch_backend.solve.poses import camera_centre
-from torch_backend.solve.solving import filter_points, quality_words, spans
+from torch_backend.solve.solving import filter_points, quality_words, refuse_poor
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -114,8 +114,8 @@ def test_progress_names_the_stages_in_order(solved):
         "features",
         "matches",
         "cameras",
-        "features of other frames",
-        "matches of other frames",
+        "other features",
+        "other matches",
         "undistort",
     ]
     assert all(0 <= done <= total for _, done, total in solved.report.steps)
@@ -141,6 +141,49 @@ def imported(tmp_path, tools, poses, **options):
     clip = tools.write_clip(tmp_path, poses, **options)
     import_footage(shot, str(clip), FootageConfig(step=1), tools.recorder())
     return shot
+
+
+def test_frames_that_cannot_be_placed_are_filled_in_and_said(tmp_path, tools):
+    poses = [tools.look([0.12 * i - 0.7, 0.02 * i, 0.0], yaw=-0.03 * i) for i in range(14)]
+    shot = imported(tmp_path, tools, poses, blurred=(105, 114))
+    report = tools.recorder()
+    result = solve_shot(shot, SolveConfig(features=1000), report)
+    path = cameras(shot)
+    sources = {f.frame: f.source for f in path.frames}
+    assert [n for n, source in sources.items() if source == "interpolated"] == [105, 114]
+    viewmats = {f.frame: np.reshape(f.viewmat, (4, 4)) for f in path.frames}
+    centres = {n: camera_centre(v) for n, v in viewmats.items()}
+    assert np.allclose(centres[105], (centres[104] + centres[106]) / 2, atol=1e-9)
+    assert (viewmats[114] == viewmats[113]).all()
+    assert (result["registered"], result["interpolated"]) == (12, 2)
+    assert result["quality"].startswith("Fair: 12 of 14 frames registered")
+    assert report.warnings == [
+        "The mapper did not register 2 solved frames: frames 105, 114.",
+        "The camera holds its pose in frame 114, beyond the last frame that was placed.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"registered": 20}, "Cameras were found for only 20 of 74 frames."),
+        (
+            {"registered": 30, "model_sizes": [30, 25, 3]},
+            "Cameras were found for only 30 of 74 frames (it falls into 2 parts that do not connect).",
+        ),
+        (
+            {"triangulation_angle_deg": 1.6},
+            "The camera moves too little for depth: half of the points are seen under 1.6 degrees or less.",
+        ),
+        ({"points": 40}, "Only 40 points of the scene could be placed: the clip is too blurred or too bare."),
+    ],
+)
+def test_models_that_nothing_could_be_trained_on_are_refused(changes, message):
+    good = {"registered": 74, "model_sizes": [74], "triangulation_angle_deg": 12.0, "points": 5000}
+    refuse_poor(good, 74)
+    with pytest.raises(JobError) as error:
+        refuse_poor({**good, **changes}, 74)
+    assert (error.value.message, error.value.exit_code) == (message, ExitCode.SOLVE)
 
 
 def refused(shot, tools):
@@ -221,7 +264,3 @@ def test_points_are_filtered():
 )
 def test_quality_in_words(registered, error, expected):
     assert quality_words(registered, 74, error) == expected
-
-
-def test_spans():
-    assert spans([3, 4, 5, 9, 11, 12]) == "3-5, 9, 11-12"
