@@ -288,5 +288,8 @@ def _add_plate(tree: Any, node: Any, plate: Path, take: Take) -> None:
     image_node.name = image_node.label = "Plate"
     image = load_sequence(plate, f"Plate {plate.parent.parent.stem}", "srgb")
     show_sequence(image_node, image, take.first, take.last)
-    image_node.location = (node.location.x - 2 * _GAP, node.location.y)
+    # The tree is ours: in a row, left to right.
+    end = compat.output_socket(tree).node
+    end.location = (node.location.x + node.width + 60.0, node.location.y)
+    image_node.location = (node.location.x - _GAP, node.location.y)
     tree.links.new(image_node.outputs["Image"], node.inputs["Image"])

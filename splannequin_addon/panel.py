@@ -121,6 +121,13 @@ class _StepPanel:
         watch = self._watch(context)
         return VIEWS[self.step](context.scene, watch.state if watch else None)
 
+    def _next_done(self, context: Any) -> bool:
+        """True if the step after this one is done: what comes next need not be said any more."""
+        names = list(VIEWS)
+        after = names[names.index(self.step) + 1 :]
+        watch = self._watch(context)
+        return bool(after) and VIEWS[after[0]](context.scene, watch.state if watch else None).done
+
     def draw_header(self, context: Any) -> None:
         """An icon for the state: a tick, at work, failed, next, or not yet."""
         watch = self._watch(context)
@@ -151,7 +158,7 @@ class _StepPanel:
         else:
             self._button(context, layout, view, running)
             self._outcome(context, layout, watch)
-            if running is None:
+            if running is None and not (view.done and self._next_done(context)):
                 wrap(layout, context, view.advice, "INFO")
         body = sub_panel(layout, f"{self.step}_more", "Advanced")
         if body is not None:

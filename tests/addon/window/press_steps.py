@@ -78,9 +78,9 @@ def _serve(blender: subprocess.Popen[bytes], work: Path, output: Path, environ: 
     until = time.monotonic() + limit
     while blender.poll() is None and time.monotonic() < until:
         for request in sorted(work.glob("*.shoot")):
-            picture = output / f"{request.stem}.png"
+            picture = output / f"window-{request.stem}.jpg"
             dump = subprocess.run(["xwd", "-root", "-silent"], env=environ, capture_output=True, check=True).stdout
-            subprocess.run(["convert", "xwd:-", "-strip", str(picture)], input=dump, check=True)
+            subprocess.run(["convert", "xwd:-", "-strip", "-quality", "88", str(picture)], input=dump, check=True)
             request.unlink()
         time.sleep(0.1)
     if blender.poll() is None:
@@ -256,7 +256,8 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
         job = next((j for j in watch.jobs.values() if not j.ended), None)
         status = job.status if job is not None else None
         far = status is not None and status.fraction > 0.3 and status.stage.startswith(stage)
-        if not taken and far:
+        drawn = watch.rendered is not None and watch.rendered[0] > 0.3 * watch.rendered[1]
+        if not taken and (drawn if name == "5-bake" else far):
             yield from _shoot(work, f"{name}-running")
             taken = True
             if cancel:
