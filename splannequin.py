@@ -661,7 +661,6 @@ def closing_figures(summary: dict[str, Any], output: Path) -> None:
     """The last lines of a freeze: how good, how long, where to look."""
     stages = summary["wall_seconds_by_stage"]
     psnr = summary.get("heldout_psnr_db")
-    say(f"Composited:    {summary.get('composited_dir')}")
     say(f"Figures:       {output / 'summary.json'}")
     say("Wall seconds:  " + ", ".join(f"{name} {seconds:.0f}" for name, seconds in stages.items()))
     quality = f"Held-out PSNR {psnr:.2f} dB" if psnr is not None else "No held-out frames"
