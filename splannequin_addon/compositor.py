@@ -69,8 +69,8 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
     else:
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
     _fill_group(scene, node.node_tree, take)
-    if before["made_tree"] and plate is not None:
-        _add_plate(tree, node, plate, take)
+    if plate is not None and json.loads(node.node_tree[_BEFORE])["made_tree"]:
+        _show_plate(scene, tree, node, plate, take)
     return changes
 
 
@@ -281,15 +281,24 @@ def render_size(scene: Any) -> tuple[int, int]:
     return render.resolution_x * share // 100, render.resolution_y * share // 100
 
 
-def _add_plate(tree: Any, node: Any, plate: Path, take: Take) -> None:
+def _show_plate(scene: Any, tree: Any, node: Any, plate: Path, take: Take) -> None:
     """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
+    for old in [n for n in tree.nodes if n.get(_TAG)]:
+        tree.nodes.remove(old)
     image_node = tree.nodes.new("CompositorNodeImage")
     image_node[_TAG] = True
     image_node.name = image_node.label = "Plate"
     image = load_sequence(plate, f"Plate {plate.parent.parent.stem}", "srgb")
     show_sequence(image_node, image, take.first, take.last)
+    stream = image_node.outputs["Image"]
     # The tree is ours: in a row, left to right.
-    end = compat.output_socket(tree).node
-    end.location = (node.location.x + node.width + 60.0, node.location.y)
-    image_node.location = (node.location.x - _GAP, node.location.y)
-    tree.links.new(image_node.outputs["Image"], node.inputs["Image"])
+    compat.output_socket(tree).node.location = (node.location.x + node.width + 60.0, node.location.y)
+    image_node.location = (node.location.x - 2 * _GAP, node.location.y)
+    if tuple(image.size) != render_size(scene):
+        fit = compat.new_fit_node(tree)
+        fit[_TAG] = True
+        fit.label = "Fit Plate"
+        fit.location = (node.location.x - _GAP, node.location.y)
+        tree.links.new(stream, fit.inputs[0])
+        stream = fit.outputs[0]
+    tree.links.new(stream, node.inputs["Image"])

@@ -92,6 +92,7 @@ def test_removal_restores_the_tree(addon, scene, artists_tree, take):
 def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene, take, shot):
     compositor, compat = addon("compositor"), addon("compat")
     plate = shot / "frames" / "000005.png"
+    scene.render.resolution_x, scene.render.resolution_y = 16, 12
     said = compositor.insert(scene, take, plate)
     tree = compat.compositor_tree(scene)
     assert compat.compositor_enabled(scene)
@@ -187,17 +188,20 @@ def test_data_layers_arrive_on_the_groups_outputs(addon, scene, take, tmp_path, 
         np.testing.assert_allclose(found, pictures.srgb(expected), atol=0.6 / 255)
 
 
-def test_frames_of_another_size_are_fitted(addon, scene, take, tmp_path, layers, pictures):
+@pytest.mark.parametrize("mix", [0.0, 1.0])
+def test_frames_of_another_size_are_fitted(addon, scene, take, shot, tmp_path, layers, pictures, mix):
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 32, 24, 100
     addon("scene_setup").keep_plate_colours(scene)
-    addon("compositor").insert(scene, take)
+    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
+    tree = addon("compat").compositor_tree(scene)
+    addon("compositor").group_node(tree).inputs["Mix"].default_value = mix
     scene.frame_start = scene.frame_end = 6
     addon("bake").render(scene, tmp_path)
     found = pictures.read(tmp_path / "000006.png")
     assert found.shape == (24, 32, 3)
-    expected = pictures.srgb(layers(6)["motion"][..., None] * 0 + layers(6)["rgba"][..., :3])
-    # Bars of the picture must lie where they lay: each quarter of it has the mean it had.
-    for rows in (slice(0, 12), slice(12, 24)):
+    plate = pictures.read(shot / "frames" / "000006.png")
+    expected = pictures.srgb(layers(6)["rgba"][..., :3]) if mix else plate
+    for rows in (slice(0, 12), slice(12, 24)):  # each quarter of the picture shows what it showed
         for columns in (slice(0, 16), slice(16, 32)):
             small = expected[rows.start // 2 : rows.stop // 2, columns.start // 2 : columns.stop // 2]
             assert found[rows, columns].mean() == pytest.approx(small.mean(), abs=0.06)
