@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -101,8 +102,11 @@ def inside() -> None:
         try:
             return next(play)
         except StopIteration:
-            bpy.ops.wm.quit_blender()
-            return None
+            pass
+        except Exception:  # whatever it was: told, and Blender must not stand open until the limit
+            traceback.print_exc()
+        bpy.ops.wm.quit_blender()
+        return None
 
     bpy.app.timers.register(turn, first_interval=2.0, persistent=True)
 
@@ -214,7 +218,7 @@ def _click(operator: str) -> Iterator[float]:
     for _ in range(6):
         area = _view(window)
         region = _sidebar(area)
-        x = region.x + region.width // 3
+        x = region.x + int(region.width * (0.8 if operator.endswith(".cancel") else 0.33))
         for y in range(region.y + region.height - 8, region.y + 4, -9):
             _move(window, x + (y % 2), y)
             yield 0.03
