@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..deformation import apply_deltas
 from ..supervision import nearest_bin, support_confidence
+from ..train.exposure import Exposure
 from ..train.model import DynamicModel, render
 
 SUPPORT_SECONDS = 2.0
@@ -28,10 +29,6 @@ class FrozenGaussians:
     """[N] in 0..1: how well each Gaussian is known at the instant."""
     motion: Tensor
     """[N] in 0..1: 1 for Gaussians that move in the clip."""
-    gain: Tensor
-    """[3] exposure of the instant: gain of display-referred colour."""
-    offset: Tensor
-    """[3] exposure of the instant: offset of display-referred colour."""
 
 
 @dataclass
@@ -71,13 +68,24 @@ def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "ne
     moving = torch.zeros(len(gaussians))
     moving[rows] = 1.0
     support = support_confidence(gaussians.support, moving > 0, model.centres, time, SUPPORT_SECONDS / seconds)
-    gain, offset = model.exposure.at(time)
-    return FrozenGaussians({k: v.detach() for k, v in state.items()}, model.sh_degree, support, moving, gain, offset)
+    return FrozenGaussians({k: v.detach() for k, v in state.items()}, model.sh_degree, support, moving)
 
 
 @torch.no_grad()
-def render_frozen(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, width: int, height: int) -> FrozenImage:
-    """One view of a frozen scene: viewmat [4, 4] in scene units, K [3, 3] in pixels."""
+def render_frozen(
+    frozen: FrozenGaussians,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    exposure: Exposure | None = None,
+    exposed_at: float = 0.0,
+) -> FrozenImage:
+    """One view of a frozen scene: viewmat [4, 4] in scene units, K [3, 3] in pixels.
+
+    Time stands still for the world, not for the camera: `exposure` at the normalised time `exposed_at` is applied, so
+    that a frozen frame matches the plate it is mixed with. None: colours as the Gaussians have them.
+    """
     mattes = torch.stack([frozen.support, frozen.motion], dim=1)
     out = render(
         frozen.state,
@@ -97,7 +105,9 @@ def render_frozen(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, width: in
     depth = out.depth_median
     if depth is None:
         raise RuntimeError("the rasteriser returned no depth")
-    color = out.colors[0, ..., :3] * frozen.gain + frozen.offset * alpha[..., None]
+    color = out.colors[0, ..., :3]
+    if exposure is not None:
+        color = exposure.apply(color, exposed_at, alpha)
     return FrozenImage(color.clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1])
 
 

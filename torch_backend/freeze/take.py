@@ -36,6 +36,8 @@ class OutputFrame:
     """[3, 3] pixels of the output size."""
     t_star: float
     """Frame number at which time stands still."""
+    exposed_like: float
+    """Frame number whose exposure the camera has: its own on the clip's poses, t* on a path of its own."""
 
 
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
@@ -98,11 +100,11 @@ def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: in
     first = numbers[0] if params.first is None else params.first
     last = numbers[-1] if params.last is None else params.last
     ramp = {int(k): float(v) for k, v in params.t_star_per_frame.items()}
-    frames = [
-        OutputFrame(n, viewmats[i], Ks[i], ramp.get(n, float(t_star)))
-        for i, n in enumerate(numbers)
-        if first <= n <= last
-    ]
+    frames = []
+    for i, n in enumerate(numbers):
+        if first <= n <= last:
+            at = ramp.get(n, float(t_star))
+            frames.append(OutputFrame(n, viewmats[i], Ks[i], at, at if params.camera_path else float(n)))
     if not frames:
         raise JobError(
             f"No frame lies between {first} and {last}.", f"The path has frames {numbers[0]} to {numbers[-1]}.",
@@ -162,7 +164,8 @@ def _render_all(
                 freeze_at(run.model, scene.time_of_frame(output.t_star), _span(scene, run), query),
                 output.t_star,
             )
-        image = render_frozen(frozen, output.viewmat, output.K, *size)
+        exposed_at = scene.time_of_frame(output.exposed_like)
+        image = render_frozen(frozen, output.viewmat, output.K, *size, run.model.exposure, exposed_at)
         _write_frame(folder, output, image, scene)
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
 
