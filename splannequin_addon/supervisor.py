@@ -164,7 +164,7 @@ def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
                     bpy.ops.ed.undo_push(message=f"Splannequin {steps.STEPS[step].label}")
                 if step == "bake":
                     bpy.ops.splannequin.render("INVOKE_DEFAULT")
-        except (contract.JobError, OSError, ValueError, RuntimeError) as error:
+        except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
             watch.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
 
 
