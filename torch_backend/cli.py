@@ -142,7 +142,8 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
         f"{summary['registered']} of {summary['solved_frames']} solved frames registered.\n"
         f"{quality}, {summary['gaussians']} Gaussians, {100 * summary['moving_share']:.1f} % of them move, "
         f"trained in {summary['train_seconds']:.0f} s.\n"
-        f"EXR frames:    {summary['exr_dir']}\nContact sheet: {summary['contact_sheet']}\nVideo:         {summary['video']}",
+        f"EXR frames:    {summary['exr_dir']}\n"
+        f"Contact sheet: {summary['contact_sheet']}\nVideo:         {summary['video']}",
         file=console.stream,
         flush=True,
     )

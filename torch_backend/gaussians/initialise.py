@@ -99,14 +99,15 @@ def _lift_seeds(
     tree = KDTree(pixels[seen].numpy())
     candidates = torch.rand(4 * count, 2, generator=generator) * limits
     distance, nearest = tree.query(candidates.numpy(), k=4)
-    far = np.argsort(-distance[:, 0], kind="stable")[: 2 * count]
+    distance, nearest = torch.from_numpy(distance), torch.from_numpy(nearest)
+    far = distance[:, 0].argsort(descending=True, stable=True)[: 2 * count]
     # Half the far ones: a bare top-k would put every seed into the largest hole.
-    keep = far[torch.randperm(len(far), generator=generator)[:count].numpy()]
+    keep = far[torch.randperm(len(far), generator=generator)[:count]]
     weights = 1.0 / (distance[keep] + 1.0)
-    depth = (weights * camera[seen][:, 2].numpy()[nearest[keep]]).sum(1) / weights.sum(1)
+    depth = (weights * camera[seen][:, 2][nearest[keep]]).sum(1) / weights.sum(1)
     chosen = candidates[keep]
     rays = torch.cat([(chosen - K[:2, 2]) / K[[0, 1], [0, 1]], torch.ones(len(chosen), 1)], dim=1)
-    local = rays * torch.from_numpy(depth).float()[:, None]
+    local = rays * depth.float()[:, None]
     world = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
     rows, columns = chosen[:, 1].long().clamp(0, height - 1), chosen[:, 0].long().clamp(0, width - 1)
     return world, image[rows, columns].float()

@@ -21,6 +21,9 @@ from .config import TrainConfig, config_from_json, config_from_params, config_to
 from .model import DynamicModel
 from .trainer import Trainer, restore_model
 
+_TOO_MUCH_MOTION = 0.25
+"""Share of open Gaussians above which the artist is told (holding still opens 0.03 to 0.10: docs/benchmarks.md)."""
+
 
 @dataclass
 class LoadedRun:
@@ -73,6 +76,11 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     summary = summarise(trainer, params.run, test, held_out, key)
     write_json(folder / "summary.json", summary)
     report.metric("train", summary)
+    if config.method == "auto" and summary["moving_share"] > _TOO_MUCH_MOTION:
+        report.warning(
+            f"Too much motion: {100 * summary['moving_share']:.0f} % of the Gaussians had to move.",
+            "Expect ghosts where people walked; a range in which they hold still does better.",
+        )
     return summary
 
 
