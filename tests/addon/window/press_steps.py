@@ -81,7 +81,11 @@ def _serve(blender: subprocess.Popen[bytes], work: Path, output: Path, environ: 
         for request in sorted(work.glob("*.shoot")):
             picture = output / f"window-{request.stem}.jpg"
             dump = subprocess.run(["xwd", "-root", "-silent"], env=environ, capture_output=True, check=True).stdout
-            subprocess.run(["convert", "xwd:-", "-strip", "-quality", "88", str(picture)], input=dump, check=True)
+            subprocess.run(
+                ["convert", "xwd:-", "-strip", "-resize", "1280x", "-quality", "85", str(picture)],
+                input=dump,
+                check=True,
+            )
             request.unlink()
         time.sleep(0.1)
     if blender.poll() is None:
@@ -230,10 +234,22 @@ def _click(operator: str) -> Iterator[float]:
             _move(window, region.x - 200, y)
             yield 0.3
             return
-        for _ in range(4):
-            window.event_simulate(type="WHEELDOWNMOUSE", value="PRESS", x=x, y=region.y + region.height // 2)
-        yield 0.5
+        yield from _scroll_down()
     raise RuntimeError(f"no button of {operator} was found in the sidebar")
+
+
+def _scroll_down() -> Iterator[float]:
+    """Turns the wheel over the sidebar."""
+    import bpy
+
+    window = bpy.context.window_manager.windows[0]
+    region = _sidebar(_view(window))
+    x, y = region.x + region.width // 3, region.y + region.height // 2
+    _move(window, x, y)
+    yield 0.1
+    for _ in range(4):
+        window.event_simulate(type="WHEELDOWNMOUSE", value="PRESS", x=x, y=y)
+    yield 0.5
 
 
 def _under_mouse(window, area, region) -> str:
@@ -259,15 +275,18 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
     while watch.running() is not None:
         job = next((j for j in watch.jobs.values() if not j.ended), None)
         status = job.status if job is not None else None
-        far = status is not None and status.fraction > 0.3 and status.stage.startswith(stage)
-        drawn = watch.rendered is not None and watch.rendered[0] > 0.3 * watch.rendered[1]
+        share = 0.3 if name in ("2-camera", "3-train") else 0.05  # the others are over soon
+        far = status is not None and status.fraction > share and status.stage.startswith(stage)
+        drawn = watch.rendered is not None and watch.rendered[0] > 0
         if not taken and (drawn if name == "5-bake" else far):
-            yield from _shoot(work, f"{name}-running")
+            yield from _shoot(work, f"{name}-running", settle=2)
             taken = True
             if cancel:
                 yield from _click("splannequin.cancel")
         yield 0.2
     yield 1.5
+    if name == "5-bake":
+        yield from _scroll_down()
     yield from _shoot(work, f"{name}-{'cancelled' if cancel else 'done'}")
     if cancel:
         return
@@ -288,12 +307,12 @@ def _supervisor():
     return found[0]
 
 
-def _shoot(work: Path, name: str) -> Iterator[float]:
+def _shoot(work: Path, name: str, settle: int = 12) -> Iterator[float]:
     """Asks the host for a picture and waits until it is taken."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]
-    for step in range(12):  # panels grow and shrink over several redraws, which the mouse brings about
+    for step in range(settle):  # panels grow and shrink over several redraws, which the mouse brings about
         _move(window, 400 + 5 * step, 300)
         for area in window.screen.areas:
             area.tag_redraw()
