@@ -26,7 +26,7 @@ class GateConfig:
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""
     rounds: tuple[float, ...] = (1.0 / 3.0, 0.45, 0.55, 0.65)
     """Shares of the run at which residuals are gathered again and more Gaussians may open."""
-    threshold: float = 3.0
+    threshold: float = 2.0
     """A Gaussian opens if its residual exceeds the median by this many robust standard deviations."""
     max_share: float = 0.3
     """Most Gaussians that may be open; the largest residuals go first."""

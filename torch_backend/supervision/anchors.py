@@ -41,7 +41,7 @@ class SupervisionConfig:
     """`paper`: a visible Gaussian with a screen gradient of at most this is defective (paper: 1e-9)."""
     support_every: int = 2
     """`support` acts every so many iterations."""
-    support_weight: float = 1.0
+    support_weight: float = 0.2
     """`support`: weight of the whole term."""
     support_samples: int = 1024
     """`support`: (Gaussian, time) pairs drawn each time."""

@@ -92,7 +92,8 @@ class Trainer:
         rows = self.model.open_rows()
         deltas = self.model.deltas(rows, torch.tensor([self.times[frame]]))
         state = apply_deltas(self.model.gaussians, rows, deltas)
-        out = self._render(state, frame)
+        # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
+        out = self._render(state, frame, background=torch.rand(3, generator=self.generator))
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
         loss = photometric(exposed, self.images[frame].float(), self.config.dssim)
         total = loss + self._regularisers(rows)
@@ -166,7 +167,7 @@ class Trainer:
 
     @property
     def background(self) -> Tensor:
-        """[3] what shows where nothing covers: mid grey, so that neither dark nor bright holes are free."""
+        """[3] what shows where nothing covers when a frame is measured or shown: mid grey."""
         return torch.full((3,), 0.5)
 
     def _render(self, state: dict[str, Tensor], frame: int, **options: Any) -> Any:

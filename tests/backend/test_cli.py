@@ -1,0 +1,86 @@
+"""The whole backend on a very small real clip, by its command line: files, figures, pixels; refusals in words."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torch_backend.contract import ExitCode
+from torch_backend.footage.color import linear_to_srgb
+from torch_backend.footage.images import read_png, resize
+from torch_backend.freeze.exr import read_frozen_exr
+
+CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
+KEYS = {
+    "frames", "registered", "gaussians", "moving_share", "train_seconds", "heldout_psnr_db", "wall_seconds_by_stage",
+    "exr_dir", "contact_sheet", "t_star_frame",
+}  # fmt: skip
+
+
+def run(*arguments):
+    command = [sys.executable, "-m", "torch_backend", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def frozen(tmp_path_factory):
+    output = tmp_path_factory.mktemp("out")
+    done = run("freeze", CLIP, "--output", output, "--first", 1, "--last", 20, "--t-star", 10, "--working-height", 240,
+               "--width", 160, "--iterations", 400, "--max-gaussians", 6000)  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return output, json.loads((output / "summary.json").read_text()), done.stdout
+
+
+def test_summary_has_the_figures(frozen):
+    _, summary, printed = frozen
+    assert summary.keys() >= KEYS
+    assert summary["frames"] == 20
+    assert summary["registered"] >= 18
+    assert abs(summary["t_star_frame"] - 10) <= 1
+    assert summary["heldout_psnr_db"] > 19.0
+    assert f"{summary['heldout_psnr_db']:.2f} dB" in printed
+    assert set(summary["wall_seconds_by_stage"]) == {"import", "solve", "train", "freeze"}
+
+
+def test_frozen_frames_look_like_their_plates(frozen):
+    """Nearly everything stands still in this clip: a frozen frame must show what its plate shows."""
+    output, summary, _ = frozen
+    scores = []
+    for frame in (2, 7, 13, 19):
+        image = read_frozen_exr(Path(summary["exr_dir"]) / f"{frame:06d}.exr")
+        plate = read_png(output / "shot.splannequin" / "frames" / f"{frame:06d}.png")
+        small = resize(plate, image.rgba.shape[1], image.rgba.shape[0]).astype(np.float64) / 255
+        shown = np.clip(linear_to_srgb(image.rgba[..., :3]), 0, 1)
+        scores.append(-10 * np.log10(np.mean((shown - small) ** 2)))
+        assert image.rgba[..., 3].mean() > 0.95
+        assert 0.0 <= image.motion.mean() < 0.5
+    assert min(scores) > 17.0
+    assert np.mean(scores) > 19.0
+
+
+def test_the_same_command_again_only_looks(frozen):
+    output, _, _ = frozen
+    checkpoint = output / "shot.splannequin" / "runs" / "main" / "checkpoint.safetensors"
+    before = checkpoint.stat().st_mtime_ns
+    done = run("train", output / "shot.splannequin", "--width", 160, "--iterations", 400, "--max-gaussians", 6000)
+    assert done.returncode == 0
+    assert "already trained" in done.stdout
+    assert checkpoint.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "word"),
+    [
+        (("freeze", "missing.mp4"), ExitCode.USAGE, "missing.mp4"),
+        (("solve", "nowhere"), ExitCode.USAGE, "nowhere"),
+    ],
+)
+def test_wrong_input_is_one_sentence(tmp_path, arguments, code, word):
+    done = run(*arguments, *(("--output", tmp_path / "o") if arguments[0] == "freeze" else ()))
+    text = done.stdout + done.stderr
+    assert done.returncode in (code, ExitCode.FOOTAGE)
+    assert word in text
+    assert "Traceback" not in text
