@@ -103,32 +103,10 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
         since = time.perf_counter()
         results[kind] = run_station(shot, kind, params, console)
         stages[kind] = round(time.perf_counter() - since, 2)
-    summary = summarise(shot, results, stages, time.perf_counter() - started)
+    summary = contract.summarise(str(shot.root), shot.info().source, results, stages, time.perf_counter() - started)
     write_json(output / "summary.json", summary)
     print_summary(summary, console)
     return ExitCode.OK
-
-
-def summarise(shot: Shot, results: dict[str, Any], stages: dict[str, float], wall: float) -> dict[str, Any]:
-    """The figures of a whole run as summary.json holds them; units in the key names."""
-    train, freeze, solve = results["train"], results["freeze"], results["solve"]
-    return {
-        "version": 1,
-        "shot": str(shot.root),
-        "source": shot.info().source,
-        **{k: solve[k] for k in ("frames", "solved_frames", "registered", "reprojection_error_px")},
-        **{k: train[k] for k in ("gaussians", "moving_share", "train_seconds", "iterations", "heldout_psnr_db")},
-        "train_width_px": train["width_px"],
-        "t_star_frame": freeze["t_star_frame"],
-        "exr_dir": freeze["exr_dir"],
-        "contact_sheet": freeze["contact_sheet"],
-        "video": freeze["video"],
-        "ply": freeze["ply"],
-        "take": freeze["take"],
-        "run": train["run"],
-        "wall_seconds_by_stage": stages,
-        "wall_seconds": round(wall, 2),
-    }
 
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:

@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import json
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -44,7 +43,7 @@ class JobReporter:
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
         now = time.time()
-        self.status = Status(kind, "running", os.getpid(), now, process_start(os.getpid()), now)
+        self.status = Status(kind, "running", os.getpid(), now, contract.process_start(os.getpid()), now)
         self._events = open(folder / contract.EVENTS_FILE, "a", encoding="utf-8")  # noqa: SIM115 - lives as long as the job
         self._stop = threading.Event()
         self._write_status()
@@ -137,15 +136,6 @@ class JobReporter:
             # A full disk, or a reader that holds the file open (Windows), must not end the job: the next beat retries.
             with contextlib.suppress(OSError):
                 write_json(self.folder / contract.STATUS_FILE, dataclasses.asdict(self.status))
-
-
-def process_start(pid: int) -> float:
-    """Start time of a process in clock ticks since boot, where the system tells (Linux); else 0."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-        return float(stat.rpartition(")")[2].split()[19])
-    except (OSError, ValueError, IndexError):
-        return 0.0
 
 
 def new_job(shot: Shot, kind: str, params: Any) -> Path:
@@ -262,8 +252,3 @@ STATIONS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "freeze": _freeze,
 }
 """Kind of job -> the station that does it: (shot, typed params, reporter) -> JSON-able result."""
-
-
-def free_bytes(folder: Path) -> int:
-    """Free bytes on the disk of `folder`."""
-    return shutil.disk_usage(folder).free

@@ -111,8 +111,11 @@ def render_frozen(
     return FrozenImage(color.clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1])
 
 
+@torch.no_grad()
 def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> int:
-    """Index of the frame to freeze: among trained frames, the one whose people were seen best and whose plate is sharp.
+    """Index of the frame to freeze: among trained frames, the one that saw most of what moves and whose plate is sharp.
+
+    Gaussians count by how far they travel, so that people weigh more than a flickering lamp.
 
     Args:
         times: [S] normalised times of the trained frames.
@@ -120,10 +123,13 @@ def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray
     """
     rows = model.open_rows()
     rank = np.argsort(np.argsort(sharpness)) / max(1, len(sharpness) - 1)
-    if len(rows):
-        support = model.gaussians.support[rows]
-        seen = np.array([float(support[:, int((model.centres - t).abs().argmin())].float().mean()) for t in times])
-        seen = seen / max(float(seen.max()), 1e-6)
-    else:
-        seen = np.ones(len(times))
-    return int(np.argmax(seen + 0.5 * rank))
+    if not len(rows) or model.field is None:
+        return int(np.argmax(rank))
+    means = model.gaussians.params["means"][rows]
+    places = torch.stack([model.field(means, torch.tensor([t])).means for t in torch.linspace(0, 1, 12).tolist()])
+    travel = (places - places.mean(0)).norm(dim=2).mean(0)
+    support = model.gaussians.support[rows].float()
+    seen = (travel[:, None] * support).sum(0) / travel.sum().clamp_min(1e-9)
+    bins = [int((model.centres - float(t)).abs().argmin()) for t in times]
+    score = seen.numpy()[bins]
+    return int(np.argmax(score / max(float(score.max()), 1e-6) + 0.5 * rank))

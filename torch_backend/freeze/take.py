@@ -227,6 +227,8 @@ def _finish(
         "take": params.take,
         "run": params.run,
         "t_star_frame": t_star,
+        "t_star_per_frame": params.t_star_per_frame,
+        "camera_path": params.camera_path,
         "query": params.query,
         "width": size[0],
         "height": size[1],
