@@ -129,8 +129,6 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
             "Choose another shot folder.",
             contract.ExitCode.DISK,
         ) from error
-    if not scene.splannequin.shot_path:
-        scene.splannequin.shot_path = str(folder)
     backend.start(job)
     return job
 

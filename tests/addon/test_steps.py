@@ -1,5 +1,6 @@
 """The five steps and their buttons, run headless on real jobs, and what they change in the scene."""
 
+import shutil
 from pathlib import Path
 
 import bpy
@@ -191,3 +192,13 @@ def test_a_newer_shot_is_refused_in_words(addon, contract, tmp_path: Path):
         addon("shots").read(tmp_path)
     watch = addon("supervisor").watch_of(tmp_path)
     assert "version 99" in watch.failures["footage"][0], "the panel shows it instead of breaking"
+
+
+def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_path):
+    steps, props = addon("steps"), scene.splannequin
+    props.use_range, props.first, props.last = True, 1, 8
+    for name in ("first.mp4", "second.mp4"):
+        props.clip = str(shutil.copy(clip, tmp_path / name))
+        steps.run(scene, "footage")
+    assert {p.name for p in tmp_path.glob("*.splannequin")} == {"first.splannequin", "second.splannequin"}
+    assert steps.shot_folder(scene) == tmp_path / "second.splannequin"
