@@ -272,7 +272,6 @@ def _train_params(args: argparse.Namespace) -> contract.TrainParams:
         max_gaussians=args.max_gaussians,
         holdout=args.holdout,
         seed=args.seed,
-        device=args.device,
         resume=not args.restart,
     )
 
@@ -347,5 +346,4 @@ def _add_train_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
     to.add_argument("--holdout", type=int, default=-1, help="keep every n-th frame out for testing (0: none)")
     to.add_argument("--seed", type=int, default=0, help="random seed")
-    to.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to train")
     to.add_argument("--restart", action="store_true", help="do not go on from the run's checkpoint")

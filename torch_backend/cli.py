@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import io
 import json
 import os
 import sys
@@ -142,6 +143,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
 
     facts["torch_device"] = "cuda" if torch.cuda.is_available() else "cpu"
     facts["cuda_device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    facts["trains_on"] = "cpu"  # the CUDA rasteriser is not part of this version
     facts["cores"] = os.cpu_count()
     facts["h264"] = "libx264" in av.codecs_available
     print(json.dumps(facts, indent=1), file=console.stream)
@@ -168,7 +170,6 @@ def _train_params(args: argparse.Namespace) -> contract.TrainParams:
         max_gaussians=args.max_gaussians,
         holdout=args.holdout,
         seed=args.seed,
-        device=args.device,
         resume=not args.restart,
     )
 
@@ -181,6 +182,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         camera_path=args.camera_path,
         query=args.freeze_query,
         width=args.freeze_width,
+        only_missing=True,
     )
 
 
@@ -258,7 +260,6 @@ def _add_train_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
     to.add_argument("--holdout", type=int, default=-1, help="keep every n-th frame out for testing (0: none)")
     to.add_argument("--seed", type=int, default=0)
-    to.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
     to.add_argument("--restart", action="store_true", help="do not go on from the run's checkpoint")
 
 
@@ -274,6 +275,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns an `ExitCode`."""
     # Spinning OpenMP threads made a frame four times slower when a core was busy; must be set before torch loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a narrow Windows code page must not end a job over a file's name
+            stream.reconfigure(errors="backslashreplace")
     args = parser().parse_args(argv)
     console = Console(as_json=args.json)
     try:

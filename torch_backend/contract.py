@@ -132,8 +132,6 @@ class TrainParams:
     """Every how many frames one is kept out for testing; 0: none, -1: the preset's choice."""
     seed: int = 0
     """Random seed."""
-    device: str = "auto"
-    """auto, cpu or cuda."""
     resume: bool = True
     """Go on from the run's checkpoint if there is one."""
 
@@ -291,7 +289,15 @@ class CameraPath:
     def from_json(data: Mapping[str, Any]) -> CameraPath:
         """Inverse of `to_json`; ValueError on an unknown version or malformed frames."""
         check_version(data, "camera path")
+        missing = {"width", "height", "frames"} - set(data)
+        if missing:
+            raise ValueError(f"camera path has no {min(missing)}")
         frames = [from_dict(CameraFrame, f) for f in data["frames"]]
+        numbers = [f.frame for f in frames]
+        if numbers != sorted(set(numbers)):
+            raise ValueError("camera path should list its frames once each, in ascending order")
+        if not (int(data["width"]) > 0 and int(data["height"]) > 0):
+            raise ValueError(f"camera path is {data['width']} x {data['height']} pixels: both should be above 0")
         return CameraPath(int(data["width"]), int(data["height"]), frames)
 
     @staticmethod

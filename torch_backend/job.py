@@ -105,7 +105,8 @@ class JobReporter:
             self._emit("error", message=message, hint=hint, exit_code=exit_code)
         self._emit("done", state=state, result=result)
         self._write_status()
-        self._events.close()
+        with contextlib.suppress(OSError):
+            self._events.close()
 
     # -- inside
 
@@ -120,9 +121,11 @@ class JobReporter:
         with self._lock:
             event = Event(kind, self._seq, time.time(), data)
             self._seq += 1
-            if not self._events.closed:
-                self._events.write(json.dumps(dataclasses.asdict(event)) + "\n")
-                self._events.flush()
+            # A full disk must not keep a job from saying so in its status and to its listener.
+            with contextlib.suppress(OSError):
+                if not self._events.closed:
+                    self._events.write(json.dumps(dataclasses.asdict(event)) + "\n")
+                    self._events.flush()
         if self._listener:
             self._listener(event)
 
@@ -184,9 +187,13 @@ def _run(request: JobRequest, reporter: JobReporter) -> tuple[int, Any]:
     except Exception as error:
         _log_traceback(reporter.folder)
         full = disk_error(request.shot) if isinstance(error, OSError) and is_disk_full(error) else None
+        text = str(error).lower()
         state, code = "failed", full.exit_code if full else int(ExitCode.INTERNAL)
-        if isinstance(error, MemoryError) or "out of memory" in str(error).lower():
+        if isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
             message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."
+        elif isinstance(error, PermissionError):
+            message = f"{error.filename2 or error.filename} cannot be written: it is protected, or open elsewhere."
+            hint = "Close it, or choose another folder, then start again: finished work is kept."
         else:
             message = full.message if full else f"The {request.kind} step broke: {type(error).__name__}: {error}"
             hint = full.hint if full else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."

@@ -140,10 +140,22 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield beside
         with open(beside, "rb+") as handle:
             os.fsync(handle.fileno())
-        os.replace(beside, path)
+        _replace(beside, path)
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
+
+
+def _replace(source: Path, target: Path) -> None:
+    """Renames over `target`; on Windows a reader may hold it open for a moment, so that is tried for two seconds."""
+    for attempt in range(40):
+        try:
+            os.replace(source, target)
+            return
+        except PermissionError:
+            if os.name != "nt" or attempt == 39:
+                raise
+            time.sleep(0.05)
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:

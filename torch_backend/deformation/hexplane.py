@@ -104,6 +104,20 @@ class HexPlane(nn.Module):
         """How many of means [M, 3] lie outside the box, where the field cannot tell them apart."""
         return int(((means < self.box[0]) | (means > self.box[1])).any(1).sum())
 
+    @torch.no_grad()
+    def refit(self, box: Tensor) -> None:
+        """Resamples the planes for another box [2, 3]; inside the old one the field stays what it was."""
+        nodes = [self.config.resolution * level for level in self.config.levels]
+        when = torch.linspace(-1.0, 1.0, self.config.time_nodes)
+        for level, count in enumerate(nodes):
+            at = box[0] + torch.linspace(0.0, 1.0, count)[:, None] * (box[1] - box[0])
+            old = 2.0 * (at - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
+            for k, (a, b) in enumerate(_SPATIAL):
+                _resample(self.spatial[3 * level + k], old[:, a], old[:, b])
+            for axis in range(3):
+                _resample(self.temporal[3 * level + axis], old[:, axis], when)
+        self.box.copy_(box)
+
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Two groups: the planes and the network."""
         c = self.config
@@ -143,6 +157,13 @@ def _sample(plane: Tensor, first: Tensor, second: Tensor) -> Tensor:
     """Bilinear samples [M, C] of a plane [1, C, R_second, R_first] at coordinates in [-1, 1]; the rim holds outside."""
     grid = torch.stack([first, second], dim=1)[None, None]
     return F.grid_sample(plane, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
+
+
+def _resample(plane: Tensor, first: Tensor, second: Tensor) -> None:
+    """Replaces a plane [1, C, R_second, R_first] by its own samples at node coordinates in [-1, 1] (rim held)."""
+    y, x = torch.meshgrid(second, first, indexing="ij")
+    grid = torch.stack([x, y], dim=-1)[None]
+    plane.copy_(F.grid_sample(plane, grid, mode="bilinear", padding_mode="border", align_corners=True))
 
 
 def _bend(plane: Tensor, axis: int) -> Tensor:

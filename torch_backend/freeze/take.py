@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,10 @@ from .contact_sheet import write_contact_sheet
 from .exr import FrameMetadata, write_frozen_exr
 from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen, suggest_t_star
 from .video import write_video
+
+TAKE_VERSION = 1
+"""Rises when frames rendered before must not stand beside new ones."""
+_FRAME = re.compile(r"-?\d+")
 
 
 @dataclass
@@ -84,11 +89,12 @@ def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams
 
 
 def output_size(scene: Scene, run: LoadedRun, params: FreezeParams) -> tuple[int, int]:
-    """(width, height) of the frozen frames: as trained, unless asked otherwise."""
-    if params.width <= 0:
+    """(width, height) of the frozen frames: as wide as trained unless asked otherwise, shaped like clip or path."""
+    if params.width <= 0 and not params.camera_path:
         return run.width, run.height
-    width = min(max(16, params.width), 16_384)
-    return width, max(16, round(scene.height * width / scene.width))
+    width = min(max(16, params.width or run.width), 16_384)
+    shape = CameraPath.load(params.camera_path) if params.camera_path else scene
+    return width, max(16, round(shape.height * width / shape.width))
 
 
 def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: int) -> list[OutputFrame]:
@@ -117,7 +123,7 @@ def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tu
     """A Blender path, in solve units and its own resolution, as scene cameras of the output size."""
     if not path.frames:
         raise JobError("The camera path has no frames.", "Send at least one pose.", ExitCode.FREEZE)
-    viewmats = np.array([f.viewmat for f in path.frames]).reshape(-1, 4, 4)
+    viewmats = np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4)
     viewmats[:, :3, 3] = scene.scale * (viewmats[:, :3, 3] + viewmats[:, :3, :3] @ scene.centre)
     x, y = width / path.width, height / path.height
     Ks = [[[f.K[0] * x, 0, f.K[2] * x], [0, f.K[1] * y, f.K[3] * y], [0, 0, 1]] for f in path.frames]
@@ -130,7 +136,14 @@ def take_key(
     """Identifies what a take shows, to tell stale frames from good ones. The frame range is not part of it."""
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
-        run.folder / "checkpoint.safetensors", t_star, params.t_star_per_frame, params.query, width, height, path
+        TAKE_VERSION,
+        run.folder / "checkpoint.safetensors",
+        t_star,
+        params.t_star_per_frame,
+        params.query,
+        width,
+        height,
+        path,
     )
 
 
@@ -140,10 +153,11 @@ def _prepare(folder: Path, key: str, only_missing: bool) -> set[int]:
     state = folder / "state.json"
     same = state.is_file() and read_json(state).get("key") == key
     if same and only_missing:
-        have = {int(p.stem) for p in folder.glob("*.exr") if not p.name.startswith(".")}
+        have = {int(p.stem) for p in folder.glob("*.exr") if _FRAME.fullmatch(p.stem)}
         return {n for n in have if (folder / "preview" / frame_file(n, ".png")).is_file()}
-    for old in [*folder.glob("*.exr"), *(folder / "preview").glob("*.png")]:
-        old.unlink()
+    stale = [p for p in [*folder.glob("*.exr"), *(folder / "preview").glob("*.png")] if _FRAME.fullmatch(p.stem)]
+    for old in [folder / "take.json", *stale]:
+        old.unlink(missing_ok=True)
     write_json(state, {"version": 1, "key": key})
     return set()
 
@@ -211,7 +225,7 @@ def _finish(
     numbers = [f.frame for f in frames]
     previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
     sheet = _contact_sheet(
-        shot, folder, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}", t_star
+        shot, params, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}", t_star
     )
     report.check_cancelled()
     report.progress("finishing the take", 1, 3, "video")
@@ -249,10 +263,12 @@ def _finish(
     return facts
 
 
-def _contact_sheet(shot: Shot, folder: Path, numbers: list[int], previews: list[Path], title: str, t_star: int) -> Path:
+def _contact_sheet(
+    shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int
+) -> Path:
     plates = [shot.frames / frame_file(n, ".png") for n in numbers]
-    own_poses = all(p.is_file() for p in plates)
-    path = folder / "contact_sheet.png"
+    own_poses = not params.camera_path and all(p.is_file() for p in plates)
+    path = shot.take(params.take) / "contact_sheet.png"
     write_contact_sheet(path, plates if own_poses else None, previews, numbers, title, mark=t_star)
     return path
 

@@ -40,7 +40,13 @@ class InitConfig:
 
 
 def initialise(
-    scene: Scene, images: Tensor, indices: list[int], bins: int, config: InitConfig, generator: torch.Generator
+    scene: Scene,
+    images: Tensor,
+    indices: list[int],
+    bins: int,
+    config: InitConfig,
+    generator: torch.Generator,
+    budget: int,
 ) -> Gaussians:
     """Gaussians from sparse points and seeds.
 
@@ -49,6 +55,7 @@ def initialise(
         images: [I, H, W, 3] training frames, display-referred.
         indices: [I] frame of the scene that each image shows.
         bins: time bins of the support bitmap.
+        budget: most Gaussians to start with; a random choice is kept.
     """
     points, colors = scene.points, scene.colors
     opacity = torch.full((len(points),), config.opacity)
@@ -59,6 +66,9 @@ def initialise(
         points = torch.cat([points, *(s[0] for s in seeds)])
         colors = torch.cat([colors, *(s[1] for s in seeds)])
         opacity = torch.cat([opacity, torch.full((len(points) - len(opacity),), config.seed_opacity)])
+    if len(points) > budget:
+        kept = torch.randperm(len(points), generator=generator)[:budget]
+        points, colors, opacity = points[kept], colors[kept], opacity[kept]
     if len(points) < 4:
         raise ValueError(f"the solve left {len(points)} points: at least 4 are needed to start")
     scales = neighbour_distance(points).clamp_min(config.min_scale)

@@ -41,7 +41,7 @@ class SupervisionConfig:
     """`paper`: a visible Gaussian with a screen gradient of at most this is defective (paper: 1e-9)."""
     support_every: int = 2
     """`support` acts every so many iterations."""
-    support_weight: float = 0.2
+    support_weight: float = 1.0
     """`support`: weight of the whole term."""
     support_samples: int = 1024
     """`support`: (Gaussian, time) pairs drawn each time."""
@@ -114,7 +114,10 @@ def _draw(support: Tensor, rows: Tensor, count: int, generator: torch.Generator)
     chosen = torch.cat([anywhere, near])
     valid = (chosen >= 0) & (chosen < bins)
     valid &= ~support[picked, chosen.clamp(0, bins - 1)]
-    return picked[valid][:count], chosen[valid][:count]
+    # Half of each kind where both are to be had: with sparse support nearly every draw "anywhere" is valid.
+    order = torch.nonzero(valid).flatten()
+    order = order[torch.randperm(len(order), generator=generator)][:count]
+    return picked[order], chosen[order]
 
 
 @dataclass

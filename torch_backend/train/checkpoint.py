@@ -31,13 +31,23 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(str(path), framework="pt", device="cpu") as stored:
             meta = json.loads((stored.metadata() or {})["splannequin"])
             check_version(meta, str(path), CHECKPOINT_VERSION)
-            return {name: stored.get_tensor(name) for name in stored.keys()}, meta  # noqa: SIM118 - not a dict
+            # Copies: views of the mapped file would keep Windows from replacing it at the next save.
+            return {name: stored.get_tensor(name).clone() for name in stored.keys()}, meta  # noqa: SIM118 - not a dict
     except (SafetensorError, KeyError, json.JSONDecodeError) as error:
         raise JobError(
             f"The checkpoint {path} cannot be read ({type(error).__name__}).",
             "Train the run again with --restart.",
             ExitCode.TRAIN,
         ) from error
+
+
+def read_meta(path: Path) -> dict[str, Any]:
+    """The facts of a checkpoint without its tensors; empty if the file is damaged."""
+    try:
+        with safe_open(str(path), framework="pt", device="cpu") as stored:
+            return json.loads((stored.metadata() or {})["splannequin"])
+    except (SafetensorError, KeyError, json.JSONDecodeError):
+        return {}
 
 
 def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:

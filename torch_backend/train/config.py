@@ -30,8 +30,6 @@ class TrainConfig:
     """Which of every `holdout` frames: 0 is what is reported; tuning uses another, so as not to tune on the judge."""
     method: str = "auto"
     """auto: HexPlane behind the gate. hexplane: HexPlane for all. static: no deformation."""
-    device: str = "cpu"
-    """Where tensors live."""
     seed: int = 0
     """Seed of every random draw."""
     dssim: float = 0.2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,10 @@ from torch import Tensor
 from ..contract import ExitCode, JobError, Reporter, TrainParams, read_json
 from ..footage.images import write_png
 from ..raster.cpu import warm_up
+from ..raster.settings import default_threads
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, write_json
-from .checkpoint import load_checkpoint
+from .checkpoint import load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .model import DynamicModel
 from .trainer import Trainer, restore_model
@@ -49,23 +49,24 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     Returns the run's figures, also written to runs/<name>/summary.json. JobError in words if it cannot be done.
     """
     config = config_from_params(params)
-    config.device = pick_device(params.device)
-    torch.set_num_threads(os.cpu_count() or 1)
+    torch.set_num_threads(default_threads())
     warm_up()  # kernels compile from the main thread, before the clock of the first step
     folder = shot.run(params.run)
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
-    key = content_key(config_to_json(config), shot.solve / "cameras.json", train, test)
+    key = content_key(config_to_json(config), solve_key(shot), train, test)
     done = finished(folder, key)
     if done is not None and params.resume:
         report.progress("training", 1, 1, "already trained")
         return done
     images = load_images(scene, train + test, width, height, report)
-    trainer = Trainer(scene, images[: len(train)], train, config, report)
+    identity = {"key": key, "solve": solve_key(shot)}
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity)
     checkpoint = folder / "checkpoint.safetensors"
-    resumed = _resume(trainer, folder, checkpoint, key, params.resume, report)
-    write_json(folder / "config.json", {"version": 1, "key": key, "config": config_to_json(config)})
+    resumed = _resume(trainer, checkpoint, params.resume, report)
+    (folder / "summary.json").unlink(missing_ok=True)  # it speaks of the checkpoint that is about to be replaced
+    write_json(folder / "config.json", {"version": 1, **identity, "config": config_to_json(config)})
     metrics = Metrics(folder, report, fresh=not resumed)
     held_out = images[len(train) :]
 
@@ -90,28 +91,25 @@ def training_size(scene: Scene, wanted: int) -> tuple[int, int]:
     return width, max(16, round(scene.height * width / scene.width))
 
 
-def pick_device(wanted: str) -> str:
-    """The torch device to use. JobError if a GPU was asked for that this backend cannot drive."""
-    if wanted == "cuda":
-        raise JobError(
-            "Training on the GPU is not part of this version.", "Choose the device auto or cpu.", ExitCode.ENVIRONMENT
-        )
-    return "cpu"
-
-
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
     """The summary of a run that was finished with the same settings on the same solve, or None."""
     path = folder / "summary.json"
-    if not path.is_file() or not (folder / "checkpoint.safetensors").is_file():
+    checkpoint = folder / "checkpoint.safetensors"
+    if not path.is_file() or not checkpoint.is_file():
         return None
     summary = read_json(path)
-    return summary if summary.get("key") == key else None
+    return summary if summary.get("key") == key == read_meta(checkpoint).get("key") else None
 
 
-def _resume(trainer: Trainer, folder: Path, checkpoint: Path, key: str, wanted: bool, report: Reporter) -> bool:
-    if not (wanted and checkpoint.is_file() and (folder / "config.json").is_file()):
+def solve_key(shot: Shot) -> str:
+    """Identifies the solved cameras, by content: a copied shot is still the same shot."""
+    return content_key(read_json(shot.solve / "cameras.json"))
+
+
+def _resume(trainer: Trainer, checkpoint: Path, wanted: bool, report: Reporter) -> bool:
+    if not (wanted and checkpoint.is_file()):
         return False
-    if read_json(folder / "config.json").get("key") != key:
+    if read_meta(checkpoint).get("key") != trainer.identity["key"]:
         report.warning("The run's settings or cameras changed: it is trained anew.")
         return False
     trainer.restore(checkpoint)
@@ -187,12 +185,13 @@ def load_run(shot: Shot, name: str) -> LoadedRun:
     """A run as it stands in its checkpoint. JobError if there is none."""
     folder = shot.run(name)
     checkpoint = folder / "checkpoint.safetensors"
-    if not checkpoint.is_file() or not (folder / "config.json").is_file():
+    if not checkpoint.is_file():
         message = f"{shot.root.name} has no trained run named {name!r}."
         raise JobError(message, "Run the training step first.", ExitCode.FREEZE)
-    config = config_from_json(read_json(folder / "config.json")["config"])
     tensors, meta = load_checkpoint(checkpoint)
-    if int(meta["iteration"]) == 0:
-        raise JobError(f"The run {name!r} has not been trained yet.", "Run the training step first.", ExitCode.FREEZE)
+    config = config_from_json(meta["config"])
+    if meta["solve"] != solve_key(shot):
+        message = f"The run {name!r} was trained on other cameras than the shot has now."
+        raise JobError(message, "Train it again.", ExitCode.FREEZE)
     model = restore_model(tensors, meta, config)
     return LoadedRun(folder, config, model, int(meta["width"]), int(meta["height"]), list(meta["train_frames"]))

@@ -10,14 +10,15 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from ..contract import ExitCode, JobError, Reporter
+from ..contract import Cancelled, ExitCode, JobError, Reporter
 from ..deformation import HexPlane, apply_deltas, open_gate, residual_per_gaussian
 from ..gaussians import Densifier, Gaussians, initialise
 from ..scene import Scene
 from ..supervision import PaperView, bin_of, bin_times, mark_seen, paper_loss, support_loss
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
-from .config import TrainConfig
+from .config import TrainConfig, config_to_json
 from .exposure import Exposure
 from .losses import photometric, psnr
 from .model import DynamicModel, field_box, render
@@ -34,9 +35,19 @@ class Trainer:
         images: the training frames.
         train: indices into the scene's frames, one per image.
         config: every number of the run.
+        identity: JSON-able facts that say which run a checkpoint belongs to; stored in it.
     """
 
-    def __init__(self, scene: Scene, images: Tensor, train: list[int], config: TrainConfig, report: Reporter) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        images: Tensor,
+        train: list[int],
+        config: TrainConfig,
+        report: Reporter,
+        identity: dict[str, Any] | None = None,
+    ) -> None:
+        self.identity = identity or {}
         self.scene, self.images, self.train_ids, self.config, self.report = scene, images, train, config, report
         self.height, self.width = images.shape[1:3]
         self.Ks = scene.camera_at(self.width, self.height)
@@ -45,7 +56,8 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.centres = bin_times(scene.times[train])
         config.hexplane.time_nodes = max(4, round(len(train) / 2))
-        gaussians = initialise(scene, images, train, len(self.centres), config.init, self.generator)
+        budget = config.densify.budget
+        gaussians = initialise(scene, images, train, len(self.centres), config.init, self.generator, budget)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
         self.initial = len(gaussians)
         self.iteration = 0
@@ -67,6 +79,7 @@ class Trainer:
         """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured."""
         every = max(1, round(self.config.evaluate_every * self.config.iterations))
         since = time.perf_counter() - self.trained_seconds
+        started = self.iteration
         try:
             while self.iteration < self.config.iterations:
                 self.report.check_cancelled()
@@ -81,9 +94,12 @@ class Trainer:
                     self.report.progress("training", self.iteration, self.config.iterations, text)
                 if time.perf_counter() - self._saved_at > self.config.checkpoint_seconds:
                     self.save(checkpoint)
-        finally:
-            self.trained_seconds = time.perf_counter() - since
-            self.save(checkpoint)
+        except Cancelled:
+            if self.iteration > started:
+                self.save(checkpoint)
+            raise
+        self.trained_seconds = time.perf_counter() - since
+        self.save(checkpoint)
 
     def step(self) -> float:
         """One optimisation step on one training frame; returns the photometric loss (nan if the step was skipped)."""
@@ -108,6 +124,8 @@ class Trainer:
             mark_seen(self.model.gaussians, bin_of(self.centres, self.times[frame]), out.weight_sum[0])
         if self._paper_is_due():
             self._paper_step(frame, rows, state, out.means2d_grad[0].clone())
+            if not self._gradients_finite():
+                return self._skip("gradient", frame)
         self.optimizer.step()
         self._after_step()
         self.bad_steps = 0
@@ -137,17 +155,22 @@ class Trainer:
         frames = list(range(0, len(self.train_ids), max(1, len(self.train_ids) // 40)))
         residual, weight = residual_per_gaussian(frames, self._residual_of, len(self.model.gaussians))
         open_gate(self.model.gaussians, residual, weight, self.config.gate)
-        if self.model.field is None and bool(self.model.gaussians.open.any()):
+        if not bool(self.model.gaussians.open.any()):
+            return
+        if self.model.field is None:
             self._create_field()
+        else:
+            self._widen_field(self.model.field)
 
     def _residual_of(self, frame: int) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
+        self.report.check_cancelled()
         with torch.no_grad():
             state = {k: v.detach() for k, v in self.model.state_at(self.times[frame]).items()}
         probe = torch.zeros(len(self.model.gaussians), 1, requires_grad=True)
         background = torch.cat([self.background, torch.zeros(1)])
         out = self._render(state, frame, colors=probe, background=background, with_contributions=True)
         exposed = self.model.exposure.apply(out.colors[0, ..., :3], self.times[frame]).detach()
-        error = (exposed - self.images[frame].float()).abs().mean(-1)
+        error = unexplained_error(exposed, self.images[frame].float(), self.config.gate.slack_px)
 
         def pull(values: Tensor) -> Tensor:
             # The gradient of sum(value * image channel) for a Gaussian's colour is its sum of alpha * T * value.
@@ -162,6 +185,16 @@ class Trainer:
         self.model.field = HexPlane(self.config.hexplane, box, self.generator)
         for group in self.model.field.parameter_groups():
             self.optimizer.add_param_group({**group, "lr_start": group["lr"]})
+
+    def _widen_field(self, field: HexPlane) -> None:
+        """Lets the field resolve what later rounds opened: outside its box it cannot tell one place from another."""
+        means = self.model.gaussians.params["means"].detach()[self.model.gaussians.open]
+        if field.outside(means) <= 0.01 * len(means):
+            return
+        wanted = field_box(means)
+        field.refit(torch.stack([torch.minimum(field.box[0], wanted[0]), torch.maximum(field.box[1], wanted[1])]))
+        for plane in [*field.spatial, *field.temporal]:
+            self.optimizer.state.pop(plane, None)
 
     # ------------------------------------------------------------------ one step's parts
 
@@ -292,7 +325,10 @@ class Trainer:
         """Mean PSNR in dB over held-out frames at their own times; None if there are none."""
         if not indices:
             return None
-        values = [psnr(self.render_frame(i), images[n].float()) for n, i in enumerate(indices)]
+        values = []
+        for n, i in enumerate(indices):
+            self.report.check_cancelled()
+            values.append(psnr(self.render_frame(i), images[n].float()))
         return sum(values) / len(values)
 
     # ------------------------------------------------------------------ checkpoints
@@ -315,6 +351,8 @@ class Trainer:
         tensors["centres"] = self.centres
         tensors["exposure"] = self.model.exposure.values
         meta = {
+            **self.identity,
+            "config": config_to_json(self.config),
             "iteration": self.iteration,
             "initial": self.initial,
             "trained_seconds": self.trained_seconds,
@@ -369,3 +407,17 @@ def inside_frustum(means: Tensor, viewmat: Tensor, K: Tensor, width: int, height
     x = camera[:, 0] / depth * K[0, 0] + K[0, 2]
     y = camera[:, 1] / depth * K[1, 1] + K[1, 2]
     return (camera[:, 2] > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+
+
+def unexplained_error(image: Tensor, target: Tensor, slack_px: float) -> Tensor:
+    """Error [H, W] of an image [H, W, 3] that no shift of the target by up to `slack_px` pixels explains.
+
+    A pose that is off by half a pixel, a rolling shutter or a soft render leave errors along every edge of a still
+    world, as large as the edge is steep; what moves leaves more.
+    """
+    error = (image - target).abs().mean(-1)
+    padded = F.pad(target.mean(-1)[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    across = (padded[1:-1, 2:] - padded[1:-1, :-2]).abs() / 2
+    down = (padded[2:, 1:-1] - padded[:-2, 1:-1]).abs() / 2
+    steep = F.max_pool2d(torch.hypot(across, down)[None, None], 3, stride=1, padding=1)[0, 0]
+    return (error - slack_px * steep).clamp_min(0.0)

@@ -88,6 +88,26 @@ def test_outside_is_counted():
     assert field().outside(x) == 1
 
 
+def test_refit_keeps_the_field_and_resolves_more():
+    """Twice the box at twice the nodes would be exact; at the same nodes the field is kept to its own blur."""
+    module = stir(field())
+    with torch.no_grad():
+        for plane in module.spatial:
+            ramp = torch.linspace(0.2, 0.6, plane.shape[3])
+            plane.copy_(ramp[None, None, None, :] + 0.5 * torch.linspace(0, 1, plane.shape[2])[None, None, :, None])
+        for plane in module.temporal:
+            plane.copy_(torch.linspace(0.8, 1.2, plane.shape[3]).expand_as(plane))
+    x = points(50)
+    x = BOX[0] + 0.1 + 0.8 * (x - BOX[0])
+    before = module.features_at(x, torch.tensor([0.3]))
+    wider = torch.stack([BOX[0] - 0.5, BOX[1] + 0.5])
+    assert module.outside(wider) == 2
+    module.refit(wider)
+    assert module.outside(wider) == 0
+    after = module.features_at(x, torch.tensor([0.3]))
+    assert float((after - before).abs().max() / before.abs().max()) < 0.2
+
+
 def test_state_round_trip():
     one = stir(field())
     two = HexPlane(one.config, BOX + 1.0, torch.Generator().manual_seed(5))

@@ -11,7 +11,7 @@ from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint
 from torch_backend.train.config import config_from_json, config_to_json
-from torch_backend.train.trainer import Trainer, inside_frustum
+from torch_backend.train.trainer import Trainer, inside_frustum, unexplained_error
 
 
 def test_it_learns_and_reports(trained):
@@ -79,6 +79,46 @@ def test_wrong_choices_are_named():
 def test_config_round_trip():
     config = config_from_params(TrainParams(preset="final", supervision="paper"))
     assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config
+
+
+def test_a_run_of_other_settings_is_not_taken_for_this_one(world, quiet):
+    """Finish one, cancel another under the same name, ask for the first again: the checkpoint is no longer its own."""
+    train_shot(world.shot, short(world, "mixed"), quiet())
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, short(world, "mixed", seed=5), quiet(cancel_at=("training", 0.3)))
+    report = quiet()
+    train_shot(world.shot, short(world, "mixed"), report)
+    assert ("progress", "training", 1, 1, "already trained") not in report.events
+
+
+def test_cancelling_at_once_keeps_the_finished_checkpoint(world, quiet):
+    train_shot(world.shot, short(world, "kept"), quiet())
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, short(world, "kept", seed=5), quiet(cancel_at=("loading frames", 0.5)))
+    assert load_run(world.shot, "kept").config.seed == 0
+
+
+def test_a_run_of_other_cameras_is_refused(tmp_path, quiet):
+    import sys
+
+    build_world = sys.modules[quiet.__module__].build_world
+    world = build_world(tmp_path)
+    train_shot(world.shot, short(world, "main"), quiet())
+    path = world.shot.solve / "cameras.json"
+    path.write_text(path.read_text().replace("registered", "localised", 1))
+    with pytest.raises(JobError, match="other cameras"):
+        load_run(world.shot, "main")
+
+
+def test_unexplained_error_forgives_half_a_pixel_but_not_a_hand():
+    x = torch.linspace(0, 12, 64)
+    stripes = (0.5 + 0.4 * torch.sin(x))[None, :, None].expand(32, 64, 3).contiguous()
+    shifted = (0.5 + 0.4 * torch.sin(x + 0.5 * 12 / 63))[None, :, None].expand(32, 64, 3).contiguous()
+    assert float((shifted - stripes).abs().mean()) > 0.02
+    assert float(unexplained_error(shifted, stripes, 0.7).mean()) < 1e-3
+    hand = stripes.clone()
+    hand[10:20, 20:40] = 0.1
+    assert float(unexplained_error(hand, stripes, 0.7)[10:20, 20:40].mean()) > 0.2
 
 
 def test_damaged_checkpoint_is_an_error_in_words(world, quiet):
