@@ -37,7 +37,7 @@ class _StepOperator:
         except contract.Cancelled:
             self.report({"WARNING"}, "Cancelled: finished work is kept")  # type: ignore[attr-defined]
             return {"CANCELLED"}
-        except (contract.JobError, ValueError, OSError) as error:
+        except (contract.JobError, ValueError, OSError, RuntimeError) as error:
             folder = steps.shot_folder(scene)
             sentence = getattr(error, "message", str(error))
             if folder is not None:
@@ -106,7 +106,11 @@ class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
             return super().execute(context)
         outcome = _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take))
         if outcome == {"FINISHED"}:
-            bpy.ops.splannequin.render("EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT")
+            try:
+                bpy.ops.splannequin.render("EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT")
+            except RuntimeError as error:
+                self.report({"ERROR"}, str(error).strip())
+                return {"CANCELLED"}
         return outcome
 
     def after(self, scene: Any, job: Any) -> list[str]:
@@ -140,7 +144,14 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
             return {"CANCELLED"}
         notes = bake.choose_output(scene, folder, scene.splannequin.take_name)
         supervisor.render_began(folder, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
-        bpy.ops.render.render(how, animation=True, scene=scene.name)
+        try:
+            refused = "CANCELLED" in bpy.ops.render.render(how, animation=True, scene=scene.name) and "it was cancelled"
+        except RuntimeError as error:
+            refused = str(error).strip()
+        if refused:
+            supervisor.watch_of(folder).rendered = None  # nothing else would tell the panel that no render runs
+            self.report({"ERROR"}, f"Blender did not render the scene: {refused}")
+            return {"CANCELLED"}
         for note in notes:
             self.report({"INFO"}, note)
         return {"FINISHED"}

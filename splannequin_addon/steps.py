@@ -77,11 +77,10 @@ def params_of(scene: Any, step: str) -> Any:
     if step == "train":
         return contract.TrainParams(run=props.run_name, preset=props.preset)
     t_star = props.t_star if props.choose_t_star else None
-    params = contract.FreezeParams(run=props.run_name, take=props.take_name, t_star=t_star)
+    params = contract.FreezeParams(run=props.run_name, take=props.take_name, t_star=t_star, only_missing=True)
     folder = shot_folder(scene)
     if step == "bake" and folder is not None:
         params = take_params(folder, props.take_name, t_star) or params
-        params.only_missing = True
     return params
 
 
@@ -94,6 +93,10 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         run=facts["run"],
         take=take,
         t_star=facts["t_star_frame"] if t_star is None else t_star,
+        t_star_per_frame=facts.get("t_star_per_frame", {}),
+        first=facts.get("first"),
+        last=facts.get("last"),
+        camera_path=facts.get("camera_path", ""),
         query=facts["query"],
         width=facts["width"],
         only_missing=True,

@@ -184,7 +184,7 @@ def render_began(shot: Path, frames: int) -> None:
 
 @persistent
 def _on_frame(*_: Any) -> None:
-    for watch in _watches.values():
+    for watch in list(_watches.values()):
         if watch.rendered is not None:
             watch.rendered = (watch.rendered[0] + 1, watch.rendered[1])
             watch.redraw = True
@@ -192,7 +192,7 @@ def _on_frame(*_: Any) -> None:
 
 @persistent
 def _on_render_end(*_: Any) -> None:
-    for watch in _watches.values():
+    for watch in list(_watches.values()):
         if watch.rendered is not None:
             done, total = watch.rendered
             watch.rendered = None

@@ -1,5 +1,6 @@
 """The five steps and their buttons, run headless on real jobs, and what they change in the scene."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -202,3 +203,20 @@ def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_pat
         steps.run(scene, "footage")
     assert {p.name for p in tmp_path.glob("*.splannequin")} == {"first.splannequin", "second.splannequin"}
     assert steps.shot_folder(scene) == tmp_path / "second.splannequin"
+
+
+def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, shot, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with_shot.render.filepath = str(tmp_path / "file" / "######")
+    with pytest.raises(RuntimeError, match="Blender did not render the scene"):
+        bpy.ops.splannequin.render()
+    assert addon("supervisor").watch_of(shot).running() is None
+
+
+def test_bake_asks_for_a_ramp_or_a_path_as_it_was_made(addon, shot):
+    path = shot / "takes" / "freeze" / "take.json"
+    facts = json.loads(path.read_text())
+    ramp = {"5": 5.0, "6": 5.5}
+    path.write_text(json.dumps({**facts, "last": 6, "t_star_per_frame": ramp, "camera_path": "/a/path.json"}))
+    params = addon("steps").take_params(shot, "freeze")
+    assert (params.first, params.last, params.t_star_per_frame, params.camera_path) == (5, 6, ramp, "/a/path.json")
