@@ -6,7 +6,7 @@ The compositor tree moved from `scene.node_tree` (4.x, output: Composite node) t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import bpy
@@ -36,12 +36,18 @@ def enable_compositor(scene: Any) -> None:
         scene.use_nodes = True
 
 
-def disable_compositor(scene: Any) -> None:
-    """Undoes `enable_compositor` where it changed something: rendering no longer runs the tree."""
-    if HAS_COMPOSITING_GROUP:
-        scene.render.use_compositing = False
-    else:
-        scene.use_nodes = False
+def compositor_switches(scene: Any) -> dict[str, bool]:
+    """What `enable_compositor` may change, by name."""
+    nodes = {} if HAS_COMPOSITING_GROUP else {"use_nodes": bool(scene.use_nodes)}
+    return {"use_compositing": bool(scene.render.use_compositing), **nodes}
+
+
+def restore_compositor_switches(scene: Any, switches: Mapping[str, bool]) -> None:
+    """Sets what `compositor_switches` told; other names are passed over."""
+    if "use_compositing" in switches:
+        scene.render.use_compositing = switches["use_compositing"]
+    if "use_nodes" in switches:
+        scene.use_nodes = switches["use_nodes"]
 
 
 def new_compositor_tree(scene: Any, name: str) -> Any:

@@ -52,13 +52,14 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
         What was changed, one sentence each.
     """
     changes: list[str] = []
-    before = {"enabled": compat.compositor_enabled(scene), "made_tree": False}
+    enabled = compat.compositor_enabled(scene)
+    before = {**compat.compositor_switches(scene), "made_tree": False}
     tree = compat.compositor_tree(scene)
     if tree is None or not len(tree.nodes):
         tree = compat.new_compositor_tree(scene, "Splannequin Compositing")
         before["made_tree"] = True
         changes.append("The scene had no compositor tree: a minimal one was made.")
-    if not before["enabled"]:
+    if not enabled:
         compat.enable_compositor(scene)
         if not before["made_tree"]:
             changes.append("The compositor was switched on.")
@@ -94,14 +95,14 @@ def remove(scene: Any) -> bool:
             tree.links.new(sources[0], target)
     images = [n.image for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image]
     tree.nodes.remove(node)
-    bpy.data.node_groups.remove(group)
+    if group.users == 0:  # another scene may show it
+        bpy.data.node_groups.remove(group)
     for ours in [n for n in tree.nodes if n.get(_TAG)]:
         images += [ours.image] if getattr(ours, "image", None) else []
         tree.nodes.remove(ours)
     if before.get("made_tree") and not [n for n in tree.nodes if n.bl_idname not in _OUTPUTS]:
         compat.drop_compositor_tree(scene)
-    elif not before.get("enabled", True):
-        compat.disable_compositor(scene)
+    compat.restore_compositor_switches(scene, before)
     for image in {i.name: i for i in images}.values():
         if image.users == 0:
             bpy.data.images.remove(image)

@@ -100,7 +100,7 @@ def start(job: Job, python: str, package_root: Path) -> None:
         with open(job.folder / contract.LOG_FILE, "ab") as log:
             job.process = subprocess.Popen(
                 command,
-                cwd=package_root,
+                cwd=job.folder,  # not the extension's: Windows keeps the folder that a process stands in
                 env=backend_environ(package_root),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -165,7 +165,8 @@ def cancel(job: Job) -> None:
     if flag.exists() and time.time() - flag.stat().st_mtime > _KILL_SECONDS and is_alive(job, job.status):
         _kill(job)
         return
-    flag.touch()
+    if not flag.exists():
+        flag.touch()
 
 
 def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
@@ -216,9 +217,13 @@ def latest(shot: Path) -> dict[str, Job]:
         if kind is None or kind in found:
             continue
         job = open_job(folder)
-        if job is not None:
+        if job is None:
+            continue
+        try:
             poll(job, 1.0)
-            found[kind] = job
+        except (OSError, ValueError):
+            continue  # files that another hand broke: the one before it is asked
+        found[kind] = job
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from ..torch_backend import contract
 from . import cameras
 
 _BEFORE = "splannequin_settings_before"
@@ -70,6 +71,7 @@ def keep_plate_colours(scene: Any) -> list[str]:
     """Sets the view transform so that pictures leave as they came in; returns what was changed, in words.
 
     Blender's default view (AgX) is made for renders and would change every plate. Dithering is noise on the last bit.
+    JobError if the colour configuration has no such view.
     """
     view = scene.view_settings
     changes = []
@@ -78,7 +80,14 @@ def keep_plate_colours(scene: Any) -> list[str]:
         was = view.view_transform
         _remember(scene, "view", tuple(_VIEW))
         for name, value in _VIEW.items():
-            setattr(view, name, value)
+            try:
+                setattr(view, name, value)
+            except TypeError as error:  # what an enumeration says to a value it lacks
+                raise contract.JobError(
+                    f"This Blender's colour configuration has no {name.replace('_', ' ')} {value!r}.",
+                    "Use Blender's own configuration, or switch Keep Plate Colours off.",
+                    contract.ExitCode.BAKE,
+                ) from error
         changes.append(f"View transform set from {was} to Standard, so that the plate keeps its colours.")
     if scene.render.dither_intensity:
         _remember(scene, "render", ("dither_intensity",))

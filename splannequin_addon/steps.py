@@ -6,6 +6,7 @@ The same functions serve the buttons, the timer and the command line.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,9 @@ STEPS = {
     )
 }
 """The steps in order."""
+
+_STEP_FILE = "step"
+"""File of a job folder: name of the step that asked for the job."""
 
 
 def shot_folder(scene: Any) -> Path | None:
@@ -120,20 +124,39 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
     if folder is None:
         raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
     backend.python()  # before anything is written: without a backend there is nothing to start
+    if any(not job.ended and jobs.is_alive(job, job.status) for job in jobs.latest(folder).values()):
+        raise contract.JobError(
+            f"A step of {folder.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
+        )
     try:
         if step == "footage":
             shots.create(folder)
         elif not (folder / "shot.json").is_file():
             raise contract.JobError(f"{folder} is no shot folder.", STEPS[step].needs, contract.ExitCode.USAGE)
         job = jobs.new_job(folder, STEPS[step].kind, params)
+        (job.folder / _STEP_FILE).write_text(step, encoding="utf-8")
     except OSError as error:
         raise contract.JobError(
             f"Cannot write to {folder}: {error.strerror or error}.",
             "Choose another shot folder.",
             contract.ExitCode.DISK,
         ) from error
-    backend.start(job)
+    try:
+        backend.start(job)
+    except contract.JobError:
+        shutil.rmtree(job.folder)  # else it would pass for one that is about to start
+        raise
     return job
+
+
+def step_of(job: jobs.Job) -> str:
+    """Name of the step that a job found in a shot folder belongs to: Freeze and Bake ask for the same kind."""
+    try:
+        told = (job.folder / _STEP_FILE).read_text(encoding="utf-8")
+    except OSError:
+        told = ""  # started from the backend's command line
+    names = [s.name for s in STEPS.values() if s.kind == job.kind]
+    return told if told in names else names[0]
 
 
 def finish(scene: Any, step: str, job: jobs.Job) -> list[str]:

@@ -7,6 +7,7 @@ the jobs of a shot that is opened are found again in its folder.
 from __future__ import annotations
 
 import time
+import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,8 +64,7 @@ def watch_of(shot: Path) -> Watch:
     watch = _watches.get(shot)
     if watch is None:
         watch = _watches[shot] = Watch(shot)
-        steps_of_kind = {"import": "footage", "solve": "camera", "train": "train", "freeze": "freeze"}
-        watch.jobs = {steps_of_kind[kind]: job for kind, job in jobs.latest(shot).items()}
+        watch.jobs = {steps.step_of(job): job for job in jobs.latest(shot).values()}
     if watch.state is None:
         refresh(watch)
     return watch
@@ -89,15 +89,15 @@ def follow(step: str, job: jobs.Job) -> None:
 def refresh(watch: Watch) -> bool:
     """Reads the shot folder again if something in it changed. True if it did."""
     watch.looked = time.monotonic()
-    stamp = shots.stamp(watch.shot)
-    if stamp == watch.stamp and watch.state is not None:
-        return False
     try:
+        stamp = shots.stamp(watch.shot)
+        if stamp == watch.stamp and watch.state is not None:
+            return False
+        watch.stamp = stamp
         watch.state = shots.read(watch.shot)
     except (OSError, ValueError, KeyError) as error:
         watch.state = shots.ShotState(watch.shot)
         watch.failures["footage"] = (f"The shot folder cannot be read: {error}", "")
-    watch.stamp = stamp
     return True
 
 
@@ -106,28 +106,41 @@ def tick() -> float:
     until = time.monotonic() + BUDGET_SECONDS
     changed = False
     for watch in list(_watches.values()):
-        changed, watch.redraw = changed or watch.redraw, False
-        for step, job in list(watch.jobs.items()):
-            if job.ended or time.monotonic() > until:
-                continue
+        try:
+            changed |= _turn(watch, until)
+        except Exception as error:  # whatever it is: an exception would end the timer, and with it every shot's panel
+            step, told = watch.running() or "footage", f"{type(error).__name__}: {error}"
+            if watch.failures.get(step, ("",))[0] != told:  # once, not at every turn
+                traceback.print_exc()
+            watch.failures[step] = (told, "The console has the details.")
             changed = True
-            try:
-                jobs.poll(job, max(until - time.monotonic(), 0.001))
-            except (OSError, ValueError, KeyError) as error:
-                watch.failures[step] = (f"The job in {job.folder} cannot be read: {error}", "")
-                del watch.jobs[step]
-                continue
-            if job.ended:
-                refresh(watch)
-                _apply(watch, step, job)
-        if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
-            if watch.running() is None and not steps.scenes_of(watch.shot):
-                del _watches[watch.shot]  # a path that was typed and left again
-                continue
-            changed |= refresh(watch)
     if changed:
         redraw()
     return TICK_SECONDS
+
+
+def _turn(watch: Watch, until: float) -> bool:
+    """One shot's part of a tick, `until` a time of `time.monotonic`; True if its panel should be drawn again."""
+    changed, watch.redraw = watch.redraw, False
+    for step, job in list(watch.jobs.items()):
+        if job.ended or time.monotonic() > until:
+            continue
+        changed = True
+        try:
+            jobs.poll(job, max(until - time.monotonic(), 0.001))
+        except (OSError, ValueError, KeyError) as error:
+            watch.failures[step] = (f"The job in {job.folder} cannot be read: {error}", "")
+            del watch.jobs[step]
+            continue
+        if job.ended:
+            refresh(watch)
+            _apply(watch, step, job)
+    if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
+        if watch.running() is None and not steps.scenes_of(watch.shot):
+            del _watches[watch.shot]  # a path that was typed and left again
+            return changed
+        changed |= refresh(watch)
+    return changed
 
 
 def redraw() -> None:

@@ -112,11 +112,25 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
 
 def test_compositor_that_was_off_is_said_and_put_back(addon, scene, artists_tree, take):
     compat = addon("compat")
-    compat.disable_compositor(scene)
+    switches = {name: False for name in compat.compositor_switches(scene)}
+    compat.restore_compositor_switches(scene, switches)
     said = addon("compositor").insert(scene, take)
     assert compat.compositor_enabled(scene) and "The compositor was switched on." in said
     addon("compositor").remove(scene)
     assert not compat.compositor_enabled(scene)
+    assert compat.compositor_switches(scene) == switches, "each switch, not just one of them"
+
+
+def test_removal_leaves_a_group_that_another_scene_shows(addon, scene, artists_tree, take):
+    compat, compositor = addon("compat"), addon("compositor")
+    compositor.insert(scene, take)
+    group = compositor.group_node(compat.compositor_tree(scene)).node_tree
+    other = bpy.data.scenes.new("other")
+    compat.new_compositor_tree(other, "other").nodes.new("CompositorNodeGroup").node_tree = group
+    assert compositor.remove(scene)
+    shown = compositor.group_node(compat.compositor_tree(other))
+    assert shown is not None and "Frozen" in shown.node_tree.nodes and shown.node_tree.nodes["Frozen"].image
+    assert compositor.remove(other) and not any(g.get("splannequin") for g in bpy.data.node_groups)
 
 
 def test_group_offers_what_a_compositor_needs(addon, scene, take):

@@ -185,3 +185,20 @@ def test_a_broken_write_leaves_what_was_there(addon, tmp_path):
     with pytest.raises(ValueError):
         jobs.write_json(target, {"a": float("nan")})
     assert json.loads(target.read_text()) == {"a": 1} and [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_cancel_pressed_again_does_not_put_off_the_end_by_force(addon, contract, empty_shot):
+    jobs = addon("jobs")
+    job = jobs.new_job(empty_shot, "train", contract.TrainParams())
+    jobs.cancel(job)
+    os.utime(job.folder / "cancel", (time.time() - 5, time.time() - 5))
+    since = (job.folder / "cancel").stat().st_mtime
+    jobs.cancel(job)
+    assert (job.folder / "cancel").stat().st_mtime == since
+
+
+def test_a_job_with_broken_files_is_passed_over(addon, contract, empty_shot):
+    jobs = addon("jobs")
+    job = jobs.new_job(empty_shot, "train", contract.TrainParams())
+    (job.folder / "status.json").write_text("{ half")
+    assert jobs.latest(empty_shot) == {}

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import types
 from pathlib import Path
 
 import bpy
@@ -206,6 +207,8 @@ def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_pat
 
 
 def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, shot, tmp_path):
+    bpy.ops.splannequin.insert_freeze()
+    with_shot.frame_start = with_shot.frame_end = 5
     (tmp_path / "file").write_text("in the way")
     with_shot.render.filepath = str(tmp_path / "file" / "######")
     with pytest.raises(RuntimeError, match="Blender did not render the scene"):
@@ -220,3 +223,41 @@ def test_bake_asks_for_a_ramp_or_a_path_as_it_was_made(addon, shot):
     path.write_text(json.dumps({**facts, "last": 6, "t_star_per_frame": ramp, "camera_path": "/a/path.json"}))
     params = addon("steps").take_params(shot, "freeze")
     assert (params.first, params.last, params.t_star_per_frame, params.camera_path) == (5, 6, ramp, "/a/path.json")
+
+
+def test_a_step_is_refused_while_another_of_the_shot_runs(addon, contract, scene, clip, tmp_path):
+    steps, jobs, props = addon("steps"), addon("jobs"), scene.splannequin
+    props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
+    job = steps.begin(scene, "footage")
+    try:
+        with pytest.raises(contract.JobError, match="is still running"):
+            steps.begin(scene, "footage")
+    finally:
+        jobs.cancel(job)
+        job.process.wait()
+    assert len(list((tmp_path / "t.splannequin" / "jobs").iterdir())) == 1
+
+
+def test_a_job_found_again_belongs_to_the_step_that_asked_for_it(addon, contract, shot):
+    jobs, steps = addon("jobs"), addon("steps")
+    job = jobs.new_job(shot, "freeze", contract.FreezeParams())
+    assert steps.step_of(job) == "freeze", "a job of the backend's own command line names no step"
+    (job.folder / "step").write_text("bake")
+    watch = addon("supervisor").watch_of(shot)
+    assert watch.running() == "bake" and watch.jobs["bake"].folder == job.folder
+
+
+def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path, capfd):
+    supervisor = addon("supervisor")
+    broken, sound = supervisor.watch_of(tmp_path), supervisor.watch_of(shot)
+    broken.jobs["train"] = types.SimpleNamespace(ended=False)
+    sound.redraw = True
+    assert supervisor.tick() == supervisor.TICK_SECONDS and not sound.redraw
+    assert "AttributeError" in broken.failures["train"][0] and "Traceback" in capfd.readouterr().err
+
+
+def test_a_view_that_the_colour_configuration_lacks_is_said(addon, contract, scene, monkeypatch):
+    setup = addon("scene_setup")
+    monkeypatch.setitem(setup._VIEW, "view_transform", "Plain")
+    with pytest.raises(contract.JobError, match="has no view transform 'Plain'"):
+        setup.keep_plate_colours(scene)
