@@ -63,7 +63,13 @@ def fit_take(scene: Any, shot: Path, take: str) -> list[str]:
     return scene_setup.fit_clip(scene, frozen.size, fps, (frozen.first, frozen.last))
 
 
-def render(scene: Any, folder: Path, png: bool = True, on_frame: Callable[[int, int], None] | None = None) -> list[int]:
+def render(
+    scene: Any,
+    folder: Path,
+    png: bool = True,
+    on_frame: Callable[[int, int], None] | None = None,
+    check_cancelled: Callable[[], None] | None = None,
+) -> list[int]:
     """Renders the scene's range through the compositor to folder/NNNNNN.*, blocking; returns the frames written.
 
     Args:
@@ -71,6 +77,7 @@ def render(scene: Any, folder: Path, png: bool = True, on_frame: Callable[[int, 
         folder: where the pictures go.
         png: write 8-bit RGB PNG; else what the scene's output format says.
         on_frame: called with (frames done, frames in all).
+        check_cancelled: called between frames (after the last one of a movie file); what it raises ends the bake.
 
     Raises:
         contract.JobError: Blender refused, or a frame is not on disk afterwards.
@@ -90,8 +97,14 @@ def render(scene: Any, folder: Path, png: bool = True, on_frame: Callable[[int, 
             on_frame(len(done), len(wanted))
 
     bpy.app.handlers.render_write.append(count)
+    span = (scene.frame_start, scene.frame_end)
+    # Blender cannot be stopped within a call; a movie file must be written in one.
+    parts = [span] if scene.render.is_movie_format else [(n, n) for n in wanted]
     try:
-        bpy.ops.render.render(animation=True, scene=scene.name)
+        for scene.frame_start, scene.frame_end in parts:
+            bpy.ops.render.render(animation=True, scene=scene.name)
+            if check_cancelled:
+                check_cancelled()
     except RuntimeError as error:
         raise contract.JobError(
             f"Blender could not render the scene: {str(error).strip()}",
@@ -99,6 +112,7 @@ def render(scene: Any, folder: Path, png: bool = True, on_frame: Callable[[int, 
             contract.ExitCode.BAKE,
         ) from error
     finally:
+        scene.frame_start, scene.frame_end = span
         bpy.app.handlers.render_write.remove(count)
     lost = [n for n in wanted if not Path(scene.render.frame_path(frame=n)).is_file()]
     if lost:

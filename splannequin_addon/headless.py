@@ -64,11 +64,29 @@ class Console:
         print(f"  {data['stage']:<22} {100 * share:3.0f}%  {data['message']}{eta}".rstrip(), flush=True)
 
 
+_interrupts: list[int] = []
+"""Signals that asked this command to stop."""
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    """Remembered, because Blender swallows what is raised in a handler of its own while it renders."""
+    _interrupts.append(number)
+    raise KeyboardInterrupt
+
+
+def _stop_if_interrupted() -> None:
+    if _interrupts:
+        raise KeyboardInterrupt
+
+
 def main(argv: Sequence[str]) -> int:
     """Runs one command; returns an exit code. Ctrl-C and SIGTERM cancel the job at work with a checkpoint."""
     before = {}
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, signal.default_int_handler)
+    _interrupts.clear()
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):
+        if hasattr(signal, name):
+            number = getattr(signal, name)
+            before[number] = signal.signal(number, _interrupt)
     try:
         args = parser().parse_args(list(argv))
         return int(args.run(args, Console(args.json)))
@@ -225,7 +243,9 @@ def _bake(scene: Any, fresh: bool, shot: Path, take: str, output: Path, console:
         console.say(f"  {change}")
     folder = output / "composited"
     blend = output / "shot.blend"
-    numbers = bake.render(scene, folder, fresh, lambda done, total: console.progress("baking", done, total))
+    numbers = bake.render(
+        scene, folder, fresh, lambda done, total: console.progress("baking", done, total), _stop_if_interrupted
+    )
     _save(scene, blend, folder)
     return {
         "composited_dir": str(folder),

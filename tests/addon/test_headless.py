@@ -1,11 +1,13 @@
 """The command line of the Blender side, in this process: exit codes, what it leaves, and a baked file that renders."""
 
 import json
+import signal
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
+from bpy.app.handlers import persistent
 
 
 @pytest.fixture
@@ -130,3 +132,19 @@ def test_doctor_tells_both_sides(run):
     code, said, _ = run("doctor")
     facts = json.loads(said)
     assert code == 0 and facts["blender"] == bpy.app.version_string and facts["backend"]["packages"]["torch"]
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_ctrl_c_while_frames_render_ends_the_bake_with_130(run, shot, tmp_path, name):
+    @persistent
+    def press(*_) -> None:
+        signal.raise_signal(getattr(signal, name))
+
+    bpy.app.handlers.render_write.append(press)
+    try:
+        code, _, err = run("bake", "--shot", shot, "--output", tmp_path / "out")
+    finally:
+        bpy.app.handlers.render_write.remove(press)
+    assert code == 130 and "Cancelled" in err
+    assert [p.name for p in (tmp_path / "out" / "composited").iterdir()] == ["000005.png"]
+    assert (bpy.context.scene.frame_start, bpy.context.scene.frame_end) == (5, 7)

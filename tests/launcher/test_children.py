@@ -18,6 +18,13 @@ def test_exit_code_is_passed_on():
     assert splannequin.run_child([sys.executable, "-c", "raise SystemExit(4)"]) == 4
 
 
+@pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
+@pytest.mark.parametrize(("name", "code"), [("SIGKILL", 1), ("SIGTERM", 130)])
+def test_a_killed_child_has_a_documented_exit_code(name: str, code: int):
+    source = f"import os, signal; os.kill(os.getpid(), signal.{name})"
+    assert splannequin.run_child([sys.executable, "-c", source]) == code
+
+
 def test_a_child_sees_this_checkout_and_no_foreign_python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setenv("PYTHONHOME", str(tmp_path))
