@@ -36,11 +36,6 @@ def candidates() -> list[tuple[str, Path]]:
         found.append(("the add-on's preferences", Path(bpy.path.abspath(chosen))))
     if os.environ.get(PYTHON_VARIABLE):
         found.append((PYTHON_VARIABLE, Path(os.environ[PYTHON_VARIABLE])))
-    try:
-        user = Path(bpy.utils.extension_path_user(PACKAGE))
-        found.append(("the extension's own folder", venv_python(user / "venv")))
-    except ValueError:
-        pass  # not loaded as an installed extension: it has no such folder
     home = os.environ.get("SPLANNEQUIN_HOME")
     if home:
         found.append(("SPLANNEQUIN_HOME", venv_python(Path(home) / ".venv")))
