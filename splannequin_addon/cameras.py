@@ -2,7 +2,7 @@
 
 OpenCV (x right, y down, z forward; viewmat world-to-camera) against Blender (x right, y up, looking along -z; camera to
 world). The solve arrives under one Empty that carries the solve-to-scene transform: moving it moves camera and points
-together, and depth and camera paths are read back through it.
+together, and depth is brought to scene units through it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix, Quaternion, Vector
+from mathutils import Matrix, Quaternion
 
 from ..torch_backend import contract
 from . import compat, compositor, shots
@@ -37,13 +37,6 @@ def camera_to_world(viewmat: np.ndarray) -> np.ndarray:
     return np.linalg.inv(np.asarray(viewmat, dtype=np.float64)) @ _FLIP
 
 
-def viewmat_from_camera(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of `camera_to_world`. A scaled camera object is taken without its scale."""
-    matrix = np.array(matrix, dtype=np.float64)
-    matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)
-    return np.linalg.inv(matrix @ _FLIP)
-
-
 def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -> tuple[float, float, float]:
     """(focal length in mm, shift_x, shift_y) for a camera with horizontal sensor fit and a sensor of `SENSOR_MM`.
 
@@ -55,17 +48,6 @@ def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -
     fx, fy, cx, cy = k
     # Shift is counted in widths of the picture, also down, where a pixel that is not square is fx / fy high.
     return fx * SENSOR_MM / width, (width / 2 - cx) / width, (cy - height / 2) * (fx / fy) / width
-
-
-def k_from_lens(
-    lens: float, shift_x: float, shift_y: float, sensor: float, width: int, height: int, aspect: float = 1.0
-) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of a camera with horizontal sensor fit; inverse of `lens_from_k`.
-
-    `aspect` is the render's pixel_aspect_y / pixel_aspect_x.
-    """
-    fx = lens * width / sensor
-    return fx, fx / aspect, width / 2 - shift_x * width, height / 2 + shift_y * width / aspect
 
 
 def pixel_aspect(k: tuple[float, float, float, float]) -> tuple[float, float]:
@@ -269,48 +251,3 @@ def _clip(path: contract.CameraPath, xyz: np.ndarray) -> tuple[float, float]:
         return 0.01, 1000.0
     reach = float(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1).max()) + _extent(path)
     return max(reach * 1e-4, 1e-3), max(reach * 4.0, 100.0) if math.isfinite(reach) else 1000.0
-
-
-def path_from_camera(scene: Any, camera_name: str, shot: Path, frames: range) -> contract.CameraPath:
-    """An animated Blender camera as a path in solve units, for the freeze: sampled on whole frames of the scene.
-
-    Raises:
-        ValueError: the object is no perspective camera.
-    """
-    camera = scene.objects.get(camera_name)
-    if camera is None or camera.type != "CAMERA" or camera.data.type != "PERSP":
-        raise ValueError(f"{camera_name!r} is no perspective camera of this scene")
-    width, height = compositor.render_size(scene)
-    aspect = scene.render.pixel_aspect_y / scene.render.pixel_aspect_x
-    root = find(scene, shot, "EMPTY")
-    now = scene.frame_current
-    poses = []
-    for frame in frames:
-        scene.frame_set(frame)
-        solve = (root.matrix_world.inverted() if root else Matrix()) @ camera.matrix_world
-        data = camera.data
-        lens, sensor = data.lens, _horizontal_sensor(data, width, height, aspect)
-        shift = _shift_in_widths(data, width, height, aspect)
-        k = k_from_lens(lens, shift[0], shift[1], sensor, width, height, aspect)
-        viewmat = viewmat_from_camera(np.array(solve))
-        poses.append(contract.CameraFrame(frame, [float(v) for v in viewmat.ravel()], list(k), "blender"))
-    scene.frame_set(now)
-    return contract.CameraPath(width, height, poses)
-
-
-def _fits_width(data: Any, width: int, height: int, aspect: float) -> bool:
-    return data.sensor_fit == "HORIZONTAL" or (data.sensor_fit == "AUTO" and width >= height * aspect)
-
-
-def _horizontal_sensor(data: Any, width: int, height: int, aspect: float) -> float:
-    """Sensor width in mm that the picture's width covers, whatever side the camera fits."""
-    if _fits_width(data, width, height, aspect):
-        return data.sensor_width
-    tall = data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width
-    return tall * width / (height * aspect)
-
-
-def _shift_in_widths(data: Any, width: int, height: int, aspect: float) -> Vector:
-    """Shift in units of the picture's width; Blender counts in units of the side that the sensor fits."""
-    side = 1.0 if _fits_width(data, width, height, aspect) else height * aspect / width
-    return Vector((data.shift_x * side, data.shift_y * side))

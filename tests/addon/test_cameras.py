@@ -35,14 +35,11 @@ def test_translation_moves_the_camera_the_other_way(addon):
     np.testing.assert_allclose(addon("cameras").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
 
 
-def test_axes_round_trip_and_ignore_scale(addon):
+def test_blenders_axes_are_y_up_and_z_back(addon):
     cameras = addon("cameras")
     turn = np.array([[0, 0, 1, 0.4], [1, 0, 0, -2.0], [0, 1, 0, 7.0], [0, 0, 0, 1]], dtype=np.float64)
     matrix = cameras.camera_to_world(turn)
-    np.testing.assert_allclose(cameras.viewmat_from_camera(matrix), turn, atol=1e-12)
-    scaled = matrix.copy()
-    scaled[:3, :3] *= 2.5
-    np.testing.assert_allclose(cameras.viewmat_from_camera(scaled), turn, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.inv(matrix @ np.diag([1.0, -1.0, -1.0, 1.0])), turn, atol=1e-12)
 
 
 def test_lens_of_a_centred_and_a_shifted_principal_point(addon):
@@ -50,7 +47,6 @@ def test_lens_of_a_centred_and_a_shifted_principal_point(addon):
     assert cameras.lens_from_k((640, 640, 320, 240), 640, 480) == (36.0, 0.0, 0.0)
     lens, shift_x, shift_y = cameras.lens_from_k((1280, 1280, 330, 220), 640, 480)
     assert (lens, shift_x, shift_y) == (72.0, -10 / 640, -20 / 640)
-    np.testing.assert_allclose(cameras.k_from_lens(lens, shift_x, shift_y, 36.0, 640, 480), (1280, 1280, 330, 220))
 
 
 @pytest.mark.parametrize(
@@ -179,28 +175,6 @@ def test_scene_is_upright(addon, scene, shot):
         ups.append(np.array(camera.matrix_world)[:3, 1])
     mean = np.mean(ups, axis=0)
     np.testing.assert_allclose(mean / np.linalg.norm(mean), (0, 0, 1), atol=1e-5)
-
-
-@pytest.mark.parametrize(("fit", "size"), [("HORIZONTAL", (64, 48)), ("VERTICAL", (64, 48)), ("AUTO", (48, 64))])
-def test_any_blender_camera_becomes_a_path(addon, scene, shot, fit, size):
-    cameras = addon("cameras")
-    cameras.build(scene, shot)
-    root = cameras.find(scene, shot, "EMPTY")
-    root.scale = (3.0, 3.0, 3.0)
-    scene.render.resolution_x, scene.render.resolution_y = size
-    data = bpy.data.cameras.new("free")
-    data.sensor_fit, data.sensor_width, data.sensor_height, data.lens = fit, 30.0, 20.0, 40.0
-    data.shift_x, data.shift_y = 0.1, -0.05
-    camera = bpy.data.objects.new("free", data)
-    scene.collection.objects.link(camera)
-    camera.location, camera.rotation_euler = (1.0, -8.0, 3.0), (1.2, 0.1, 0.2)
-    bpy.context.view_layer.update()
-    path = cameras.path_from_camera(scene, "free", shot, range(5, 7))
-    assert [f.frame for f in path.frames] == [5, 6] and (path.width, path.height) == size
-    point = np.array([[0.2, 0.1, -0.4]])
-    u, v = project(np.reshape(path.frames[0].viewmat, (4, 4)), path.frames[0].K, point)[0]
-    x, y, _ = world_to_camera_view(scene, camera, root.matrix_world @ Vector(point[0]))
-    assert (u, v) == pytest.approx((x * size[0], (1 - y) * size[1]), abs=1e-3)
 
 
 def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_path, pictures):
