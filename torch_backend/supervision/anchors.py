@@ -41,8 +41,8 @@ class SupervisionConfig:
     """`paper`: a visible Gaussian with a screen gradient of at most this is defective (paper: 1e-9)."""
     support_every: int = 2
     """`support` acts every so many iterations."""
-    support_weight: float = 1.0
-    """`support`: weight of the whole term."""
+    support_weight: float = 0.2
+    """`support`: weight of the whole term (docs/benchmarks.md)."""
     support_samples: int = 1024
     """`support`: (Gaussian, time) pairs drawn each time."""
     support_seconds: float = 4.0
@@ -65,7 +65,7 @@ def support_loss(
 ) -> Tensor | None:
     """Draws deltas at unsupported times to those at the nearest supported bins on either side.
 
-    Canonical parameters are not moved: only the field learns. Near distances are drawn as often as far ones.
+    Canonical parameters are not moved: only the field learns.
 
     Args:
         centres: [B] normalised times of the bins.
@@ -103,7 +103,11 @@ def support_loss(
 
 
 def _draw(support: Tensor, rows: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Unsupported (Gaussian, bin) pairs: half anywhere, half at a log-uniform distance from a supported bin."""
+    """Up to `count` unsupported (Gaussian, bin) pairs: anywhere first, then at a log-uniform distance from support.
+
+    Near pairs pull hardest, also at what faded because it moved away: an even mix of both kinds with weight 1 trained
+    the bundled clip to 22.96 dB on held-out frames, against 24.39 dB with that weight and mostly far pairs.
+    """
     bins = support.shape[1]
     picked = rows[torch.randint(len(rows), (2 * count,), generator=generator)]
     anywhere = torch.randint(bins, (count,), generator=generator)
@@ -114,10 +118,7 @@ def _draw(support: Tensor, rows: Tensor, count: int, generator: torch.Generator)
     chosen = torch.cat([anywhere, near])
     valid = (chosen >= 0) & (chosen < bins)
     valid &= ~support[picked, chosen.clamp(0, bins - 1)]
-    # Half of each kind where both are to be had: with sparse support nearly every draw "anywhere" is valid.
-    order = torch.nonzero(valid).flatten()
-    order = order[torch.randperm(len(order), generator=generator)][:count]
-    return picked[order], chosen[order]
+    return picked[valid][:count], chosen[valid][:count]
 
 
 @dataclass
