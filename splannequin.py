@@ -929,7 +929,7 @@ def backend_findings(backend: Environment, facts: dict[str, Any]) -> Iterator[Fi
     packages = facts["packages"]
     yield Finding("backend", "ok", f"{backend.folder}, Python {facts['python']}, warp {packages['warp-lang']}")
     device = facts.get("cuda_device") or facts["torch_device"]
-    yield Finding("torch", "ok", f"{packages['torch']} on {device}")
+    yield Finding("torch", "ok", f"{packages['torch']} sees {device}; training uses the {facts['trains_on']}")
     h264 = facts["h264"]
     yield Finding("H.264", "ok" if h264 else "note", "libx264" if h264 else "no encoder in PyAV: reinstall .venv")
 
