@@ -26,10 +26,8 @@ class GateConfig:
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""
     rounds: tuple[float, ...] = (1.0 / 3.0, 0.45, 0.55, 0.65)
     """Shares of the run at which residuals are gathered again and more Gaussians may open."""
-    threshold: float = 4.0
+    threshold: float = 3.0
     """A Gaussian opens if its residual exceeds the median by this many robust standard deviations."""
-    slack_px: float = 0.7
-    """Error that a shift of the picture by so many pixels explains is not motion: poses are never exact."""
     floor: float = 0.03
     """Residuals below this (display-referred, 0 to 1) never open: where nothing moves, the spread means nothing."""
     max_share: float = 0.3

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from ..contract import Cancelled, ExitCode, JobError, Reporter
 from ..deformation import HexPlane, apply_deltas, open_gate, residual_per_gaussian
@@ -170,7 +169,7 @@ class Trainer:
         background = torch.cat([self.background, torch.zeros(1)])
         out = self._render(state, frame, colors=probe, background=background, with_contributions=True)
         exposed = self.model.exposure.apply(out.colors[0, ..., :3], self.times[frame]).detach()
-        error = unexplained_error(exposed, self.images[frame].float(), self.config.gate.slack_px)
+        error = (exposed - self.images[frame].float()).abs().mean(-1)
 
         def pull(values: Tensor) -> Tensor:
             # The gradient of sum(value * image channel) for a Gaussian's colour is its sum of alpha * T * value.
@@ -407,17 +406,3 @@ def inside_frustum(means: Tensor, viewmat: Tensor, K: Tensor, width: int, height
     x = camera[:, 0] / depth * K[0, 0] + K[0, 2]
     y = camera[:, 1] / depth * K[1, 1] + K[1, 2]
     return (camera[:, 2] > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-
-
-def unexplained_error(image: Tensor, target: Tensor, slack_px: float) -> Tensor:
-    """Error [H, W] of an image [H, W, 3] that no shift of the target by up to `slack_px` pixels explains.
-
-    A pose that is off by half a pixel, a rolling shutter or a soft render leave errors along every edge of a still
-    world, as large as the edge is steep; what moves leaves more.
-    """
-    error = (image - target).abs().mean(-1)
-    padded = F.pad(target.mean(-1)[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    across = (padded[1:-1, 2:] - padded[1:-1, :-2]).abs() / 2
-    down = (padded[2:, 1:-1] - padded[:-2, 1:-1]).abs() / 2
-    steep = F.max_pool2d(torch.hypot(across, down)[None, None], 3, stride=1, padding=1)[0, 0]
-    return (error - slack_px * steep).clamp_min(0.0)
