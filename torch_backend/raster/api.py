@@ -72,14 +72,16 @@ def _body(backend: str, means: Tensor) -> str:
 def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, colors: Tensor | None = None,
               sh: Tensor | None = None, *, viewmats: Tensor, Ks: Tensor, width: int, height: int,
               background: Tensor | None = None, settings: RasterSettings | None = None, backend: str = "auto",
-              with_depth: bool = False, with_contributions: bool = False, sh_degree: int | None = None) -> RasterOutput:
+              with_depth: bool = False, with_contributions: bool = False, with_top: bool = False,
+              sh_degree: int | None = None) -> RasterOutput:
     """Splat N Gaussians into C pinhole views.
 
     means [N, 3] world; quats [N, 4] wxyz of any non-zero norm; log_scales [N, 3] natural logs of world units;
     opacity_logits [N]; colors [N, D] any channels, and/or sh [N, K, 3], K = (degree + 1)^2 with degree 0 to 3: colour
     = harmonics at the direction from camera to mean + 0.5, floored at 0 (a gradient passes the floor when it would
     raise the colour), no ceiling. With both, the output has the 3 channels of `sh` first, then those of `colors`.
-    `sh_degree` uses the first bands only. viewmats [C, 4, 4] world to camera, OpenCV axes; Ks [C, 3, 3] px, pixel
+    `sh_degree` uses the first bands only. `with_depth`, `with_contributions` (weight_sum, weight_max) and `with_top`
+    (top_ids, top_weights: mattes) fill the outputs that cost extra. viewmats [C, 4, 4] world to camera, OpenCV axes; Ks [C, 3, 3] px, pixel
     centres at +0.5, no skew; background [D] or None for black.
 
     Returns a RasterOutput; its attributes give shapes and units. Gradients flow from colors, alphas and depth_expected
@@ -106,7 +108,8 @@ def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: 
         colors=None if colors is None else ready(colors), sh=None if sh is None else ready(sh),
         viewmats=ready(viewmats), Ks=Ks.detach().to("cpu", torch.float64),
         background=None if background is None else ready(background), width=width, height=height, sh_degree=degree,
-        settings=settings or RasterSettings(), with_depth=with_depth, with_contributions=with_contributions)
+        settings=settings or RasterSettings(), with_depth=with_depth, with_contributions=with_contributions,
+        with_top=with_top)
     _check_gaussians(scene)
     if not scene.settings.near > 0:
         raise ValueError(f"settings.near must be positive, not {scene.settings.near}")

@@ -54,6 +54,11 @@ class RasterOutput:
     means2d_absgrad: Tensor
     """[C, N]: norm of (sum over pixels |d loss / d x|, sum |d loss / d y|), 1/px; as above. Zeros if settings.absgrad
     is off."""
+    top_ids: Tensor | None = None
+    """[C, H, W] int32: index of the Gaussian with the largest alpha T at the pixel, the front one of equals; -1 where
+    alpha is 0."""
+    top_weights: Tensor | None = None
+    """[C, H, W]: its alpha T; 0 where alpha is 0. No gradient."""
 
 
 @dataclass
@@ -75,6 +80,7 @@ class Scene:
     settings: RasterSettings
     with_depth: bool
     with_contributions: bool
+    with_top: bool = False
 
     @property
     def channels(self) -> int:
