@@ -62,32 +62,35 @@ def _import_warp():
     return wp
 
 
+def build(name: str, text: str) -> Callable[[int, int, int], None]:
+    """Compile the C++ `text`, or load it from Warp's cache, as a module of its own. Called as f(block, stage, worker)."""
+    wp = _import_warp()
+
+    def run(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
+
+    run.__name__ = run.__qualname__ = name
+    native = wp.func_native(text)(run)
+
+    def entry(block: wp.uint64, stage: wp.int32, worker: wp.int32):
+        native(block, stage, worker)
+
+    module = f"{__name__}.{name}"
+    kernel = wp.Kernel(entry, key=name, module=wp.get_module(module), options={"enable_backward": False})
+    wp.load_module(module, device="cpu")
+
+    def launch(block: int, stage: int, worker: int) -> None:
+        wp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
+
+    return launch
+
+
 def _compile(channels: int) -> Callable[[int, int, int], None]:
     """Kernel of the stages that know no channels (channels = 0), or of blending. Called as f(block, stage, worker)."""
     with _lock:
-        if channels in _kernels:
-            return _kernels[channels]
-        wp = _import_warp()
-        name = f"raster_blend{channels}" if channels else "raster_stages"
-        text = source.blend_source(channels) if channels else source.stages_source()
-
-        def run(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
-
-        run.__name__ = run.__qualname__ = name
-        native = wp.func_native(text)(run)
-
-        def entry(block: wp.uint64, stage: wp.int32, worker: wp.int32):
-            native(block, stage, worker)
-
-        kernel = wp.Kernel(entry, key=name, module=wp.get_module(f"{__name__}.{name}"),
-                           options={"enable_backward": False})
-        wp.load_module(f"{__name__}.{name}", device="cpu")
-
-        def launch(block: int, stage: int, worker: int) -> None:
-            wp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
-
-        _kernels[channels] = launch
-        return launch
+        if channels not in _kernels:
+            _kernels[channels] = (build(f"raster_blend{channels}", source.blend_source(channels)) if channels
+                                  else build("raster_stages", source.stages_source()))
+        return _kernels[channels]
 
 
 def warm_up(channels: int = 3) -> None:
@@ -167,7 +170,8 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.record_stride = -(-(source.HEAD + image_channels) // 16) * 16
     block.grad_stride = -(-(source.MOMENTS + image_channels) // 16) * 16
     block.antialiased, block.want_depth = int(scene.settings.antialiased), int(scene.with_depth)
-    block.want_weights, block.want_abs = int(scene.with_contributions), int(scene.settings.absgrad)
+    block.want_weights, block.want_top = int(scene.with_contributions), int(scene.with_top)
+    block.want_abs = int(scene.settings.absgrad)
     block.workers = max(1, min(scene.settings.threads, block.chunks))
     block.view[:] = scene.viewmats[camera, :3].reshape(-1).tolist()
     K = scene.Ks[camera]
@@ -220,6 +224,8 @@ class _Rasterize(torch.autograd.Function):
         size = (cameras, scene.height, scene.width)
         image, alpha = torch.empty(*size, channels), torch.empty(size)
         median = torch.empty(size if scene.with_depth else (0,))
+        top_size = size if scene.with_top else (cameras, 0)
+        top_ids, top_weights = torch.empty(top_size, dtype=torch.int32), torch.empty(top_size)
         radii, means2d = torch.zeros(cameras, n, dtype=torch.int32), torch.zeros(cameras, n, 2)
         weights = torch.zeros(2, cameras, n if scene.with_contributions else 0)
         behind = torch.zeros(channels)
@@ -231,15 +237,15 @@ class _Rasterize(torch.autograd.Function):
             _point(lease.workspace.block, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors,
                    sh=sh, background=behind, image=image[c], alpha=alpha[c],
                    median=median[c] if scene.with_depth else None, radii=radii[c], means2d=means2d[c],
-                   weight_sum=weights[0, c], weight_max=weights[1, c])
+                   top_ids=top_ids[c], top_weights=top_weights[c], weight_sum=weights[0, c], weight_max=weights[1, c])
             _forward_camera(lease.workspace, scene, channels)
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha,
                                   behind)
             ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
-        ctx.mark_non_differentiable(median, radii, means2d, weights)
+        ctx.mark_non_differentiable(median, radii, means2d, weights, top_ids, top_weights)
         ctx.set_materialize_grads(False)
-        return image, alpha, median, radii, means2d, weights
+        return image, alpha, median, radii, means2d, weights, top_ids, top_weights
 
     @staticmethod
     def backward(ctx, *grads):
@@ -281,7 +287,7 @@ def rasterize(scene: Scene) -> RasterOutput:
         raise ValueError(f"{channels} channels, depth included; one call carries at most {source.MAX_CHANNELS}")
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
     norms = (torch.zeros(cameras, n), torch.zeros(cameras, n))
-    image, alphas, median, radii, means2d, weights = _Rasterize.apply(
+    image, alphas, median, radii, means2d, weights, top_ids, top_weights = _Rasterize.apply(
         scene, norms, scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh,
         scene.viewmats, scene.background)
     colors, depth = image, None
@@ -291,4 +297,5 @@ def rasterize(scene: Scene) -> RasterOutput:
     return RasterOutput(
         colors=colors, alphas=alphas, depth_expected=depth, depth_median=median if scene.with_depth else None,
         radii=radii, means2d=means2d, weight_sum=weights[0] if scene.with_contributions else None,
-        weight_max=weights[1] if scene.with_contributions else None, means2d_grad=norms[0], means2d_absgrad=norms[1])
+        weight_max=weights[1] if scene.with_contributions else None, means2d_grad=norms[0], means2d_absgrad=norms[1],
+        top_ids=top_ids if scene.with_top else None, top_weights=top_weights if scene.with_top else None)

@@ -34,16 +34,16 @@ _FIELDS: list[tuple[str, type, str]] = [
     *[(n, _P, "const float*") for n in ("means", "quats", "log_scales", "logits", "colors", "sh", "background",
                                         "grad_image", "grad_alpha")],
     *[(n, _P, "float*") for n in (
-        "record", "aux", "hit_weight", "hit_grad", "image", "alpha", "median", "means2d", "weight_sum", "weight_max",
+        "record", "aux", "hit_weight", "hit_grad", "image", "alpha", "median", "top_weights", "means2d", "weight_sum", "weight_max",
         "grad_means", "grad_quats", "grad_log_scales", "grad_logits", "grad_colors", "grad_sh", "grad_view",
         "grad_norm", "grad_abs")],
     *[(n, _P, "int*") for n in (
         "index", "hit_count", "hit_start", "chunk_count", "order", "order2", "key", "key2", "histogram", "tile_start",
-        "tile_end", "hit_slot", "hit_place", "radii", "span", "span_start", "span_count")],
+        "tile_end", "hit_slot", "hit_place", "radii", "top_ids", "span", "span_start", "span_count")],
     *[(n, _I, "long long") for n in (
         "n", "width", "height", "tiles_x", "tiles_y", "chunks", "visible", "hits", "workers", "n_colors", "n_sh",
         "sh_degree", "sh_stride", "channels", "record_stride", "grad_stride", "antialiased", "want_depth",
-        "want_weights", "want_abs", "counter")],
+        "want_weights", "want_top", "want_abs", "counter")],
     ("view", _F * 12, "float"),
     *[(n, _F, "float") for n in ("fx", "fy", "cx", "cy", "x_low", "x_high", "y_low", "y_high", "near")],
 ]
@@ -564,33 +564,66 @@ _BATCH = r"""
             store(fields[0], 0.5f - mx); store(fields[1], my);
         }
 """
-_HIT = r"""
+HIT = r"""
             const float* channel = P.record + slots[l] * RS + @HEAD@;
             float left_edge = fields[0][l], my = fields[1][l], A = fields[2][l], kk = fields[3][l], R = fields[4][l];
             float lop = fields[5][l];
 """
-_ALPHA = r"""
-                float dy = row + 0.5f - my;
+ROW = """
+                float dy = row + 0.5f - my;"""
+"""Start of the work on one row of a tile for one hit; `benchmarks/hot_loop.py` counts here."""
+LIT = """
+                if (!any(lit)) continue;"""
+"""Where a row goes on if the hit adds to any of its pixels."""
+_ALPHA = ROW + r"""
                 F e = LANE + (left_edge - kk * dy);
                 F p = fma(A * e, e, (F)(lop + R * dy * dy));
-                I lit = (p >= PMIN) & (T[row] > T_STOP);
-                if (!any(lit)) continue;
+                I lit = (p >= PMIN) & (T[row] > T_STOP);""" + LIT + r"""
                 F raw = exp2v(p), al = vmin(raw, (F)ALPHA_MAX);
                 al = lit ? al : (F)0.f;
                 F w = al * T[row];
 """
+FORWARD_ROW = _ALPHA + r"""
+                T[row] = fma(-al, T[row], T[row]);
+                for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)channel[c], C[c][row]);
+                total += w; peak = vmax(peak, w);
+"""
+"""One row of one hit, forward, without the parts that depth and top contributor add."""
+BACKWARD_SUMS = r"""
+            F s0 = (F)0.f, s1 = s0, s2 = s0, s3 = s0, s4 = s0, s5 = s0, ax = s0, ay = s0, gc[NCH];
+            for (int c = 0; c < NCH; c++) gc[c] = (F)0.f;
+            float qa = -2.f * LN2 * A, qc = -2.f * LN2 * R;"""
+"""Sums of one hit over its rows."""
+BACKWARD_ROW = _ALPHA + r"""
+                F along = (F)0.f;
+                for (int c = 0; c < NCH; c++) {
+                    along = fma(G[c][row], (F)channel[c], along); gc[c] = fma(w, G[c][row], gc[c]); }
+                F seen = w * along, behind = left[row] - seen;
+                left[row] = behind;
+                T[row] = fma(-al, T[row], T[row]);
+                // d loss / d log alpha; nothing passes the clamp.
+                F v = seen - al / (1.f - al) * behind;
+                v = raw <= ALPHA_MAX ? v : (F)0.f;
+                F ve = v * e;
+                s0 += v; s1 += ve; s2 = fma(v, (F)dy, s2);
+                s3 = fma(ve, e, s3); s4 = fma(ve, (F)dy, s4); s5 = fma(v, (F)(dy * dy), s5);
+                if (want_abs) { ax += vabs(ve); ay += vabs(fma(v, (F)(qc * dy), ve * -(kk * qa))); }
+"""
+"""One row of one hit, backward."""
 
 # Blend stage 0: forward. Parallel over tiles.
 _STAGE_BLEND = _TILE + r"""
+const bool want_depth = P.want_depth != 0, want_top = P.want_top != 0, want_weights = P.want_weights != 0;
 for (long long tile; (tile = take()) < tiles;) {
     long long tx = tile % P.tiles_x, ty = tile / P.tiles_x, start = P.tile_start[tile], stop = P.tile_start[tile + 1];
     float x0 = tx * 16.f, y0 = ty * 16.f;
     int rows = (int)(H - ty * 16 < 16 ? H - ty * 16 : 16), columns = (int)(W - tx * 16 < 16 ? W - tx * 16 : 16);
     F T[16], C[NCH][16], best[16], median[16];
+    I top[16];
     // Lanes outside the image start without transmittance: they are finished from the beginning.
     for (int i = 0; i < 16; i++) {
         T[i] = LANE < (F)(i < rows ? (float)columns : 0.f) ? (F)1.f : (F)0.f;
-        best[i] = (F)0.f; median[i] = (F)@DEPTH_EMPTY@f;
+        best[i] = (F)0.f; median[i] = (F)@DEPTH_EMPTY@f; top[i] = (I)-1;
         for (int c = 0; c < NCH; c++) C[c][i] = (F)0.f; }
     long long b = start;
     for (; b < stop; b += 16) {
@@ -601,24 +634,25 @@ for (long long tile; (tile = take()) < tiles;) {
         F totals[16], peaks[16];
         for (int l = m; l < 16; l++) { totals[l] = (F)0.f; peaks[l] = (F)0.f; }
         for (int l = 0; l < m; l++) {
-""" + _HIT + r"""
+""" + HIT + r"""
             F total = (F)0.f, peak = (F)0.f;
+            float depth = 0.f; int id = 0;
+            if (want_depth) depth = P.aux[4 * (long long)slots[l] + 3];
+            if (want_top) id = P.index[slots[l]];
             for (int row = first[l]; row <= last[l]; row++) {
-""" + _ALPHA + r"""
-                T[row] = fma(-al, T[row], T[row]);
-                for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)channel[c], C[c][row]);
-                total += w; peak = vmax(peak, w);
-                if (P.want_depth) {
+""" + FORWARD_ROW + r"""
+                if (want_depth | want_top) {
+                    I larger = w > best[row];
                     // T before > 0.5 and T after <= 0.5: crossed here. Until then, the largest so far.
-                    I open = T[row] + w > 0.5f;
-                    I pick = open & ((T[row] <= 0.5f) | (w > best[row])) & lit;
-                    median[row] = pick ? (F)P.aux[4 * (long long)slots[l] + 3] : median[row];
+                    I pick = (T[row] + w > 0.5f) & ((T[row] <= 0.5f) | larger) & lit;
+                    median[row] = pick ? (F)depth : median[row];
+                    top[row] = larger ? (I)id : top[row];
                     best[row] = vmax(best[row], w);
                 }
             }
             totals[l] = total; peaks[l] = peak;
         }
-        if (P.want_weights) {
+        if (want_weights) {
             float sums[16], tops[16];
             store(sums, fold16(totals, add)); store(tops, fold16(peaks, vmax));
             for (int l = 0; l < m; l++) {
@@ -628,13 +662,14 @@ for (long long tile; (tile = take()) < tiles;) {
     }
     b = b < stop ? b : stop;
     P.tile_end[tile] = (int)b;
-    if (P.want_weights) for (; b < stop; b++) {
+    if (want_weights) for (; b < stop; b++) {
         float* to = P.hit_weight + 2 * (long long)P.hit_place[b]; to[0] = 0.f; to[1] = 0.f; }
     for (int i = 0; i < rows; i++) {
         long long at = (ty * 16 + i) * W + tx * 16;
         for (int l = 0; l < columns; l++) {
             P.alpha[at + l] = 1.f - T[i][l];
-            if (P.want_depth) P.median[at + l] = median[i][l];
+            if (want_depth) P.median[at + l] = median[i][l];
+            if (want_top) { P.top_ids[at + l] = top[i][l]; P.top_weights[at + l] = best[i][l]; }
             for (int c = 0; c < NCH; c++) P.image[(at + l) * NCH + c] = C[c][i][l] + T[i][l] * P.background[c]; }
     }
 }
@@ -664,26 +699,11 @@ for (long long tile; (tile = take()) < tiles;) {
     for (long long b = start; b < stop; b += 16) {
 """ + _BATCH + r"""
         for (int l = 0; l < m; l++) {
-""" + _HIT + r"""
+""" + HIT + r"""
             F out[(@MOMENTS@ + NCH + 15) / 16 * 16];
-            F s0 = (F)0.f, s1 = s0, s2 = s0, s3 = s0, s4 = s0, s5 = s0, ax = s0, ay = s0, gc[NCH];
-            for (int c = 0; c < NCH; c++) gc[c] = (F)0.f;
-            float qa = -2.f * LN2 * A, qc = -2.f * LN2 * R;
+""" + BACKWARD_SUMS + r"""
             for (int row = first[l]; row <= last[l]; row++) {
-""" + _ALPHA + r"""
-                F along = (F)0.f;
-                for (int c = 0; c < NCH; c++) {
-                    along = fma(G[c][row], (F)channel[c], along); gc[c] = fma(w, G[c][row], gc[c]); }
-                F seen = w * along, behind = left[row] - seen;
-                left[row] = behind;
-                T[row] = fma(-al, T[row], T[row]);
-                // d loss / d log alpha; nothing passes the clamp.
-                F v = seen - al / (1.f - al) * behind;
-                v = raw <= ALPHA_MAX ? v : (F)0.f;
-                F ve = v * e;
-                s0 += v; s1 += ve; s2 = fma(v, (F)dy, s2);
-                s3 = fma(ve, e, s3); s4 = fma(ve, (F)dy, s4); s5 = fma(v, (F)(dy * dy), s5);
-                if (want_abs) { ax += vabs(ve); ay += vabs(fma(v, (F)(qc * dy), ve * -(kk * qa))); }
+""" + BACKWARD_ROW + r"""
             }
             float* to = P.hit_grad + P.hit_place[b + l] * GS;
             out[0] = s0; out[1] = s1; out[2] = s2; out[3] = s3; out[4] = s4; out[5] = s5; out[6] = qa * ax; out[7] = ay;
@@ -701,7 +721,7 @@ PROJECT, SORT, COUNT, PREFIX, EMIT, WEIGHTS, PROJECT_BACKWARD = range(7)
 BLEND, BLEND_BACKWARD = range(2)
 
 
-def _assemble(stages: list[str], extra: dict[str, object]) -> str:
+def assemble(stages: list[str], extra: dict[str, object]) -> str:
     """One snippet that switches over `stages`, with the constants of `constants.py` put in."""
     values = {name: getattr(k, name) for name in dir(k) if name.isupper() or name.startswith("SH_")}
     values |= {"CHUNK": CHUNK, "SPANS": SPANS, "HEAD": HEAD, "MOMENTS": MOMENTS} | extra
@@ -721,13 +741,13 @@ def _assemble(stages: list[str], extra: dict[str, object]) -> str:
 
 def stages_source() -> str:
     """The stages that do not depend on the number of channels."""
-    return _assemble([_STAGE_PROJECT, _STAGE_SORT, _STAGE_COUNT, _STAGE_PREFIX, _STAGE_EMIT, _STAGE_WEIGHTS,
+    return assemble([_STAGE_PROJECT, _STAGE_SORT, _STAGE_COUNT, _STAGE_PREFIX, _STAGE_EMIT, _STAGE_WEIGHTS,
                       _STAGE_PROJECT_BACKWARD], {"GRAD_MAX": 64})
 
 
 def blend_source(channels: int) -> str:
     """Blending, forward and backward, for images of `channels` channels (depth included)."""
-    return _assemble([_STAGE_BLEND, _STAGE_BLEND_BACKWARD], {"NCH": channels})
+    return assemble([_STAGE_BLEND, _STAGE_BLEND_BACKWARD], {"NCH": channels})
 
 
 MAX_CHANNELS = 64 - MOMENTS
