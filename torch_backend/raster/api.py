@@ -18,14 +18,16 @@ def _shape(name: str, value: Tensor, expected: tuple[int | str, ...]) -> None:
         raise ValueError(f"{name} must have shape [{wanted}], not {list(value.shape)}")
 
 
-def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> None:
+def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, body: str) -> None:
+    """Raise ValueError for cameras that do not fit. `body` 'cuda' leaves values on a GPU unread: it would stall."""
     _shape("viewmats", viewmats, ("C", 4, 4))
     _shape("Ks", Ks, (viewmats.shape[0], 3, 3))
     if width < 1 or height < 1:
         raise ValueError(f"width and height must be at least 1, not {width} x {height}")
-    if not bool(torch.isfinite(viewmats).all()) or not bool(torch.isfinite(Ks).all()):
+    on_host = [value for value in (viewmats, Ks) if body != "cuda" or not value.is_cuda]
+    if not all(bool(torch.isfinite(value).all()) for value in on_host):
         raise ValueError("viewmats and Ks must be finite")
-    if not bool((Ks[:, 0, 0] > 0).all()) or not bool((Ks[:, 1, 1] > 0).all()):
+    if any(value is Ks for value in on_host) and not bool((Ks[:, [0, 1], [0, 1]] > 0).all()):
         raise ValueError("Ks must have positive focal lengths")
 
 
@@ -60,13 +62,19 @@ def _sh_degree(sh: Tensor | None, degree: int | None) -> int:
 
 
 def _body(backend: str, means: Tensor) -> str:
-    if backend not in ("auto", "cpu", "reference"):
-        raise ValueError(f"backend must be 'auto', 'cpu' or 'reference', not {backend!r}")
-    if backend != "reference" and means.device.type != "cpu":
+    """Name of the body to run: 'cpu', 'cuda' or 'reference'."""
+    if backend not in ("auto", "cpu", "cuda", "reference"):
+        raise ValueError(f"backend must be 'auto', 'cpu', 'cuda' or 'reference', not {backend!r}")
+    device = means.device.type
+    if backend == "reference":
+        return backend
+    if device not in ("cpu", "cuda") or (device == "cuda" and torch.version.hip is not None):
         raise NotImplementedError(
-            f"there is no rasteriser for {means.device.type} tensors yet: move the tensors to the CPU, or pass "
-            "backend='reference', which is slow")
-    return "cpu" if backend == "auto" else backend
+            f"there is no rasteriser for {'AMD GPU' if device == 'cuda' else device} tensors yet: move the tensors to "
+            "the CPU, or pass backend='reference', which is slow")
+    if backend == "cpu" and device == "cuda":
+        raise ValueError("backend='cpu' needs tensors on the CPU: move them there, or pass backend='auto'")
+    return device if backend == "auto" else backend
 
 
 def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, colors: Tensor | None = None,
@@ -81,23 +89,27 @@ def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: 
     = harmonics at the direction from camera to mean + 0.5, floored at 0 (a gradient passes the floor when it would
     raise the colour), no ceiling. With both, the output has the 3 channels of `sh` first, then those of `colors`.
     `sh_degree` uses the first bands only. `with_depth`, `with_contributions` (weight_sum, weight_max) and `with_top`
-    (top_ids, top_weights: mattes) fill the outputs that cost extra. viewmats [C, 4, 4] world to camera, OpenCV axes; Ks [C, 3, 3] px, pixel
-    centres at +0.5, no skew; background [D] or None for black.
+    (top_ids, top_weights: mattes) fill the outputs that cost extra. viewmats [C, 4, 4] world to camera, OpenCV axes;
+    Ks [C, 3, 3] px, pixel centres at +0.5, no skew; background [D] or None for black.
 
     Returns a RasterOutput; its attributes give shapes and units. Gradients flow from colors, alphas and depth_expected
     to means, quats, log_scales, opacity_logits, colors, sh, viewmats and background. `constants.py` states the rules of
     culling and blending; NaN and infinite Gaussians are culled and get zero gradients.
 
-    backend: 'cpu' (float32, compiled), 'reference' (torch, the inputs' float type and device, slow), 'auto' picks by
-    the device of `means`. Raises ValueError for arguments that do not fit, NotImplementedError for a device without a
-    body.
+    backend: 'cpu' (float32, compiled), 'cuda' (float32, compiled, NVIDIA; with CPU tensors the same kernels run on
+    fibers: very slow, for tests), 'reference' (torch, the inputs' float type and device, slow), 'auto' picks by the
+    device of `means`. Inputs follow `means` to its device. On a GPU nothing waits for it, a call and its backward pass
+    can be captured as a CUDA graph (`cuda.py` says how), and cameras that are not finite or without positive focal
+    lengths give an empty image, because they cannot be checked without waiting; give viewmats and Ks on the GPU too.
+    Raises ValueError for arguments that do not fit, NotImplementedError for a device without a body, RuntimeError if
+    Warp cannot use the GPU.
 
     Source: Kerbl et al. 2023, "3D Gaussian Splatting"; Zwicker et al. 2001, "EWA Volume Splatting"; opacity
     compensation: Yu et al. 2024, "Mip-Splatting"; |gradient|: Ye et al. 2024, "AbsGS".
     """
-    _check_camera(viewmats, Ks, width, height)
-    degree = _sh_degree(sh, sh_degree)
     body = _body(backend, means)
+    _check_camera(viewmats, Ks, width, height, body)
+    degree = _sh_degree(sh, sh_degree)
     dtype = means.dtype if body == "reference" else torch.float32
 
     def ready(value: Tensor) -> Tensor:
@@ -106,7 +118,8 @@ def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: 
     scene = Scene(
         means=ready(means), quats=ready(quats), log_scales=ready(log_scales), opacity_logits=ready(opacity_logits),
         colors=None if colors is None else ready(colors), sh=None if sh is None else ready(sh),
-        viewmats=ready(viewmats), Ks=Ks.detach().to("cpu", torch.float64),
+        viewmats=ready(viewmats),
+        Ks=ready(Ks.detach()) if body == "cuda" else Ks.detach().to("cpu", torch.float64),
         background=None if background is None else ready(background), width=width, height=height, sh_degree=degree,
         settings=settings or RasterSettings(), with_depth=with_depth, with_contributions=with_contributions,
         with_top=with_top)
@@ -117,6 +130,11 @@ def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: 
         raise ValueError(f"settings.threads must be at least 1, not {scene.settings.threads}")
     if body == "reference":
         return reference.rasterize(scene)
+    # Warp is imported only where it is needed: it takes a while.
+    if body == "cuda":
+        from . import cuda
+
+        return cuda.rasterize(scene)
     from . import cpu
 
     return cpu.rasterize(scene)

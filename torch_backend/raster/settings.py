@@ -59,6 +59,9 @@ class RasterOutput:
     alpha is 0."""
     top_weights: Tensor | None = None
     """[C, H, W]: its alpha T; 0 where alpha is 0. No gradient."""
+    hits: Tensor | None = None
+    """[2] int64, CUDA body only: (Gaussian, tile) pairs of the call, and how many its list holds. Where the first
+    exceeds the second, the call was slower, not wrong (`cuda.py`)."""
 
 
 @dataclass
@@ -73,6 +76,7 @@ class Scene:
     sh: Tensor | None
     viewmats: Tensor
     Ks: Tensor
+    """float64 on the CPU; for the CUDA body float32 on the device."""
     background: Tensor | None
     width: int
     height: int

@@ -1,0 +1,346 @@
+"""CUDA body of the rasteriser: kernels compiled by Warp, own backward, no word to the host in between.
+
+Needs no CUDA toolkit: Warp brings the compiler and caches what it made. With tensors on the CPU the very same kernels
+run on Warp's CPU fibers: slow, for tests on machines without a GPU.
+
+**The list of hits** has a fixed capacity per call, so that nothing is read back. The capacity follows the calls before:
+the device keeps the most hits that a call of this device, camera count and image size ever wanted, and sends the figure
+to the host without anyone waiting for it. A call with more hits than its list holds is slower, never wrong: its tiles
+then search all Gaussians in depth order (see `cuda_source.py`), and a later call has a larger list. `RasterOutput.hits`
+says, on the device, how many hits a call had and how many its list held.
+
+**CUDA graphs.** `rasterize` and its backward pass can be captured, for instance by `torch.cuda.graph`, after a call of
+the same shapes outside (it compiles the kernels). The list then stays as large as it was at capture; look at `hits` now
+and then, and capture again when its first number has outgrown the second.
+"""
+
+import threading
+from contextlib import nullcontext
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import cuda_source as source
+from .constants import TILE
+from .cpu import _import_warp
+from .reference import expected_depth
+from .settings import RasterOutput, Scene
+
+MAX_CHANNELS = 64 - source.MOMENTS
+"""Channels, depth included, that one call can carry."""
+_HITS_MAX = 2**27
+_HITS_STEP = 2**12
+_lock = threading.RLock()
+_kernels: dict[tuple[str, int], Any] = {}
+_streams: dict[tuple[int, int], Any] = {}
+_demands: dict[tuple[torch.device, int, int, int], "_Demand"] = {}
+
+
+def _structure(wp):
+    """Warp type of the kernels' parameter structure; one for all modules."""
+    if ("", 0) not in _kernels:
+        types = {name: getattr(wp, kind) for name, kind in source.FIELDS.items()}
+        _kernels["", 0] = wp.struct(type("RasterArgs", (), {"__annotations__": types, "__module__": __name__}))
+    return _kernels["", 0]
+
+
+def build(name: str, channels: int = 0):
+    """Warp kernel `name` of `cuda_source`, in module `module_name(name, channels)`; blending needs `channels`."""
+    with _lock:
+        if (name, channels) in _kernels:
+            return _kernels[name, channels]
+        wp = _import_warp()
+        structure = _structure(wp)
+        text = (source.blending(channels) if channels else source.stages())[name]
+
+        def native(args, task, tid): ...
+
+        native.__annotations__ = {"args": structure, "task": wp.int32, "tid": wp.int32}
+        native.__name__ = native.__qualname__ = f"{name}_native"
+        function = wp.func_native(text)(native)
+
+        def entry(args, block_dim):
+            task = wp.tid()
+            function(args, task, task % block_dim)
+
+        entry.__annotations__ = {"args": structure, "block_dim": wp.int32}
+        _kernels[name, channels] = wp.Kernel(
+            entry, key=name, module=wp.get_module(module_name(name, channels)),
+            options={"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK})
+        return _kernels[name, channels]
+
+
+def module_name(name: str, channels: int = 0) -> str:
+    """Name of the Warp module that holds kernel `name`."""
+    return f"{__name__}.{name}{channels}" if channels else f"{__name__}.stages"
+
+
+def _refusal(device: torch.device) -> str | None:
+    """Why Warp cannot use `device`, and what to do; None if it can."""
+    wp = _import_warp()
+    if device.type != "cuda" or (wp.is_cuda_available() and (device.index or 0) < wp.get_cuda_device_count()):
+        return None
+    return ("PyTorch sees the NVIDIA GPU, but Warp, which compiles the rasteriser, does not: update the NVIDIA driver "
+            "to version 580 or newer (the GPU must be of the Turing generation, compute capability 7.5, or later), or "
+            "choose the CPU")
+
+
+class _Launcher:
+    """Launches kernels on torch's current stream of one device."""
+
+    def __init__(self, device: torch.device):
+        self.wp = wp = _import_warp()
+        self.device = device
+        if device.type == "cuda":
+            handle = torch.cuda.current_stream(device).cuda_stream
+            key = (device.index or 0, handle)
+            with _lock:
+                if key not in _streams:
+                    _streams[key] = wp.stream_from_torch(torch.cuda.current_stream(device))
+            self.where: dict[str, Any] = {"stream": _streams[key]}
+        else:
+            self.where = {"device": "cpu"}
+
+    def __call__(self, name: str, args: Any, threads: int, channels: int = 0) -> None:
+        """Run kernel `name` on at least `threads` threads."""
+        if threads == 0:
+            return
+        blocks = -(-threads // source.BLOCK)
+        kernel = build(name, channels)
+        with nullcontext() if self.device.type == "cuda" else _Fibers(self.wp):
+            self.wp.launch(kernel, dim=blocks * source.BLOCK, inputs=[args, source.BLOCK], block_dim=source.BLOCK,
+                           record_tape=False, **self.where)
+
+
+class _Fibers:
+    """Switches Warp's CPU blocks on, for one caller at a time: shared memory is static there."""
+
+    def __init__(self, wp: Any):
+        self.wp = wp
+
+    def __enter__(self) -> None:
+        _lock.acquire()
+        self.before = self.wp.config.enable_cpu_blocks
+        self.wp.config.enable_cpu_blocks = True
+
+    def __exit__(self, *_: object) -> None:
+        self.wp.config.enable_cpu_blocks = self.before
+        _lock.release()
+
+
+class _Demand:
+    """How many hits calls of one shape want: a running maximum on the device, and its echo on the host."""
+
+    def __init__(self, device: torch.device):
+        self.most = torch.zeros(1, dtype=torch.int64, device=device)
+        self.echo = torch.zeros(1, dtype=torch.int64, pin_memory=device.type == "cuda")
+        self.host = self.echo.numpy()
+        self.capacity = 0
+
+    def grow(self, slots: int) -> None:
+        """Room for a third more than was wanted so far; for four tiles a Gaussian before anything is known."""
+        wanted = int(self.host[0])
+        if self.capacity == 0 or wanted > 0.9 * self.capacity:
+            wanted = wanted * 4 // 3 if wanted else 4 * slots
+            self.capacity = min(-(-max(wanted, self.capacity, 1) // _HITS_STEP) * _HITS_STEP, _HITS_MAX)
+
+
+def _demand(scene: Scene) -> _Demand:
+    """The demand of calls like this one, brought up to date unless a graph is being captured."""
+    device, cameras = scene.means.device, scene.viewmats.shape[0]
+    capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+    with _lock:
+        key = (device, cameras, scene.width, scene.height)
+        if key not in _demands:
+            if capturing:
+                raise RuntimeError("capture a rasterize call as a CUDA graph only after one of the same device, image "
+                                   "size and number of cameras outside the capture")
+            _demands[key] = _Demand(device)
+        demand = _demands[key]
+        if not capturing:
+            demand.grow(cameras * scene.means.shape[0])
+            demand.echo.copy_(demand.most, non_blocking=True)
+        return demand
+
+
+def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
+    """Parameter structure with the sizes and flags of a call."""
+    args = _structure(wp)()
+    args.n, args.cameras, args.width, args.height = (
+        scene.means.shape[0], scene.viewmats.shape[0], scene.width, scene.height)
+    args.tiles_x, args.tiles_y = -(-scene.width // TILE), -(-scene.height // TILE)
+    args.n_colors = 0 if scene.colors is None else scene.colors.shape[1]
+    args.n_sh, args.bands = (0, 0) if scene.sh is None else (3, (scene.sh_degree + 1) ** 2)
+    args.sh_stride = 0 if scene.sh is None else 3 * scene.sh.shape[1]
+    args.channels = channels
+    # Whole 32-byte sectors a record, whole warps' halves a gradient.
+    args.record_stride = -(-(source.HEAD + channels) // 8) * 8
+    args.grad_stride = -(-(source.MOMENTS + channels) // 16) * 16
+    args.antialiased, args.want_depth = int(scene.settings.antialiased), int(scene.with_depth)
+    args.want_weights, args.want_top = int(scene.with_contributions), int(scene.with_top)
+    args.want_abs = int(scene.settings.absgrad)
+    args.wide = int(args.tiles_x * args.tiles_y * args.cameras >= source.WIDE_FROM)
+    args.near = scene.settings.near
+    return args
+
+
+def _point(args: Any, **tensors: Tensor | None) -> None:
+    for name, tensor in tensors.items():
+        setattr(args, name, 0 if tensor is None else tensor.data_ptr())
+
+
+class _Maker:
+    """Makes tensors on one device."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+
+    def empty(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=self.device)
+
+    def zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(shape, dtype=dtype, device=self.device)
+
+
+def _bin(launch: _Launcher, args: Any, scene: Scene, demand: _Demand, capacity: int, depth_key: Tensor,
+         hit_count: Tensor) -> tuple[Tensor, ...]:
+    """List the hits tile by tile, front to back. Returns (order, ends, sorted_slot, tile_start, tile_end, hits)."""
+    make = _Maker(scene.means.device)
+    slots, tiles = hit_count.shape[0], args.tiles_x * args.tiles_y * args.cameras
+    tile_start, tile_end = make.zeros(tiles, dtype=torch.int32), make.zeros(tiles, dtype=torch.int32)
+    hits = make.zeros(2, dtype=torch.int64)
+    order = torch.sort(depth_key, stable=True).indices
+    ends = torch.cumsum(hit_count[order], 0, dtype=torch.int64)
+    sorted_slot = make.empty(capacity, dtype=torch.int32)
+    _point(args, order=order, ends=ends, sorted_slot=sorted_slot, tile_start=tile_start, tile_end=tile_end)
+    args.capacity = capacity
+    if slots and tiles:
+        key = torch.full((capacity,), tiles, dtype=torch.int32 if args.wide else torch.int16, device=make.device)
+        hit_slot = make.empty(capacity, dtype=torch.int32)
+        _point(args, hit_key=key, hit_slot=hit_slot)
+        launch("raster_emit", args, slots)
+        sorted_key, permutation = torch.sort(key, stable=True)
+        _point(args, sorted_key=sorted_key, permutation=permutation, hits=hits, demand=demand.most)
+        launch("raster_ranges", args, capacity)
+    return order, ends, sorted_slot, tile_start, tile_end, hits
+
+
+class _Rasterize(torch.autograd.Function):
+    """Autograd's view of the CUDA body. Tensors are float32, contiguous, on one device."""
+
+    @staticmethod
+    def forward(ctx, scene: Scene, norms: tuple[Tensor, Tensor], means, quats, log_scales, logits, colors, sh, viewmats,
+                background):
+        make, launch = _Maker(means.device), _Launcher(means.device)
+        cameras, n = viewmats.shape[0], means.shape[0]
+        channels, slots = scene.channels + int(scene.with_depth), cameras * n
+        size = (cameras, scene.height, scene.width)
+        none = (0,)
+        image, alpha = make.empty(*size, channels), make.empty(*size)
+        median = make.empty(*(size if scene.with_depth else none))
+        top = size if scene.with_top else none
+        top_id, top_weight = make.empty(*top, dtype=torch.int32), make.empty(*top)
+        radii, means2d = make.empty(cameras, n, dtype=torch.int32), make.empty(cameras, n, 2)
+        per_slot = (cameras, n) if scene.with_contributions else none
+        weight_parts, weight_max = make.zeros(*per_slot, dtype=torch.int64), make.zeros(*per_slot)
+        behind = make.zeros(channels)
+        if background is not None:
+            behind[: scene.channels] = background
+        args = _arguments(launch.wp, scene, channels)
+        record, aux = make.empty(slots, args.record_stride), make.empty(slots, 2)
+        hit_count, depth_key = make.empty(slots, dtype=torch.int32), make.empty(slots, dtype=torch.int32)
+        _point(args, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh,
+               viewmats=viewmats, Ks=scene.Ks, background=behind, record=record, aux=aux, radii=radii, means2d=means2d,
+               hit_count=hit_count, depth_key=depth_key)
+        launch("raster_project", args, slots)
+        demand = _demand(scene)
+        binned = _bin(launch, args, scene, demand, demand.capacity, depth_key, hit_count)
+        _point(args, image=image, alpha=alpha, median=median, top_id=top_id, top_weight=top_weight,
+               weight_sum=weight_parts, weight_max=weight_max)
+        launch("raster_blend", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha,
+                                  record, aux, hit_count, *binned)
+            ctx.scene, ctx.norms, ctx.capacity = scene, norms, demand.capacity
+        weight_sum = (weight_parts.double() / source.WEIGHT_SCALE).float()
+        extras = (median, radii, means2d, weight_sum, weight_max, top_id, top_weight, binned[-1])
+        ctx.mark_non_differentiable(*extras)
+        ctx.set_materialize_grads(False)
+        return image, alpha, *extras
+
+    @staticmethod
+    def backward(ctx, *grads):
+        (means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, record, aux, hit_count,
+         order, ends, sorted_slot, tile_start, tile_end, _) = ctx.saved_tensors
+        scene: Scene = ctx.scene
+        make, launch = _Maker(means.device), _Launcher(means.device)
+        channels, cameras, n = image.shape[-1], viewmats.shape[0], means.shape[0]
+        grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
+        grad_alpha = torch.zeros_like(alpha) if grads[1] is None else grads[1].contiguous()
+        args = _arguments(launch.wp, scene, channels)
+        args.capacity, args.want_view = ctx.capacity, int(ctx.needs_input_grad[8])
+        grad = make.zeros(cameras * n, args.grad_stride)
+        inputs = {"grad_means": means, "grad_quats": quats, "grad_log_scales": log_scales, "grad_logits": logits,
+                  "grad_colors": colors, "grad_sh": sh}
+        out = {name: None if value is None else torch.empty_like(value) for name, value in inputs.items()}
+        grad_view = torch.zeros_like(viewmats)
+        _point(args, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh,
+               viewmats=viewmats, Ks=scene.Ks, record=record, aux=aux, hit_count=hit_count, order=order, ends=ends,
+               sorted_slot=sorted_slot, tile_start=tile_start, tile_end=tile_end, image=image, alpha=alpha,
+               grad_image=grad_image, grad_alpha=grad_alpha, grad=grad, grad_view=grad_view, grad_norm=ctx.norms[0],
+               grad_abs=ctx.norms[1], **out)
+        if n:
+            launch("raster_blend_backward", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
+            launch("raster_project_backward", args, n)
+        grad_background = None
+        if background is not None and ctx.needs_input_grad[9]:
+            grad_background = ((1 - alpha)[..., None] * grad_image[..., : scene.channels]).sum((0, 1, 2))
+        return (None, None, *out.values(), grad_view, grad_background)
+
+
+def warm_up(channels: int = 3, device: torch.device | str = "cuda") -> None:
+    """Compile, or load from the cache, what images of `channels` channels (one more with depth) need on `device`.
+
+    Raises RuntimeError with what to do if Warp cannot use the GPU.
+    """
+    device = torch.device(device)
+    if refusal := _refusal(device):
+        raise RuntimeError(refusal)
+    wp = _import_warp()
+    names = [(name, 0) for name in source.stages()] + [(name, channels) for name in source.blending(channels)]
+    modules = {module_name(*each): build(*each) for each in names}
+    with nullcontext() if device.type == "cuda" else _Fibers(wp):
+        for module in modules:
+            wp.load_module(module, device=str(device), block_dim=source.BLOCK)
+
+
+def rasterize(scene: Scene) -> RasterOutput:
+    """All cameras of `scene` (float32, contiguous, on one device).
+
+    Raises ValueError for too many channels, RuntimeError with what to do if Warp cannot use the GPU.
+    """
+    channels = scene.channels + int(scene.with_depth)
+    if channels > MAX_CHANNELS:
+        raise ValueError(f"{channels} channels, depth included; one call carries at most {MAX_CHANNELS}")
+    device = scene.means.device
+    if refusal := _refusal(device):
+        raise RuntimeError(refusal)
+    cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
+    if cameras * n >= 2**31 or cameras * -(-scene.width // TILE) * -(-scene.height // TILE) >= 2**31 // source.BLOCK:
+        raise ValueError(f"{cameras} cameras of {scene.width} x {scene.height} px with {n} Gaussians are too much for "
+                         "one call: split the cameras")
+    norms = (torch.zeros(cameras, n, device=device), torch.zeros(cameras, n, device=device))
+    image, alphas, median, radii, means2d, weight_sum, weight_max, top_ids, top_weights, hits = _Rasterize.apply(
+        scene, norms, scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh,
+        scene.viewmats, scene.background)
+    colors, depth = image, None
+    if scene.with_depth:
+        colors, depth_sum = image[..., :-1], image[..., -1]
+        depth = expected_depth(depth_sum, alphas)
+    weights, top = scene.with_contributions, scene.with_top
+    return RasterOutput(
+        colors=colors, alphas=alphas, depth_expected=depth, depth_median=median if scene.with_depth else None,
+        radii=radii, means2d=means2d, weight_sum=weight_sum if weights else None,
+        weight_max=weight_max if weights else None, means2d_grad=norms[0], means2d_absgrad=norms[1],
+        top_ids=top_ids if top else None, top_weights=top_weights if top else None, hits=hits)
