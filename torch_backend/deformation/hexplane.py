@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from . import planes as compiled
 from .protocol import Deltas
 
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
@@ -64,9 +65,9 @@ class HexPlane(nn.Module):
             nodes = config.resolution * level
             for _ in _SPATIAL:
                 plane = torch.empty(1, config.features, nodes, nodes).uniform_(0.1, 0.5, generator=generator)
-                self.spatial.append(nn.Parameter(plane))
+                self.spatial.append(_plane(plane))
             for _ in range(3):
-                self.temporal.append(nn.Parameter(torch.ones(1, config.features, config.time_nodes, nodes)))
+                self.temporal.append(_plane(torch.ones(1, config.features, config.time_nodes, nodes)))
         self.trunk = _linear(config.features * len(config.levels), config.width, generator)
         self.hidden = nn.ModuleDict({name: _linear(config.width, config.width, generator) for name in _WIDTHS})
         self.out = nn.ModuleDict({name: nn.Linear(config.width, size) for name, size in _WIDTHS.items()})
@@ -78,6 +79,9 @@ class HexPlane(nn.Module):
         """Product of the six planes' samples, levels concatenated: [M, features * levels]."""
         where = 2.0 * (means.detach() - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
         when = (2.0 * times - 1.0).expand(len(means))
+        planes = self._by_level()
+        if compiled.supports(planes) and where.dtype == torch.float32:
+            return compiled.features(torch.cat([where, when[:, None]], dim=1), planes)
         parts = []
         for level in range(len(self.config.levels)):
             product = where.new_ones(())
@@ -99,6 +103,11 @@ class HexPlane(nn.Module):
             opacity_logits=out["opacity_logits"][:, 0],
             sh0=out["sh0"][:, None, :],
         )
+
+    def _by_level(self) -> list[Tensor]:
+        """Three planes of space, then three of time, level by level."""
+        levels = range(0, len(self.spatial), 3)
+        return [plane for n in levels for plane in (*self.spatial[n : n + 3], *self.temporal[n : n + 3])]
 
     def outside(self, means: Tensor) -> int:
         """How many of means [M, 3] lie outside the box, where the field cannot tell them apart."""
@@ -131,7 +140,10 @@ class HexPlane(nn.Module):
 
     def regularisation(self) -> Tensor:
         """Smoothness of the planes and closeness of the time planes to 1, weighted, summed over planes."""
-        c = self.config
+        c, planes = self.config, self._by_level()
+        if compiled.supports(planes):
+            space, time = (c.smooth_space, c.smooth_space, 0.0), (c.smooth_time, 0.0, c.time_l1)
+            return compiled.penalty(planes, [*[space] * 3, *[time] * 3] * len(c.levels))
         space = torch.stack([_bend(p, 2) + _bend(p, 3) for p in self.spatial]).sum()
         time = torch.stack([_bend(p, 2) for p in self.temporal]).sum()
         still = torch.stack([(1.0 - p).abs().mean() for p in self.temporal]).sum()
@@ -144,6 +156,11 @@ class HexPlane(nn.Module):
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Inverse of `state`; RuntimeError names what does not fit."""
         self.load_state_dict({k.removeprefix("field."): v for k, v in tensors.items() if k.startswith("field.")})
+
+
+def _plane(values: Tensor) -> nn.Parameter:
+    """A plane [1, C, H, W] with its channels side by side in memory."""
+    return nn.Parameter(values.contiguous(memory_format=torch.channels_last))
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:

@@ -1,0 +1,181 @@
+"""Breakdown of one training step before and after the gate opens: `python benchmarks/training_step.py SHOT [--json FILE]`.
+
+SHOT is a solved shot folder (nothing is written into it). One run of the preset trains with the tuning split (every 8th
+frame held out, four frames off); steps are timed in two windows: before the gate opens, with `--at` of the run done, and
+after, each of `--steps` steps. Times are medians over the steps of a window, in ms; every part is timed on its own, and
+what no part covers is listed as the rest. Parts of the backward pass are told apart by the moment at which the gradients
+of the images and of the Gaussians arrive: autograd works through the graph in the reverse order of its making.
+"""
+
+import argparse
+import json
+import os
+import pathlib
+import statistics
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+
+import torch
+
+from torch_backend.contract import TrainParams
+from torch_backend.raster.cpu import warm_up
+from torch_backend.raster.settings import default_threads
+from torch_backend.scene import load_images, load_scene, split_frames
+from torch_backend.shot import Shot
+from torch_backend.train import config_from_params, trainer as trainer_module
+from torch_backend.train.run import training_size
+from torch_backend.train.trainer import Trainer
+
+
+class _Silent:
+    """A reporter that says nothing."""
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None: ...
+
+    def metric(self, stage: str, values: Any) -> None: ...
+
+    def image(self, label: str, path: Any) -> None: ...
+
+    def warning(self, message: str, hint: str = "") -> None:
+        print(f"note: {message} {hint}")
+
+    def check_cancelled(self) -> None: ...
+
+
+class Parts:
+    """Milliseconds per part of the step at hand; a part inside another is taken off the outer one."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = defaultdict(float)
+        self._inner = [0.0]
+        self.mark = 0.0
+
+    def timed(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """`call`, with its time noted under `name`."""
+
+        def run(*args: Any, **kwargs: Any) -> Any:
+            since = time.perf_counter()
+            self._inner.append(0.0)
+            try:
+                return call(*args, **kwargs)
+            finally:
+                whole = time.perf_counter() - since
+                self.spent[name] += 1e3 * (whole - self._inner.pop())
+                self._inner[-1] += whole
+
+        return run
+
+    def lap(self, name: str) -> None:
+        """Notes the time since the last mark under `name`, and marks again: for the stretches of one backward pass."""
+        now = time.perf_counter()
+        self.spent[name] += 1e3 * (now - self.mark)
+        self.mark = now
+
+
+def watch(trainer: Trainer, parts: Parts) -> None:
+    """Puts timers round what a step calls. Call it anew when the trainer has made its field."""
+    module: Any = trainer_module
+    model, patched = trainer.model, set(vars(trainer).get("_timed", ()))
+
+    def patch(owner: Any, name: str, label: str) -> None:
+        if (id(owner), name) not in patched:
+            setattr(owner, name, parts.timed(label, getattr(owner, name)))
+            patched.add((id(owner), name))
+
+    for owner, name, label in (
+        (model, "deltas", "field, forward"), (module, "apply_deltas", "deltas applied"),
+        (model.exposure, "apply", "exposure, forward"), (module, "photometric", "L1 + SSIM, forward"),
+        (trainer, "_regularisers", "penalties, forward"), (module, "support_loss", "support loss, forward"),
+        (trainer.optimizer, "zero_grad", "gradients cleared"), (trainer.optimizer, "step", "Adam"),
+        (trainer, "_gradients_finite", "gradients checked"), (trainer, "_after_step", "scales clamped"),
+        (trainer.densifier, "observe", "densifier observes"), (module, "mark_seen", "support marked"),
+        (trainer, "_schedule", "learning rates"), (trainer, "_milestones", "densification and gate"), (trainer, "_next_frame", "frame drawn"),
+    ):  # fmt: skip
+        if hasattr(owner, name):
+            patch(owner, name, label)
+    if model.field is not None:
+        patch(model.field, "regularisation", "field's penalties, forward")
+    if (id(trainer), "_render") not in patched:
+        render = parts.timed("rasterise, forward", trainer._render)
+
+        def watched(state: dict[str, torch.Tensor], *args: Any, **options: Any) -> Any:
+            out = render(state, *args, **options)
+            leaf = state["means"]
+            if leaf.requires_grad:
+                out.colors.register_hook(lambda _: parts.lap("losses, penalties and exposure, backward"))
+                leaf.register_hook(lambda _: parts.lap("rasterise, backward"))
+            return out
+
+        trainer._render = watched  # type: ignore[method-assign]
+        backward = torch.Tensor.backward
+
+        def whole(self: torch.Tensor, *args: Any, **kwargs: Any) -> None:
+            since = parts.mark = time.perf_counter()
+            backward(self, *args, **kwargs)
+            parts.lap("field and Gaussians, backward")
+            parts._inner[-1] += time.perf_counter() - since
+
+        torch.Tensor.backward = whole  # type: ignore[method-assign]
+        patched.add((id(trainer), "_render"))
+    vars(trainer)["_timed"] = patched
+
+
+def measure(trainer: Trainer, parts: Parts, steps: int) -> dict[str, float]:
+    """Mean ms per part over `steps` steps, and the median of whole steps."""
+    watch(trainer, parts)
+    parts.spent.clear()
+    whole = []
+    for _ in range(steps):
+        since = time.perf_counter()
+        trainer._milestones()
+        trainer.step()
+        trainer.iteration += 1
+        whole.append(1e3 * (time.perf_counter() - since))
+    found = {name: spent / steps for name, spent in parts.spent.items()}
+    mean = statistics.fmean(whole)
+    return {"whole step (median)": statistics.median(whole), "whole step (mean)": mean, **found,
+            "the rest": mean - sum(found.values())}  # fmt: skip
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("shot")
+    parser.add_argument("--preset", default="preview")
+    parser.add_argument("--iterations", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--at", type=float, nargs=2, default=(0.25, 0.7), help="shares of the run that are measured")
+    parser.add_argument("--json", metavar="FILE")
+    args = parser.parse_args()
+    shot = Shot.open(args.shot)
+    config = config_from_params(TrainParams(preset=args.preset, iterations=args.iterations, holdout=8))
+    config.holdout_phase = 4
+    torch.set_num_threads(default_threads())
+    warm_up()
+    scene = load_scene(shot)
+    width, height = training_size(scene, config.width)
+    train, _ = split_frames(scene.solved, config.holdout, config.holdout_phase)
+    trainer = Trainer(scene, load_images(scene, train, width, height), train, config, _Silent())  # type: ignore[arg-type]
+    parts, results = Parts(), {}
+    for share in args.at:
+        while trainer.progress < share:
+            trainer._milestones()
+            trainer.step()
+            trainer.iteration += 1
+        label = f"at {share:.0%}: {len(trainer.model.gaussians)} Gaussians, {len(trainer.model.open_rows())} open"
+        results[label] = measure(trainer, parts, args.steps)
+        print(f"\n{label}, {width}x{height}")
+        for name, value in results[label].items():
+            print(f"  {name:<44} {value:8.2f} ms")
+    if args.json:
+        pathlib.Path(args.json).write_text(json.dumps(results, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
