@@ -5,8 +5,7 @@ the same way, over one tile of 16 full rows and 16 Gaussians, all of it in the f
 branch predictable. It leaves out what blending does besides: fetching Gaussians, row ranges, sums over lanes, mispredicted
 branches, tile set-up and images. The best of many short runs counts, so that an interruption cannot flatter the share.
 
-Lanes: 16 for every row on which a hit adds to at least one pixel, counted by blending built with counters; a row whose
-pixels are all dark or finished is left early, and counts as nothing though its time does. Cycles: core clock, measured
+Lanes: 16 for every row of a hit that is worked on, counted by blending built with a counter. Cycles: core clock, measured
 beside by a chain of dependent additions and exclusive ors, one cycle each.
 
 Share = (limit in cycles per lane x lanes) / (seconds of the blending stage x clock x threads).
@@ -49,12 +48,16 @@ P.visible = x;
 """
 _OPERANDS = r"""
 const int NCH = @NCH@;
-F T[16];
-float fields[6][16]; int first[16], last[16], slots[16];
-for (int l = 0; l < 16; l++) {
-    slots[l] = l; first[l] = (int)P.width; last[l] = (int)P.height;
-    for (int c = 0; c < 6; c++) fields[c][l] = P.record[l * P.record_stride + c]; }
 const long long RS = P.record_stride;
+F T[16];
+int slots[16];
+unsigned masks[16];
+float dys[16][16], shifts[16][16], levels[16][16];
+for (int l = 0; l < 16; l++) {
+    const float* r = P.record + l * RS;
+    F dy = LANE + 0.5f - r[1];
+    slots[l] = l; masks[l] = (unsigned)P.width;
+    store(dys[l], dy); store(shifts[l], 0.5f - r[0] - r[3] * dy); store(levels[l], fma(r[4] * dy, dy, (F)r[5])); }
 """
 _RESET = r"""
     // T falls with every hit; it is set back before it reaches the stop.
@@ -68,8 +71,7 @@ for (long long turn = 0; turn < P.n; turn++) {
     for (int l = 0; l < 16; l++) {
 """ + source.HIT + r"""
         F total = (F)0.f, peak = (F)0.f;
-        for (int row = first[l]; row <= last[l]; row++) {
-""" + source.FORWARD_ROW + r"""
+""" + source.ROWS + source.FORWARD_ROW + r"""
         }
         totals[l] = total; peaks[l] = peak;
     }
@@ -87,8 +89,7 @@ for (long long turn = 0; turn < P.n; turn++) {
 """ + _RESET + r"""
     for (int l = 0; l < 16; l++) {
 """ + source.HIT + source.BACKWARD_SUMS + r"""
-        for (int row = first[l]; row <= last[l]; row++) {
-""" + source.BACKWARD_ROW + r"""
+""" + source.ROWS + source.BACKWARD_ROW + r"""
         }
         all += s0 + s1 + s2 + s3 + s4 + s5 + ax + ay;
         for (int c = 0; c < NCH; c++) all += gc[c];
@@ -116,11 +117,8 @@ class BlendTimes:
     forward_s: float
     backward_s: float
     forward_lanes: int
-    """16 for every row of a hit that adds to at least one pixel."""
+    """16 for every row of a hit that is worked on."""
     backward_lanes: int
-    forward_rows_entered: int
-    """Rows begun, lit or not."""
-    backward_rows_entered: int
     threads: int
 
     def shares(self, limit: HotLoop) -> tuple[float, float]:
@@ -147,7 +145,7 @@ def limits(repeats: int = 60) -> HotLoop:
     sink, background = torch.zeros(64), torch.full((CHANNELS,), 1e-3)
     block.record, block.record_stride, block.image = records.data_ptr(), records.shape[1], sink.data_ptr()
     block.background, block.want_abs = background.data_ptr(), 1
-    block.width, block.height = 0, 15  # first and last row
+    block.width = 0xFFFF  # the rows, as bits
     block.visible, block.hits = 1, 3
 
     def seconds(stage: int, turns: int) -> float:
@@ -199,15 +197,14 @@ def _blending(kernel) -> Iterator[None]:
 @functools.cache
 def _counting_kernel():
     text = source.blend_source(CHANNELS)
-    for number, mark in enumerate((source.ROW, source.LIT)):
-        assert text.count(mark) == 2, "blending does not hold its two row loops"
-        text = text.replace(mark, mark + f"((long long*)P.weight_sum)[stage * 2 + {number}]++;")
+    assert text.count(source.ROWS) == 2, "blending does not hold its two row loops"
+    text = text.replace(source.ROWS, source.ROWS + "((long long*)P.weight_sum)[stage]++;")
     return cpu.build("raster_blend_counting", text)
 
 
 def count_rows(frames: _Frames) -> list[int]:
-    """Rows of one frame: entered and lit forward, entered and lit backward."""
-    counts, run = torch.zeros(4, dtype=torch.int64), _counting_kernel()
+    """Rows entered in one frame, forward and backward."""
+    counts, run = torch.zeros(2, dtype=torch.int64), _counting_kernel()
 
     def count(address: int, stage: int, worker: int) -> None:
         block = source.Block.from_address(address)
@@ -223,7 +220,7 @@ def count_rows(frames: _Frames) -> list[int]:
 
 def blend_times(work: "Workload", threads: int, rounds: int = 15) -> BlendTimes:
     """Time the blending stages of `rounds` forward and backward passes of `work` (three colours), and count rows."""
-    entered, lit, entered_back, lit_back = count_rows(_Frames(work, 1))
+    rows, rows_back = count_rows(_Frames(work, 1))
     frames = _Frames(work, threads)
     own, times = cpu._workers, {source.BLEND: [], source.BLEND_BACKWARD: []}
     blend = cpu._compile(CHANNELS)
@@ -242,7 +239,7 @@ def blend_times(work: "Workload", threads: int, rounds: int = 15) -> BlendTimes:
     finally:
         cpu._workers = own
     return BlendTimes(float(np.median(times[source.BLEND])), float(np.median(times[source.BLEND_BACKWARD])),
-                      16 * lit, 16 * lit_back, entered, entered_back, threads)
+                      16 * rows, 16 * rows_back, threads)
 
 
 def main() -> None:
@@ -267,8 +264,7 @@ def main() -> None:
             per = times.threads * limit.clock_hz
             print(f"{name}  {threads} threads  forward {times.forward_s * 1e3:6.2f} ms, "
                   f"{times.forward_s * per / times.forward_lanes:.2f} cycles per lane, {ahead:.0%} of the limit   backward "
-                  f"{times.backward_s * 1e3:6.2f} ms, {times.backward_s * per / times.backward_lanes:.2f}, {back:.0%}   "
-                  f"rows lit {times.forward_lanes / times.forward_rows_entered / 16:.0%}")
+                  f"{times.backward_s * 1e3:6.2f} ms, {times.backward_s * per / times.backward_lanes:.2f}, {back:.0%}")
     if arguments.json:
         arguments.json.write_text(json.dumps({"limit": asdict(limit), "results": results}, indent=1) + "\n")
 

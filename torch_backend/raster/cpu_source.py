@@ -74,6 +74,10 @@ auto vmax = FN(F a, F b) -> F { return a > b ? a : b; };
 auto vabs = FN(F a) -> F { return __builtin_elementwise_abs(a); };
 auto vsqrt = FN(F a) -> F { return __builtin_elementwise_sqrt(a); };
 auto fma = FN(F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
+auto vround = FN(F a) -> F { return __builtin_elementwise_roundeven(a); };
+typedef bool Bits __attribute__((ext_vector_type(16)));
+auto bits = FN(I m) -> unsigned {
+    return __builtin_bit_cast(unsigned short, __builtin_convertvector(m, Bits)); };
 auto any = FN(I m) -> bool { return __builtin_reduce_or(m) != 0; };
 auto smin = FN(float a, float b) -> float { return a < b ? a : b; };
 auto smax = FN(float a, float b) -> float { return a > b ? a : b; };
@@ -538,53 +542,45 @@ const long long RS = P.record_stride, W = P.width, H = P.height, tiles = P.tiles
 typedef float Row __attribute__((ext_vector_type(16)));
 """
 
-# Sixteen hits at a time: place within the tile, and the rows in which the ellipse meets the tile's columns. Solves
-# A (x - k dy)^2 + R dy^2 = L for dy at the column nearest to the ellipse's top and bottom points.
+# Sixteen hits at a time: the rows that each one touches, as bits, and what its ellipse is on each of the 16 rows.
 _BATCH = r"""
-        int slots[16], first[16], last[16], m = stop - b < 16 ? (int)(stop - b) : 16;
-        float fields[6][16];
-        for (int l = 0; l < 16; l++) {
-            slots[l] = P.hit_slot[b + (l < m ? l : m - 1)];
+        unsigned live = 0;
+        for (int i = 0; i < 16; i++) live |= (unsigned)any(T[i] > T_STOP) << i;
+        if (!live) break;
+        int slots[16], m = stop - b < 16 ? (int)(stop - b) : 16;
+        unsigned masks[16];
+        float dys[16][16], shifts[16][16], levels[16][16];
+        for (int l = 0; l < m; l++) {
+            slots[l] = P.hit_slot[b + l];
             const float* r = P.record + slots[l] * RS;
-            for (int c = 0; c < 6; c++) fields[c][l] = r[c];
-        }
-        {
-            F mx = load(fields[0]) - x0, my = load(fields[1]) - y0, kk = load(fields[3]);
-            F A = -load(fields[2]), R = -load(fields[4]), L = load(fields[5]) - PMIN;
-            F q = A * kk * kk + R, tip = kk * vsqrt(L / R);
-            F xu = vmin(vmax(tip, 0.5f - mx), 15.5f - mx), xd = vmin(vmax(-tip, 0.5f - mx), 15.5f - mx);
-            F hi = A * kk * xu + vsqrt(vmax(L * q - A * R * xu * xu, (F)0.f));
-            F lo = A * kk * xd - vsqrt(vmax(L * q - A * R * xd * xd, (F)0.f));
-            // A hair of slack against rounding: rows too many cost time, rows too few cost pixels.
-            F from = vmin(vmax(my - 0.502f + lo / q, (F)0.f), (F)16.f);
-            F to = vmin(vmax(my + 0.502f + hi / q, (F)0.f), (F)16.f);
-            I t = __builtin_convertvector(from, I), u = __builtin_convertvector(to, I) - 1;
-            t -= __builtin_convertvector(t, F) < from;
-            __builtin_memcpy(first, &t, 64); __builtin_memcpy(last, &u, 64);
-            store(fields[0], 0.5f - mx); store(fields[1], my);
+            // Exponent of alpha on a row: level + A e^2, e = column + shift.
+            F dy = LANE + 0.5f - (r[1] - y0), shift = (0.5f - (r[0] - x0)) - r[3] * dy;
+            F level = fma(r[4] * dy, dy, (F)r[5]);
+            store(dys[l], dy); store(shifts[l], shift); store(levels[l], level);
+            // The row's pixel nearest to the ellipse's middle is lit, or none is; a hair of slack against rounding.
+            F e = shift + vround(vmin(vmax(-shift, (F)0.f), (F)15.f));
+            masks[l] = bits(fma(r[2] * e, e, level) >= PMIN - 1e-3f) & live;
         }
 """
 HIT = r"""
             const float* channel = P.record + slots[l] * RS + @HEAD@;
-            float left_edge = fields[0][l], my = fields[1][l], A = fields[2][l], kk = fields[3][l], R = fields[4][l];
-            float lop = fields[5][l];
+            float A = P.record[slots[l] * RS + 2], kk = P.record[slots[l] * RS + 3], R = P.record[slots[l] * RS + 4];
 """
-ROW = """
-                float dy = row + 0.5f - my;"""
-"""Start of the work on one row of a tile for one hit; `benchmarks/hot_loop.py` counts here."""
-LIT = """
-                if (!any(lit)) continue;"""
-"""Where a row goes on if the hit adds to any of its pixels."""
-_ALPHA = ROW + r"""
-                F e = LANE + (left_edge - kk * dy);
-                F p = fma(A * e, e, (F)(lop + R * dy * dy));
-                I lit = (p >= PMIN) & (T[row] > T_STOP);""" + LIT + r"""
+"""What one hit needs beside its rows."""
+ROWS = r"""
+            for (unsigned rest = masks[l]; rest; rest &= rest - 1) {
+                int row = __builtin_ctz(rest);
+"""
+"""The loop over one hit's rows; `benchmarks/hot_loop.py` counts here."""
+_ALPHA = r"""
+                F e = LANE + shifts[l][row], before = T[row];
+                F p = fma(A * e, e, (F)levels[l][row]);
                 F raw = exp2v(p), al = vmin(raw, (F)ALPHA_MAX);
-                al = lit ? al : (F)0.f;
-                F w = al * T[row];
+                al = ((p >= PMIN) & (before > T_STOP)) ? al : (F)0.f;
+                F w = al * before;
+                T[row] = fma(-al, before, before);
 """
 FORWARD_ROW = _ALPHA + r"""
-                T[row] = fma(-al, T[row], T[row]);
                 for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)channel[c], C[c][row]);
                 total += w; peak = vmax(peak, w);
 """
@@ -595,12 +591,12 @@ BACKWARD_SUMS = r"""
             float qa = -2.f * LN2 * A, qc = -2.f * LN2 * R;"""
 """Sums of one hit over its rows."""
 BACKWARD_ROW = _ALPHA + r"""
+                float dy = dys[l][row];
                 F along = (F)0.f;
                 for (int c = 0; c < NCH; c++) {
                     along = fma(G[c][row], (F)channel[c], along); gc[c] = fma(w, G[c][row], gc[c]); }
                 F seen = w * along, behind = left[row] - seen;
                 left[row] = behind;
-                T[row] = fma(-al, T[row], T[row]);
                 // d loss / d log alpha; nothing passes the clamp.
                 F v = seen - al / (1.f - al) * behind;
                 v = raw <= ALPHA_MAX ? v : (F)0.f;
@@ -627,9 +623,6 @@ for (long long tile; (tile = take()) < tiles;) {
         for (int c = 0; c < NCH; c++) C[c][i] = (F)0.f; }
     long long b = start;
     for (; b < stop; b += 16) {
-        F most = T[0];
-        for (int i = 1; i < 16; i++) most = vmax(most, T[i]);
-        if (!any(most > T_STOP)) break;
 """ + _BATCH + r"""
         F totals[16], peaks[16];
         for (int l = m; l < 16; l++) { totals[l] = (F)0.f; peaks[l] = (F)0.f; }
@@ -639,12 +632,11 @@ for (long long tile; (tile = take()) < tiles;) {
             float depth = 0.f; int id = 0;
             if (want_depth) depth = P.aux[4 * (long long)slots[l] + 3];
             if (want_top) id = P.index[slots[l]];
-            for (int row = first[l]; row <= last[l]; row++) {
-""" + FORWARD_ROW + r"""
+""" + ROWS + FORWARD_ROW + r"""
                 if (want_depth | want_top) {
                     I larger = w > best[row];
                     // T before > 0.5 and T after <= 0.5: crossed here. Until then, the largest so far.
-                    I pick = (T[row] + w > 0.5f) & ((T[row] <= 0.5f) | larger) & lit;
+                    I pick = (before > 0.5f) & ((T[row] <= 0.5f) | larger) & (w > 0.f);
                     median[row] = pick ? (F)depth : median[row];
                     top[row] = larger ? (I)id : top[row];
                     best[row] = vmax(best[row], w);
@@ -696,14 +688,14 @@ for (long long tile; (tile = take()) < tiles;) {
                 G[c][i][l] = value; all += value * P.image[(at + l) * NCH + c]; }
             T[i][l] = 1.f; left[i][l] = all; }
     }
-    for (long long b = start; b < stop; b += 16) {
+    long long b = start;
+    for (; b < stop; b += 16) {
 """ + _BATCH + r"""
         for (int l = 0; l < m; l++) {
 """ + HIT + r"""
             F out[(@MOMENTS@ + NCH + 15) / 16 * 16];
 """ + BACKWARD_SUMS + r"""
-            for (int row = first[l]; row <= last[l]; row++) {
-""" + BACKWARD_ROW + r"""
+""" + ROWS + BACKWARD_ROW + r"""
             }
             float* to = P.hit_grad + P.hit_place[b + l] * GS;
             out[0] = s0; out[1] = s1; out[2] = s2; out[3] = s3; out[4] = s4; out[5] = s5; out[6] = qa * ax; out[7] = ay;
@@ -712,7 +704,7 @@ for (long long tile; (tile = take()) < tiles;) {
             for (int c = 0; c < (int)(sizeof(out) / sizeof(F)); c += 16) store(to + c, fold16(out + c, add));
         }
     }
-    for (long long h = stop; h < P.tile_start[tile + 1]; h++)
+    for (long long h = b < stop ? b : stop; h < P.tile_start[tile + 1]; h++)
         for (long long c = 0; c < GS; c += 16) store(P.hit_grad + P.hit_place[h] * GS + c, (F)0.f);
 }
 """
