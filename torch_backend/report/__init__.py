@@ -1,0 +1,1 @@
+"""Folders of runs and ground truth into figures: metrics, tables, plots, one page. Reads folders only."""

@@ -1,0 +1,244 @@
+"""How far a picture is from the truth: PSNR, SSIM, ST-LPIPS, FLIP over regions, and what many such figures say.
+
+Pictures are display-referred sRGB in [0, 1], [H, W, 3]. Every metric is a map over pixels first, so that a region (what
+was never seen at t*, what moves) is judged by its own pixels; a window or a receptive field still looks a little beyond
+the region's border. A metric whose package is absent is None, and `missing_metrics` says so: never a made-up figure.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from . import colorvideovdp, stlpips
+
+METRICS = {"psnr_db": True, "ssim": True, "st_lpips": False, "flip": False}
+"""Metric of a picture -> whether more is better."""
+WHOLE = "whole"
+"""The region of all pixels; always there."""
+LEAST_SHARE = 0.002
+"""A region below this share of the picture is taken for empty: the PSNR of a dozen pixels is noise."""
+WINDOW, SIGMA = 11, 1.5
+"""SSIM's Gaussian window in pixels (Wang et al. 2004); a smaller picture has a smaller window."""
+_MSE_FLOOR = 1e-12
+"""Identical pictures are 120 dB apart, not infinitely many: JSON knows no infinity."""
+
+
+def missing_metrics() -> dict[str, str]:
+    """Metrics that cannot be had here, each with the sentence that the report prints."""
+    said = {}
+    if stlpips.weights_path() is None:
+        said["st_lpips"] = "ST-LPIPS was not measured: stlpips-pytorch is not installed (requirements/bench.txt)."
+    if importlib.util.find_spec("flip_evaluator") is None:
+        said["flip"] = "FLIP was not measured: flip-evaluator is not installed (requirements/bench.txt)."
+    if not colorvideovdp.available():
+        said["jod"] = "ColorVideoVDP was not measured: cvvdp is not installed (requirements/bench.txt)."
+    return said
+
+
+def score(image: Tensor, truth: Tensor, regions: Mapping[str, Tensor] | None = None) -> dict[str, dict]:
+    """Scores a picture against the truth, over the whole and over regions.
+
+    Args:
+        image, truth: [H, W, 3] float, display-referred; clamped to [0, 1] as a display does.
+        regions: name -> bool [H, W].
+
+    Returns:
+        {region: {"pixels": int, metric: float | None}}, `WHOLE` among them. A metric is None where its package is
+        absent, where the picture is too small for it, or where the region is (nearly) empty.
+    """
+    if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"image and truth should be [H, W, 3] alike, got {tuple(image.shape)}, {tuple(truth.shape)}")
+    maps = error_maps(image, truth)
+    whole = torch.ones(image.shape[:2], dtype=torch.bool)
+    return {name: _over(maps, mask) for name, mask in {WHOLE: whole, **(regions or {})}.items()}
+
+
+def error_maps(image: Tensor, truth: Tensor) -> dict[str, Tensor | None]:
+    """Maps [H, W] of two pictures [H, W, 3] by metric (psnr_db: the squared error); None where it is not to be had."""
+    image, truth = image.float().clamp(0.0, 1.0), truth.float().clamp(0.0, 1.0)
+    return {
+        "psnr_db": (image - truth).double().square().mean(2),
+        "ssim": ssim_map(image, truth),
+        "st_lpips": stlpips.distance_map(image, truth),
+        "flip": flip_map(image, truth),
+    }
+
+
+def _over(maps: Mapping[str, Tensor | None], mask: Tensor) -> dict[str, float | int | None]:
+    """Each map's figure over a mask [H, W]."""
+    count = int(mask.sum())
+    row: dict[str, float | int | None] = {"pixels": count}
+    enough = count >= max(1, LEAST_SHARE * mask.numel())
+    for name, values in maps.items():
+        mean = float(values[mask].double().mean()) if values is not None and enough else None
+        row[name] = psnr_of(mean) if name == "psnr_db" and mean is not None else mean
+    return row
+
+
+def psnr_of(mse: float) -> float:
+    """Decibels of a mean squared error of values in [0, 1]; at most 120."""
+    return -10.0 * math.log10(max(mse, _MSE_FLOOR))
+
+
+def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
+    """SSIM at every pixel, mean over channels: [H, W] from [H, W, C]; data_range 1, borders renormalised.
+
+    The window is `WINDOW` wide, or the largest odd width that fits the shorter side.
+    """
+    side = min(image.shape[:2])
+    width = min(WINDOW, side if side % 2 else side - 1)
+    rows, columns = (_blur_matrix(size, width) for size in image.shape[:2])
+    x, y = image.double().permute(2, 0, 1), truth.double().permute(2, 0, 1)
+
+    def blur(v: Tensor) -> Tensor:
+        return rows @ v @ columns.T
+
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    values = (2 * mx * my + c1) * (2 * vxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+    return values.mean(0)
+
+
+def _blur_matrix(size: int, width: int) -> Tensor:
+    """[size, size] float64: rows are Gaussian windows cut at the border, each summing to 1."""
+    at = torch.arange(size, dtype=torch.float64)
+    distance = at[:, None] - at[None, :]
+    weights = torch.exp(-0.5 * (distance / SIGMA).square()) * (distance.abs() <= width // 2)
+    return weights / weights.sum(1, keepdim=True)
+
+
+def flip_map(image: Tensor, truth: Tensor) -> Tensor | None:
+    """LDR-FLIP at every pixel [H, W], at the package's viewing distance (67 pixels per degree); None if absent."""
+    if importlib.util.find_spec("flip_evaluator") is None:
+        return None
+    import flip_evaluator
+
+    reference, test = (np.ascontiguousarray(v.cpu().numpy(), dtype=np.float32) for v in (truth, image))
+    values, _, _ = flip_evaluator.evaluate(reference, test, "LDR", inputsRGB=True, applyMagma=False, parameters={})
+    return torch.from_numpy(np.array(values, dtype=np.float32)).reshape(image.shape[:2])
+
+
+def best_share_psnr(image: Tensor, truth: Tensor, share: float = 0.9) -> float:
+    """PSNR in dB over the best `share` of the pixels: what is left when the worst errors are somebody's motion."""
+    errors = (image.clamp(0.0, 1.0) - truth.clamp(0.0, 1.0)).double().square().mean(2).flatten()
+    return psnr_of(float(errors.sort().values[: max(1, math.floor(share * len(errors)))].mean()))
+
+
+def gradient_energy(image: Tensor, mask: Tensor | None = None) -> float:
+    """Mean squared gradient (forward differences) of Rec. 709 luma over pixels [H, W]: how sharp a picture is."""
+    luma = image.clamp(0.0, 1.0).double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
+    energy = F.pad(luma[:, 1:] - luma[:, :-1], (0, 1)).square() + F.pad(luma[1:] - luma[:-1], (0, 0, 0, 1)).square()
+    return float(energy.mean() if mask is None else energy[mask].mean())
+
+
+# ------------------------------------------------------------------------------------------------- many figures
+
+
+@dataclass
+class Summary:
+    """The paper's row of a table: the mean, and the mean of the worst shares of the frames."""
+
+    count: int
+    """Frames."""
+    mean: float
+    """Of all frames."""
+    bottom_75: float
+    """Of the worst 75 % of the frames (rounded up to whole frames), and so on."""
+    bottom_50: float
+    bottom_25: float
+    worst: float
+    """The worst frame."""
+
+
+def summarise(values: Sequence[float | None], more_is_better: bool = True) -> Summary | None:
+    """The summary of the values that are there; None if none is."""
+    there = sorted((v for v in values if v is not None), reverse=not more_is_better)
+    if not there:
+        return None
+
+    def bottom(share: float) -> float:
+        return float(np.mean(there[: max(1, math.ceil(share * len(there)))]))
+
+    return Summary(len(there), bottom(1.0), bottom(0.75), bottom(0.5), bottom(0.25), there[0])
+
+
+Key = tuple[str, str, int, int, int]
+"""(scene, cameras, seed, t*, pose): where two methods are compared."""
+
+_UNITS = (("runs", 3), ("freezes", 4), ("frames", 5))
+"""Independent units of a comparison, and how many leading parts of `Key` name one."""
+_LEAST_UNITS = 4
+
+
+@dataclass
+class Paired:
+    """Method a against method b on the frames that both have."""
+
+    mean: float
+    """Mean difference a - b over frames."""
+    se: float | None
+    """Standard error of that mean, from the spread over independent units; None with fewer than two."""
+    unit: str
+    """What was taken as independent: runs (scene and seed), freezes (and t*) or frames."""
+    units: int
+    """How many of them."""
+    frames: int
+    """Frames compared."""
+    frame_se: float | None
+    """The standard error if every frame were independent, which frames of one run are not: too small."""
+    verdict: str
+    """win: the difference is to a's favour by more than twice `se`; loss; undecided."""
+
+
+def paired(a: Mapping[Key, float | None], b: Mapping[Key, float | None], more_is_better: bool = True) -> Paired | None:
+    """Compares two methods frame by frame. None if no frame has both.
+
+    Frames of one run fail together, so the error is taken over runs where at least four are at hand, else over
+    freezes, else over frames: units' means, weighted by their frames.
+    """
+    differences = {k: float(x) - float(y) for k, x in a.items() if x is not None and (y := b.get(k)) is not None}
+    if not differences:
+        return None
+    values = np.array(list(differences.values()))
+    unit, groups = "frames", list(differences)
+    for name, parts in _UNITS:
+        groups = [key[:parts] for key in differences]
+        unit = name
+        if len(set(groups)) >= _LEAST_UNITS:
+            break
+    index = {group: i for i, group in enumerate(dict.fromkeys(groups))}
+    which = np.array([index[group] for group in groups])
+    se, frame_se = _clustered_error(values, which), _clustered_error(values, np.arange(len(values)))
+    gain = float(values.mean()) * (1 if more_is_better else -1)
+    verdict = "undecided" if se is None or abs(gain) <= 2.0 * se else "win" if gain > 0 else "loss"
+    return Paired(float(values.mean()), se, unit, len(index), len(values), frame_se, verdict)
+
+
+def _clustered_error(values: np.ndarray, which: np.ndarray) -> float | None:
+    """Standard error of the mean of `values` [V] whose errors are shared within clusters `which` [V] of 0..G-1."""
+    count = int(which.max()) + 1
+    if count < 2:
+        return None
+    sums = np.bincount(which, weights=values - values.mean())
+    return float(np.sqrt(count / (count - 1) * np.square(sums).sum()) / len(values))
+
+
+def pareto_front(cost: Sequence[float], gain: Sequence[float]) -> list[int]:
+    """Indices of the points that no other beats: less or equal cost and more or equal gain, one of them strictly.
+
+    Ordered by cost.
+    """
+    front: list[int] = []
+    for i in sorted(range(len(cost)), key=lambda i: (cost[i], -gain[i])):
+        if not front or gain[i] > gain[front[-1]]:
+            front.append(i)
+    return front
