@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from . import contract
-from .contract import Event, ExitCode
+from .contract import DEVICES, Event, ExitCode
 from .shot import SHOT_SUFFIX, Shot, disk_error, is_disk_full, write_json
 
 
@@ -141,9 +141,12 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     import av
     import torch
 
+    from .train.device import choose_device, cuda_refusal
+
     facts["torch_device"] = "cuda" if torch.cuda.is_available() else "cpu"
     facts["cuda_device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    facts["trains_on"] = "cpu"  # the CUDA rasteriser is not part of this version
+    facts["trains_on"] = choose_device("auto").type
+    facts["cuda_refusal"] = cuda_refusal()
     facts["cores"] = os.cpu_count()
     facts["h264"] = "libx264" in av.codecs_available
     print(json.dumps(facts, indent=1), file=console.stream)
@@ -171,6 +174,7 @@ def _train_params(args: argparse.Namespace) -> contract.TrainParams:
         holdout=args.holdout,
         seed=args.seed,
         resume=not args.restart,
+        device=args.device,
     )
 
 
@@ -183,6 +187,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         query=args.freeze_query,
         width=args.freeze_width,
         only_missing=True,
+        device=args.device,
     )
 
 
@@ -216,6 +221,7 @@ def parser() -> argparse.ArgumentParser:
     _add_import_flags(whole)
     _add_train_flags(whole)
     _add_freeze_flags(whole)
+    _add_device_flag(whole)
 
     for name, text in (
         ("import", "footage into a shot"),
@@ -232,8 +238,10 @@ def parser() -> argparse.ArgumentParser:
             one.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
         elif name == "train":
             _add_train_flags(one)
+            _add_device_flag(one)
         else:
             _add_freeze_flags(one)
+            _add_device_flag(one)
             one.add_argument("--run", default="main", help="run to freeze")
     state = commands.add_parser("status", help="jobs of a shot")
     state.add_argument("shot")
@@ -269,6 +277,10 @@ def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--camera-path", default="", help="JSON camera path to render from (default: the clip's poses)")
     to.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"))
     to.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
+
+
+def _add_device_flag(to: argparse.ArgumentParser) -> None:
+    to.add_argument("--device", default="auto", choices=DEVICES, help="where to train and freeze")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -134,6 +134,8 @@ class TrainParams:
     """Random seed."""
     resume: bool = True
     """Go on from the run's checkpoint if there is one."""
+    device: str = "auto"
+    """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used. A run may go on on another device."""
 
 
 @dataclass
@@ -160,7 +162,12 @@ class FreezeParams:
     """Width in pixels of the frozen frames; 0: the preset's delivery size."""
     only_missing: bool = False
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
+    device: str = "auto"
+    """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
+
+DEVICES = ("auto", "cpu", "cuda")
+"""Where a run may train and freeze."""
 
 PARAMS: dict[str, type] = {
     "import": ImportParams,

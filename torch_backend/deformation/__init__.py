@@ -2,7 +2,7 @@
 
 from .gate import GateConfig, open_gate, residual_per_gaussian
 from .hexplane import HexPlane, HexPlaneConfig
-from .protocol import Deformation, Deltas, apply_deltas
+from .protocol import Deformation, Deltas, apply_deltas, split_deltas
 
 __all__ = [
     "Deformation",
@@ -13,4 +13,5 @@ __all__ = [
     "apply_deltas",
     "open_gate",
     "residual_per_gaussian",
+    "split_deltas",
 ]

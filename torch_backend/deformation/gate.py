@@ -56,13 +56,13 @@ def residual_per_gaussian(
         errors.append(pull(error) / weight.clamp_min(1e-6))
         weights.append(weight)
     if not errors:
-        return torch.zeros(count), torch.zeros(count)
+        return torch.zeros(count, device="cpu"), torch.zeros(count, device="cpu")
     error, weight = torch.stack(errors), torch.stack(weights)
     # A hand is elsewhere in a few frames only: the mean over all would drown it, the maximum would listen to noise.
     seen = weight > 0.5
     ranked = torch.where(seen, error, -1.0).sort(dim=0, descending=True).values
     take = (seen.sum(0) / 3.0).ceil().long().clamp_min(1)
-    mask = torch.arange(len(ranked))[:, None] < take[None, :]
+    mask = torch.arange(len(ranked), device=take.device)[:, None] < take[None, :]
     residual = (ranked.clamp_min(0.0) * mask).sum(0) / take
     return residual, weight.sum(0)
 
@@ -74,9 +74,10 @@ def open_gate(model: Gaussians, residual: Tensor, weight: Tensor, config: GateCo
     if int(painted.sum()) <= config.neighbours:
         return 0
     rows = torch.nonzero(painted).flatten()
-    means = model.params["means"].detach()[rows].numpy()
+    means = model.params["means"].detach()[rows].cpu().numpy()
     nearest = KDTree(means).query(means, k=config.neighbours + 1)[1].reshape(len(rows), -1)
-    smooth = residual[rows][torch.from_numpy(np.ascontiguousarray(nearest))].median(1).values
+    nearest = torch.from_numpy(np.ascontiguousarray(nearest)).to(rows.device)
+    smooth = residual[rows][nearest].median(1).values
     median = smooth.median()
     spread = 1.4826 * (smooth - median).abs().median()
     wanted = torch.zeros_like(model.open)
@@ -84,7 +85,7 @@ def open_gate(model: Gaussians, residual: Tensor, weight: Tensor, config: GateCo
     room = int(config.max_share * len(model)) - int(model.open.sum())
     candidates = wanted & ~model.open
     if int(candidates.sum()) > room:
-        score = torch.full((len(model),), -torch.inf)
+        score = smooth.new_full((len(model),), -torch.inf)
         score[rows] = smooth
         score[~candidates] = -torch.inf
         candidates = torch.zeros_like(candidates)

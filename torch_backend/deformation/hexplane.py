@@ -51,7 +51,10 @@ class HexPlaneConfig:
 
 
 class HexPlane(nn.Module):
-    """The field. `box` [2, 3] is the part of the scene it resolves; outside it the rim's feature holds."""
+    """The field. `box` [2, 3] is the part of the scene it resolves; outside it the rim's feature holds.
+
+    Made on the CPU, so that a seed means one start on every device; `to` moves it.
+    """
 
     def __init__(self, config: HexPlaneConfig, box: Tensor, generator: torch.Generator) -> None:
         super().__init__()
@@ -59,18 +62,20 @@ class HexPlane(nn.Module):
             raise ValueError(f"box {box.tolist()} should have its maximum above its minimum on every axis")
         self.config = config
         self.box: Tensor
-        self.register_buffer("box", box.float())
+        self.register_buffer("box", box.float().cpu())
         self.spatial, self.temporal = nn.ParameterList(), nn.ParameterList()
         for level in config.levels:
             nodes = config.resolution * level
             for _ in _SPATIAL:
-                plane = torch.empty(1, config.features, nodes, nodes).uniform_(0.1, 0.5, generator=generator)
+                plane = torch.empty(1, config.features, nodes, nodes, device="cpu")
+                plane.uniform_(0.1, 0.5, generator=generator)
                 self.spatial.append(_plane(plane))
             for _ in range(3):
-                self.temporal.append(_plane(torch.ones(1, config.features, config.time_nodes, nodes)))
+                still = torch.ones(1, config.features, config.time_nodes, nodes, device="cpu")
+                self.temporal.append(_plane(still))
         self.trunk = _linear(config.features * len(config.levels), config.width, generator)
         self.hidden = nn.ModuleDict({name: _linear(config.width, config.width, generator) for name in _WIDTHS})
-        self.out = nn.ModuleDict({name: nn.Linear(config.width, size) for name, size in _WIDTHS.items()})
+        self.out = nn.ModuleDict({name: nn.Linear(config.width, size, device="cpu") for name, size in _WIDTHS.items()})
         for head in self.out.values():
             nn.init.zeros_(head.weight)  # type: ignore[arg-type]
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
@@ -117,9 +122,10 @@ class HexPlane(nn.Module):
     def refit(self, box: Tensor) -> None:
         """Resamples the planes for another box [2, 3]; inside the old one the field stays what it was."""
         nodes = [self.config.resolution * level for level in self.config.levels]
-        when = torch.linspace(-1.0, 1.0, self.config.time_nodes)
+        box = box.to(self.box)
+        when = torch.linspace(-1.0, 1.0, self.config.time_nodes, device=box.device)
         for level, count in enumerate(nodes):
-            at = box[0] + torch.linspace(0.0, 1.0, count)[:, None] * (box[1] - box[0])
+            at = box[0] + torch.linspace(0.0, 1.0, count, device=box.device)[:, None] * (box[1] - box[0])
             old = 2.0 * (at - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
             for k, (a, b) in enumerate(_SPATIAL):
                 _resample(self.spatial[3 * level + k], old[:, a], old[:, b])
@@ -164,7 +170,7 @@ def _plane(values: Tensor) -> nn.Parameter:
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    layer = nn.Linear(inputs, outputs)
+    layer = nn.Linear(inputs, outputs, device="cpu")
     nn.init.xavier_uniform_(layer.weight, generator=generator)
     nn.init.zeros_(layer.bias)
     return layer

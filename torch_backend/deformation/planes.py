@@ -154,11 +154,11 @@ def supports(planes: Sequence[Tensor]) -> bool:
 
 
 def _table(tensors: Sequence[Tensor]) -> Tensor:
-    return torch.tensor([t.data_ptr() for t in tensors], dtype=torch.int64)
+    return torch.tensor([t.data_ptr() for t in tensors], dtype=torch.int64, device="cpu")
 
 
 def _sizes(planes: Sequence[Tensor]) -> Tensor:
-    return torch.tensor([p.shape[2:] for p in planes], dtype=torch.int64)
+    return torch.tensor([p.shape[2:] for p in planes], dtype=torch.int64, device="cpu")
 
 
 class _Product(torch.autograd.Function):
@@ -167,9 +167,9 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def forward(ctx, where: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
         count, channels, levels = len(where), planes[0].shape[1], len(planes) // 6
-        features = torch.empty(count, levels * channels)
+        features = torch.empty(count, levels * channels, device="cpu")
         wanted = any(ctx.needs_input_grad)
-        samples = torch.empty(len(planes), count, channels) if wanted else None
+        samples = torch.empty(len(planes), count, channels, device="cpu") if wanted else None
         pointers, sizes = _table(planes), _sizes(planes)
         _sampler(channels).run(
             threads, planes=pointers.data_ptr(), grads=0, sizes=sizes.data_ptr(), where=where.data_ptr(),
@@ -212,10 +212,9 @@ class _Bend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, weights: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
         grads = [torch.empty_like(p) for p in planes] if any(ctx.needs_input_grad) else []
-        rows = torch.cat([
-            torch.stack([torch.full((p.shape[2],), n), torch.arange(p.shape[2])], dim=1) for n, p in enumerate(planes)
-        ])  # fmt: skip
-        partial = torch.empty(len(rows))
+        units = [(n, row) for n, p in enumerate(planes) for row in range(p.shape[2])]
+        rows = torch.tensor(units, dtype=torch.int64, device="cpu")
+        partial = torch.empty(len(rows), device="cpu")
         pointers, targets, sizes = _table(planes), _table(grads), _sizes(planes)
         _penalty(planes[0].shape[1]).run(
             threads, planes=pointers.data_ptr(), grads=targets.data_ptr() if grads else 0, sizes=sizes.data_ptr(),
@@ -240,4 +239,4 @@ def penalty(
     for plane, (down, along, still) in zip(planes, weights, strict=True):
         _, c, h, w = plane.shape
         scaled.append((down / max(1, c * (h - 2) * w), along / max(1, c * h * (w - 2)), still / (c * h * w)))
-    return _Bend.apply(torch.tensor(scaled), threads, *planes)  # type: ignore[no-any-return]
+    return _Bend.apply(torch.tensor(scaled, device="cpu"), threads, *planes)  # type: ignore[no-any-return]

@@ -1,59 +1,215 @@
-"""What a host is: (means, times) -> deltas, with its own parameters, learning rates and regularisers."""
+"""What a host of the method is: (means, times) -> deltas, with its own parameters, learning rates and regularisers.
+
+A host stands in one file: a subclass of `Deformation`, a dataclass of its numbers, and a `HOST` that names both
+(`hosts.py` finds it).
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from ..gaussians import PARAM_NAMES, Gaussians
+from .geometry import near_identity, quat_product
 
 
 class Deltas(NamedTuple):
-    """Changes of M Gaussians at their times, added before activation (method-hosts 1.1, "Application").
+    """Changes of M Gaussians at their times; None for what a host does not move.
 
-    means [M, 3] scene units, quats [M, 4], log_scales [M, 3], opacity_logits [M], sh0 [M, 1, 3].
+    means [M, 3] scene units, quats [M, 4], log_scales [M, 3], opacity_logits [M], sh0 [M, 1, 3]. How they
+    meet the canonical parameters is the host's `rules`; without a rule they are added.
     """
 
     means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    opacity_logits: Tensor
-    sh0: Tensor
+    quats: Tensor | None = None
+    log_scales: Tensor | None = None
+    opacity_logits: Tensor | None = None
+    sh0: Tensor | None = None
+
+    def moved(self) -> dict[str, Tensor]:
+        """Those that are there, by the name of the parameter they change."""
+        return {name: delta for name, delta in self._asdict().items() if delta is not None}
+
+    def detached(self) -> Deltas:
+        """The same values without gradient."""
+        return Deltas(*(None if delta is None else delta.detach() for delta in self))
 
 
-class Deformation(Protocol):
-    """A host of the method."""
+def split_deltas(deltas: Deltas, first: int) -> tuple[Deltas, Deltas]:
+    """The deltas of the first `first` Gaussians, and of the others."""
+    parts = [(None, None) if delta is None else (delta[:first], delta[first:]) for delta in deltas]
+    return Deltas(*(part[0] for part in parts)), Deltas(*(part[1] for part in parts))  # type: ignore[arg-type]
 
-    def __call__(self, means: Tensor, times: Tensor) -> Deltas:
-        """Deltas of M Gaussians: canonical means [M, 3] in scene units, times [M] in [0, 1]."""
-        ...
+
+Rule = Callable[[Tensor, Tensor], Tensor]
+"""(canonical rows, their deltas) -> rows at the time."""
+
+MIN_SCALE = 1e-5
+"""Smallest standard deviation in scene units that `add_to_scale` leaves (the trainer's own limit)."""
+
+
+def add_to_scale(log_scales: Tensor, delta: Tensor) -> Tensor:
+    """log(exp(log_scales) + delta), the published rule of Deformable 3DGS and SC-GS (method-hosts 1.2, 1.3).
+
+    The sum can leave the domain; it is held at MIN_SCALE, where it passes no gradient.
+    """
+    return (log_scales.exp() + delta).clamp_min(MIN_SCALE).log()
+
+
+def add_to_unit_quat(quats: Tensor, delta: Tensor) -> Tensor:
+    """normalise(quats) + delta, Deformable 3DGS. Its rasteriser does not normalise the sum; ours does (1.2)."""
+    return F.normalize(quats, dim=1) + delta
+
+
+def turn(quats: Tensor, delta: Tensor) -> Tensor:
+    """The canonical rotation, then the one that `delta` says as a change from the identity quaternion."""
+    return quat_product(near_identity(delta), F.normalize(quats, dim=1))
+
+
+class Owned(NamedTuple):
+    """A parameter per Gaussian that belongs to a host: what a row starts as, and its learning rates."""
+
+    shape: tuple[int, ...]
+    value: float
+    lr: float
+    lr_end: float
+
+
+@dataclass
+class HostConfig:
+    """What every host's numbers say. Shares are of the run's length."""
+
+    start: float = 1.0 / 3.0
+    """Share of the run at which the field joins where all Gaussians move (behind the gate, the gate says when)."""
+    detached: float = 0.0
+    """Until this share the images move the Gaussians through the deformation, but not the field."""
+
+
+@dataclass
+class Start:
+    """What a host is made from."""
+
+    means: Tensor
+    """[N, 3] canonical means of the Gaussians that it will move, scene units."""
+    box: Tensor
+    """[2, 3] robust bounds of them, with a margin."""
+    points: Tensor
+    """[P, 3] the solve's points."""
+    frames: int
+    """How many frames are trained."""
+    generator: torch.Generator
+    """Source of every random draw."""
+
+
+@dataclass
+class Rehearsal:
+    """What a host's pre-stage trains with, before the run's own steps."""
+
+    points: Tensor
+    """[P, 3] where to start."""
+    colors: Tensor
+    """[P, 3] display-referred colours of the points."""
+    times: list[float]
+    """Normalised times of the training frames."""
+    steps: int
+    """How many steps to take."""
+    loss: Callable[[dict[str, Tensor], int], Tensor]
+    """(parameters of a set of Gaussians at the frame's time, SH degree 0; frame) -> photometric loss."""
+    generator: torch.Generator
+    """Source of every random draw."""
+
+
+class Deformation(nn.Module):
+    """A host of the method. `config` is its dataclass of numbers. Means are never moved through the field."""
+
+    config: Any
+    rules: Mapping[str, Rule]
+    """How deltas meet canonical parameters, by parameter; what is not named is added."""
+    owned: Mapping[str, Owned]
+    """Parameters per Gaussian that belong to the host, by name; calls get their rows as `own`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rules, self.owned = {}, {}
+
+    def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
+        """Deltas of M Gaussians: canonical means [M, 3] in scene units, times [M] or [1] in [0, 1], owned rows."""
+        raise NotImplementedError
+
+    def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:
+        """The time at which a training frame of `time` is to be asked for; all Gaussians share a draw."""
+        return time
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Optimiser groups: params, lr (start), lr_end, name."""
-        ...
+        """Optimiser groups: params, lr (start), lr_end, name; `until`: the share of the run that ends the decay."""
+        raise NotImplementedError
 
-    def regularisation(self) -> Tensor:
-        """Scalar that keeps the field plausible, already weighted."""
-        ...
+    def regularisation(self, progress: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
+        """Scalar that keeps the field plausible, already weighted; `progress` is the share of the run that is done."""
+        return next(self.parameters()).new_zeros(())
+
+    def rehearse(self, stage: Rehearsal) -> None:
+        """The host's pre-stage, `rehearsal` of the run's steps long. Only hosts with `rehearsal` > 0 are asked."""
+        raise NotImplementedError
+
+    @property
+    def rehearsal(self) -> float:
+        """Share of the run that the pre-stage takes; 0: there is none."""
+        return 0.0
+
+    def cover(self, means: Tensor, optimizer: torch.optim.Optimizer) -> None:
+        """Called when more Gaussians have opened; means [N, 3] are those of all open ones."""
 
     def state(self) -> dict[str, Tensor]:
-        """Tensors for a checkpoint."""
-        ...
+        """Tensors for a checkpoint, names starting with `field.`."""
+        return {f"field.{name}": value.detach() for name, value in self.state_dict().items()}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Inverse of `state`; KeyError or ValueError names what does not fit."""
-        ...
+        """Inverse of `state`; RuntimeError names what does not fit."""
+        self.load_state_dict({k.removeprefix("field."): v for k, v in tensors.items() if k.startswith("field.")})
 
 
-def apply_deltas(model: Gaussians, rows: Tensor, deltas: Deltas | None) -> dict[str, Tensor]:
-    """The model's parameters with `deltas` added at `rows` [M]; without deltas the canonical ones.
+@dataclass(frozen=True)
+class HostSpec:
+    """A host as `hosts.py` finds it: a module's `HOST`."""
 
-    quats: the delta is added before normalisation, which the rasteriser does.
+    name: str
+    """What the command line and config.json call it."""
+    settings: type
+    """Dataclass of its numbers, a HostConfig; the defaults are our configuration."""
+    reference: Callable[[int], Any]
+    """Iterations of the run -> the published numbers, schedules as shares of the run."""
+    create: Callable[[Any, Start], Deformation]
+    """A new field from its numbers."""
+    restore: Callable[[Any, dict[str, Tensor]], Deformation]
+    """The field of a checkpoint, from its numbers and the checkpoint's tensors."""
+
+
+def rate_scale(published: int, iterations: int) -> float:
+    """Factor on published learning rates for a run shorter than the published one: the root of the ratio, at least 1.
+
+    Adam moves a parameter by about a rate per step: a short run at the rates of a long one ends far from where that
+    one does, and a comparison would flatter ours. Where the published run is no longer than ours, rates are as published.
     """
+    return max(1.0, published / iterations) ** 0.5
+
+
+def apply_deltas(
+    model: Gaussians, rows: Tensor, deltas: Deltas | None, rules: Mapping[str, Rule] | None = None
+) -> dict[str, Tensor]:
+    """The model's parameters with `deltas` met at `rows` [M] by a host's `rules`; without deltas the canonical ones."""
     state: dict[str, Tensor] = {name: model.params[name] for name in PARAM_NAMES}
     if deltas is None or len(rows) == 0:
         return state
-    for name, delta in deltas._asdict().items():
-        state[name] = state[name].index_add(0, rows, delta)
+    for name, delta in deltas.moved().items():
+        rule = (rules or {}).get(name)
+        if rule is None:
+            state[name] = state[name].index_add(0, rows, delta)
+        else:
+            state[name] = state[name].index_copy(0, rows, rule(state[name][rows], delta))
     return state

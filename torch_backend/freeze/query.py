@@ -46,6 +46,10 @@ class FrozenImage:
     motion: Tensor
     """[H, W] in 0..1: how much of what is seen moves in the clip."""
 
+    def cpu(self) -> FrozenImage:
+        """The same on the CPU, where files are written."""
+        return FrozenImage(*(value.cpu() for value in vars(self).values()))
+
 
 @torch.no_grad()
 def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "nearest") -> FrozenGaussians:
@@ -60,12 +64,12 @@ def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "ne
     if query not in ("nearest", "plain"):
         raise ValueError(f"query is {query!r}: it should be nearest or plain")
     gaussians, rows = model.gaussians, model.open_rows()
-    times = torch.full((len(rows),), float(time))
+    times = torch.full((len(rows),), float(time), device=model.device)
     if query == "nearest" and len(rows):
         bins, known = nearest_bin(gaussians.support[rows], model.centres, time)
         times = torch.where(known, model.centres[bins], times)
     state = apply_deltas(gaussians, rows, model.deltas(rows, times))
-    moving = torch.zeros(len(gaussians))
+    moving = torch.zeros(len(gaussians), device=model.device)
     moving[rows] = 1.0
     support = support_confidence(gaussians.support, moving > 0, model.centres, time, SUPPORT_SECONDS / seconds)
     return FrozenGaussians({k: v.detach() for k, v in state.items()}, model.sh_degree, support, moving)
@@ -81,7 +85,7 @@ def render_frozen(
     exposure: Exposure | None = None,
     exposed_at: float = 0.0,
 ) -> FrozenImage:
-    """One view of a frozen scene: viewmat [4, 4] in scene units, K [3, 3] in pixels.
+    """One view of a frozen scene, brought to the CPU: viewmat [4, 4] in scene units, K [3, 3] in pixels.
 
     Time stands still for the world, not for the camera: `exposure` at the normalised time `exposed_at` is applied, so
     that a frozen frame matches the plate it is mixed with. None: colours as the Gaussians have them.
@@ -90,8 +94,8 @@ def render_frozen(
     out = render(
         frozen.state,
         frozen.sh_degree,
-        viewmat,
-        K,
+        viewmat.to(mattes.device),
+        K.to(mattes.device),
         width,
         height,
         colors=mattes,
@@ -108,7 +112,7 @@ def render_frozen(
     color = out.colors[0, ..., :3]
     if exposure is not None:
         color = exposure.apply(color, exposed_at, alpha)
-    return FrozenImage(color.clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1])
+    return FrozenImage(color.clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1]).cpu()
 
 
 @torch.no_grad()
@@ -126,10 +130,11 @@ def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray
     if not len(rows) or model.field is None:
         return int(np.argmax(rank))
     means = model.gaussians.params["means"][rows]
-    places = torch.stack([model.field(means, torch.tensor([t])).means for t in torch.linspace(0, 1, 12).tolist()])
+    instants = torch.linspace(0, 1, 12, device=model.device)
+    places = torch.stack([model.field(means, instants[n : n + 1]).means for n in range(len(instants))])
     travel = (places - places.mean(0)).norm(dim=2).mean(0)
     support = model.gaussians.support[rows].float()
     seen = (travel[:, None] * support).sum(0) / travel.sum().clamp_min(1e-9)
     bins = [int((model.centres - float(t)).abs().argmin()) for t in times]
-    score = seen.numpy()[bins]
+    score = seen.cpu().numpy()[bins]
     return int(np.argmax(score / max(float(score.max()), 1e-6) + 0.5 * rank))

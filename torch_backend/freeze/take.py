@@ -17,7 +17,7 @@ from ..footage.images import read_png
 from ..gaussians.ply import write_ply
 from ..scene import Scene, load_scene
 from ..shot import Shot, content_key, disk_error, is_disk_full, need_disk, write_json
-from ..train import LoadedRun, load_run
+from ..train import LoadedRun, choose_device, load_run
 from ..train.run import save_png
 from .contact_sheet import write_contact_sheet
 from .exr import FrameMetadata, write_frozen_exr
@@ -50,7 +50,7 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
 
     Returns the take's figures (also in take.json). JobError in words if it cannot be done.
     """
-    run = load_run(shot, params.run)
+    run = load_run(shot, params.run, choose_device(params.device))
     scene = load_scene(shot)
     t_star = choose_t_star(shot, scene, run, params, report)
     width, height = output_size(scene, run, params)
@@ -127,7 +127,7 @@ def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tu
     viewmats[:, :3, 3] = scene.scale * (viewmats[:, :3, 3] + viewmats[:, :3, :3] @ scene.centre)
     x, y = width / path.width, height / path.height
     Ks = [[[f.K[0] * x, 0, f.K[2] * x], [0, f.K[1] * y, f.K[3] * y], [0, 0, 1]] for f in path.frames]
-    return torch.from_numpy(viewmats).float(), torch.tensor(Ks).float(), [f.frame for f in path.frames]
+    return torch.from_numpy(viewmats).float(), torch.tensor(Ks, device="cpu").float(), [f.frame for f in path.frames]
 
 
 def take_key(
@@ -275,7 +275,7 @@ def _contact_sheet(
 
 def _write_ply(path: Path, frozen: FrozenGaussians, scene: Scene) -> None:
     """The frozen instant in solve units, as every splat viewer reads it."""
-    s = frozen.state
+    s = {name: value.cpu() for name, value in frozen.state.items()}
     means = s["means"].double() / scene.scale + torch.from_numpy(scene.centre)
     sh = torch.cat([s["sh0"], s["shN"]], dim=1)
     write_ply(

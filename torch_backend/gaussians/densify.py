@@ -44,14 +44,15 @@ class DensifyConfig:
 class Densifier:
     """Gathers the signal between two rounds and carries a round out."""
 
-    def __init__(self, config: DensifyConfig, count: int) -> None:
+    def __init__(self, config: DensifyConfig, count: int, device: torch.device | str = "cpu") -> None:
         self.config = config
+        self.device = torch.device(device)
         self.reset(count)
 
     def reset(self, count: int) -> None:
         """Forgets the signal; called after every round, for `count` Gaussians."""
-        self.gradient = torch.zeros(count)
-        self.seen = torch.zeros(count)
+        self.gradient = torch.zeros(count, device=self.device)
+        self.seen = torch.zeros(count, device=self.device)
 
     @torch.no_grad()
     def observe(self, absgrad: Tensor, radii: Tensor) -> None:
@@ -78,7 +79,7 @@ class Densifier:
         survivors = torch.nonzero(keep & ~split).flatten()
         parents = torch.nonzero(split).flatten()
         rows = torch.cat([survivors, parents, parents])
-        fresh = torch.zeros(len(rows), dtype=torch.bool)
+        fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
         fresh[len(survivors) :] = True
         pruned = int((~keep).sum())
         if len(parents) or pruned:
@@ -118,7 +119,7 @@ def _separate(model: Gaussians, first: int, count: int) -> None:
     axis = torch.gather(_rotation(p["quats"][one]), 2, longest[:, None, None].expand(-1, 3, 1))[..., 0]
     # The mixture of the two keeps the parent's second moment: s^2 = d^2 + (s / 1.6)^2.
     distance = log_scales.gather(1, longest[:, None]).exp() * math.sqrt(1.0 - _SHRINK**-2)
-    shrunk = log_scales.scatter_add(1, longest[:, None], torch.full((count, 1), -math.log(_SHRINK)))
+    shrunk = log_scales.scatter_add(1, longest[:, None], log_scales.new_full((count, 1), -math.log(_SHRINK)))
     # Half the parent's mass each, spread over a shorter axis: peak opacity 1.6 / 2 of the parent's.
     logit = torch.logit((torch.sigmoid(p["opacity_logits"][one]) * _SHRINK / 2).clamp(1e-4, 1.0 - 1e-4))
     for rows, sign in ((one, 1.0), (two, -1.0)):

@@ -48,32 +48,32 @@ def initialise(
     generator: torch.Generator,
     budget: int,
 ) -> Gaussians:
-    """Gaussians from sparse points and seeds.
+    """Gaussians from sparse points and seeds, on the CPU, where the scene is.
 
     Args:
         scene: the scene; its points [P, 3].
-        images: [I, H, W, 3] training frames, display-referred.
+        images: [I, H, W, 3] training frames, display-referred, on any device.
         indices: [I] frame of the scene that each image shows.
         bins: time bins of the support bitmap.
         budget: most Gaussians to start with; a random choice is kept.
     """
     points, colors = scene.points, scene.colors
-    opacity = torch.full((len(points),), config.opacity)
+    opacity = torch.full((len(points),), config.opacity, device="cpu")
     if config.seeds > 0:
         picked = np.unique(np.linspace(0, len(indices) - 1, min(config.frames, len(indices))).round().astype(int))
         each = min(config.seeds // len(picked), images.shape[1] * images.shape[2] // _PIXELS_PER_SEED)
         seeds = [_lift_seeds(scene, images[n], indices[n], each, generator) for n in picked]
         points = torch.cat([points, *(s[0] for s in seeds)])
         colors = torch.cat([colors, *(s[1] for s in seeds)])
-        opacity = torch.cat([opacity, torch.full((len(points) - len(opacity),), config.seed_opacity)])
+        opacity = torch.cat([opacity, opacity.new_full((len(points) - len(opacity),), config.seed_opacity)])
     if len(points) > budget:
-        kept = torch.randperm(len(points), generator=generator)[:budget]
+        kept = torch.randperm(len(points), generator=generator, device="cpu")[:budget]
         points, colors, opacity = points[kept], colors[kept], opacity[kept]
     if len(points) < 4:
         raise ValueError(f"the solve left {len(points)} points: at least 4 are needed to start")
     scales = neighbour_distance(points).clamp_min(config.min_scale)
     count = len(points)
-    quats = torch.zeros(count, 4)
+    quats = points.new_zeros(count, 4)
     quats[:, 0] = 1.0
     params = {
         "means": points.clone(),
@@ -81,7 +81,7 @@ def initialise(
         "log_scales": scales.log()[:, None].repeat(1, 3),
         "opacity_logits": torch.logit(opacity),
         "sh0": ((colors - 0.5) / SH_C0)[:, None, :],
-        "shN": torch.zeros(count, sh_bases(config.sh_degree) - 1, 3),
+        "shN": points.new_zeros(count, sh_bases(config.sh_degree) - 1, 3),
     }
     return Gaussians(params, bins)
 
@@ -102,22 +102,22 @@ def _lift_seeds(
     camera = scene.points @ viewmat[:3, :3].T + viewmat[:3, 3]
     in_front = camera[:, 2] > 1e-3
     pixels = (camera[:, :2] / camera[:, 2:].clamp_min(1e-3)) * K[[0, 1], [0, 1]] + K[:2, 2]
-    limits = torch.tensor([width, height])
+    limits = torch.tensor([width, height], device="cpu")
     seen = in_front & ((pixels >= 0) & (pixels < limits)).all(1)
     if seen.sum() < 4:
         return scene.points[:0], scene.colors[:0]
     tree = KDTree(pixels[seen].numpy())
-    candidates = torch.rand(4 * count, 2, generator=generator) * limits
+    candidates = torch.rand(4 * count, 2, generator=generator, device="cpu") * limits
     distance, nearest = tree.query(candidates.numpy(), k=4)
     distance, nearest = torch.from_numpy(distance), torch.from_numpy(nearest)
     far = distance[:, 0].argsort(descending=True, stable=True)[: 2 * count]
     # Half the far ones: a bare top-k would put every seed into the largest hole.
-    keep = far[torch.randperm(len(far), generator=generator)[:count]]
+    keep = far[torch.randperm(len(far), generator=generator, device="cpu")[:count]]
     weights = 1.0 / (distance[keep] + 1.0)
     depth = (weights * camera[seen][:, 2][nearest[keep]]).sum(1) / weights.sum(1)
     chosen = candidates[keep]
-    rays = torch.cat([(chosen - K[:2, 2]) / K[[0, 1], [0, 1]], torch.ones(len(chosen), 1)], dim=1)
+    rays = torch.cat([(chosen - K[:2, 2]) / K[[0, 1], [0, 1]], chosen.new_ones(len(chosen), 1)], dim=1)
     local = rays * depth.float()[:, None]
     world = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
     rows, columns = chosen[:, 1].long().clamp(0, height - 1), chosen[:, 0].long().clamp(0, width - 1)
-    return world, image[rows, columns].float()
+    return world, image[rows, columns].float().cpu()

@@ -35,8 +35,9 @@ class Gaussians:
             if params[name].shape[0] != count:
                 raise ValueError(f"{name} has {params[name].shape[0]} rows, means has {count}")
         self.params = {name: nn.Parameter(params[name].contiguous()) for name in PARAM_NAMES}
-        self.open = torch.zeros(count, dtype=torch.bool)
-        self.support = torch.zeros(count, bins, dtype=torch.bool)
+        device = params["means"].device
+        self.open = torch.zeros(count, dtype=torch.bool, device=device)
+        self.support = torch.zeros(count, bins, dtype=torch.bool, device=device)
 
     def __len__(self) -> int:
         return self.params["means"].shape[0]
@@ -80,6 +81,14 @@ class Gaussians:
         tensors["gaussians.support"] = pack_bits(self.support)
         return tensors
 
+    def to(self, device: torch.device) -> Gaussians:
+        """The same model on another device, with parameters of its own; this one if it is there already."""
+        if self.open.device == device:
+            return self
+        model = Gaussians({name: p.detach().to(device) for name, p in self.params.items()}, self.support.shape[1])
+        model.open, model.support = self.open.to(device), self.support.to(device)
+        return model
+
     @staticmethod
     def from_state(tensors: dict[str, Tensor], bins: int) -> Gaussians:
         """Inverse of `state`; KeyError names a missing tensor."""
@@ -89,16 +98,17 @@ class Gaussians:
         return model
 
 
-_WEIGHTS = torch.tensor([1, 2, 4, 8, 16, 32, 64, 128], dtype=torch.uint8)
+def _weights(device: torch.device) -> Tensor:
+    return 2 ** torch.arange(8, dtype=torch.uint8, device=device)
 
 
 def pack_bits(flags: Tensor) -> Tensor:
     """bool [N, B] -> uint8 [N, ceil(B / 8)], lowest bit first."""
     padded = torch.nn.functional.pad(flags, (0, -flags.shape[1] % 8)).view(flags.shape[0], -1, 8)
-    return (padded * _WEIGHTS).sum(-1, dtype=torch.uint8)
+    return (padded * _weights(flags.device)).sum(-1, dtype=torch.uint8)
 
 
 def unpack_bits(packed: Tensor, bins: int) -> Tensor:
     """Inverse of `pack_bits`."""
-    flags = (packed[:, :, None] & _WEIGHTS) != 0
+    flags = (packed[:, :, None] & _weights(packed.device)) != 0
     return flags.reshape(packed.shape[0], -1)[:, :bins].contiguous()

@@ -1,13 +1,15 @@
 """Who was seen when, and what holds a Gaussian at times at which nobody saw it."""
 
-from .anchors import PaperView, SupervisionConfig, paper_loss, support_loss
+from .anchors import Anchored, PaperView, SupervisionConfig, draw_anchored, paper_loss, support_loss
 from .support import bin_of, bin_times, mark_seen, nearest_bin, nearest_supported, support_confidence
 
 __all__ = [
+    "Anchored",
     "PaperView",
     "SupervisionConfig",
     "bin_of",
     "bin_times",
+    "draw_anchored",
     "mark_seen",
     "nearest_bin",
     "nearest_supported",

@@ -48,7 +48,7 @@ def nearest_supported(support: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Te
     Returns:
         (left [M], has_left [M], right [M], has_right [M]); where there is none the index is the bin itself.
     """
-    index = torch.arange(support.shape[1]).expand_as(support)
+    index = torch.arange(support.shape[1], device=support.device).expand_as(support)
     before = torch.where(support & (index <= bins[:, None]), index, -1).amax(1)
     after = torch.where(support & (index >= bins[:, None]), index, support.shape[1]).amin(1)
     has_left, has_right = before >= 0, after < support.shape[1]

@@ -20,7 +20,7 @@ _CHUNK = 4096
 """Elements per unit of work."""
 _WHOLE, _REAL = 8, 8
 """Columns of a segment's tables: addresses of p, g, m, v, elements, row width (0: no rows), first chunk, address of
-the step count | rate, 1 - b1, 1 - b2, eps, low, high, rate / (1 - b1^t), 1 / sqrt(1 - b2^t). Without p, g is only checked."""
+the step count | rate, 1 - b1, 1 - b2, eps, low, high, rate / (1 - b1^t), 1 / sqrt(1 - b2^t). No p: only a check."""
 
 _SOURCE = r"""
 const long long CHUNK = @CHUNK@;
@@ -167,7 +167,7 @@ class FusedAdam(torch.optim.Optimizer):
         """`threads`: workers on the CPU (default: all cores). `kernel`: use the Warp kernel (default: not on a CPU)."""
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "rows": False, "clamp": (-math.inf, math.inf)})
         self.threads, self.kernel = threads, kernel
-        self.applied = torch.tensor(True)
+        self.applied = torch.tensor(True, device="cpu")
 
     @torch.no_grad()
     def step(self, closure: None = None, *, visible: Tensor | None = None, guard: Sequence[Tensor] = ()) -> None:  # type: ignore[override]
@@ -232,7 +232,10 @@ class FusedAdam(torch.optim.Optimizer):
     def _run_snippet(
         self, whole: list[int], real: list[float], bad: Tensor, visible: Tensor | None, chunks: int
     ) -> Tensor:
-        table, numbers = torch.tensor(whole, dtype=torch.int64), torch.tensor(real, dtype=torch.float32)
+        table, numbers = (
+            torch.tensor(values, dtype=kind, device="cpu")
+            for values, kind in ((whole, torch.int64), (real, torch.float32))
+        )
         for stage in (0, 1):
             _snippet().run(
                 self.threads, stage, whole=table.data_ptr(), real=numbers.data_ptr(), bad=bad.data_ptr(),

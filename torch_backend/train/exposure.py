@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -35,14 +36,15 @@ class Exposure:
 
     def __init__(self, times: Tensor, config: ExposureConfig) -> None:
         self.times, self.config = times, config
-        self.values = torch.nn.Parameter(torch.zeros(len(times), 2, 3))
+        self.values = torch.nn.Parameter(torch.zeros(len(times), 2, 3, device=times.device))
+        self._at = times.cpu().numpy()  # times are looked up on the host: a GPU need not be asked where a frame lies
 
     def at(self, time: float) -> tuple[Tensor, Tensor]:
         """(gain [3], offset [3]) at a normalised time; held constant beyond the ends."""
-        right = int(torch.searchsorted(self.times, torch.tensor(time)).clamp(0, len(self.times) - 1))
+        right = min(int(np.searchsorted(self._at, np.float32(time))), len(self._at) - 1)
         left = max(right - 1, 0)
-        span = float(self.times[right] - self.times[left])
-        share = min(max((time - float(self.times[left])) / span, 0.0), 1.0) if span > 0 else 0.0
+        span = float(self._at[right] - self._at[left])
+        share = min(max((time - float(self._at[left])) / span, 0.0), 1.0) if span > 0 else 0.0
         log_gain, offset = torch.lerp(self.values[left], self.values[right], share)
         return log_gain.exp(), offset
 

@@ -47,7 +47,7 @@ def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
     Two dense products beat torch's depthwise 11-tap convolution on CPU at these sizes (docs/benchmarks.md).
     """
-    offset = torch.arange(size, dtype=torch.float64)
+    offset = torch.arange(size, dtype=torch.float64, device="cpu")
     distance = offset[:, None] - offset[None, :]
     weights = torch.exp(-0.5 * (distance / _SIGMA).square()) * (distance.abs() <= _WINDOW // 2)
     return (weights / weights.sum(1, keepdim=True)).to(device, dtype)

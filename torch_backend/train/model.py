@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,12 +29,22 @@ class DynamicModel:
     """SH degree in use."""
     exposure: Exposure
     """How the camera exposed each frame; the Gaussians' colours are those of no correction."""
+    _rows: tuple[Tensor, int, Tensor] | None = field(default=None, repr=False)
+
+    @property
+    def device(self) -> torch.device:
+        """Where all tensors of the model are."""
+        return self.gaussians.open.device
 
     def open_rows(self) -> Tensor:
         """Rows of the Gaussians that the field moves, int64 [M]."""
+        is_open = self.gaussians.open
         if self.field is None:
-            return torch.zeros(0, dtype=torch.long)
-        return torch.nonzero(self.gaussians.open).flatten()
+            return torch.zeros(0, dtype=torch.long, device=is_open.device)
+        # Asking which are open makes the host wait for a GPU; they change between steps only.
+        if self._rows is None or self._rows[0] is not is_open or self._rows[1] != is_open._version:
+            self._rows = (is_open, is_open._version, torch.nonzero(is_open).flatten())
+        return self._rows[2]
 
     def deltas(self, rows: Tensor, times: Tensor) -> Deltas | None:
         """The field at the canonical means of `rows` [M]; times [M] or [1]. None without a field or rows."""
@@ -45,7 +55,7 @@ class DynamicModel:
     def state_at(self, time: float) -> dict[str, Tensor]:
         """All parameters at a normalised time, with gradients."""
         rows = self.open_rows()
-        return apply_deltas(self.gaussians, rows, self.deltas(rows, torch.tensor([time])))
+        return apply_deltas(self.gaussians, rows, self.deltas(rows, torch.tensor([time], device=self.device)))
 
 
 def render(
@@ -80,7 +90,7 @@ def render(
 
 def field_box(means: Tensor) -> Tensor:
     """Box [2, 3] that a field should resolve for the Gaussians means [M, 3]: robust bounds and a margin."""
-    low, high = np.quantile(means.numpy(), (0.01, 0.99), axis=0)
-    low, high = torch.from_numpy(low).float(), torch.from_numpy(high).float()
+    low, high = np.quantile(means.cpu().numpy(), (0.01, 0.99), axis=0)
+    low, high = torch.from_numpy(low).float().to(means.device), torch.from_numpy(high).float().to(means.device)
     margin = 0.15 * (high - low).clamp_min(1e-2)
     return torch.stack([low - margin, high + margin])

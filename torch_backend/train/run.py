@@ -11,13 +11,17 @@ import torch
 from torch import Tensor
 
 from ..contract import ExitCode, JobError, Reporter, TrainParams, read_json
+from ..deformation import planes
 from ..footage.images import write_png
-from ..raster.cpu import warm_up
+from ..raster import cpu as raster_cpu
+from ..raster import ssim
 from ..raster.settings import default_threads
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, write_json
+from . import adam
 from .checkpoint import load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
+from .device import choose_device
 from .model import DynamicModel
 from .trainer import Trainer, restore_model
 
@@ -48,9 +52,11 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
 
     Returns the run's figures, also written to runs/<name>/summary.json. JobError in words if it cannot be done.
     """
-    config = config_from_params(params)
+    config, device = config_from_params(params), choose_device(params.device)
     torch.set_num_threads(default_threads())
-    warm_up()  # kernels compile from the main thread, before the clock of the first step
+    if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
+        for module in (raster_cpu, ssim, adam, planes):
+            module.warm_up()
     folder = shot.run(params.run)
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
@@ -60,9 +66,9 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if done is not None and params.resume:
         report.progress("training", 1, 1, "already trained")
         return done
-    images = load_images(scene, train + test, width, height, report)
+    images = place_images(load_images(scene, train + test, width, height, report), device)
     identity = {"key": key, "solve": solve_key(shot)}
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity)
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
     checkpoint = folder / "checkpoint.safetensors"
     resumed = _resume(trainer, checkpoint, params.resume, report)
     (folder / "summary.json").unlink(missing_ok=True)  # it speaks of the checkpoint that is about to be replaced
@@ -83,6 +89,15 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
             "Expect ghosts where people walked; a range in which they hold still does better.",
         )
     return summary
+
+
+def place_images(images: Tensor, device: torch.device) -> Tensor:
+    """Images [I, H, W, 3] on the device, or in pinned host memory if they would take over half of what is free there.
+    """
+    if device.type == "cpu":
+        return images
+    free, _ = torch.cuda.mem_get_info(device)
+    return images.to(device) if images.nbytes <= free // 2 else images.pin_memory()
 
 
 def training_size(scene: Scene, wanted: int) -> tuple[int, int]:
@@ -153,7 +168,7 @@ def moving_share(model: DynamicModel) -> float:
 
 def save_png(path: Path, image: Tensor) -> None:
     """Writes a display-referred [H, W, 3] image as 8-bit PNG."""
-    write_png(path, (image.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).contiguous().numpy())
+    write_png(path, (image.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).contiguous().cpu().numpy())
 
 
 def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, key: str) -> dict[str, Any]:
@@ -176,13 +191,14 @@ def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, ke
         "gaussians": len(model.gaussians),
         "moving_gaussians": len(model.open_rows()),
         "moving_share": round(moving_share(model), 5),
+        "device": model.device.type,
         "sh_degree": model.sh_degree,
         "train_seconds": round(trainer.trained_seconds, 2),
     }
 
 
-def load_run(shot: Shot, name: str) -> LoadedRun:
-    """A run as it stands in its checkpoint. JobError if there is none."""
+def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> LoadedRun:
+    """A run as it stands in its checkpoint, on `device`. JobError if there is none."""
     folder = shot.run(name)
     checkpoint = folder / "checkpoint.safetensors"
     if not checkpoint.is_file():
@@ -193,5 +209,5 @@ def load_run(shot: Shot, name: str) -> LoadedRun:
     if meta["solve"] != solve_key(shot):
         message = f"The run {name!r} was trained on other cameras than the shot has now."
         raise JobError(message, "Train it again.", ExitCode.FREEZE)
-    model = restore_model(tensors, meta, config)
+    model = restore_model(tensors, meta, config, device)
     return LoadedRun(folder, config, model, int(meta["width"]), int(meta["height"]), list(meta["train_frames"]))

@@ -12,10 +12,20 @@ import torch
 from torch import Tensor
 
 from ..contract import Cancelled, ExitCode, JobError, Reporter
-from ..deformation import HexPlane, apply_deltas, open_gate, residual_per_gaussian
+from ..deformation import Deltas, HexPlane, apply_deltas, open_gate, residual_per_gaussian, split_deltas
 from ..gaussians import Densifier, Gaussians, initialise
 from ..scene import Scene
-from ..supervision import PaperView, bin_of, bin_times, mark_seen, paper_loss, support_loss
+from ..supervision import (
+    Anchored,
+    PaperView,
+    bin_of,
+    bin_times,
+    draw_anchored,
+    mark_seen,
+    paper_loss,
+    support_loss,
+)
+from .adam import FusedAdam
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
@@ -24,17 +34,23 @@ from .model import DynamicModel, field_box, render
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
+_LOOK_EVERY = 10
+"""Steps between two looks at what a GPU counted, and between two reports of progress."""
 
 
 class Trainer:
-    """Optimises one run. All tensors on the CPU; images [I, H, W, 3] float16 display-referred.
+    """Optimises one run on one device; images [I, H, W, 3] float16 display-referred, on the device or in host memory.
+
+    Random numbers are drawn on the CPU whatever the device is: a run is the same experiment everywhere, and its
+    checkpoint goes on anywhere. On a GPU a step reads nothing back; `run` looks every `_LOOK_EVERY` steps.
 
     Args:
-        scene: normalised scene.
+        scene: normalised scene, on the CPU.
         images: the training frames.
         train: indices into the scene's frames, one per image.
         config: every number of the run.
         identity: JSON-able facts that say which run a checkpoint belongs to; stored in it.
+        device: where it trains.
     """
 
     def __init__(
@@ -45,18 +61,24 @@ class Trainer:
         config: TrainConfig,
         report: Reporter,
         identity: dict[str, Any] | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
-        self.identity = identity or {}
+        self.identity, self.device = identity or {}, torch.device(device)
         self.scene, self.images, self.train_ids, self.config, self.report = scene, images, train, config, report
         self.height, self.width = images.shape[1:3]
-        self.Ks = scene.camera_at(self.width, self.height)
+        self.viewmats = scene.viewmats.to(self.device)
+        self.Ks = scene.camera_at(self.width, self.height).to(self.device)
         self.times = [float(scene.times[i]) for i in train]
+        self._when = torch.tensor(self.times, device=self.device)
         self.seconds = float(scene.seconds[train[-1]] - scene.seconds[train[0]])
-        self.generator = torch.Generator().manual_seed(config.seed)
-        self.centres = bin_times(scene.times[train])
+        self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
+        centres = bin_times(scene.times[train])
+        self._bins = [bin_of(centres, time) for time in self.times]
+        self.centres = centres.to(self.device)
         config.hexplane.time_nodes = max(4, round(len(train) / 2))
         budget = config.densify.budget
         gaussians = initialise(scene, images, train, len(self.centres), config.init, self.generator, budget)
+        gaussians = gaussians.to(self.device)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
         self.initial = len(gaussians)
         self.iteration = 0
@@ -64,7 +86,8 @@ class Trainer:
         self.bad_steps = 0
         self.order: list[int] = []
         self.optimizer = self._gaussian_optimizer()
-        self.densifier = Densifier(config.densify, len(gaussians))
+        self.densifier = Densifier(config.densify, len(gaussians), self.device)
+        self._bad = torch.zeros(2, dtype=torch.int32, device=self.device)
         self._saved_at = time.perf_counter()
 
     # ------------------------------------------------------------------ the run
@@ -88,8 +111,9 @@ class Trainer:
                 self.trained_seconds = time.perf_counter() - since
                 if self.iteration % every == 0:
                     evaluate(self)
-                if self.iteration % 10 == 0 or self.iteration == self.config.iterations:
-                    text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {loss:.4f}"
+                if self.iteration % _LOOK_EVERY == 0 or self.iteration == self.config.iterations:
+                    self._look()
+                    text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {float(loss):.4f}"
                     self.report.progress("training", self.iteration, self.config.iterations, text)
                 if time.perf_counter() - self._saved_at > self.config.checkpoint_seconds:
                     self.save(checkpoint)
@@ -100,35 +124,52 @@ class Trainer:
         self.trained_seconds = time.perf_counter() - since
         self.save(checkpoint)
 
-    def step(self) -> float:
-        """One optimisation step on one training frame; returns the photometric loss (nan if the step was skipped)."""
+    def step(self) -> Tensor:
+        """One optimisation step on one training frame; returns its photometric loss (0-dim). Not finite: left out."""
         frame = self._next_frame()
         self._schedule()
         rows = self.model.open_rows()
-        deltas = self.model.deltas(rows, torch.tensor([self.times[frame]]))
+        pairs = self._pairs_to_anchor(rows)
+        deltas, anchored = self._deltas(rows, frame, pairs)
         state = apply_deltas(self.model.gaussians, rows, deltas)
         # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
-        out = self._render(state, frame, background=torch.rand(3, generator=self.generator))
+        background = torch.rand(3, generator=self.generator, device="cpu").to(self.device, non_blocking=True)
+        out = self._render(state, frame, background=background)
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
-        loss = photometric(exposed, self.images[frame].float(), self.config.dssim)
+        loss = photometric(exposed, self._image(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
+        if pairs is not None and anchored is not None:
+            total = total + self._support_loss(pairs, anchored)
         self.optimizer.zero_grad(set_to_none=True)
-        if not bool(torch.isfinite(total)):
-            return self._skip("loss", frame)
         total.backward()
-        if not self._gradients_finite():
-            return self._skip("gradient", frame)
-        with torch.no_grad():
-            self.densifier.observe(out.means2d_absgrad[0], out.radii[0])
-            mark_seen(self.model.gaussians, bin_of(self.centres, self.times[frame]), out.weight_sum[0])
         if self._paper_is_due():
             self._paper_step(frame, rows, state, out.means2d_grad[0].clone())
-            if not self._gradients_finite():
-                return self._skip("gradient", frame)
-        self.optimizer.step()
-        self._after_step()
+        self.optimizer.step(guard=[total])
+        applied = self.optimizer.applied
+        if self.device.type == "cpu" and not bool(applied):
+            self._left_out(frame)
+            return loss.detach()
         self.bad_steps = 0
-        return float(loss.detach())
+        radii, weight = out.radii[0], out.weight_sum[0]
+        if self.device.type != "cpu":
+            left_out = ~applied
+            self._bad = torch.stack([self._bad[0] + left_out, (self._bad[1] + 1) * left_out])
+            radii, weight = radii * applied, weight * applied
+        self.densifier.observe(out.means2d_absgrad[0], radii)
+        mark_seen(self.model.gaussians, self._bins[frame], weight)
+        return loss.detach()
+
+    def _deltas(self, rows: Tensor, frame: int, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
+        """The field for the frame's Gaussians and for the pairs to anchor, in one call: (of `rows`, of `pairs`)."""
+        when = self._when[frame : frame + 1]
+        if pairs is None:
+            return self.model.deltas(rows, when), None
+        times = torch.cat([when.expand(len(rows)), self.centres[pairs.bins]])
+        deltas = self.model.deltas(torch.cat([rows, pairs.rows]), times)
+        return split_deltas(deltas, len(rows)) if deltas is not None else (None, None)
+
+    def _image(self, frame: int) -> Tensor:
+        return self.images[frame].to(self.device, torch.float32, non_blocking=True)
 
     def _milestones(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
@@ -165,11 +206,11 @@ class Trainer:
         self.report.check_cancelled()
         with torch.no_grad():
             state = {k: v.detach() for k, v in self.model.state_at(self.times[frame]).items()}
-        probe = torch.zeros(len(self.model.gaussians), 1, requires_grad=True)
-        background = torch.cat([self.background, torch.zeros(1)])
+        probe = torch.zeros(len(self.model.gaussians), 1, device=self.device, requires_grad=True)
+        background = torch.cat([self.background, self.background.new_zeros(1)])
         out = self._render(state, frame, colors=probe, background=background, with_contributions=True)
         exposed = self.model.exposure.apply(out.colors[0, ..., :3], self.times[frame]).detach()
-        error = (exposed - self.images[frame].float()).abs().mean(-1)
+        error = (exposed - self._image(frame)).abs().mean(-1)
 
         def pull(values: Tensor) -> Tensor:
             # The gradient of sum(value * image channel) for a Gaussian's colour is its sum of alpha * T * value.
@@ -181,7 +222,7 @@ class Trainer:
     def _create_field(self) -> None:
         model = self.model.gaussians
         box = field_box(model.params["means"].detach()[model.open])
-        self.model.field = HexPlane(self.config.hexplane, box, self.generator)
+        self.model.field = HexPlane(self.config.hexplane, box, self.generator).to(self.device)
         for group in self.model.field.parameter_groups():
             self.optimizer.add_param_group({**group, "lr_start": group["lr"]})
 
@@ -200,20 +241,20 @@ class Trainer:
     @property
     def background(self) -> Tensor:
         """[3] what shows where nothing covers when a frame is measured or shown: mid grey."""
-        return torch.full((3,), 0.5)
+        return torch.full((3,), 0.5, device=self.device)
 
     def _render(self, state: dict[str, Tensor], frame: int, **options: Any) -> Any:
         index = self.train_ids[frame]
         options.setdefault("background", self.background)
         options.setdefault("with_contributions", True)
         return render(
-            state, self.model.sh_degree, self.scene.viewmats[index], self.Ks[index], self.width, self.height,
+            state, self.model.sh_degree, self.viewmats[index], self.Ks[index], self.width, self.height,
             with_depth=False, **options,
         )  # fmt: skip
 
     def _next_frame(self) -> int:
         if not self.order:
-            self.order = torch.randperm(len(self.train_ids), generator=self.generator).tolist()
+            self.order = torch.randperm(len(self.train_ids), generator=self.generator, device="cpu").tolist()
         return self.order.pop()
 
     def _regularisers(self, rows: Tensor) -> Tensor:
@@ -225,12 +266,21 @@ class Trainer:
             return total
         if self.iteration % c.field_every == 0:
             total = total + c.field_every * field.regularisation()
-        s = c.supervision
-        if s.preset == "support" and self.progress >= s.start and self.iteration % s.support_every == 0:
-            anchored = support_loss(self.model.gaussians, field, self.centres, self.seconds, s, self.generator)
-            if anchored is not None:
-                total = total + s.support_every * anchored
         return total
+
+    def _pairs_to_anchor(self, rows: Tensor) -> Anchored | None:
+        s = self.config.supervision
+        due = s.preset == "support" and self.progress >= s.start and self.iteration % s.support_every == 0
+        if self.model.field is None or not due:
+            return None
+        return draw_anchored(self.model.gaussians, rows, s, self.generator)
+
+    def _support_loss(self, pairs: Anchored, here: Deltas) -> Tensor:
+        s, field = self.config.supervision, self.model.field
+        if field is None:
+            raise RuntimeError("pairs were drawn without a field")
+        loss = support_loss(self.model.gaussians, field, pairs, here, self.centres, self.seconds, s)
+        return s.support_every * loss
 
     def _paper_is_due(self) -> bool:
         s = self.config.supervision
@@ -239,13 +289,13 @@ class Trainer:
 
     def _paper_step(self, frame: int, rows: Tensor, state: dict[str, Tensor], gradient: Tensor) -> None:
         """Adds the paper's terms for this frame and a random other one; their gradients join the step's."""
-        other = int(torch.randint(len(self.train_ids), (1,), generator=self.generator))
+        other = int(torch.randint(len(self.train_ids), (1,), generator=self.generator, device="cpu"))
         if self.times[other] == self.times[frame] or not len(rows):
             return
         other_state = self.model.state_at(self.times[other])
         out = self._render(other_state, other)
         exposed = self.model.exposure.apply(out.colors[0], self.times[other])
-        photometric(exposed, self.images[other].float(), self.config.dssim).backward(retain_graph=True)
+        photometric(exposed, self._image(other), self.config.dssim).backward(retain_graph=True)
         views = [
             self._paper_view(self.model.state_at(self.times[frame]), frame, rows, gradient),
             self._paper_view(other_state, other, rows, out.means2d_grad[0]),
@@ -257,35 +307,43 @@ class Trainer:
     def _paper_view(self, state: dict[str, Tensor], frame: int, rows: Tensor, gradient: Tensor) -> PaperView:
         index = self.train_ids[frame]
         means = state["means"][rows].detach()
-        inside = inside_frustum(means, self.scene.viewmats[index], self.Ks[index], self.width, self.height)
+        inside = inside_frustum(means, self.viewmats[index], self.Ks[index], self.width, self.height)
         return PaperView(self.times[frame], {k: v[rows] for k, v in state.items()}, inside, gradient[rows])
 
-    def _gradients_finite(self) -> bool:
-        grads = [p.grad for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
-        return all(bool(torch.isfinite(grad.sum())) for grad in grads)
-
-    def _skip(self, what: str, frame: int) -> float:
-        """Leaves a step out; a run that keeps failing ends in words, with the last good checkpoint in place."""
+    def _left_out(self, frame: int) -> None:
+        """Counts a step that was left out on the CPU; a run that keeps failing ends in words, its checkpoint in place.
+        """
         self.bad_steps += 1
-        self.optimizer.zero_grad(set_to_none=True)
         if self.bad_steps >= _MAX_BAD_STEPS:
-            raise JobError(
-                f"Training became unstable at step {self.iteration} (the {what} is not finite).",
-                "The last good checkpoint is kept; train again with a smaller width or another seed.",
-                ExitCode.TRAIN,
-            )
+            raise self._unstable()
         if self.bad_steps == 1:
             number = self.scene.frames[self.train_ids[frame]]
-            self.report.warning(f"Step {self.iteration} on frame {number} was skipped: its {what} is not finite.")
-        return math.nan
+            self.report.warning(
+                f"Step {self.iteration} on frame {number} was skipped: its loss or gradient is not finite."
+            )
 
-    def _after_step(self) -> None:
-        with torch.no_grad():
-            self.model.gaussians.params["log_scales"].clamp_(*_LOG_SCALE_RANGE)
+    def _look(self) -> None:
+        """Reads a GPU's counts of steps left out: in all since the last look, and in a row."""
+        if self.device.type == "cpu":
+            return
+        count, in_a_row = self._bad.tolist()
+        self._bad[0] = 0
+        if in_a_row >= _MAX_BAD_STEPS:
+            raise self._unstable()
+        if count:
+            text = f"{count} of the steps up to {self.iteration} were skipped: their loss or gradient is not finite."
+            self.report.warning(text)
+
+    def _unstable(self) -> JobError:
+        return JobError(
+            f"Training became unstable at step {self.iteration} (the loss or its gradient is not finite).",
+            "The last good checkpoint is kept; train again with a smaller width or another seed.",
+            ExitCode.TRAIN,
+        )
 
     # ------------------------------------------------------------------ optimiser
 
-    def _gaussian_optimizer(self) -> torch.optim.Optimizer:
+    def _gaussian_optimizer(self) -> FusedAdam:
         c, p = self.config, self.model.gaussians.params
         rates = {
             "means": (c.lr_means, c.lr_means_end), "quats": (c.lr_quats, 0.1 * c.lr_quats),
@@ -293,14 +351,15 @@ class Trainer:
             "sh0": (c.lr_sh0, 0.1 * c.lr_sh0), "shN": (c.lr_sh_rest, 0.1 * c.lr_sh_rest),
         }  # fmt: skip
         groups = [
-            {"params": [p[name]], "lr": start, "lr_start": start, "lr_end": end, "name": name}
+            {"params": [p[name]], "lr": start, "lr_start": start, "lr_end": end, "name": name, "rows": True}
             for name, (start, end) in rates.items()
         ]
+        groups[list(rates).index("log_scales")]["clamp"] = _LOG_SCALE_RANGE
         e = self.model.exposure
         groups.append(
             {"params": [e.values], "lr": c.exposure.lr, "lr_start": c.exposure.lr, "lr_end": 0.1 * c.exposure.lr}
         )
-        return torch.optim.Adam(groups, eps=1e-15, fused=True)
+        return FusedAdam(groups, eps=1e-15)
 
     def _schedule(self) -> None:
         """Log-linear learning rates from start to end over the run (3DGS get_expon_lr_func)."""
@@ -315,7 +374,7 @@ class Trainer:
         """Frame `index` of the scene at its own time, [H, W, 3], not clamped."""
         state = self.model.state_at(float(self.scene.times[index]))
         out = render(
-            state, self.model.sh_degree, self.scene.viewmats[index], self.Ks[index], self.width, self.height,
+            state, self.model.sh_degree, self.viewmats[index], self.Ks[index], self.width, self.height,
             background=self.background, with_depth=False, with_contributions=False,
         )  # fmt: skip
         return self.model.exposure.apply(out.colors[0], float(self.scene.times[index]))
@@ -327,7 +386,7 @@ class Trainer:
         values = []
         for n, i in enumerate(indices):
             self.report.check_cancelled()
-            values.append(psnr(self.render_frame(i), images[n].float()))
+            values.append(psnr(self.render_frame(i), images[n].to(self.device, torch.float32)))
         return sum(values) / len(values)
 
     # ------------------------------------------------------------------ checkpoints
@@ -346,7 +405,7 @@ class Trainer:
         d = self.densifier
         tensors.update({"densify.gradient": d.gradient, "densify.seen": d.seen})
         tensors["generator"] = self.generator.get_state()
-        tensors["order"] = torch.tensor(self.order, dtype=torch.long)
+        tensors["order"] = torch.tensor(self.order, dtype=torch.long, device="cpu")
         tensors["centres"] = self.centres
         tensors["exposure"] = self.model.exposure.values
         meta = {
@@ -371,29 +430,32 @@ class Trainer:
                 "The run's checkpoint was trained on other frames.", "Train with --restart, or another run name.",
                 ExitCode.TRAIN,
             )  # fmt: skip
-        self.model = restore_model(tensors, meta, self.config)
+        self.model = restore_model(tensors, meta, self.config, self.device)
         self.optimizer = self._gaussian_optimizer()
         if self.model.field is not None:
             for group in self.model.field.parameter_groups():
                 self.optimizer.add_param_group({**group, "lr_start": group["lr"]})
         restore_optimizer(self._named(), self.optimizer, tensors)
-        self.densifier = Densifier(self.config.densify, len(self.model.gaussians))
+        self.densifier = Densifier(self.config.densify, len(self.model.gaussians), self.device)
         for name in ("gradient", "seen"):
-            setattr(self.densifier, name, tensors[f"densify.{name}"].clone())
+            setattr(self.densifier, name, tensors[f"densify.{name}"].to(self.device, copy=True))
         self.generator.set_state(tensors["generator"])
         self.order = tensors["order"].tolist()
         self.iteration, self.initial = int(meta["iteration"]), int(meta["initial"])
         self.trained_seconds = float(meta["trained_seconds"])
 
 
-def restore_model(tensors: dict[str, Tensor], meta: dict[str, Any], config: TrainConfig) -> DynamicModel:
-    """The model of a checkpoint, without its optimiser."""
-    centres = tensors["centres"].clone()
-    gaussians = Gaussians.from_state(tensors, len(centres))
+def restore_model(
+    tensors: dict[str, Tensor], meta: dict[str, Any], config: TrainConfig, device: torch.device | str = "cpu"
+) -> DynamicModel:
+    """The model of a checkpoint, without its optimiser, on `device`."""
+    centres = tensors["centres"].to(device, copy=True)
+    gaussians = Gaussians.from_state(tensors, len(centres)).to(torch.device(device))
     field = None
     if "field.box" in tensors:
-        field = HexPlane(config.hexplane, tensors["field.box"], torch.Generator().manual_seed(0))
+        field = HexPlane(config.hexplane, tensors["field.box"], torch.Generator(device="cpu").manual_seed(0))
         field.load_state(tensors)
+        field = field.to(device)
     exposure = Exposure(centres, config.exposure)
     exposure.values.data.copy_(tensors["exposure"])
     return DynamicModel(gaussians, field, centres, int(meta["sh_degree"]), exposure)

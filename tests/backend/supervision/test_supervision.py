@@ -13,6 +13,7 @@ from torch_backend.supervision import (
     SupervisionConfig,
     bin_of,
     bin_times,
+    draw_anchored,
     mark_seen,
     nearest_bin,
     nearest_supported,
@@ -84,17 +85,39 @@ class Ramp:
         return Deltas(moved, torch.zeros(count, 4), torch.zeros(count, 3), torch.zeros(count), torch.zeros(count, 1, 3))
 
 
+def anchor(m, field, bins):
+    """The support loss of whatever is drawn from all open Gaussians; None if nothing is."""
+    config, centres = SupervisionConfig(), torch.linspace(0, 1, bins)
+    rows = torch.nonzero(m.open).flatten()
+    pairs = draw_anchored(m, rows, config, torch.Generator().manual_seed(0))
+    if pairs is None:
+        return None
+    here = field(m.params["means"].detach()[pairs.rows], centres[pairs.bins])
+    return support_loss(m, field, pairs, here, centres, 1.0, config)
+
+
+def test_drawn_pairs_are_unsupported_and_half_of_them_near_support():
+    flags = [[0, 0, 1, 1, 0, 0, 0, 0], [1, 1, 1, 1, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0, 0, 0]]
+    m = model(flags)
+    pairs = draw_anchored(m, torch.arange(3), SupervisionConfig(), torch.Generator().manual_seed(1))
+    assert 200 < len(pairs.rows) <= SupervisionConfig().support_samples
+    assert not bool(m.support[pairs.rows, pairs.bins].any())
+    assert set(pairs.rows.tolist()) == {0, 1}
+    assert set(pairs.bins[pairs.rows == 0].tolist()) == {0, 1, 4, 5, 6, 7}
+    assert bool((pairs.weights == 1).all())
+
+
 def test_support_loss_is_zero_where_time_interpolates_between_anchors():
     """Seen at both ends: a linear motion lies exactly between its anchors."""
     m = model([[1, 0, 0, 0, 1]])
-    loss = support_loss(m, Ramp(), torch.linspace(0, 1, 5), 1.0, SupervisionConfig(), torch.Generator().manual_seed(0))
+    loss = anchor(m, Ramp(), 5)
     assert float(loss.detach()) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_support_loss_pulls_an_extrapolation_back():
     m = model([[1, 0, 0, 0, 0]])
     field = Ramp()
-    loss = support_loss(m, field, torch.linspace(0, 1, 5), 1.0, SupervisionConfig(), torch.Generator().manual_seed(0))
+    loss = anchor(m, field, 5)
     loss.backward()
     assert float(loss.detach()) > 0
     assert float(field.slope.grad) > 0  # descending it slows the drift
@@ -103,9 +126,9 @@ def test_support_loss_pulls_an_extrapolation_back():
 
 def test_support_loss_needs_open_gaussians_that_were_seen():
     m = model([[0, 0, 0]])
-    assert support_loss(m, Ramp(), torch.linspace(0, 1, 3), 1.0, SupervisionConfig(), torch.Generator()) is None
+    assert anchor(m, Ramp(), 3) is None
     m = model([[1, 1, 1]])
-    assert support_loss(m, Ramp(), torch.linspace(0, 1, 3), 1.0, SupervisionConfig(), torch.Generator()) is None
+    assert anchor(m, Ramp(), 3) is None
 
 
 def view(time, x, inside, gradient, flip=1.0):

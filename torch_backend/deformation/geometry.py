@@ -1,0 +1,121 @@
+"""Rotations, rigid motions and samples of point sets that hosts share. Finite values and gradients everywhere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+_SERIES = 0.25
+"""Below this squared angle sin and cos quotients are series: their closed forms cancel in float32."""
+
+
+def quat_product(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product [..., 4] of quaternions wxyz: the rotation b, then a."""
+    w, x, y, z = a.unbind(-1)
+    p, q, r, s = b.unbind(-1)
+    return torch.stack(
+        [
+            w * p - x * q - y * r - z * s,
+            w * q + x * p + y * s - z * r,
+            w * r - x * s + y * p + z * q,
+            w * s + x * r - y * q + z * p,
+        ],
+        dim=-1,
+    )
+
+
+def near_identity(change: Tensor) -> Tensor:
+    """Unit quaternions [..., 4] of changes from (1, 0, 0, 0); the identity where the sum vanishes."""
+    one = torch.zeros_like(change)
+    one[..., 0] = 1.0
+    quats = one + change
+    return F.normalize(torch.where(quats.square().sum(-1, keepdim=True) < 1e-12, one, quats), dim=-1)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """[..., 3, 3] of unit quaternions [..., 4] wxyz."""
+    w, x, y, z = quats.unbind(-1)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+
+def screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
+    """Points [M, 3] under the rigid motions exp(turn, shift) of SE(3), both [M, 3]; turn in radians about its own axis.
+
+    Deformable 3DGS divides by the angle and gives NaN at 0; here the quotients are series there.
+    """
+    a, b, c = _quotients(turn.square().sum(1, keepdim=True))
+    rotated = points + a * torch.linalg.cross(turn, points) + b * _twice(turn, points)
+    return rotated + shift + b * torch.linalg.cross(turn, shift) + c * _twice(turn, shift)
+
+
+def _twice(turn: Tensor, v: Tensor) -> Tensor:
+    return torch.linalg.cross(turn, torch.linalg.cross(turn, v))
+
+
+def _quotients(s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(x) / x, (1 - cos(x)) / x^2 and (x - sin(x)) / x^3 for s = x^2."""
+    near = s < _SERIES
+    # Both branches must be finite for the gradient of the chosen one to be.
+    t = torch.where(near, s, 0.0)
+    x = torch.where(near, 1.0, s).sqrt()
+    a = 1 - t / 6 * (1 - t / 20 * (1 - t / 42 * (1 - t / 72)))
+    b = 0.5 * (1 - t / 12 * (1 - t / 30 * (1 - t / 56 * (1 - t / 90))))
+    c = (1 - t / 20 * (1 - t / 42 * (1 - t / 72))) / 6
+    return (
+        torch.where(near, a, x.sin() / x),
+        torch.where(near, b, (1 - x.cos()) / x.square()),
+        torch.where(near, c, (x - x.sin()) / x**3),
+    )
+
+
+def farthest_points(features: Tensor, count: int, chosen: Tensor | None = None) -> Tensor:
+    """Indices int64 [<= count] of features [N, D], each the farthest from those before it and from `chosen` [C, D].
+
+    Starts at the one farthest from `chosen`, or nearest to the mean. Stops early when only duplicates are left.
+    """
+    if chosen is not None and len(chosen):
+        distance = torch.cdist(features, chosen).amin(1)
+    else:
+        centre = features.mean(0, keepdim=True)
+        distance = torch.full((len(features),), torch.inf, dtype=features.dtype, device=features.device)
+        distance[(features - centre).square().sum(1).argmin()] = torch.finfo(features.dtype).max
+        distance = torch.where(torch.isinf(distance), torch.finfo(features.dtype).max / 2, distance)
+    picked: list[int] = []
+    for _ in range(min(count, len(features))):
+        index = int(distance.argmax())
+        if not float(distance[index]) > 0.0:
+            break
+        picked.append(index)
+        distance = torch.minimum(distance, (features - features[index]).norm(dim=1))
+    return torch.tensor(picked, dtype=torch.long, device=features.device)
+
+
+def nearest(queries: Tensor, points: Tensor, count: int) -> Tensor:
+    """Indices int64 [Q, count] of the points [P, D] nearest to queries [Q, D], nearest first; no gradient."""
+    chunks = queries.detach().split(4096)
+    targets = points.detach()
+    found = [torch.cdist(chunk, targets).topk(count, dim=1, largest=False).indices for chunk in chunks]
+    return torch.cat(found) if found else torch.zeros(0, count, dtype=torch.long, device=points.device)
+
+
+def rigid_rotations(before: Tensor, after: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations that turn edges best: (R [M, 3, 3], usable bool [M]), without gradient.
+
+    before, after: [M, K, 3] edges of M nodes; valid: bool [M, K]. det R is +1. A node whose edges are collapsed or not
+    finite is not usable and gets the identity (hard cases: "ARAP SVD").
+    """
+    with torch.no_grad():
+        kept = valid[..., None].to(before.dtype)
+        covariance = (after * kept).transpose(1, 2) @ (before * kept)
+        usable = torch.isfinite(covariance).all(-1).all(-1) & (covariance.square().sum((1, 2)) > 1e-24)
+        eye = torch.eye(3, dtype=before.dtype, device=before.device)
+        u, _, vh = torch.linalg.svd(torch.where(usable[:, None, None], covariance, eye))
+        flip = torch.ones_like(u[:, 0])
+        flip[:, 2] = torch.linalg.det(u @ vh).sign()
+        return torch.where(usable[:, None, None], (u * flip[:, None, :]) @ vh, eye), usable

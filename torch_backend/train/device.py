@@ -1,0 +1,31 @@
+"""Where a run lives: the CPU, or the NVIDIA GPU if torch and Warp can both use it."""
+
+from __future__ import annotations
+
+import torch
+
+from ..contract import DEVICES, ExitCode, JobError
+from ..raster.cpu import _import_warp
+
+_HINT = "Choose --device cpu, or auto."
+
+
+def choose_device(wanted: str) -> torch.device:
+    """The device for `auto`, `cpu` or `cuda`. ValueError for another word, JobError if `cuda` cannot be had."""
+    if wanted not in DEVICES:
+        raise ValueError(f"device is {wanted!r}: it should be one of {', '.join(DEVICES)}")
+    refusal = None if wanted == "cpu" else cuda_refusal()
+    if wanted == "cuda" and refusal:
+        raise JobError(refusal, _HINT, ExitCode.TRAIN)
+    return torch.device("cpu" if wanted == "cpu" or refusal else "cuda")
+
+
+def cuda_refusal() -> str:
+    """Why no NVIDIA GPU can be used, in a sentence; empty if one can."""
+    if torch.version.hip is not None:
+        return "This PyTorch is built for AMD GPUs, which the rasteriser has no body for."
+    if not torch.cuda.is_available():
+        return "PyTorch sees no NVIDIA GPU."
+    if not _import_warp().is_cuda_available():
+        return "PyTorch sees the NVIDIA GPU, but Warp does not: update the NVIDIA driver to version 580 or newer."
+    return ""
