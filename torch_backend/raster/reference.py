@@ -4,13 +4,19 @@ Slow and clear. It states in tensor language what every other body must compute;
 Projection: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, section 4).
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import cast
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from . import constants as k
 from .settings import RasterOutput, Scene, camera_limits
+
+_LANES = 2**20
+"""Most (pixel, Gaussian) pairs blended at once: a dozen arrays of this size are the memory that blending takes."""
 
 
 class _FloorAtZero(torch.autograd.Function):
@@ -66,6 +72,8 @@ class _Projected:
     colors: Tensor
     extent: Tensor
     radius: Tensor
+    absgrad: Tensor | None = None
+    """[V, 2]: the backward pass adds |d loss / d mean2d| of every pixel."""
 
 
 def _finite_inputs(scene: Scene) -> Tensor:
@@ -133,98 +141,203 @@ def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
     conic = torch.stack((yy, -xy, xx), -1) / det[:, None]
     index = candidates[order]
     return _Projected(index, mean2d[order], conic[order], opacity[order], z[order],
-                      _colors(scene, index, means[order], viewmat), extent[order], radius[order])
+                      _colors(scene, index, means[order], viewmat), extent[order], radius[order],
+                      torch.zeros_like(mean2d[order]) if scene.settings.absgrad else None)
 
 
-def _blend_tile(p: _Projected, members: Tensor, pixels: Tensor, absgrad: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Weights alpha T [P, M] and transmittance after each [P, M] of Gaussians `members` [M] at pixel centres [P, 2]."""
-    mean2d = p.mean2d[members].expand(pixels.shape[0], -1, -1)
-    if absgrad is not None and mean2d.requires_grad:
-        index = p.index[members]
+def _hits(p: _Projected, across: int, down: int) -> tuple[Tensor, Tensor]:
+    """Which Gaussian may touch which of `across` x `down` tiles: (members [hits], counts [tiles]).
+
+    `members` are positions in `p`, tile after tile in raster order, front to back within each. A pair is dropped where
+    the ellipse alpha >= ALPHA_MIN misses the rectangle of the tile's pixel centres.
+    """
+    last = torch.tensor((across - 1, down - 1), device=p.mean2d.device)
+
+    def tile(at: Tensor) -> Tensor:  # clamped as a float: a box may reach further than an int64
+        return (at.clamp(0, k.TILE * max(across, down)) / k.TILE).long().minimum(last)
+
+    low, high = tile(p.mean2d - p.extent - 0.5), tile(p.mean2d + p.extent - 0.5)
+    spans = (high - low + 1).clamp_min(0)
+    boxes = spans.prod(-1)
+    members = torch.arange(len(boxes), device=boxes.device).repeat_interleave(boxes)
+    number = torch.arange(len(members), device=boxes.device) - (boxes.cumsum(0) - boxes)[members]
+    xs, ys = low[members, 0] + number % spans[members, 0], low[members, 1] + number // spans[members, 0]
+    keep = _ellipse_meets_tile(p, members, torch.stack((xs, ys), -1))
+    tiles, order = torch.sort((ys * across + xs)[keep], stable=True)
+    return members[keep][order], torch.bincount(tiles, minlength=across * down)
+
+
+def _ellipse_meets_tile(p: _Projected, members: Tensor, tiles: Tensor) -> Tensor:
+    """Mask [hits]: does the ellipse of the Gaussian reach a pixel centre's rectangle of tiles [hits, 2] (x, y)?"""
+    low = tiles * k.TILE + 0.5 - p.mean2d[members]
+    high = low + (k.TILE - 1)
+    a, b, c = p.conic[members].unbind(-1)
+    inside = ((low <= 0) & (high >= 0)).all(-1)
+    nearest = torch.full_like(a, torch.inf)
+    for x in (low[:, 0], high[:, 0]):  # on each edge the quadratic's minimum lies where its slope is 0, or at an end
+        y = torch.minimum(torch.maximum(-b * x / c, low[:, 1]), high[:, 1])
+        nearest = torch.minimum(nearest, a * x * x + 2 * b * x * y + c * y * y)
+    for y in (low[:, 1], high[:, 1]):
+        x = torch.minimum(torch.maximum(-b * y / a, low[:, 0]), high[:, 0])
+        nearest = torch.minimum(nearest, a * x * x + 2 * b * x * y + c * y * y)
+    # A little generous, since the pixels' own test decides.
+    return inside | ~(nearest > 2 * torch.log(p.opacity[members] / k.ALPHA_MIN) + 0.01)
+
+
+@dataclass
+class _Batch:
+    """Tiles of similar numbers of hits, padded to the most: B tiles, P pixels each, M hits."""
+
+    members: Tensor
+    """[B, M]: positions in _Projected, front to back; any where not `valid`."""
+    valid: Tensor
+    """[B, M]"""
+    xs: Tensor
+    """[B, TILE]: pixel centres of the columns; P = TILE * TILE in raster order."""
+    ys: Tensor
+    """[B, TILE]: of the rows."""
+
+
+def _blend(p: _Projected, batch: _Batch, left: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Blend the batch behind transmittance `left` [B, P].
+
+    Returns weights alpha T [B, P, M]; the transmittance after each [B, P, M] (no gradient; meaningless once at
+    T_STOP); the weights' sums of colour and depth [B, P, D + 1]; the transmittance after all [B, P].
+    """
+    members = batch.members
+    # Of the axes [tile, row, column, hit], dx lacks the rows and dy the columns: most of the exponent is cheap.
+    x, y = p.mean2d[members][:, None, None].unbind(-1)
+    a, b, c = p.conic[members][:, None, None].unbind(-1)
+    dx, dy = batch.xs[:, None, :, None] - x, batch.ys[:, :, None, None] - y
+    exponent = (-0.5 * a * dx - b * dy) * dx - 0.5 * c * dy * dy
+    if p.absgrad is not None and exponent.requires_grad:
+        totals, slopes = p.absgrad.unbind(-1), ((a, dx, b, dy), (b, dx, c, dy))
 
         def gather(grad: Tensor) -> None:
-            absgrad.index_add_(0, index, grad.abs().sum(0))
+            for total, (s, dx, t, dy) in zip(totals, slopes, strict=True):
+                pixel = grad * (s.detach() * dx.detach() + t.detach() * dy.detach())
+                total.index_add_(0, members.flatten(), torch.linalg.vector_norm(pixel, 1, dim=(1, 2)).flatten())
 
-        mean2d.register_hook(gather)
-    dx, dy = (pixels[:, None, :] - mean2d).unbind(-1)
-    a, b, c = p.conic[members].unbind(-1)
-    alpha = p.opacity[members] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    alpha = torch.where(alpha >= k.ALPHA_MIN, alpha.clamp_max(k.ALPHA_MAX), torch.zeros_like(alpha))
-    with torch.no_grad():
-        before = torch.cumprod(1 - alpha, -1).roll(1, -1)
-        before[:, 0] = 1
-        live = before > k.T_STOP
-    alpha = torch.where(live, alpha, torch.zeros_like(alpha))
-    after = torch.exp(torch.cumsum(torch.log1p(-alpha), -1))
-    before = torch.cat((torch.ones_like(after[:, :1]), after[:, :-1]), -1)
-    return alpha * before, after
+        exponent.register_hook(gather)
+    opacity = (p.opacity[members] * batch.valid)[:, None]
+    alpha = opacity * torch.exp(exponent.flatten(1, 2))
+    alpha = alpha.clamp_max(k.ALPHA_MAX).masked_fill(alpha < k.ALPHA_MIN, 0.0)
+    after = left[..., None] * torch.cumprod(1 - alpha, -1)
+    before = torch.cat((left[..., None], after[..., :-1]), -1)
+    weights = (alpha * before).masked_fill(before <= k.T_STOP, 0.0)
+    sums = weights @ torch.cat((p.colors, p.depth[:, None]), -1)[members]
+    return weights, after.detach(), sums, left - weights.sum(-1)
 
 
-def _median_depth(weights: Tensor, after: Tensor, depth: Tensor) -> Tensor:
-    """Depth [P] at which the transmittance reaches 0.5, else that of the largest weight, else DEPTH_EMPTY."""
-    crossing = after <= 0.5
-    pick = torch.where(crossing.any(-1), crossing.to(torch.uint8).argmax(-1), weights.argmax(-1))
-    return torch.where(weights.amax(-1) > 0, depth[pick], torch.full_like(weights[:, 0], k.DEPTH_EMPTY))
+@dataclass
+class _Pixels:
+    """What blending leaves at P pixels of B tiles; no gradient in the last three."""
+
+    sums: Tensor
+    """[B, P, D + 1]: sum of alpha T times colour, and times depth."""
+    left: Tensor
+    """[B, P]: transmittance."""
+    top: Tensor
+    """[B, P] int64: position in _Projected of the largest alpha T, -1 for none."""
+    top_weight: Tensor
+    """[B, P]: its alpha T."""
+    median: Tensor
+    """[B, P]: median depth, as RasterOutput has it."""
 
 
 class _Camera:
-    """Accumulates the images of one camera tile by tile; rows of the images are pixels in raster order."""
+    """Blends one camera's tiles, batch by batch. To bound memory, the backward pass blends each batch once more."""
 
-    def __init__(self, scene: Scene, p: _Projected, absgrad: Tensor | None):
-        self.scene, self.p, self.absgrad = scene, p, absgrad
-        like = {"dtype": scene.means.dtype, "device": scene.means.device}
-        n = scene.means.shape[0]
-        self.weight_sum, self.weight_max = torch.zeros(n, **like), torch.zeros(n, **like)
-        background = scene.background
-        self.background = torch.zeros(scene.channels, **like) if background is None else background
+    def __init__(self, scene: Scene, p: _Projected):
+        self.scene, self.p = scene, p
+        self.like = {"dtype": scene.means.dtype, "device": scene.means.device}
+        self.weight_sum, self.weight_max = (torch.zeros(len(p.index), **self.like) for _ in range(2))
+        self.across, self.down = -(-scene.width // k.TILE), -(-scene.height // k.TILE)
+        self.members, self.counts = _hits(p, self.across, self.down)
+        self.starts = self.counts.cumsum(0) - self.counts
 
-    def tile(self, x0: int, y0: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """(flat pixel ids, colors, alphas, depth sums, depth medians) of the tile whose first pixel is x0, y0."""
-        scene, p = self.scene, self.p
-        like = {"dtype": scene.means.dtype, "device": scene.means.device}
-        xs = torch.arange(x0, min(x0 + k.TILE, scene.width), device=scene.means.device)
-        ys = torch.arange(y0, min(y0 + k.TILE, scene.height), device=scene.means.device)
-        ids = (ys[:, None] * scene.width + xs[None, :]).reshape(-1)
-        pixels = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), -1).reshape(-1, 2).to(**like) + 0.5
-        with torch.no_grad():
-            low, high = pixels[0], pixels[-1]
-            hit = ((p.mean2d + p.extent >= low) & (p.mean2d - p.extent <= high)).all(-1)
-            members = hit.nonzero()[:, 0]
-        if members.numel() == 0:
-            zero = torch.zeros(len(ids), **like)
-            return ids, self.background.expand(len(ids), -1), zero, zero, torch.full_like(zero, k.DEPTH_EMPTY)
-        weights, after = _blend_tile(p, members, pixels, self.absgrad)
-        left = after[:, -1]
-        colors = weights @ p.colors[members] + left[:, None] * self.background
-        depth = p.depth[members]
-        with torch.no_grad():
-            index = p.index[members]
-            self.weight_sum.index_add_(0, index, weights.sum(0))
-            self.weight_max[index] = torch.maximum(self.weight_max[index], weights.amax(0))
-            median = _median_depth(weights, after, depth)
-        return ids, colors, 1 - left, weights @ depth, median
+    def _batches(self) -> Iterator[Tensor]:
+        """All tiles, those with most hits first, as many at a time as _LANES allows."""
+        order = self.counts.argsort(descending=True)
+        counts, first = self.counts[order].tolist(), 0
+        while first < len(counts):
+            size = max(1, _LANES // (max(counts[first], 1) * k.TILE**2))
+            yield order[first:first + size]
+            first += size
 
-    def images(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(colors [H, W, D], alphas, depth sums, depth medians [H, W])."""
-        w, h = self.scene.width, self.scene.height
-        tiles = [self.tile(x, y) for y in range(0, h, k.TILE) for x in range(0, w, k.TILE)]
-        ids, *images = (torch.cat(part) for part in zip(*tiles, strict=True))
-        place = torch.empty_like(ids)
-        place[ids] = torch.arange(len(ids), device=ids.device)
-        colors, alphas, depth, median = (image[place] for image in images)
-        return colors.reshape(h, w, -1), alphas.reshape(h, w), depth.reshape(h, w), median.reshape(h, w)
+    def _empty(self, tiles: Tensor) -> tuple[Tensor, Tensor, _Pixels]:
+        """Pixel centres of columns and rows [B, TILE] of `tiles` [B], and the pixels before any Gaussian."""
+        centres = torch.arange(k.TILE, **self.like) + 0.5
+        xs, ys = (at[:, None] * k.TILE + centres for at in (tiles % self.across, tiles // self.across))
+        inside = ((ys < self.scene.height)[:, :, None] & (xs < self.scene.width)[:, None, :]).flatten(1)
+        # What overhangs the image is finished from the start.
+        left = torch.where(inside, 1.0, k.T_STOP).to(**self.like)
+        sums = torch.zeros(*left.shape, self.p.colors.shape[1] + 1, **self.like)
+        top, top_weight = torch.full_like(left, -1, dtype=torch.int64), torch.zeros_like(left)
+        return xs, ys, _Pixels(sums, left, top, top_weight, torch.full_like(left, k.DEPTH_EMPTY))
+
+    def _tiles(self, tiles: Tensor) -> _Pixels:
+        """Blend `tiles` [B], in steps over their hits if even one tile has too many."""
+        xs, ys, out = self._empty(tiles)
+        starts, counts = self.starts[tiles, None], self.counts[tiles, None]
+        crossed = torch.zeros_like(out.left, dtype=torch.bool)
+        most, step = int(counts.max()), _LANES // k.TILE**2
+        for first in range(0, most, step):
+            numbers = torch.arange(first, min(first + step, most), device=tiles.device)
+            valid = numbers < counts
+            batch = _Batch(self.members[torch.where(valid, starts + numbers, 0)], valid, xs, ys)
+            weights, after, sums, out.left = cast(tuple[Tensor, ...], checkpoint(
+                _blend, self.p, batch, out.left, use_reentrant=False, preserve_rng_state=False))
+            out.sums = out.sums + sums
+            with torch.no_grad():
+                if self.scene.with_contributions:
+                    self._contribute(batch, weights)
+                if self.scene.with_depth or self.scene.with_top:
+                    crossed = self._pick(batch, weights, after, out, crossed)
+        return out
+
+    def _contribute(self, batch: _Batch, weights: Tensor) -> None:
+        members = batch.members.flatten()
+        self.weight_sum.index_add_(0, members, weights.sum(1).flatten())
+        self.weight_max.scatter_reduce_(0, members, weights.amax(1).flatten(), "amax")
+
+    def _pick(self, batch: _Batch, weights: Tensor, after: Tensor, out: _Pixels, crossed: Tensor) -> Tensor:
+        """Update top and median; returns where [B, P] the transmittance has reached 0.5, at which the median stays."""
+        weight, at = weights.max(-1)  # the first of equals
+        larger = weight > out.top_weight
+        out.top = torch.where(larger, batch.members.gather(1, at), out.top)
+        out.top_weight = torch.where(larger, weight, out.top_weight)
+        median = torch.where(larger, self.p.depth[out.top], out.median)
+        crosses = after <= 0.5
+        crossing = batch.members.gather(1, crosses.to(torch.uint8).argmax(-1))
+        median = torch.where(crosses.any(-1), self.p.depth[crossing], median)
+        out.median = torch.where(crossed, out.median, median)
+        return crossed | crosses.any(-1)
+
+    def images(self) -> _Pixels:
+        """All pixels as [H, W, ...]."""
+        tiles = list(self._batches())
+        pixels = [self._tiles(batch) for batch in tiles]
+        place = torch.cat(tiles).argsort()
+
+        def image(name: str) -> Tensor:
+            value = torch.cat([getattr(batch, name) for batch in pixels])[place]
+            value = value.unflatten(1, (k.TILE, k.TILE)).unflatten(0, (self.down, self.across))
+            return value.transpose(1, 2).flatten(2, 3).flatten(0, 1)[:self.scene.height, :self.scene.width]
+
+        return _Pixels(*(image(field.name) for field in fields(_Pixels)))
 
 
-def _watch_gradients(p: _Projected, norm: Tensor, absnorm: Tensor, absgrad: Tensor | None) -> None:
+def _watch_gradients(p: _Projected, norm: Tensor, absnorm: Tensor) -> None:
     """Have the backward pass write the densification figures of one camera into `norm` and `absnorm` [N]."""
     if not p.mean2d.requires_grad:
         return
 
     def write(grad: Tensor) -> None:
         norm.zero_()[p.index] = grad.norm(dim=-1)
-        if absgrad is not None:
-            absnorm.copy_(absgrad.norm(dim=-1))
-            absgrad.zero_()
+        if p.absgrad is not None:
+            absnorm.zero_()[p.index] = p.absgrad.norm(dim=-1)
+            p.absgrad.zero_()
 
     p.mean2d.register_hook(write)
 
@@ -239,33 +352,37 @@ def rasterize(scene: Scene) -> RasterOutput:
     """All cameras of `scene`, one after the other."""
     n, cameras = scene.means.shape[0], scene.viewmats.shape[0]
     like = {"dtype": scene.means.dtype, "device": scene.means.device}
-    norm, absnorm = torch.zeros(cameras, n, **like), torch.zeros(cameras, n, **like)
+    norm, absnorm, weight_sum, weight_max = torch.zeros(4, cameras, n, **like)
     radii = torch.zeros(cameras, n, dtype=torch.int32, device=scene.means.device)
     means2d = torch.zeros(cameras, n, 2, **like)
+    background = torch.zeros(scene.channels, **like) if scene.background is None else scene.background
     candidates = _finite_inputs(scene).nonzero()[:, 0]
-    rows: list[tuple[Tensor, ...]] = []
+    size = (0, scene.height, scene.width)
+    images: list[tuple[Tensor, ...]] = []
     for camera in range(cameras):
         p = _project(scene, camera, candidates)
-        absgrad = torch.zeros(n, 2, **like) if scene.settings.absgrad else None
-        _watch_gradients(p, norm[camera], absnorm[camera], absgrad)
+        _watch_gradients(p, norm[camera], absnorm[camera])
         radii[camera, p.index] = p.radius.clamp_max(2.0**30).to(torch.int32)
         means2d[camera, p.index] = p.mean2d.detach()
-        state = _Camera(scene, p, absgrad)
-        rows.append((*state.images(), state.weight_sum, state.weight_max))
+        blender = _Camera(scene, p)
+        out = blender.images()
+        weight_sum[camera, p.index], weight_max[camera, p.index] = blender.weight_sum, blender.weight_max
+        top = torch.cat((p.index, p.index.new_tensor([-1])))[out.top].to(torch.int32)
+        images.append((out.sums[..., :-1] + out.left[..., None] * background, 1 - out.left, out.sums[..., -1],
+                       out.median, top, out.top_weight))
     if cameras:
-        colors, alphas, depth_sum, median, weight_sum, weight_max = (torch.stack(r) for r in zip(*rows, strict=True))
+        colors, alphas, depth_sum, median, top, top_weight = (torch.stack(i) for i in zip(*images, strict=True))
     else:
-        size = (0, scene.height, scene.width)
-        colors, alphas, depth_sum, median = (torch.zeros(*size, *d, **like) for d in ((scene.channels,), (), (), ()))
-        weight_sum = weight_max = torch.zeros(0, n, **like)
-    colors = anchor(colors, scene)
+        colors, top = torch.zeros(*size, scene.channels, **like), radii.new_zeros(size)
+        alphas = depth_sum = median = top_weight = torch.zeros(size, **like)
     return RasterOutput(
-        colors=colors, alphas=alphas,
+        colors=anchor(colors, scene), alphas=alphas,
         depth_expected=expected_depth(depth_sum, alphas) if scene.with_depth else None,
         depth_median=median if scene.with_depth else None, radii=radii, means2d=means2d,
         weight_sum=weight_sum if scene.with_contributions else None,
         weight_max=weight_max if scene.with_contributions else None,
-        means2d_grad=norm, means2d_absgrad=absnorm)
+        means2d_grad=norm, means2d_absgrad=absnorm, top_ids=top if scene.with_top else None,
+        top_weights=top_weight if scene.with_top else None)
 
 
 def anchor(colors: Tensor, scene: Scene) -> Tensor:

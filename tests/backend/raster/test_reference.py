@@ -1,12 +1,67 @@
-"""The oracle itself: against closed forms, and its gradients against finite differences."""
+"""The oracle itself: against closed forms and a loop over pixels, and its gradients against finite differences."""
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from torch_backend.raster import RasterSettings, rasterize
+from torch_backend.raster import RasterSettings, rasterize, reference
 from torch_backend.raster.reference import rotation_matrices, sh_basis
+
+
+def pixel_alphas(scene, antialiased=False):
+    """Alphas [H, W, N] before cut and clamp, and camera depths [N], by the textbook, one Gaussian after the other."""
+    tensors, K, viewmat = scene.tensors, scene.Ks[0].numpy(), scene.tensors["viewmats"][0].numpy()
+    ys, xs = np.mgrid[:scene.height, :scene.width] + 0.5
+    alphas, depths = [], []
+    for mean, quat, log_scale, logit in zip(*(tensors[name].numpy() for name in (
+            "means", "quats", "log_scales", "opacity_logits")), strict=True):
+        x, y, z = viewmat[:3, :3] @ mean + viewmat[:3, 3]
+        centre = (K @ (x / z, y / z, 1))[:2]
+        u, v = (np.clip(at / z, (-0.15 * size - c) / f, (1.15 * size - c) / f)
+                for at, size, f, c in ((x, scene.width, K[0, 0], K[0, 2]), (y, scene.height, K[1, 1], K[1, 2])))
+        J = np.array([[K[0, 0] / z, 0, -K[0, 0] * u / z], [0, K[1, 1] / z, -K[1, 1] * v / z]])
+        R = viewmat[:3, :3] @ Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
+        raw = J @ R @ np.diag(np.exp(2 * log_scale)) @ R.T @ J.T
+        blurred = raw + 0.3 * np.eye(2)
+        opacity = 1 / (1 + np.exp(-logit))
+        if antialiased:
+            opacity *= np.sqrt(np.linalg.det(raw) / np.linalg.det(blurred))
+        offset = np.stack((xs, ys), -1) - centre
+        alphas.append(opacity * np.exp(-0.5 * np.einsum("hwi,ij,hwj->hw", offset, np.linalg.inv(blurred), offset)))
+        depths.append(z)
+    return np.stack(alphas, -1), np.array(depths)
+
+
+def blended(scene):
+    """What a loop over pixels and Gaussians makes of `pixel_alphas`, by the names of RasterOutput; colours only."""
+    alphas, depths = pixel_alphas(scene)
+    height, width, n = alphas.shape
+    colors, background = scene.tensors["colors"].numpy(), scene.tensors["background"].numpy()
+    out = {"colors": np.zeros((height, width, len(background))), "alphas": np.zeros((height, width)),
+           "depth_median": np.zeros((height, width)), "top_ids": np.zeros((height, width)),
+           "top_weights": np.zeros((height, width)), "weight_sum": np.zeros(n), "weight_max": np.zeros(n)}
+    for pixel in np.ndindex(height, width):
+        left, median, top, top_weight = 1.0, None, -1, 0.0
+        for i in np.argsort(depths, kind="stable"):
+            if alphas[pixel][i] < 1 / 255 or left <= 1e-4:
+                continue
+            alpha = min(alphas[pixel][i], 0.99)
+            weight, left = alpha * left, left * (1 - alpha)
+            out["colors"][pixel] += weight * colors[i]
+            out["weight_sum"][i] += weight
+            out["weight_max"][i] = max(out["weight_max"][i], weight)
+            if weight > top_weight:
+                top, top_weight = i, weight
+            if median is None and left <= 0.5:
+                median = depths[i]
+        out["colors"][pixel] += left * background
+        out["alphas"][pixel] = 1 - left
+        out["top_ids"][pixel], out["top_weights"][pixel] = top, top_weight
+        out["depth_median"][pixel] = median or (depths[top] if top >= 0 else 1e10)
+    return out
 
 
 def test_centre_pixel_of_one_gaussian_is_the_closed_form(tools):
@@ -36,6 +91,50 @@ def test_front_covers_back_whatever_the_order_of_the_inputs(tools):
     assert out.colors[0, 8, 8].tolist() == pytest.approx([0.99, 0.0099, 0.0])
     assert out.depth_median[0, 8, 8].item() == 2.0
     assert out.depth_expected[0, 8, 8].item() == pytest.approx((0.99 * 2 + 0.0099 * 4) / 0.9999)
+
+
+@pytest.mark.parametrize("shift", [0.0, 2.5])
+def test_images_contributions_and_top_ids_are_those_of_a_loop_over_pixels(tools, shift):
+    # Three by two tiles, two of them cut by the image's edges; with the shift, pixels reach clamp and stop.
+    scene = tools.cloud(60, 37, 21, seed=11, channels=4)
+    scene.tensors["log_scales"] += 0.3 * shift
+    scene.tensors["opacity_logits"] += shift
+    for name in ("means", "quats", "log_scales", "opacity_logits"):  # equals: the first one is in front
+        scene.tensors[name][50:] = scene.tensors[name][:10]
+    out = scene.run("reference", with_depth=True, with_contributions=True, with_top=True)
+    expected = blended(scene)
+    assert (expected["alphas"].max() >= 1 - 1e-4) == (shift > 0)
+    assert (expected["top_ids"] == -1).any() == (shift == 0)
+    assert out.top_ids.dtype == torch.int32
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(out, name)[0].detach().numpy(), value, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_hits_of_a_tile_blend_in_steps_as_they_do_at_once(tools, monkeypatch):
+    scene = tools.cloud(200, 37, 21, seed=12)
+    scene.tensors["log_scales"] += 1
+    options = {"with_depth": True, "with_contributions": True, "with_top": True}
+    whole, whole_grads = scene.gradients("reference", **options)
+    monkeypatch.setattr(reference, "_LANES", 16 * 16 * 7)
+    steps, steps_grads = scene.gradients("reference", **options)
+    for name, value in vars(whole).items():
+        torch.testing.assert_close(getattr(steps, name), value, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(steps_grads, whole_grads, rtol=1e-9, atol=1e-12)
+
+
+def test_graph_keeps_no_pairs_of_pixels_and_gaussians(tools):
+    scene = tools.cloud(300, 128, 128)
+    scene.tensors["log_scales"] += 2
+    saved = 0
+
+    def count(value):
+        nonlocal saved
+        saved += value.numel()
+        return value
+
+    with torch.autograd.graph.saved_tensors_hooks(count, lambda value: value):
+        scene.run("reference")
+    assert 0 < saved < 300 * 128 * 128 / 8
 
 
 def test_harmonics_are_orthonormal_over_the_sphere():
@@ -70,7 +169,9 @@ def test_gradients_are_those_of_finite_differences(tools, antialiased):
                         backend="reference", settings=settings)
         return out.colors, out.alphas, out.depth_expected
 
-    assert images(*scene.tensors.values())[1].min() > 0.1
+    alphas, _ = pixel_alphas(scene, antialiased)
+    assert alphas.min() > 0.01
+    assert alphas.max() < 0.9
     assert torch.autograd.gradcheck(images, tuple(scene.leaves(torch.float64).values()), eps=1e-6, atol=1e-7, rtol=1e-5,
                                     check_undefined_grad=False, check_batched_grad=False)
 
