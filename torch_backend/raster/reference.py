@@ -145,6 +145,7 @@ def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
                       torch.zeros_like(mean2d[order]) if scene.settings.absgrad else None)
 
 
+@torch.no_grad()
 def _hits(p: _Projected, across: int, down: int) -> tuple[Tensor, Tensor]:
     """Which Gaussian may touch which of `across` x `down` tiles: (members [hits], counts [tiles]).
 
