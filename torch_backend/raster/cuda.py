@@ -54,17 +54,16 @@ def build(name: str, channels: int = 0):
         structure = _structure(wp)
         text = (source.blending(channels) if channels else source.stages())[name]
 
-        def native(args, task, tid): ...
+        def native(args, task): ...
 
-        native.__annotations__ = {"args": structure, "task": wp.int32, "tid": wp.int32}
+        native.__annotations__ = {"args": structure, "task": wp.int32}
         native.__name__ = native.__qualname__ = f"{name}_native"
         function = wp.func_native(text)(native)
 
-        def entry(args, block_dim):
-            task = wp.tid()
-            function(args, task, task % block_dim)
+        def entry(args):
+            function(args, wp.tid())
 
-        entry.__annotations__ = {"args": structure, "block_dim": wp.int32}
+        entry.__annotations__ = {"args": structure}
         _kernels[name, channels] = wp.Kernel(
             entry, key=name, module=wp.get_module(module_name(name, channels)),
             options={"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK})
@@ -109,7 +108,7 @@ class _Launcher:
         blocks = -(-threads // source.BLOCK)
         kernel = build(name, channels)
         with nullcontext() if self.device.type == "cuda" else _Fibers(self.wp):
-            self.wp.launch(kernel, dim=blocks * source.BLOCK, inputs=[args, source.BLOCK], block_dim=source.BLOCK,
+            self.wp.launch(kernel, dim=blocks * source.BLOCK, inputs=[args], block_dim=source.BLOCK,
                            record_tape=False, **self.where)
 
 
@@ -145,11 +144,20 @@ class _Demand:
             wanted = wanted * 4 // 3 if wanted else 4 * slots
             self.capacity = min(-(-max(wanted, self.capacity, 1) // _HITS_STEP) * _HITS_STEP, _HITS_MAX)
 
+    def report(self) -> None:
+        """Send the maximum to the host, behind the work queued so far; whoever asks before it arrives sees the last."""
+        if not _capturing(self.most.device):
+            self.echo.copy_(self.most, non_blocking=True)
+
+
+def _capturing(device: torch.device) -> bool:
+    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
 
 def _demand(scene: Scene) -> _Demand:
     """The demand of calls like this one, brought up to date unless a graph is being captured."""
     device, cameras = scene.means.device, scene.viewmats.shape[0]
-    capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+    capturing = _capturing(device)
     with _lock:
         key = (device, cameras, scene.width, scene.height)
         if key not in _demands:
@@ -160,7 +168,6 @@ def _demand(scene: Scene) -> _Demand:
         demand = _demands[key]
         if not capturing:
             demand.grow(cameras * scene.means.shape[0])
-            demand.echo.copy_(demand.most, non_blocking=True)
         return demand
 
 
@@ -203,10 +210,9 @@ class _Maker:
         return torch.zeros(shape, dtype=dtype, device=self.device)
 
 
-def _bin(launch: _Launcher, args: Any, scene: Scene, demand: _Demand, capacity: int, depth_key: Tensor,
-         hit_count: Tensor) -> tuple[Tensor, ...]:
+def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_count: Tensor) -> tuple[Tensor, ...]:
     """List the hits tile by tile, front to back. Returns (order, ends, sorted_slot, tile_start, tile_end, hits)."""
-    make = _Maker(scene.means.device)
+    make, capacity = _Maker(depth_key.device), demand.capacity
     slots, tiles = hit_count.shape[0], args.tiles_x * args.tiles_y * args.cameras
     tile_start, tile_end = make.zeros(tiles, dtype=torch.int32), make.zeros(tiles, dtype=torch.int32)
     hits = make.zeros(2, dtype=torch.int64)
@@ -223,6 +229,7 @@ def _bin(launch: _Launcher, args: Any, scene: Scene, demand: _Demand, capacity: 
         sorted_key, permutation = torch.sort(key, stable=True)
         _point(args, sorted_key=sorted_key, permutation=permutation, hits=hits, demand=demand.most)
         launch("raster_ranges", args, capacity)
+        demand.report()
     return order, ends, sorted_slot, tile_start, tile_end, hits
 
 
@@ -255,14 +262,14 @@ class _Rasterize(torch.autograd.Function):
                hit_count=hit_count, depth_key=depth_key)
         launch("raster_project", args, slots)
         demand = _demand(scene)
-        binned = _bin(launch, args, scene, demand, demand.capacity, depth_key, hit_count)
+        binned = _bin(launch, args, demand, depth_key, hit_count)
         _point(args, image=image, alpha=alpha, median=median, top_id=top_id, top_weight=top_weight,
                weight_sum=weight_parts, weight_max=weight_max)
         launch("raster_blend", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha,
                                   record, aux, hit_count, *binned)
-            ctx.scene, ctx.norms, ctx.capacity = scene, norms, demand.capacity
+            ctx.scene, ctx.norms, ctx.capacity = scene, norms, args.capacity
         weight_sum = (weight_parts.double() / source.WEIGHT_SCALE).float()
         extras = (median, radii, means2d, weight_sum, weight_max, top_id, top_weight, binned[-1])
         ctx.mark_non_differentiable(*extras)
@@ -327,7 +334,8 @@ def rasterize(scene: Scene) -> RasterOutput:
     if refusal := _refusal(device):
         raise RuntimeError(refusal)
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
-    if cameras * n >= 2**31 or cameras * -(-scene.width // TILE) * -(-scene.height // TILE) >= 2**31 // source.BLOCK:
+    tiles = cameras * -(-scene.width // TILE) * -(-scene.height // TILE)
+    if max(cameras * n, tiles * source.BLOCK) > 2**31 - source.BLOCK:
         raise ValueError(f"{cameras} cameras of {scene.width} x {scene.height} px with {n} Gaussians are too much for "
                          "one call: split the cameras")
     norms = (torch.zeros(cameras, n, device=device), torch.zeros(cameras, n, device=device))

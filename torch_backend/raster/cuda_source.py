@@ -75,7 +75,7 @@ const float ALPHA_MAX = @ALPHA_MAX@f, T_STOP = @T_STOP@f, LOW_PASS = @LOW_PASS@f
 auto smin = [](float a, float b) -> float { return a < b ? a : b; };
 auto smax = [](float a, float b) -> float { return a > b ? a : b; };
 auto finite = [&](float v) -> bool { return (bits(v) & 0x7f800000) != 0x7f800000; };
-const int lane = tid & 31, warp = tid >> 5;
+const int tid = WP_TILE_THREAD_IDX, lane = tid & 31, warp = tid >> 5;
 """
 
 _SHUFFLE = r"""
@@ -602,7 +602,7 @@ def _field(match: re.Match) -> str:
 
 
 def _assemble(stage: str, **extra: object) -> str:
-    """The snippet of one stage, with the constants of `constants.py` put in. Its arguments: args, task, tid."""
+    """The snippet of one stage, with the constants of `constants.py` put in. Its arguments: args, and task, the thread's number."""
     values = {name: getattr(k, name) for name in dir(k) if name.isupper() and not name.startswith("SH_")}
     values |= {"BLOCK": BLOCK, "HEAD": HEAD, "MOMENTS": MOMENTS, "WEIGHT_SCALE": WEIGHT_SCALE} | extra
     text = _COMMON + stage

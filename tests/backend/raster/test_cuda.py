@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -18,18 +19,21 @@ def device(request) -> torch.device:
     return torch.device(request.param)
 
 
-def run(scene, device, leaves=None, **options) -> RasterOutput:
+def run(scene, device, leaves=None, **options) -> Any:
     leaves = scene.leaves() if leaves is None else leaves
     return rasterize(**{name: leaf.to(device) for name, leaf in leaves.items()}, Ks=scene.Ks.to(device),
                      width=scene.width, height=scene.height, backend="cuda", **(scene.options | options))
 
 
-def on_host(out: RasterOutput) -> RasterOutput:
-    values = {f.name: getattr(out, f.name) for f in dataclasses.fields(out)}
-    return RasterOutput(**{name: None if value is None else value.cpu() for name, value in values.items()})
+def on_host(out: RasterOutput) -> Any:
+    moved: dict[str, Any] = {}
+    for name in (field.name for field in dataclasses.fields(out)):
+        value = getattr(out, name)
+        moved[name] = None if value is None else value.cpu()
+    return RasterOutput(**moved)
 
 
-def gradients(scene, device, where=1.0, **options) -> tuple[RasterOutput, dict[str, torch.Tensor]]:
+def gradients(scene, device, where=1.0, **options) -> tuple[Any, dict[str, Any]]:
     """As `Scene.gradients`, on `device`; everything that comes back lies on the CPU."""
     leaves, generator = scene.leaves(), torch.Generator().manual_seed(5)
     out = run(scene, device, leaves, **options)
@@ -225,8 +229,7 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
     wanted, held = small.hits.tolist()
     assert held == 4 * 24 < wanted, "the first call's list should have been too short"
     if GPU:
-        torch.cuda.synchronize()
-    run(scene, device)
+        torch.cuda.synchronize()  # what the device wanted arrives whenever it arrives
     large, large_grads = gradients(scene, device)
     assert large.hits[0] == wanted
     assert large.hits[1] >= wanted * 1.3
@@ -265,7 +268,7 @@ def test_the_host_never_waits_for_the_gpu(tools):
     Ks = scene.Ks.float().cuda()
 
     def step() -> None:
-        out = rasterize(**leaves, Ks=Ks, width=64, height=48, **scene.options)
+        out: Any = rasterize(**leaves, Ks=Ks, width=64, height=48, **scene.options)
         (out.colors.sum() + out.depth_expected.clamp_max(10).sum()).backward()
 
     step()
@@ -290,7 +293,7 @@ def test_a_training_step_is_captured_as_a_cuda_graph(tools):
 
     def step(leaves, optimizer):
         optimizer.zero_grad(set_to_none=False)
-        out = rasterize(**leaves, Ks=Ks, width=64, height=48)
+        out: Any = rasterize(**leaves, Ks=Ks, width=64, height=48)
         loss = (out.colors - target).square().mean()
         loss.backward()
         optimizer.step()
