@@ -1,0 +1,1 @@
+"""Synthetic scenes with truth: people who hold still and drift, seen by a handheld camera."""

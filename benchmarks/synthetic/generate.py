@@ -1,0 +1,252 @@
+"""One scene from its seed: geometry of every frame, textures, cameras, and the list of pictures to render.
+
+Written into the scene's folder: geometry/static.npz, geometry/<name>.npz and <name>.npy (vertices [T, V, 3] of
+everything that moves), textures/*.png, and plan.json, last: what render_bpy.py reads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_backend.footage.images import write_png
+from torch_backend.shot import atomic_path, write_json
+
+from .cameras import FOCAL_PER_WIDTH, CameraMove
+from .geometry import Builder, Mesh, turn
+from .noise import Array, stream
+from .places import Furnisher, Keepout, Place
+from .sizes import Size, camera_move_of, place_of
+from .textures import TEXTURES
+
+if TYPE_CHECKING:
+    from .people import Bodies, Person
+
+MAX_PEOPLE = 5
+EXPOSURE_RAMP_STOPS = 1.2
+SHUTTER_SECONDS = 0.06
+"""Time between the first and the last row of a frame in `rolling-shutter`."""
+SHUTTER_BANDS = 9
+
+
+@dataclass
+class Mover:
+    """Something that changes from frame to frame."""
+
+    name: str
+    vertices: NDArray[np.float32]
+    """[T, V, 3] world, metres."""
+    mesh: Mesh
+    """Its triangles; the mesh's own vertices are those of the first frame."""
+    texture: str
+    """File in textures/."""
+    in_view: bool = True
+    """False: only its shadow is seen."""
+
+
+def frame_number(index: int) -> int:
+    """Frames are numbered from 1."""
+    return index + 1
+
+
+def frame_name(index: int) -> str:
+    """File of a frame."""
+    return f"{frame_number(index):06d}.png"
+
+
+def frame_seconds(size: Size) -> Array:
+    """[T] seconds of the clip's frames."""
+    return np.arange(size.frames) / size.fps
+
+
+def camera_of(seed: int, size: Size) -> CameraMove:
+    """The camera's path through the clip."""
+    return CameraMove(camera_move_of(seed), seed, (size.frames - 1) / size.fps)
+
+
+def write_geometry(folder: Path, seed: int, kind: str, size: Size, samples: int, key: str, bodies: Bodies) -> None:
+    """Everything that rendering needs, plan.json last."""
+    seconds = frame_seconds(size)
+    camera = camera_of(seed, size)
+    path = camera.eyes_and_targets(np.linspace(0.0, camera.duration, 60))[0][:, :2]
+    people = _people(seed, kind, path, camera)
+    furnisher = Furnisher(seed, path, [Keepout(*p.place, 0.45) for p in people])
+    movers = []
+    for person in people:
+        body = bodies.make(person, seed, seconds)
+        mesh = Mesh(body.vertices[0], body.triangles, body.uv, np.zeros(len(body.triangles), np.int32))
+        movers.append(Mover(person.name, body.vertices, mesh, f"{person.name}.png"))
+        write_png(folder / "textures" / f"{person.name}.png", body.texture)
+        if body.seat:
+            furnisher.stool(*person.place, body.seat, person.heading)
+    place, static = furnisher.room() if place_of(seed) == "room" else furnisher.ground()
+    if kind == "fast-mover":
+        movers.append(_thrown_ball(folder, seed, seconds))
+    if kind == "moving-shadow":
+        movers.append(_shadow_board(folder, place, seconds, camera.duration))
+    for material in place.materials:
+        texture, rng = TEXTURES[material.texture], stream(seed, "picture", material.texture, material.variant)
+        write_png(folder / "textures" / material.file, texture.draw(rng, texture.pixels // size.texture_step))
+    _write_mesh(folder / "geometry" / "static.npz", static)
+    for mover in movers:
+        _write_mesh(folder / "geometry" / f"{mover.name}.npz", mover.mesh)
+        with atomic_path(folder / "geometry" / f"{mover.name}.npy") as beside:
+            np.save(beside, mover.vertices, allow_pickle=False)
+    plan = {
+        "key": key,
+        "seed": seed,
+        "kind": kind,
+        "width": size.width,
+        "height": size.height,
+        "focal_per_width": FOCAL_PER_WIDTH,
+        "samples": samples,
+        "sky": place.sky,
+        "sky_strength": place.sky_strength,
+        "sky_turn": place.sky_turn,
+        "lights": place.lights,
+        "materials": [
+            {"file": m.file, "roughness": TEXTURES[m.texture].roughness, "emission": m.emission}
+            for m in place.materials
+        ],
+        "movers": [{"name": m.name, "texture": m.texture, "in_view": m.in_view} for m in movers],
+        "people": [{"name": p.name, "pose": p.pose, "phenotype": p.phenotype, "place": p.place} for p in people],
+        "jobs": _jobs(seed, kind, size, camera),
+    }
+    write_json(folder / "plan.json", plan)
+
+
+def _write_mesh(path: Path, mesh: Mesh) -> None:
+    with atomic_path(path) as beside:
+        np.savez(beside, vertices=mesh.vertices, triangles=mesh.triangles, uv=mesh.uv, material=mesh.material)
+
+
+# --------------------------------------------------------------------------------------------------- who and what
+
+
+def _people(seed: int, kind: str, path: Array, camera: CameraMove) -> list[Person]:
+    """Two to five people in view and out of the camera's way."""
+    from .people import POSES, Person
+
+    rng = stream(seed, "people")
+    count = int(rng.integers(2, MAX_PEOPLE + 1)) if kind == "plain" else 3
+    views = camera.world_to_camera(np.linspace(0.0, camera.duration, 12))
+    poses = list(rng.permutation(list(POSES)))
+    ages = [float(rng.uniform(0.62, 0.75)), float(rng.choice([rng.uniform(0.18, 0.34), rng.uniform(0.9, 1.0)]))]
+    ages += [float(rng.choice([0.25, 0.67, 0.67, 0.95])) for _ in range(MAX_PEOPLE)]
+    people: list[Person] = []
+    for _ in range(4000):
+        if len(people) == count:
+            break
+        x, y = float(rng.uniform(-2.4, 2.4)), float(rng.uniform(-1.6, 2.2))
+        clear = np.hypot(path[:, 0] - x, path[:, 1] - y).min() > 0.85
+        apart = all(np.hypot(p.place[0] - x, p.place[1] - y) > 0.95 for p in people)
+        if not clear or not apart or _share_in_view(views, np.array([x, y, 1.0])) < 0.5:
+            continue
+        to_camera = path[len(path) // 2] - [x, y]
+        heading = float(np.arctan2(to_camera[0], -to_camera[1]) + np.radians(rng.normal(0.0, 40.0)))
+        phenotype = {
+            "gender": float(rng.uniform()),
+            "age": ages[len(people)],
+            "muscle": float(rng.uniform(0.35, 0.7)),
+            "weight": float(rng.uniform(0.3, 0.7)),
+            "height": float(rng.uniform(0.4, 0.6)),
+            "proportions": float(rng.uniform(0.4, 0.8)),
+        }
+        accents = {"spine03": tuple(rng.normal(0.0, 2.0, 3)), "head": tuple(rng.normal(0.0, 5.0, 3))}
+        waves = kind == "fast-mover" and not people
+        pose = "wave" if waves else poses[len(people)]
+        name = f"person{len(people)}"
+        restless = float(rng.uniform(0.7, 1.4))
+        people.append(Person(name, phenotype, pose, (x, y), heading, restless, waves, accents))
+    return people
+
+
+def _share_in_view(views: Array, point: Array) -> float:
+    """Share of world-to-camera poses [C, 4, 4] in which a point lies well inside the width of the picture."""
+    local = views[:, :3, :3] @ point + views[:, :3, 3]
+    return float(((local[:, 2] > 0.5) & (np.abs(local[:, 0]) * FOCAL_PER_WIDTH < 0.42 * local[:, 2])).mean())
+
+
+def _thrown_ball(folder: Path, seed: int, seconds: Array) -> Mover:
+    """A ball that bounces across the scene, 3 m/s and more."""
+    rng = stream(seed, "ball")
+    write_png(folder / "textures" / "ball.png", TEXTURES["fabric"].draw(rng, 512))
+    builder = Builder([0.4])
+    radius = 0.14
+    builder.ball([0, 0, 0], [radius] * 3, 0, 28, 18)
+    mesh = builder.mesh()
+    phase = (seconds * 0.55 + 0.2) % 2.0
+    x = np.where(phase < 1.0, -2.0 + 4.0 * phase, 6.0 - 4.0 * phase)
+    z = radius + 1.6 * np.abs(np.sin(np.pi * 1.1 * seconds))
+    at = np.stack([x, np.full_like(x, -0.5), z], 1)
+    spin = np.array([turn(5.0 * s) for s in seconds])
+    vertices = np.einsum("tij,vj->tvi", spin, mesh.vertices) + at[:, None]
+    return Mover("ball", vertices.astype(np.float32), mesh, "ball.png")
+
+
+def _shadow_board(folder: Path, place: Place, seconds: Array, duration: float) -> Mover:
+    """A board that passes between a strong lamp and the scene, itself out of view."""
+    write_png(folder / "textures" / "board.png", np.full((8, 8, 3), 60, np.uint8))
+    lamp = np.array([1.2, -3.8, 5.2])
+    aim = np.array([0.0, 0.8, 0.6]) - lamp
+    aim /= np.linalg.norm(aim)
+    light = {"type": "SPOT", "location": lamp.tolist(), "direction": aim.tolist(), "size": [0.06, 1.3]}
+    place.lights.append({**light, "energy": 2600.0, "color": [1.0, 0.93, 0.82], "portal": False})
+    side = np.cross(aim, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    up = np.cross(side, aim)
+    builder = Builder([1.0])
+    for offset in (-0.38, 0.0, 0.38):
+        builder.rect(side * (offset - 0.08) - up * 0.8, side * 0.16, up * 1.6, 0)
+    mesh = builder.mesh()
+    at = lamp + 1.2 * aim + side * np.linspace(-0.8, 0.8, len(seconds))[:, None] * np.minimum(1.0, duration / 4.0)
+    vertices = mesh.vertices[None] + at[:, None]
+    return Mover("board", vertices.astype(np.float32), mesh, "board.png", in_view=False)
+
+
+# --------------------------------------------------------------------------------------------------- what to render
+
+
+def exposure_stops(kind: str, share: float) -> float:
+    """Stops added at `share` in [0, 1] of the clip."""
+    return EXPOSURE_RAMP_STOPS * (share - 0.5) if kind == "exposure-ramp" else 0.0
+
+
+def _jobs(seed: int, kind: str, size: Size, camera: CameraMove) -> list[dict[str, Any]]:
+    """The clip's frames, and after each instant's frame the truth of that instant."""
+    seconds = frame_seconds(size)
+    views = camera.world_to_camera(seconds)
+    instants, poses = set(size.t_star_indices()), size.pose_indices()
+    jobs = []
+    for index in range(size.frames):
+        jobs.append(_job(f"frames/{frame_name(index)}", seed, kind, size, index, index, views))
+        if kind == "rolling-shutter":
+            jobs[-1]["bands"] = _bands(size, camera, index)
+        if index in instants:
+            folder = f"truth/{frame_number(index):06d}"
+            jobs += [_job(f"{folder}/{frame_name(p)}", seed, kind, size, index, p, views) for p in poses]
+    return jobs
+
+
+def _job(out: str, seed: int, kind: str, size: Size, time: int, pose: int, views: Array) -> dict[str, Any]:
+    """One picture: the scene of frame `time` from the camera of frame `pose`. The same pair has the same noise."""
+    band = {"rows": [0, size.height], "time": float(time), "world_to_camera": views[pose].tolist()}
+    stops = exposure_stops(kind, time / (size.frames - 1))
+    noise = int(stream(seed, "cycles", time, pose).integers(1 << 31))
+    return {"out": out, "bands": [band], "stops": stops, "noise": noise}
+
+
+def _bands(size: Size, camera: CameraMove, index: int) -> list[dict[str, Any]]:
+    """Strips of rows, each at its own time around the frame's, in frames; the middle row is on time."""
+    edges = np.linspace(0, size.height, min(SHUTTER_BANDS, size.height) + 1).round().astype(int)
+    bands = []
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        late = (0.5 * (low + high) / size.height - 0.5) * SHUTTER_SECONDS
+        view = camera.world_to_camera(np.array([index / size.fps + late]))[0]
+        time = float(np.clip(index + late * size.fps, 0, size.frames - 1))
+        bands.append({"rows": [int(low), int(high)], "time": time, "world_to_camera": view.tolist()})
+    return bands

@@ -1,0 +1,84 @@
+"""Exact visibility: rays against triangles with Warp, on the CPU. Everything here is in the world's metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+SLACK = 2e-3
+"""Metres by which a ray may end before the point that it looks for."""
+
+
+@wp.kernel(enable_backward=False)
+def _cast(
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    distance: wp.array(dtype=wp.float32),
+    face: wp.array(dtype=wp.int32),
+    barycentric: wp.array(dtype=wp.vec3),
+):
+    i = wp.tid()
+    hit = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e6)
+    if hit.result:
+        distance[i] = hit.t
+        face[i] = hit.face
+        barycentric[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+    else:
+        distance[i] = wp.inf
+        face[i] = -1
+
+
+@dataclass
+class Hits:
+    """What R rays met first."""
+
+    distance: NDArray[np.float32]
+    """[R] in lengths of the ray's direction; inf if nothing."""
+    face: NDArray[np.int32]
+    """[R] triangle, -1 if nothing."""
+    barycentric: NDArray[np.float32]
+    """[R, 3] weights of its corners."""
+
+
+class RayScene:
+    """Triangles ready to be looked at: `vertices` [V, 3] metres, `triangles` [F, 3]."""
+
+    def __init__(self, vertices: NDArray, triangles: NDArray) -> None:
+        self.vertices = np.ascontiguousarray(vertices, np.float32)
+        self.triangles = np.ascontiguousarray(triangles, np.int32)
+        points = wp.array(self.vertices, dtype=wp.vec3, device="cpu")
+        indices = wp.array(self.triangles.ravel(), dtype=wp.int32, device="cpu")
+        self._mesh = wp.Mesh(points, indices)
+
+    def cast(self, origins: NDArray, directions: NDArray) -> Hits:
+        """First hits of rays from `origins` [R, 3] along `directions` [R, 3] (any length)."""
+        count = len(origins)
+        length = np.linalg.norm(directions, axis=1, keepdims=True)
+        hits = Hits(np.empty(count, np.float32), np.empty(count, np.int32), np.zeros((count, 3), np.float32))
+        arrays = [
+            wp.array(np.ascontiguousarray(value, np.float32), dtype=wp.vec3, device="cpu")
+            for value in (origins, directions / length)
+        ]
+        outputs = [
+            wp.array(hits.distance, dtype=wp.float32, device="cpu", copy=False),
+            wp.array(hits.face, dtype=wp.int32, device="cpu", copy=False),
+            wp.array(hits.barycentric, dtype=wp.vec3, device="cpu", copy=False),
+        ]
+        wp.launch(_cast, dim=count, inputs=[self._mesh.id, *arrays], outputs=outputs, device="cpu")
+        hits.distance /= length[:, 0].astype(np.float32)
+        return hits
+
+    def sees(self, eye: NDArray, points: NDArray) -> NDArray[np.bool_]:
+        """[P] whether nothing lies between `eye` [3] and `points` [P, 3]."""
+        away = points - eye
+        hits = self.cast(np.broadcast_to(eye, points.shape), away)
+        length = np.linalg.norm(away, axis=1)
+        return hits.distance * length >= length - SLACK
+
+    def escapes(self, eye: NDArray, directions: NDArray) -> NDArray[np.bool_]:
+        """[R] whether rays from `eye` [3] along `directions` [R, 3] meet nothing."""
+        return self.cast(np.broadcast_to(eye, directions.shape), directions).face < 0

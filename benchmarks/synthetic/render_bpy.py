@@ -1,0 +1,293 @@
+# pyright: reportMissingImports=false
+"""Renders the pictures that a plan.json lists: `python render_bpy.py SCENE_FOLDER`, inside a bpy wheel's Python.
+
+Cycles on the CPU, in one process per scene so that its data persist. Needs bpy, numpy and the standard library only.
+Standard output carries JSON lines {"done", "total", "seconds"}; standard input is held open by the parent, and when it
+closes this process ends. Pictures that exist are left alone; each is written beside its place and renamed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+METER_GREY = 0.20
+"""Scene-linear value that the median of the metered pixels is exposed to."""
+METER_BRIGHT = 0.95
+METER_SIZE = 64
+
+
+def main(folder: Path, only: str = "", sample_factor: int = 1) -> None:
+    """Renders what is missing; `only` and `sample_factor` serve the measurement of noise."""
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+    jobs = [job for job in plan["jobs"] if (job["out"] == only if only else not (folder / job["out"]).exists())]
+    if not jobs:
+        return
+    stage = Stage(folder, plan, sample_factor)
+    stops = _metered(folder, plan, stage)
+    for done, job in enumerate(jobs, start=1):
+        began = time.perf_counter()
+        stage.render(job, stops, folder / (f"noise/{sample_factor}/" if only else "") / job["out"])
+        _say(done=done, total=len(jobs), seconds=time.perf_counter() - began, out=job["out"])
+
+
+def _say(**message: Any) -> None:
+    sys.__stdout__.write(json.dumps(message) + "\n")
+    sys.__stdout__.flush()
+
+
+def _die_with_parent() -> None:
+    while os.read(0, 64):
+        pass
+    os._exit(1)
+
+
+class Stage:
+    """The Blender scene."""
+
+    def __init__(self, folder: Path, plan: dict[str, Any], sample_factor: int) -> None:
+        self.folder, self.plan = folder, plan
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        self.scene = bpy.context.scene
+        self._settings(sample_factor)
+        self._world()
+        for light in plan["lights"]:
+            self._light(light)
+        surfaces = [self._material(m["file"], m["roughness"], m["emission"]) for m in plan["materials"]]
+        self._mesh("static", surfaces, smooth=False)
+        self.movers: list[tuple[Any, np.ndarray]] = []
+        for mover in plan["movers"]:
+            made = self._mesh(mover["name"], [self._material(mover["texture"], 0.75, 0.0)], smooth=True)
+            made.visible_camera = mover["in_view"]
+            path = folder / "geometry" / f"{mover['name']}.npy"
+            self.movers.append((made.data, np.load(path, mmap_mode="r", allow_pickle=False)))
+        self.time: float | None = None
+        camera = bpy.data.cameras.new("camera")
+        camera.sensor_fit, camera.sensor_width = "HORIZONTAL", 36.0
+        camera.lens = 36.0 * plan["focal_per_width"]
+        camera.clip_start, camera.clip_end = 0.01, 1000.0
+        self.camera = bpy.data.objects.new("camera", camera)
+        self.scene.collection.objects.link(self.camera)
+        self.scene.camera = self.camera
+
+    def _settings(self, sample_factor: int) -> None:
+        render, cycles = self.scene.render, self.scene.cycles
+        render.engine = "CYCLES"
+        render.resolution_x, render.resolution_y = self.plan["width"], self.plan["height"]
+        render.resolution_percentage = 100
+        render.use_persistent_data = True
+        render.dither_intensity = 0.0
+        render.use_motion_blur = False
+        render.use_compositing = render.use_sequencer = False
+        cycles.device = "CPU"
+        cycles.samples = self.plan["samples"] * sample_factor
+        cycles.use_adaptive_sampling = False
+        cycles.use_denoising = True
+        cycles.denoiser = "OPENIMAGEDENOISE"
+        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+        cycles.denoising_prefilter = "FAST"
+        cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 4, 3, 1
+        cycles.transmission_bounces = cycles.volume_bounces = 0
+        cycles.caustics_reflective = cycles.caustics_refractive = False
+        cycles.sample_clamp_indirect = 4.0
+        cycles.use_light_tree = True
+        cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.3
+        self.scene.view_settings.view_transform = "Standard"
+        self.scene.view_settings.look = "None"
+        self._picture_format("PNG")
+
+    def _picture_format(self, name: str) -> None:
+        settings = self.scene.render.image_settings
+        settings.file_format = name
+        settings.color_mode = "RGB"
+        settings.color_depth = "8" if name == "PNG" else "32"
+        settings.compression = 30
+
+    def _world(self) -> None:
+        world = bpy.data.worlds.new("sky")
+        self.scene.world = world
+        world.use_nodes = True
+        nodes, links = world.node_tree.nodes, world.node_tree.links
+        nodes.clear()
+        coordinate, mapping = nodes.new("ShaderNodeTexCoord"), nodes.new("ShaderNodeMapping")
+        picture, background = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeBackground")
+        output = nodes.new("ShaderNodeOutputWorld")
+        skies = Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / "world"
+        picture.image = bpy.data.images.load(str(skies / f"{self.plan['sky']}.exr"))
+        mapping.inputs["Rotation"].default_value[2] = self.plan["sky_turn"]
+        background.inputs["Strength"].default_value = self.plan["sky_strength"]
+        links.new(coordinate.outputs["Generated"], mapping.inputs["Vector"])
+        links.new(mapping.outputs["Vector"], picture.inputs["Vector"])
+        links.new(picture.outputs["Color"], background.inputs["Color"])
+        links.new(background.outputs["Background"], output.inputs["Surface"])
+        world.cycles.sampling_method = "MANUAL"
+        world.cycles.sample_map_resolution = 512
+
+    def _light(self, wanted: dict[str, Any]) -> None:
+        light = bpy.data.lights.new(wanted["type"].lower(), wanted["type"])
+        light.energy, light.color = wanted["energy"], wanted["color"]
+        if wanted["type"] == "AREA":
+            light.shape = "RECTANGLE"
+            light.size, light.size_y = wanted["size"]
+            light.cycles.is_portal = wanted["portal"]
+        elif wanted["type"] == "SUN":
+            light.angle = wanted["size"][0]
+        else:
+            light.shadow_soft_size, light.spot_size = wanted["size"]
+            light.spot_blend = 0.3
+        made = bpy.data.objects.new(light.name, light)
+        made.location = wanted["location"]
+        made.rotation_euler = Vector(wanted["direction"]).to_track_quat("-Z", "Y").to_euler()
+        made.visible_camera = False
+        self.scene.collection.objects.link(made)
+
+    def _material(self, file: str, roughness: float, emission: float) -> Any:
+        material = bpy.data.materials.new(file)
+        material.use_nodes = True
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        surface, picture = nodes["Principled BSDF"], nodes.new("ShaderNodeTexImage")
+        picture.image = bpy.data.images.load(str(self.folder / "textures" / file), check_existing=True)
+        links.new(picture.outputs["Color"], surface.inputs["Base Color"])
+        surface.inputs["Roughness"].default_value = roughness
+        surface.inputs["Specular IOR Level"].default_value = 0.25
+        if emission:
+            surface.inputs["Emission Color"].default_value = (1.0, 0.97, 0.92, 1.0)
+            surface.inputs["Emission Strength"].default_value = emission
+            # It is seen, but the area light beside it does the lighting.
+            material.cycles.emission_sampling = "NONE"
+        return material
+
+    def _mesh(self, name: str, materials: list[Any], smooth: bool) -> Any:
+        with np.load(self.folder / "geometry" / f"{name}.npz", allow_pickle=False) as data:
+            vertices, triangles, uv, material = (data[k] for k in ("vertices", "triangles", "uv", "material"))
+        mesh = bpy.data.meshes.new(name)
+        count = len(triangles)
+        mesh.vertices.add(len(vertices))
+        mesh.vertices.foreach_set("co", vertices.ravel())
+        mesh.loops.add(3 * count)
+        mesh.loops.foreach_set("vertex_index", triangles.ravel())
+        mesh.polygons.add(count)
+        mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
+        mesh.polygons.foreach_set("material_index", material)
+        mesh.polygons.foreach_set("use_smooth", np.full(count, smooth))
+        mesh.uv_layers.new(name="uv").data.foreach_set("uv", uv.ravel())
+        for each in materials:
+            mesh.materials.append(each)
+        mesh.update(calc_edges=True)
+        made = bpy.data.objects.new(name, mesh)
+        self.scene.collection.objects.link(made)
+        return made
+
+    def _go_to(self, moment: float) -> None:
+        """Moves everything to a time in (fractional) frames, between neighbouring frames linearly."""
+        if moment == self.time:
+            return
+        before = int(np.floor(moment))
+        share = np.float32(moment - before)
+        for mesh, vertices in self.movers:
+            at = vertices[before]
+            if share:
+                at = (1 - share) * at + share * vertices[min(before + 1, len(vertices) - 1)]
+            mesh.vertices.foreach_set("co", np.ascontiguousarray(at, np.float32).ravel())
+            mesh.update()
+        self.time = moment
+
+    def _look(self, world_to_camera: list[list[float]]) -> None:
+        # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
+        self.camera.matrix_world = Matrix(world_to_camera).inverted() @ Matrix.Diagonal((1, -1, -1, 1))
+
+    def render(self, job: dict[str, Any], stops: float, out: Path) -> None:
+        """One picture, in one piece or in strips of rows that have each their own time."""
+        out.parent.mkdir(parents=True, exist_ok=True)
+        self.scene.view_settings.exposure = stops + job["stops"]
+        self.scene.cycles.seed = job["noise"]
+        beside = out.with_name(f".{out.stem}.{os.getpid()}.tmp.png")
+        if len(job["bands"]) == 1:
+            self._take(job["bands"][0], beside)
+        else:
+            self._take_strips(job["bands"], beside)
+        os.replace(beside, out)
+
+    def _take(self, band: dict[str, Any], path: Path) -> None:
+        self._go_to(band["time"])
+        self._look(band["world_to_camera"])
+        self.scene.render.filepath = str(path)
+        bpy.ops.render.render(write_still=True)
+
+    def _take_strips(self, bands: list[dict[str, Any]], path: Path) -> None:
+        render, width, height = self.scene.render, self.plan["width"], self.plan["height"]
+        whole = np.zeros((height, width, 4), np.float32)
+        render.use_border, render.use_crop_to_border = True, False
+        render.border_min_x, render.border_max_x = 0.0, 1.0
+        for band in bands:
+            low, high = band["rows"]
+            render.border_min_y, render.border_max_y = 1.0 - high / height, 1.0 - low / height
+            self._take(band, path)
+            # Blender's rows run upwards.
+            whole[height - high : height - low] = _pixels(path)[height - high : height - low]
+        render.use_border = False
+        picture = bpy.data.images.new("strips", width, height, alpha=False)
+        picture.colorspace_settings.name = "Non-Color"
+        picture.pixels.foreach_set(whole.ravel())
+        picture.filepath_raw, picture.file_format = str(path), "PNG"
+        picture.save()
+        bpy.data.images.remove(picture)
+
+    def meter(self) -> float:
+        """Stops that bring the clip to a good exposure, as a camera would that is then locked."""
+        scene, plan = self.scene, self.plan
+        frames = [job for job in plan["jobs"] if job["out"].startswith("frames/")]
+        size = scene.render.resolution_x, scene.render.resolution_y
+        scene.render.resolution_x = METER_SIZE
+        scene.render.resolution_y = max(8, round(METER_SIZE * size[1] / size[0]))
+        self._picture_format("OPEN_EXR")
+        path = self.folder / f".meter.{os.getpid()}.exr"
+        values = []
+        for job in (frames[0], frames[len(frames) // 2], frames[-1]):
+            self._take({**job["bands"][0], "time": round(job["bands"][0]["time"])}, path)
+            values.append(_pixels(path)[..., :3].reshape(-1, 3) @ [0.2126, 0.7152, 0.0722])
+        path.unlink()
+        self._picture_format("PNG")
+        scene.render.resolution_x, scene.render.resolution_y = size
+        light = np.concatenate(values)
+        middle, bright = np.median(light), np.quantile(light, 0.92)
+        return float(np.log2(min(METER_GREY / max(middle, 1e-6), METER_BRIGHT / max(bright, 1e-6))))
+
+
+def _pixels(path: Path) -> np.ndarray:
+    """[H, W, 4] float32 of a picture file as stored, rows upwards."""
+    picture = bpy.data.images.load(str(path))
+    picture.colorspace_settings.name = "Non-Color"
+    width, height = picture.size
+    values = np.empty(width * height * 4, np.float32)
+    picture.pixels.foreach_get(values)
+    bpy.data.images.remove(picture)
+    return values.reshape(height, width, 4)
+
+
+def _metered(folder: Path, plan: dict[str, Any], stage: Stage) -> float:
+    """The clip's exposure in stops: measured once, then kept in meter.json."""
+    path = folder / "meter.json"
+    if path.exists():
+        return json.loads(path.read_text(encoding="utf-8"))["stops"]
+    stops = stage.meter()
+    record = {"stops": stops, "bpy": bpy.app.version_string, "threads": stage.scene.render.threads}
+    beside = path.with_name(f".meter.{os.getpid()}.tmp")
+    beside.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    os.replace(beside, path)
+    return stops
+
+
+if __name__ == "__main__":
+    arguments = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+    main(Path(arguments[0]), *arguments[1:2], *map(int, arguments[2:3]))
