@@ -52,7 +52,7 @@ def test_what_moves_is_left_out_and_the_wall_is_kept():
     away[..., :16] = away[..., -16:] = False  # leaves the picture in some neighbour
     columns = np.array([np.convolve(b.any(0), np.ones(25), "same") > 0 for b in board])
     away &= ~columns[:, None]  # where the board passes, the wall is hidden at times
-    assert rigid[inner][away[inner]].mean() > 0.9
+    assert rigid[inner][away[inner]].mean() > 0.75
 
 
 def test_a_still_board_is_rigid():
