@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from . import reference
+from .constants import SIDE_MAX
 from .settings import RasterOutput, RasterSettings, Scene
 
 _BANDS = {1: 0, 4: 1, 9: 2, 16: 3}
@@ -22,8 +23,8 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, body: s
     """Raise ValueError for cameras that do not fit. `body` 'cuda' leaves values on a GPU unread: it would stall."""
     _shape("viewmats", viewmats, ("C", 4, 4))
     _shape("Ks", Ks, (viewmats.shape[0], 3, 3))
-    if width < 1 or height < 1:
-        raise ValueError(f"width and height must be at least 1, not {width} x {height}")
+    if not 1 <= width <= SIDE_MAX or not 1 <= height <= SIDE_MAX:
+        raise ValueError(f"width and height must be 1 to {SIDE_MAX}, not {width} x {height}")
     on_host = [value for value in (viewmats, Ks) if body != "cuda" or not value.is_cuda]
     if not all(bool(torch.isfinite(value).all()) for value in on_host):
         raise ValueError("viewmats and Ks must be finite")

@@ -37,6 +37,9 @@ DEPTH_EMPTY = 1e10
 """Depth of a pixel whose alpha is 0."""
 TILE = 16
 """Edge of a tile in pixels."""
+SIDE_MAX = 2**18
+"""Largest width and height of an image: float32 places nothing to less than 1/64 px beyond, and a column of tiles must
+fit 15 bits."""
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 

@@ -1,0 +1,348 @@
+"""What holds for every input, tried on generated ones. SPLANNEQUIN_CASES=20000 asks for that many cases per property.
+
+Examples are derandomised (tests/conftest.py): a run tries the same ones as the run before. On CPU fibers, which are
+slow, the CUDA body gets a small share.
+"""
+
+import dataclasses
+import math
+import os
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from benchmarks.numerics import BODIES, PER_GAUSSIAN, SAME_SIDE, Scene, camera, compare, scalar
+from torch_backend.raster import RasterSettings
+from torch_backend.raster.constants import ALPHA_MIN
+
+ASKED = int(os.environ.get("SPLANNEQUIN_CASES", "0"))
+SHARE = {"cpu": 1.0, "reference": 0.25, "reference32": 0.25, "cuda": 0.05, "gpu": 0.5}
+"""Cases per body relative to the CPU's, by how fast it is."""
+on_every_body = pytest.mark.parametrize("body", BODIES)
+
+
+def for_all(strategy, body, usual, generated, holds):
+    """Assert `holds(example)` for `usual` examples (or as many as asked for), times the body's share."""
+
+    @settings(max_examples=max(5, round(SHARE[body] * (ASKED or usual))), suppress_health_check=list(HealthCheck))
+    @given(strategy)
+    def each(example):
+        generated()
+        holds(example)
+
+    each()
+
+
+EXTREMES = [0.0, -0.0, 1e-45, -1e-45, 1e-38, 1e-8, 1e8, -1e8, 1e30, -1e30, 3e38, -3e38, math.inf, -math.inf, math.nan]
+ANY = st.one_of(st.floats(width=32), st.sampled_from(EXTREMES), st.floats(-3, 3, width=32))
+UNIT = st.floats(-1, 1, width=32)
+SIZES = st.sampled_from([(1, 1), (7, 5), (16, 16), (17, 3), (20, 18), (1, 33)])
+NEAR = 0.0625
+"""A float32 number, so that all bodies cull by the same plane."""
+POINTS = st.sampled_from([(0.5, 0.5), (0.1, 0.8), (-0.6, 0.5), (1.5, 1.4)])
+"""Principal point as a share of the image: centred, off centre, outside twice."""
+
+
+@st.composite
+def gaussians(draw):
+    """(mean, quaternion, log-scales, logit) of one Gaussian; each of the last three may be extreme."""
+    u = [draw(UNIT) for _ in range(3)]
+    place = draw(st.sampled_from(["view", "view", "view", "behind", "plane", "through", "edge", "far", "pixel"]))
+    depth = 2.5 + 1.5 * u[2]
+    mean = {"view": (0.5 * u[0] * depth, 0.5 * u[1] * depth, depth), "behind": (u[0], u[1], -depth),
+            "plane": (0.1 * u[0], 0.1 * u[1], NEAR * (1 + draw(st.sampled_from([-1e-6, 0.0, 1e-6, 0.1])))),
+            "through": (0.3 * u[0], 0.3 * u[1], NEAR + 0.1 * (1 + u[2])),
+            "edge": (draw(st.sampled_from([-1.0, 1.0])) * depth * (0.6 + 0.6 * abs(u[0])), u[1] * depth, depth),
+            "far": (1e4 * u[0], 1e4 * u[1], 1e5), "pixel": (1e-3 * u[0], 1e-3 * u[1], 2.5)}[place]
+    quat = draw(st.one_of(st.tuples(UNIT, UNIT, UNIT, UNIT), st.sampled_from(
+        [(0.0,) * 4, (1.0, 0.0, 0.0, 0.0), (1e-7,) * 4, (0.0, 0.0, 1e-5, 0.0), (0.0, -3e18, 1e18, 0.0)])))
+    scale = st.one_of(st.floats(-4, -0.5, width=32), st.sampled_from([math.log(1e-8), -6.0, 1.0, 3.0, math.log(1e8)]))
+    extreme = st.sampled_from([-100.0, -5.6, -5.5, 100.0, math.inf, -math.inf])
+    logit = draw(st.one_of(st.floats(-3, 6, width=32), extreme))
+    return mean, quat, (draw(scale), draw(scale), draw(scale)), logit
+
+
+VIEWS = st.sampled_from([1, 1, 1, 2, 0])
+BANDS = st.sampled_from([(None, 3), (None, 1), (0, 3), (1, 4), (2, 3)])
+"""(degree of the harmonics, channels in all)."""
+KINDS = gaussians()
+
+
+@st.composite
+def scenes(draw, least=0, most=6, kind=KINDS, views=VIEWS, sizes=SIZES, points=POINTS, bands=BANDS):
+    """A scene of `least` to `most` Gaussians of `kind`, and its options."""
+    rows = draw(st.lists(kind, min_size=least, max_size=most))
+    width, height = draw(sizes)
+    degree, channels = draw(bands)
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**20)))
+    n, count = len(rows), draw(views)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    tensors = {name: torch.tensor([row[i] for row in rows], dtype=torch.float64).reshape(n, *shape) for i, (name, shape)
+               in enumerate((("means", (3,)), ("quats", (4,)), ("log_scales", (3,)), ("opacity_logits", ())))}
+    if degree is not None:
+        tensors["sh"] = 0.5 * normal(n, (degree + 1) ** 2, 3)
+    if degree is None or channels > 3:
+        tensors["colors"] = normal(n, channels if degree is None else channels - 3)
+    tensors["background"] = normal(channels)
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    viewmats[:, :2, 3] += 0.1 * normal(count, 2) * torch.arange(count)[:, None]  # depths stay exact: they are cut
+    tensors["viewmats"] = viewmats
+    px, py = draw(points)
+    Ks = camera(width, height, 0.9 * max(width, height), px * width, py * height).repeat(count, 1, 1)
+    options = {"settings": RasterSettings(threads=draw(st.sampled_from([1, 2])), near=NEAR,
+                                          antialiased=draw(st.booleans())),
+               "with_depth": draw(st.booleans()), "with_contributions": True}
+    return Scene(tensors, Ks, width, height, options).rounded()
+
+
+@st.composite
+def good_gaussians(draw):
+    """One that is well inside the view, neither tiny nor huge."""
+    u = [draw(UNIT) for _ in range(3)]
+    depth = 2.5 + u[2]
+    quat = draw(st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT))
+    scale = st.floats(-3.5, -0.5, width=32)
+    return ((0.3 * u[0] * depth, 0.3 * u[1] * depth, depth), quat, (draw(scale), draw(scale), draw(scale)),
+            draw(st.floats(-3, 4, width=32)))
+
+
+@st.composite
+def good_scenes(draw, **options):
+    """Scenes of such Gaussians, one camera, no two depths alike (rounding must not change the order)."""
+    scene = draw(scenes(least=1, kind=good_gaussians(), views=st.just(1), **options))
+    order = scene.tensors["means"][:, 2].argsort()
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(order))
+    scene.tensors["means"][:, 2] += 0.01 * rank
+    return scene.rounded()
+
+
+def run(scene, body):
+    _, dtype, device = BODIES[body]
+    leaves = scene.leaves(dtype, device)
+    out = scene.run(body, leaves)
+    scalar(out).backward()
+    return out, {name: leaf.grad for name, leaf in leaves.items()}
+
+
+def assert_sane(scene, out, grads):
+    """What holds of one body's output on any scene."""
+    for name in ("colors", "alphas", "means2d", "weight_sum", "weight_max", "means2d_grad", "means2d_absgrad"):
+        assert torch.isfinite(getattr(out, name)).all(), name
+    if out.depth_expected is not None:
+        assert torch.isfinite(out.depth_expected).all()
+        assert torch.isfinite(out.depth_median).all()
+        assert ((out.depth_median == 1e10) == (out.alphas == 0)).all()
+        assert ((out.depth_expected == 1e10) == (out.alphas == 0)).all()
+    assert (out.alphas >= 0).all()
+    assert (out.alphas <= 1).all()
+    assert (out.weight_max <= 0.99 + 1e-5).all()
+    assert (out.weight_sum >= out.weight_max * (1 - 1e-5)).all()
+    total, seen = out.weight_sum.double().sum().item(), out.alphas.detach().double().sum().item()
+    assert total == pytest.approx(seen, rel=1e-4, abs=1e-6 * max(1, out.alphas.numel()))
+    culled = out.radii == 0
+    for name in ("weight_sum", "weight_max", "means2d", "means2d_grad", "means2d_absgrad"):
+        assert (getattr(out, name)[culled] == 0).all(), name
+    for name, grad in grads.items():
+        assert grad is not None, name
+        assert torch.isfinite(grad).all(), name
+        if name in PER_GAUSSIAN:
+            assert (grad[culled.all(0)] == 0).all(), name
+
+
+def assert_alike(one, other, count, bound=2e-3):
+    """Two images of `count` Gaussians: equal within `bound`, but for alphas of 1/255 in one and not in the other."""
+    gap = (one.alphas - other.alphas).abs()
+    same = gap < SAME_SIDE
+    assert (gap <= count * ALPHA_MIN + bound).all()
+    assert ((one.colors - other.colors).abs()[same] <= bound * (1 + one.colors.abs().max())).all()
+
+
+@on_every_body
+def test_generated_scenes_give_sane_images_and_gradients(body, generated):
+    def holds(scene):
+        assert_sane(scene, *run(scene, body))
+
+    for_all(scenes(), body, 250, generated, holds)
+
+
+@on_every_body
+def test_any_numbers_give_sane_images_and_gradients(body, generated):
+    def holds(example):
+        values, degree, antialiased = example
+        flat = torch.tensor(values, dtype=torch.float64)
+        color = flat[22:28].reshape(2, 3)
+        tensors = {"means": flat[:6].reshape(2, 3), "quats": flat[6:14].reshape(2, 4),
+                   "log_scales": flat[14:20].reshape(2, 3), "opacity_logits": flat[20:22],
+                   "viewmats": torch.eye(4, dtype=torch.float64)[None]}
+        tensors["colors" if degree is None else "sh"] = (
+            color if degree is None else color[:, None].repeat(1, (degree + 1) ** 2, 1))
+        scene = Scene(tensors, camera(7, 5, 9.0, 3.0, 2.0), 7, 5,
+                      {"settings": RasterSettings(threads=1, antialiased=antialiased), "with_contributions": True})
+        _, dtype, device = BODIES[body]
+        leaves = scene.leaves(dtype, device)
+        out = scene.run(body, leaves)
+        assert torch.isfinite(out.alphas).all()
+        assert torch.isfinite(out.colors).all()
+        # A bounded loss: colours may be as large as float32 allows, and then the gradients of positions are, too.
+        (out.alphas.sum() + torch.tanh(out.colors).sum()).backward()
+        for name, leaf in leaves.items():
+            assert not torch.isnan(leaf.grad).any(), name
+            assert torch.isfinite(leaf.grad).all() or color.nan_to_num().abs().max() > 1e6, name
+
+    example = st.tuples(st.lists(ANY, min_size=28, max_size=28), st.sampled_from([None, 0, 1]), st.booleans())
+    for_all(example, body, 200, generated, holds)
+
+
+@on_every_body
+def test_bodies_agree_with_the_oracle_on_any_scene(body, generated):
+    def holds(scene):
+        errors = compare(scene, body)
+        assert_sane(scene, errors.out, errors.grads)
+        gap = (errors.out.alphas.detach().cpu() - errors.oracle.alphas.detach()).abs()
+        assert (gap <= len(scene.tensors["means"]) * ALPHA_MIN + 2e-3).all()
+        assert errors.image <= 2e-3
+
+    for_all(scenes(), body, 250, generated, holds)
+
+
+@on_every_body
+def test_gradients_agree_with_the_oracle_on_good_scenes(body, generated):
+    def holds(scene):
+        errors = compare(scene, body)
+        assert errors.image <= 5e-4
+        for name, truth in errors.oracle_grads.items():
+            difference = (errors.grads[name].cpu().double() - truth).norm()
+            assert difference <= 2e-3 * truth.norm() + 1e-3, name
+
+    for_all(good_scenes(), body, 250, generated, holds)
+
+
+@on_every_body
+def test_order_of_the_gaussians_changes_nothing(body, generated):
+    def holds(example):
+        scene, seed = example
+        order = torch.randperm(len(scene.tensors["means"]), generator=torch.Generator().manual_seed(seed))
+        shuffled = {k: v[order] if k in PER_GAUSSIAN else v for k, v in scene.tensors.items()}
+        out, grads = run(scene, body)
+        other, other_grads = run(Scene(shuffled, scene.Ks, scene.width, scene.height, scene.options), body)
+        assert torch.allclose(out.colors, other.colors, rtol=1e-5, atol=1e-6)
+        assert torch.equal(out.radii[:, order], other.radii)
+        assert torch.allclose(out.weight_sum[:, order], other.weight_sum, rtol=1e-4, atol=1e-6)
+        for name in PER_GAUSSIAN:
+            if name in grads:
+                scale = float(grads[name].abs().max())
+                assert torch.allclose(grads[name][order], other_grads[name], rtol=1e-3, atol=1e-5 * (1 + scale)), name
+
+    for_all(st.tuples(good_scenes(), st.integers(0, 1000)), body, 150, generated, holds)
+
+
+@on_every_body
+def test_moving_the_world_and_the_camera_together_changes_nothing(body, generated):
+    def holds(example):
+        scene, turn, shift = example
+        w, x, y, z = turn = torch.tensor(turn, dtype=torch.float64) / torch.tensor(turn).double().norm()
+        R = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+                         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]).reshape(3, 3)
+        t = torch.tensor(shift, dtype=torch.float64)
+        a, v = scene.tensors["quats"][:, 0], scene.tensors["quats"][:, 1:]
+        quats = torch.cat([(w * a - v @ turn[1:])[:, None],
+                           w * v + a[:, None] * turn[1:] + torch.linalg.cross(turn[1:].expand_as(v), v)], 1)
+        view = scene.tensors["viewmats"].clone()
+        view[:, :3, :3] = view[:, :3, :3] @ R.T
+        view[:, :3, 3] -= view[:, :3, :3] @ t
+        moved = scene.tensors | {"means": scene.tensors["means"] @ R.T + t, "quats": quats, "viewmats": view}
+        other = Scene(moved, scene.Ks, scene.width, scene.height, scene.options).run(body)
+        assert_alike(scene.run(body), other, len(quats))
+
+    flat = good_scenes(bands=st.sampled_from([(None, 3), (0, 3)]))  # higher harmonics are tied to the world's axes
+    turns = st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT)
+    for_all(st.tuples(flat, turns, st.tuples(UNIT, UNIT, UNIT)), body, 150, generated, holds)
+
+
+@on_every_body
+def test_scaling_the_world_scales_the_depth(body, generated):
+    def holds(example):
+        scene, exponent = example
+        factor = 10.0**exponent
+        view = scene.tensors["viewmats"].clone()
+        view[:, :3, 3] *= factor
+        scaled = scene.tensors | {"means": scene.tensors["means"] * factor, "viewmats": view,
+                                  "log_scales": scene.tensors["log_scales"] + math.log(factor)}
+        near = [dataclasses.replace(scene.options["settings"], near=NEAR * f) for f in (1, factor)]
+        options = [scene.options | {"with_depth": True, "settings": value} for value in near]
+        one = Scene(scene.tensors, scene.Ks, scene.width, scene.height, options[0]).run(body)
+        other = Scene(scaled, scene.Ks, scene.width, scene.height, options[1]).run(body)
+        assert_alike(one, other, len(view) * len(scene.tensors["means"]))
+        solid = (one.alphas > 0.2) & ((one.alphas - other.alphas).abs() < SAME_SIDE)
+        assert torch.allclose(one.depth_expected[solid] * factor, other.depth_expected[solid], rtol=5e-3)
+
+    for_all(st.tuples(good_scenes(), st.floats(-5, 5)), body, 150, generated, holds)
+
+
+@on_every_body
+def test_two_halves_make_the_image(body, generated):
+    # Other tiles, another principal point. The means are so near to the middle that no half clamps a Jacobian.
+    def holds(scene):
+        scene.tensors["means"][:, 0] *= 0.25
+        whole = scene.run(body)
+        half = scene.width // 2
+        parts = []
+        for x in (0, half):
+            K = scene.Ks.clone()
+            K[:, 0, 2] -= x
+            parts.append(Scene(scene.tensors, K, half, scene.height, scene.options).run(body))
+        for name in ("colors", "alphas"):
+            setattr(parts[0], name, torch.cat([getattr(p, name) for p in parts], 2))
+        assert_alike(whole, parts[0], len(scene.tensors["means"]), 1e-3)
+        both = parts[0].weight_sum + parts[1].weight_sum
+        assert (whole.weight_sum - both).abs().max() <= whole.alphas.numel() * ALPHA_MIN * 0.25 + 1e-3
+
+    for_all(good_scenes(sizes=st.just((34, 20)), points=st.just((0.5, 0.5))), body, 150, generated, holds)
+
+
+@st.composite
+def fans(draw):
+    """One long Gaussian anywhere before the camera, mostly outside the view."""
+    depth = draw(st.floats(0.125, 4, width=32))
+    mean = (draw(st.floats(-8, 8, width=32)) * depth, draw(st.floats(-8, 8, width=32)) * depth, depth)
+    quat = draw(st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT))
+    return mean, quat, (draw(st.floats(-1, 2, width=32)), -4.0, -4.0), draw(st.floats(0, 6, width=32))
+
+
+@on_every_body
+def test_footprints_at_the_frustum_edge_are_bounded(body, generated):
+    # sigma^2 <= |J|^2 s^2 + 0.3 with the clamped x/z and y/z in J; the ellipse ends at sqrt(2 ln 255) sigma at most.
+    def holds(scene):
+        out, grads = run(scene, body)
+        assert_sane(scene, out, grads)
+        (fx, _, cx), (_, fy, cy), _ = scene.Ks[0].tolist()
+        z = scene.tensors["means"][0, 2].item()
+        u = 0.15 * scene.width / fx + max(cx, scene.width - cx) / fx
+        v = 0.15 * scene.height / fy + max(cy, scene.height - cy) / fy
+        J2 = (fx / z) ** 2 * (1 + u * u) + (fy / z) ** 2 * (1 + v * v)
+        largest = math.exp(scene.tensors["log_scales"].max().item())
+        reach = math.sqrt(2 * math.log(255.0) * (J2 * largest**2 + 0.3))
+        assert out.radii[0, 0] <= math.ceil(reach * (1 + 1e-5))
+
+    strategy = scenes(least=1, most=1, kind=fans(), views=st.just(1), points=st.sampled_from([(0.5, 0.5), (0.1, 0.8)]))
+    for_all(strategy, body, 250, generated, holds)
+
+
+@on_every_body
+def test_a_camera_of_a_batch_sees_what_it_sees_alone(body, generated):
+    def holds(scene):
+        both = scene.run(body)
+        for c in range(2):
+            tensors = scene.tensors | {"viewmats": scene.tensors["viewmats"][c:c + 1]}
+            alone = Scene(tensors, scene.Ks[c:c + 1], scene.width, scene.height, scene.options).run(body)
+            assert torch.equal(both.colors[c], alone.colors[0])
+            assert torch.equal(both.radii[c], alone.radii[0])
+
+    for_all(scenes(views=st.just(2)), body, 60, generated, holds)
