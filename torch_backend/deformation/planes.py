@@ -226,7 +226,7 @@ class _Bend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        return None, None, *torch._foreach_mul(list(ctx.saved_tensors), grad)
+        return None, None, *(saved * grad for saved in ctx.saved_tensors)
 
 
 def penalty(

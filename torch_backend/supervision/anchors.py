@@ -49,8 +49,8 @@ class SupervisionConfig:
     """`support`: confidence in an anchor decays as exp(-|dt| / this)."""
 
 
-_ATTRIBUTE_WEIGHTS = Deltas(means=5.0, quats=0.2, log_scales=0.2, opacity_logits=0.1, sh0=0.2)  # type: ignore[arg-type]
-"""Weights of the attributes in `support`, so that typical deltas of each count alike; means in scene units."""
+_ATTRIBUTE_WEIGHTS = (5.0, 0.2, 0.2, 0.1, 0.2)
+"""Weights of means, quats, log_scales, opacity_logits and sh0 in `support`, so that typical deltas of each count alike; means in scene units."""
 _KNEE = 0.02
 """Below this the support loss is quadratic, above it linear (Charbonnier)."""
 
@@ -119,6 +119,8 @@ def support_loss(
         confidence = torch.exp(-distance / config.support_seconds)
     total = torch.zeros_like(confidence)
     for weight, value, anchors in zip(_ATTRIBUTE_WEIGHTS, here, there, strict=True):
+        if value is None or anchors is None:  # not every host moves every attribute
+            continue
         first, second = anchors.reshape(2, len(rows), -1)
         gap = value.reshape(len(rows), -1) - torch.lerp(first, second, share[:, None])
         total = total + weight * (torch.sqrt(gap.square() + _KNEE**2) - _KNEE).sum(1)

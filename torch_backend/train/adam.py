@@ -213,7 +213,8 @@ class FusedAdam(torch.optim.Optimizer):
         else:
             self.applied = self._run_snippet(whole, real, bad, rows, chunks)
             if bool(self.applied):
-                torch._foreach_add_(steps, 1.0)
+                for t in steps:
+                    t += 1.0
 
     def _state_of(self, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Moments and step count; moments lie in memory as their parameter does, wherever they came from."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..raster import ssim as compiled_ssim
+from ..raster import ssim_cuda
 
 _C1, _C2 = 0.01**2, 0.03**2
 """Constants of SSIM for data_range = 1."""
@@ -26,12 +27,15 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity of [H, W, C] images, data_range 1, Gaussian window 11 x 11 with sigma 1.5.
 
     ValueError if a side is smaller than the window. Borders are weighted by what lies inside the image. Differentiable
-    in `image`. float32 on the CPU runs compiled (`raster.ssim`); anything else, float64 for instance, runs in torch.
+    in `image`. float32 runs compiled on the CPU (`raster.ssim`) and on an NVIDIA GPU (`raster.ssim_cuda`); anything
+    else, float64 for instance, runs in torch.
     """
     if image.shape != target.shape or min(image.shape[:2]) < _WINDOW:
         raise ValueError(f"SSIM needs two images of one shape and at least {_WINDOW} px, got {tuple(image.shape)}")
     if compiled_ssim.supports(image, target):
         return compiled_ssim.ssim(image, target)
+    if image.is_cuda and ssim_cuda.supports(image, target):
+        return ssim_cuda.ssim(image, target)
     return _TorchSsim.apply(image, target)  # type: ignore[no-any-return]
 
 

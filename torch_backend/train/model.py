@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ class DynamicModel:
     """SH degree in use."""
     exposure: Exposure
     """How the camera exposed each frame; the Gaussians' colours are those of no correction."""
-    _rows: tuple[Tensor, int, Tensor] | None = field(default=None, repr=False)
+    _rows: tuple[Tensor, int, Tensor] | None = dataclasses.field(default=None, repr=False)
 
     @property
     def device(self) -> torch.device:

@@ -1,0 +1,136 @@
+"""Mean SSIM of float32 images on a GPU with its gradient: a Warp kernel in four passes, nothing read back.
+
+The mathematics and the notation are those of `ssim`: separable blurs of x - 0.5, y - 0.5, x^2 + y^2 and x y, cut at the
+border and renormalised per axis; the backward blur is the plain one of values multiplied by the reciprocal weight sums
+first. Passes: 0 blurs down the columns, 1 along the rows and takes the score and the gradient's fields, 2 blurs these
+down, 3 along, and puts the gradient together. A thread is one value of one pixel. The same kernel runs on Warp's cpu
+device, where tests compare it with float64.
+"""
+
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..native import launch_on
+from . import cpu
+from .ssim import WINDOW, _taps
+
+_SOURCE = r"""
+const int HALF = @HALF@;
+const float TAP[2 * HALF + 1] = {@TAPS@}, C1 = 1e-4f, C2 = 9e-4f, MID = 0.5f;
+const float* image = (const float*)images; const float* target = (const float*)targets;
+float* blurred = (float*)blurreds; float* back = (float*)backs;
+const int length = width * channels, count = height * length;
+const int h = tid / length, w = tid % length / channels;
+// The loops have constant bounds, so that the taps become constants of the code.
+#define TAPS_DOWN _Pragma("unroll") for (int k = -HALF; k <= HALF; k++) if (h + k >= 0 && h + k < height)
+#define TAPS_ALONG _Pragma("unroll") for (int k = -HALF; k <= HALF; k++) if (w + k >= 0 && w + k < width)
+float m[4] = {0.f, 0.f, 0.f, 0.f}, weight = 0.f;
+if (stage == 0) {
+    TAPS_DOWN {
+        float tap = TAP[k + HALF], x = image[tid + k * length] - MID, y = target[tid + k * length] - MID;
+        weight += tap; m[0] += tap * x; m[1] += tap * y; m[2] += tap * (x * x + y * y); m[3] += tap * x * y; }
+    for (int q = 0; q < 4; q++) blurred[q * count + tid] = m[q] / weight;
+} else if (stage == 1) {
+    TAPS_ALONG {
+        float tap = TAP[k + HALF];
+        weight += tap;
+        for (int q = 0; q < 4; q++) m[q] += tap * blurred[q * count + tid + k * channels]; }
+    float rx = 1.f / weight, u = m[0] * rx, v = m[1] * rx, square = m[2] * rx, both = m[3] * rx;
+    float mx = u + MID, my = v + MID;
+    float a1 = 2.f * mx * my + C1, a2 = 2.f * (both - u * v) + C2;
+    float b1 = mx * mx + my * my + C1, b2 = square - (u * u + v * v) + C2;
+    float inverse = 1.f / (b1 * b2), score = a1 * a2 * inverse;
+    ((float*)scores)[tid] = score;
+    if (!back) return;
+    float down = 0.f;
+    TAPS_DOWN down += TAP[k + HALF];
+    float share = rx / down, d1 = score * inverse * b2, d2 = score * inverse * b1;
+    // By the mean of x (inside the luminance, then inside the variances), by x^2, by x y.
+    back[tid] = share * (2.f * (my * (a2 * inverse) - mx * d1) + 2.f * (u * d2 - v * (a1 * inverse)));
+    back[count + tid] = share * -d2;
+    back[2 * count + tid] = share * (2.f * a1 * inverse);
+} else if (stage == 2) {
+    TAPS_DOWN
+        for (int q = 0; q < 3; q++) m[q] += TAP[k + HALF] * back[q * count + tid + k * length];
+    for (int q = 0; q < 3; q++) blurred[q * count + tid] = m[q];
+} else {
+    TAPS_ALONG
+        for (int q = 0; q < 3; q++) m[q] += TAP[k + HALF] * blurred[q * count + tid + k * channels];
+    back[tid] = (m[0] + 2.f * (image[tid] - MID) * m[1] + (target[tid] - MID) * m[2]) / (float)count;
+}
+"""
+
+
+@functools.lru_cache(maxsize=1)
+def kernel() -> Any:
+    """The Warp kernel of all passes; compiled for a device at its first launch there."""
+    wp = cpu._import_warp()
+    taps = ", ".join(f"{tap:.9g}f" for tap in _taps())
+    source = _SOURCE.replace("@HALF@", str(WINDOW // 2)).replace("@TAPS@", taps)
+
+    def ssim_pass(
+        images: wp.uint64, targets: wp.uint64, blurreds: wp.uint64, backs: wp.uint64, scores: wp.uint64,
+        height: wp.int32, width: wp.int32, channels: wp.int32, stage: wp.int32, tid: wp.int32,
+    ): ...  # fmt: skip
+
+    native = wp.func_native(source)(ssim_pass)
+
+    def entry(
+        images: wp.uint64, targets: wp.uint64, blurreds: wp.uint64, backs: wp.uint64, scores: wp.uint64,
+        height: wp.int32, width: wp.int32, channels: wp.int32, stage: wp.int32,
+    ):  # fmt: skip
+        native(images, targets, blurreds, backs, scores, height, width, channels, stage, wp.tid())
+
+    return wp.Kernel(entry, key="ssim_pass", module=wp.get_module(__name__), options={"enable_backward": False})
+
+
+class _Ssim(torch.autograd.Function):
+    """Autograd's view; the gradient is linear in the incoming one, so it is computed along with the value."""
+
+    @staticmethod
+    def forward(ctx, image: Tensor, target: Tensor) -> Tensor:  # type: ignore[override]
+        image, target = image.contiguous(), target.contiguous()
+        height, width, channels = image.shape
+        wanted = ctx.needs_input_grad[0]
+        blurred, score = image.new_empty(4, *image.shape), torch.empty_like(image)
+        back = image.new_empty(3, *image.shape) if wanted else None
+        for stage in range(4 if wanted else 2):
+            inputs = [
+                image.data_ptr(), target.data_ptr(), blurred.data_ptr(), 0 if back is None else back.data_ptr(),
+                score.data_ptr(), height, width, channels, stage,
+            ]  # fmt: skip
+            launch_on(kernel(), image.numel(), inputs, image.device)
+        ctx.save_for_backward(None if back is None else back[0])
+        return score.mean(dtype=torch.float64).float()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        (gradient,) = ctx.saved_tensors
+        return grad * gradient, None
+
+
+def supports(image: Tensor, target: Tensor) -> bool:
+    """Whether `ssim` takes these tensors: float32, dense, on one device (CPU, CUDA), no gradient for the target."""
+    return not target.requires_grad and image.device == target.device and all(
+        t.dtype == torch.float32 and t.device.type in ("cpu", "cuda") and t.layout == torch.strided
+        for t in (image, target)
+    )  # fmt: skip
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean structural similarity (0-dim) of two float32 images [H, W, C] of one device; differentiable in the first.
+
+    ValueError if the shapes differ, a side is smaller than the window, or `supports` says no.
+    """
+    if image.ndim != 3 or image.shape != target.shape or min(image.shape[:2]) < WINDOW or image.shape[2] < 1:
+        raise ValueError(f"SSIM needs two [H, W, C] images of one shape and at least {WINDOW} px, "
+                         f"got {tuple(image.shape)} and {tuple(target.shape)}")
+    if not supports(image, target):
+        raise ValueError(f"SSIM here takes float32 images of one device and a target without gradient, got "
+                         f"{image.dtype} on {image.device} and {target.dtype} on {target.device}")
+    return _Ssim.apply(image, target)  # type: ignore[no-any-return]
