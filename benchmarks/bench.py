@@ -1,0 +1,385 @@
+"""The benchmark of the method: hosts x supervision x presets on scenes with truth, and the report of it.
+
+    python3 splannequin.py bench [--quick] [--ablations]
+    python -m benchmarks.bench --truth FOLDER ... --shot SHOT ... --results DIR
+
+Every run is a child process: it trains (or goes on from its checkpoint), freezes, scores, and writes
+RESULTS/<run-id>.json whole. A run that has its file is not run again, so an interrupted benchmark goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
+
+from torch_backend.contract import ExitCode, TrainParams, from_dict, read_json
+from torch_backend.job import new_job, run_job
+from torch_backend.report.records import RECORD_VERSION, RunRecord, finished, machine_facts, save_record
+from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
+from torch_backend.scene import load_scene, split_frames
+from torch_backend.shot import Shot, content_key, write_json
+from torch_backend.train import PRESETS, TrainConfig, config_from_params
+from torch_backend.train.config import METHODS, SUPERVISIONS, config_to_json
+
+ROOT = Path(__file__).resolve().parents[1]
+HOSTS = {"hexplane": "4DGaussians", "mlp": "Deformable 3DGS", "control_points": "SC-GS"}
+"""TrainConfig.method of each published host -> its name."""
+HOLDOUT = 8
+"""Every how many frames one is kept out of training."""
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """One thing taken away from, or changed in, a method."""
+
+    name: str
+    host: str
+    supervision: str
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    """Dotted field of TrainConfig -> value."""
+    query: str = "nearest"
+
+
+ABLATIONS = (
+    Ablation("no hidden loss", "hexplane", "paper", {"supervision.weight_hidden": 0.0}),
+    Ablation("no defective loss", "hexplane", "paper", {"supervision.weight_defective": 0.0}),
+    Ablation("no confidence weighting", "hexplane", "paper", {"supervision.tau": 0.0}),
+    Ablation("detector: weight", "hexplane", "paper", {"supervision.detector": "weight"}),
+    Ablation("detector: grad_norm", "hexplane", "paper", {"supervision.detector": "grad_norm"}),
+    Ablation("detector: grad_signed", "hexplane", "paper", {"supervision.detector": "grad_signed"}),
+    Ablation("gate, no anchors", "auto", "none"),
+    Ablation("gate, paper's anchors", "auto", "paper"),
+    Ablation("asked at t* itself", "auto", "support", query="plain"),
+    Ablation("no exposure", "auto", "support", {"exposure.on": False}),
+)
+"""The paper's and ours. Without the gate, `support` is the host's own row of the main table."""
+
+
+@dataclass
+class RunSpec:
+    """One run of the plan: what its child process is told."""
+
+    source: str
+    """Where the scene is: truth:FOLDER or shot:FOLDER."""
+    scene_key: str
+    """Content of the scene."""
+    host: str
+    supervision: str
+    preset: str
+    variant: str = "default"
+    seed: int = 0
+    query: str = "nearest"
+    overrides: dict[str, Any] = field(default_factory=dict)
+    """Dotted field of TrainConfig -> value."""
+    iterations: int = 0
+    """0: the preset's; the same for the next two."""
+    width: int = 0
+    max_gaussians: int = 0
+    holdout_phase: int = 0
+    """Which of every `HOLDOUT` frames is kept out: one that spares the instants."""
+
+    def params(self, run: str) -> TrainParams:
+        """The training job's parameters."""
+        return TrainParams(
+            run=run,
+            preset=self.preset,
+            method=self.host,
+            supervision=self.supervision,
+            iterations=self.iterations,
+            width=self.width,
+            max_gaussians=self.max_gaussians,
+            holdout=HOLDOUT,
+            seed=self.seed,
+        )
+
+    def config(self) -> TrainConfig:
+        """Every number of the run. ValueError if something of it does not exist."""
+        config = config_from_params(self.params("bench"))
+        for path, value in {"holdout_phase": self.holdout_phase, **self.overrides}.items():
+            override(config, path, value)
+        return config
+
+    @property
+    def run_name(self) -> str:
+        """The training run's folder in the shot: runs that differ only in how they are asked share it."""
+        return f"bench-{content_key(config_to_json(self.config()))}"
+
+    @property
+    def run_id(self) -> str:
+        """Name of the record: readable, and hashed from scene and settings, not from the code."""
+        words = f"{Path(self.source).stem}-{self.host}-{self.supervision}-{self.preset}-{self.variant}-s{self.seed}"
+        key = content_key(RECORD_VERSION, self.scene_key, config_to_json(self.config()), self.query)
+        return re.sub(r"[^\w-]+", "-", words).strip("-")[:80] + f"-{key}"
+
+
+def override(config: Any, path: str, value: Any) -> None:
+    """Sets a dotted field of a configuration. ValueError if there is none of that name."""
+    *parents, name = path.split(".")
+    for parent in parents:
+        config = getattr(config, parent, None)
+    if config is None or name not in {f.name for f in dataclasses.fields(config)}:
+        raise ValueError(f"the training configuration has no {path}")
+    setattr(config, name, value)
+
+
+def load_source(source: str, results: Path) -> TruthScene:
+    """The scene of `truth:FOLDER` or `shot:FOLDER`. ValueError for anything else."""
+    kind, _, folder = source.partition(":")
+    if kind == "truth":
+        return TruthFolder(folder)
+    if kind == "shot":
+        return RealScene(Shot.open(folder), results)
+    raise ValueError(f"scene {source!r}: it should be truth:FOLDER or shot:FOLDER")
+
+
+# ------------------------------------------------------------------------------------------------- the plan
+
+
+def plan(
+    sources: Sequence[str],
+    results: Path,
+    *,
+    presets: Sequence[str] = ("preview",),
+    seeds: Sequence[int] = (0,),
+    ablations: bool = False,
+    **size: int,
+) -> tuple[list[RunSpec], list[str]]:
+    """(runs, sentences about what is missing): hosts x {none, paper, support}, auto and static, then ablations.
+
+    Runs are ordered so that an interrupted benchmark has compared something on every scene: by setting, then scene.
+    `size` goes to `RunSpec`: iterations, width, max_gaussians.
+    """
+    settings = [
+        RunSpec("", "", host, supervision, "preview")
+        for host in HOSTS
+        for supervision in ("none", "paper", "support")
+        if host in METHODS and supervision in SUPERVISIONS
+    ]
+    settings += [RunSpec("", "", "auto", "support", "preview"), RunSpec("", "", "static", "none", "preview")]
+    said = [
+        f"{name} is not in this report: the trainer has no host {host!r}."
+        for host, name in HOSTS.items()
+        if host not in METHODS
+    ]
+    if ablations:
+        for a in ABLATIONS:
+            spec = RunSpec("", "", a.host, a.supervision, "preview", a.name, 0, a.query, dict(a.overrides))
+            try:
+                spec.config()
+            except ValueError as error:
+                said.append(f"The ablation {a.name!r} is not in this report: {error}.")
+            else:
+                settings.append(spec)
+    scenes = [(source, load_source(source, results)) for source in sources]
+    runs = []
+    for preset in presets:
+        for seed in seeds:
+            for setting in settings:
+                for source, scene in scenes:
+                    runs.append(
+                        dataclasses.replace(
+                            setting,
+                            source=source,
+                            scene_key=scene.key,
+                            preset=preset,
+                            seed=seed,
+                            holdout_phase=_phase(scene),
+                            **size,
+                        )
+                    )
+    return runs, said
+
+
+def _phase(scene: TruthScene) -> int:
+    """The hold-out phase that keeps the fewest instants out of training; 0, what is reported elsewhere, if it can be."""
+    if scene.kind == "real":
+        return 0
+    loaded = load_scene(scene.shot)
+
+    def lost(phase: int) -> int:
+        _, test = split_frames(loaded.solved, HOLDOUT, phase)
+        return len({loaded.frames[i] for i in test} & set(scene.t_stars))
+
+    return min(range(HOLDOUT), key=lost)
+
+
+# ------------------------------------------------------------------------------------------------- running
+
+
+def run_plan(runs: Iterable[RunSpec], results: Path) -> list[str]:
+    """Runs what has no record yet, one child at a time. Returns sentences about runs that failed.
+
+    KeyboardInterrupt ends the child at its next checkpoint and is raised again.
+    """
+    failures = []
+    todo = [spec for spec in runs if not finished(results, spec.run_id)]
+    for n, spec in enumerate(todo):
+        print(f"[{n + 1}/{len(todo)}] {spec.run_id}", flush=True)
+        code = _child(spec, results)
+        if code != ExitCode.OK or not finished(results, spec.run_id):
+            log = results / "logs" / f"{spec.run_id}.txt"
+            failures.append(f"{spec.run_id} failed (exit code {code}): see {log}.")
+            print(f"  {failures[-1]}", flush=True)
+    return failures
+
+
+def _child(spec: RunSpec, results: Path) -> int:
+    """Runs one spec in a process of its own, its output to RESULTS/logs; returns the exit code."""
+    request = results / "requests" / f"{spec.run_id}.json"
+    write_json(request, dataclasses.asdict(spec))
+    log = results / "logs" / f"{spec.run_id}.txt"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "benchmarks.bench", "--work", str(request), "--results", str(results)]
+    with open(log, "w", encoding="utf-8") as out:
+        child = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=subprocess.STDOUT)
+        try:
+            return child.wait()
+        except BaseException:
+            child.send_signal(signal.SIGTERM)
+            child.wait()
+            raise
+
+
+def work(request: Path, results: Path) -> int:
+    """The child: trains, freezes, scores, writes the record. Returns an exit code."""
+    spec: RunSpec = from_dict(RunSpec, read_json(request))
+    truth = load_source(spec.source, results)
+    run_name = spec.run_name
+    folder = truth.shot.run(run_name)
+    whole = not folder.exists()
+    # The job's parameters name a preset; this process knows one more, with the plan's overrides in it.
+    known = PRESETS[spec.preset]
+    PRESETS[spec.preset] = lambda: _overridden(known(), spec)
+    since = time.process_time()
+    code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print)
+    cpu_seconds = round(time.process_time() - since, 2)
+    facts = folder / "bench.json"
+    if code != ExitCode.OK:
+        return int(code)
+    if whole and not facts.is_file():
+        write_json(facts, {"version": 1, "train_cpu_seconds": cpu_seconds, "machine": machine_facts()})
+    return _judge(spec, truth, run_name, results, read_json(facts) if facts.is_file() else {})
+
+
+def _overridden(config: TrainConfig, spec: RunSpec) -> TrainConfig:
+    for path, value in {"holdout_phase": spec.holdout_phase, **spec.overrides}.items():
+        override(config, path, value)
+    return config
+
+
+def _judge(spec: RunSpec, truth: TruthScene, run_name: str, results: Path, trained: dict[str, Any]) -> int:
+    """Scores the trained run and writes its record."""
+    from torch_backend.report.evaluate import evaluate_run
+
+    measured = evaluate_run(truth, run_name, spec.query, results, spec.run_id, _Log())
+    record = RunRecord(
+        run_id=spec.run_id,
+        scene=truth.name,
+        kind=truth.kind,
+        cameras=truth.cameras,
+        host=spec.host,
+        supervision=spec.supervision,
+        preset=spec.preset,
+        variant=spec.variant,
+        seed=spec.seed,
+        query=spec.query,
+        train_cpu_seconds=trained.get("train_cpu_seconds"),
+        machine=machine_facts(),
+        command=f"python -m benchmarks.bench --work requests/{spec.run_id}.json",
+        finished=time.strftime("%Y-%m-%d %H:%M", time.gmtime()),
+        **measured,
+    )
+    save_record(results, record)
+    return int(ExitCode.OK)
+
+
+class _Log:
+    """A reporter that says one line per stage."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
+        if stage != self._stage:
+            print(stage, flush=True)
+            self._stage = stage
+
+    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
+        print(stage, dict(values), flush=True)
+
+    def image(self, label: str, path: str | Path) -> None:
+        print(label, path, flush=True)
+
+    def warning(self, message: str, hint: str = "") -> None:
+        print(f"note: {message} {hint}", flush=True)
+
+    def check_cancelled(self) -> None:
+        """Ctrl-C and SIGTERM end scoring by their own exceptions."""
+
+
+# ------------------------------------------------------------------------------------------------- command line
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns an exit code."""
+    args = _parser().parse_args(argv)
+    results = Path(args.results).absolute()
+    if args.work:
+        return work(Path(args.work), results)
+    from torch_backend.report.write import write_report
+
+    results.mkdir(parents=True, exist_ok=True)
+    sources = [f"truth:{Path(p).absolute()}" for p in args.truth] + [f"shot:{Path(p).absolute()}" for p in args.shot]
+    if not sources:
+        print("Error: no scene: name folders with --truth or --shot.", file=sys.stderr)
+        return int(ExitCode.USAGE)
+    runs, said = plan(
+        sources,
+        results,
+        presets=args.preset or ("preview",),
+        seeds=range(args.seeds),
+        ablations=args.ablations,
+        iterations=args.iterations,
+        width=args.width,
+        max_gaussians=args.max_gaussians,
+    )
+    try:
+        said += run_plan(runs, results)
+    except KeyboardInterrupt:
+        print("Interrupted. The same command goes on from here.", flush=True)
+        return int(ExitCode.CANCELLED)
+    command = "python -m benchmarks.bench " + subprocess.list2cmdline(sys.argv[1:] if argv is None else list(argv))
+    path = write_report(results, results / "report", [r.run_id for r in runs], said, command.strip())
+    print(f"Report: {path}", flush=True)
+    return int(ExitCode.OK)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="bench", description="Hosts and supervisions against truth.")
+    parser.add_argument("--truth", action="append", default=[], metavar="FOLDER", help="scene with rendered truth")
+    parser.add_argument("--shot", action="append", default=[], metavar="SHOT", help="solved shot of a real clip")
+    parser.add_argument("--results", default="bench", metavar="DIR", help="records, pictures and report")
+    parser.add_argument("--preset", action="append", choices=tuple(PRESETS), help="default: preview")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="training seeds 0 to N - 1")
+    parser.add_argument("--ablations", action="store_true", help="the paper's and ours")
+    parser.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
+    parser.add_argument("--width", type=int, default=0, help="width of training images in pixels (0: the preset's)")
+    parser.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
+    parser.add_argument("--work", help=argparse.SUPPRESS)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,198 @@
+"""A trained run against a scene with truth: freezes at every t*, sees it from every pose, scores, keeps pictures."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..contract import Reporter, frame_file, read_json
+from ..footage.images import write_png
+from ..freeze.query import FrozenGaussians, freeze_at, render_frozen
+from ..scene import Scene, load_scene, read_image, split_frames
+from ..train import LoadedRun, load_run
+from ..train.checkpoint import load_checkpoint
+from .colorvideovdp import sequence_jod
+from .metrics import best_share_psnr, gradient_energy, missing_metrics, score
+from .records import PICTURES, FrameScore, Picture
+from .truth import TruthScene
+
+SHOWN = 6
+"""Pictures kept of every run, the same frames for all runs of a scene."""
+WORST = 4
+"""Pictures kept of a run's worst frames."""
+
+
+@dataclass
+class _Frozen:
+    """A run frozen at one instant, ready to be seen."""
+
+    run: LoadedRun
+    scene: Scene
+    gaussians: FrozenGaussians
+
+    def view(self, pose: int) -> Tensor:
+        """[H, W, 3] from the pose of frame `pose`, exposed as that frame is."""
+        run, scene = self.run, self.scene
+        index = scene.frames.index(pose)
+        K = scene.camera_at(run.width, run.height)[index]
+        exposed_at = scene.time_of_frame(pose)
+        image = render_frozen(
+            self.gaussians, scene.viewmats[index], K, run.width, run.height, run.model.exposure, exposed_at
+        )
+        return (image.color + (1.0 - image.alpha[..., None]) * 0.5).clamp(0.0, 1.0)
+
+
+def evaluate_run(truth: TruthScene, run_name: str, query: str, results: Path, run_id: str, report: Reporter) -> dict:
+    """Everything in a `RunRecord` that comes from the trained run, by field name.
+
+    Args:
+        truth: the scene; its shot holds the run.
+        run_name: folder in the shot's runs/.
+        query: how Gaussians are asked at t*: nearest or plain.
+        results: folder of the records; pictures go into `PICTURES` there.
+        run_id: names this run's pictures.
+
+    JobError if there is no such run; `Cancelled` if a stop was asked for.
+    """
+    run, scene = load_run(truth.shot, run_name), load_scene(truth.shot)
+    held_out = _held_out(run, scene)
+    size = (run.width, run.height)
+    rows: list[FrameScore] = []
+    jod: dict[str, float | None] = {}
+    frozen: dict[int, _Frozen] = {}
+    for n, t_star in enumerate(truth.t_stars):
+        frozen[t_star] = _freeze(run, scene, t_star, query)
+        ours, theirs = [], []
+        poses = truth.poses(t_star, held_out)
+        for m, pose in enumerate(poses):
+            report.check_cancelled()
+            report.progress("scoring", n + m / len(poses), len(truth.t_stars), f"t* {t_star}, pose {pose}")
+            image, target = frozen[t_star].view(pose), truth.truth(t_star, pose, *size)
+            rows.append(_score(truth, t_star, pose, pose in held_out, image, target))
+            ours.append(image)
+            theirs.append(target)
+        steady = truth.fps > 0 and len(ours) > 1
+        jod[str(t_star)] = sequence_jod(torch.stack(ours), torch.stack(theirs), truth.fps) if steady else None
+    keeper = _Keeper(truth, frozen, size, results, run_id)
+    summary = read_json(run.folder / "summary.json")
+    tensors, _ = load_checkpoint(run.folder / "checkpoint.safetensors")
+    return {
+        **{name: summary[name] for name in ("iterations", "train_seconds", "gaussians", "moving_share")},
+        "heldout_psnr_db": summary["heldout_psnr_db"],
+        "width": run.width,
+        "height": run.height,
+        "model_bytes": sum(v.nbytes for k, v in tensors.items() if not k.startswith("adam.")),
+        "frozen_fps": _fps(next(iter(frozen.values())), scene),
+        "rows": rows,
+        "jod": jod,
+        "pictures": keeper.pictures(rows),
+        **keeper.two_instants(rows),
+        "missing": missing_metrics(),
+    }
+
+
+def _held_out(run: LoadedRun, scene: Scene) -> list[int]:
+    """Frame numbers that the run did not train on."""
+    _, test = split_frames(scene.solved, run.config.holdout, run.config.holdout_phase)
+    return [scene.frames[i] for i in test]
+
+
+def _freeze(run: LoadedRun, scene: Scene, t_star: int, query: str) -> _Frozen:
+    at = dict(zip(scene.frames, scene.seconds, strict=True))
+    span = max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
+    return _Frozen(run, scene, freeze_at(run.model, scene.time_of_frame(t_star), span, query))
+
+
+def _score(truth: TruthScene, t_star: int, pose: int, held_out: bool, image: Tensor, target: Tensor) -> FrameScore:
+    regions = truth.regions(t_star, pose, target.shape[1], target.shape[0])
+    judged = regions.get(truth.judged)
+    energy = gradient_energy(target, judged)
+    return FrameScore(
+        t_star,
+        pose,
+        held_out,
+        score(image, target, regions),
+        best_share_psnr(image, target),
+        gradient_energy(image, judged) / energy if energy > 0 else None,
+    )
+
+
+def _fps(frozen: _Frozen, scene: Scene) -> float:
+    """Frames per second of one frozen instant along the clip's poses (at most 40 of them), after one for warming up."""
+    poses = [scene.frames[i] for i in np.linspace(0, len(scene.frames) - 1, min(40, len(scene.frames))).astype(int)]
+    frozen.view(poses[0])
+    seconds = []
+    for pose in poses:
+        since = time.perf_counter()
+        frozen.view(pose)
+        seconds.append(time.perf_counter() - since)
+    return 1.0 / float(np.median(seconds))
+
+
+class _Keeper:
+    """Writes the pictures that the report shows."""
+
+    def __init__(
+        self, truth: TruthScene, frozen: dict[int, _Frozen], size: tuple[int, int], results: Path, run_id: str
+    ) -> None:
+        self._truth, self._frozen, self._size = truth, frozen, size
+        self._results, self._run_id = results, run_id
+        self._common = f"{PICTURES}/{truth.key}-{size[0]}"
+
+    def pictures(self, rows: list[FrameScore]) -> list[Picture]:
+        """The shown and the worst frames, worst first."""
+        ranked = sorted(rows, key=lambda row: _rank(self._truth, row))
+        spread = np.linspace(0, len(rows) - 1, min(SHOWN, len(rows))).round().astype(int) if rows else []
+        picked = {(row.t_star, row.pose): row for row in [*ranked[:WORST], *(rows[i] for i in spread)]}
+        return [self._picture(row) for row in ranked if (row.t_star, row.pose) in picked]
+
+    def two_instants(self, rows: list[FrameScore]) -> dict[str, Any]:
+        """One pose at the instants farthest apart that share one, with the plates of those instants."""
+        by_pose: dict[int, list[FrameScore]] = {}
+        for row in rows:
+            by_pose.setdefault(row.pose, []).append(row)
+        if not by_pose:
+            return {}
+        middle = float(np.median([row.pose for row in rows]))
+
+        def apart(pose: int) -> tuple[int, float]:
+            instants = [row.t_star for row in by_pose[pose]]
+            return max(instants) - min(instants), -abs(pose - middle)
+
+        shared = sorted(by_pose[max(by_pose, key=apart)], key=lambda row: row.t_star)
+        pair = [shared[0], shared[-1]] if len(shared) > 1 else []
+        return {
+            "two_instants": [self._picture(row) for row in pair],
+            "plates": {str(row.t_star): self._plate(row.t_star) for row in pair},
+        }
+
+    def _picture(self, row: FrameScore) -> Picture:
+        name = f"{row.t_star:06d}_{row.pose:06d}.png"
+        ours, theirs = f"{PICTURES}/{self._run_id}/{name}", f"{self._common}/{name}"
+        self._write(ours, self._frozen[row.t_star].view(row.pose))
+        if not (self._results / theirs).is_file():
+            self._write(theirs, self._truth.truth(row.t_star, row.pose, *self._size))
+        return Picture(row.t_star, row.pose, ours, theirs, _rank(self._truth, row))
+
+    def _plate(self, frame: int) -> str:
+        path = f"{self._common}/plate_{frame:06d}.png"
+        if not (self._results / path).is_file():
+            self._write(path, read_image(self._truth.shot.frames / frame_file(frame, ".png"), *self._size))
+        return path
+
+    def _write(self, path: str, image: Tensor) -> None:
+        write_png(self._results / path, (image * 255.0 + 0.5).clamp(0, 255).to(torch.uint8).contiguous().numpy())
+
+
+def _rank(truth: TruthScene, row: FrameScore) -> float:
+    """PSNR in dB that ranks frames; over the whole frame where the judged region is empty."""
+    value = row.value("psnr_db", truth.judged)
+    whole = row.value("psnr_db")
+    assert whole is not None  # the whole frame is never empty
+    return whole if value is None else value

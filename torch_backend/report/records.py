@@ -1,0 +1,194 @@
+"""What a benchmark run leaves behind: one JSON file per run, written whole, read by the report and by nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..contract import check_version, from_dict, read_json
+from ..shot import write_json
+from .metrics import WHOLE, Key
+
+RECORD_VERSION = 1
+"""Rises when figures measured before must not stand beside new ones."""
+PICTURES = "pictures"
+"""Folder of pictures beside the records."""
+
+
+@dataclass
+class FrameScore:
+    """One pose of one frozen instant against the truth."""
+
+    t_star: int
+    """Frame number of the clip at which time stands still."""
+    pose: int
+    """Frame number of the clip from whose pose it is seen."""
+    held_out: bool
+    """True if the clip's frame at that pose was kept out of training."""
+    regions: dict[str, Any]
+    """{region: {"pixels": int, metric: float or None}}, as `metrics.score` returns it."""
+    best_90_psnr_db: float | None = None
+    """PSNR over the best 90 % of the pixels."""
+    gradient_ratio: float | None = None
+    """Gradient energy over the truth's: below 1 is softer."""
+
+    def value(self, metric: str, region: str = WHOLE) -> float | None:
+        """A figure, or None if it is not there."""
+        return self.regions.get(region, {}).get(metric)
+
+
+@dataclass
+class Picture:
+    """A frozen frame and the truth on disk, relative to the folder of the records."""
+
+    t_star: int
+    pose: int
+    ours: str
+    truth: str
+    psnr_db: float
+    """Over the whole frame (real clips: over what never moves)."""
+
+
+@dataclass
+class RunRecord:
+    """One training run and all that was measured of its freezes."""
+
+    run_id: str
+    """Name of the file; hashes scene and settings."""
+    scene: str
+    """Name of the scene."""
+    kind: str
+    """synthetic (truth rendered) or real (truth where nothing moves)."""
+    cameras: str
+    """exact or solved."""
+    host: str
+    """TrainConfig.method."""
+    supervision: str
+    """none, paper or support."""
+    preset: str
+    """Training preset."""
+    variant: str
+    """default, reference, or the name of an ablation."""
+    seed: int
+    """Training seed."""
+    query: str
+    """How Gaussians are asked at t*: nearest or plain."""
+    iterations: int
+    """Training steps."""
+    width: int
+    """Pixels of training and scoring."""
+    height: int
+    train_seconds: float
+    """Wall seconds of the training loop, evaluation excluded; other work on the machine lengthens them."""
+    train_cpu_seconds: float | None
+    """Processor seconds of the training job; None if it was interrupted."""
+    gaussians: int
+    moving_share: float
+    """Share of the Gaussians that the field moves."""
+    model_bytes: int
+    """What must be kept to freeze at any instant: Gaussians, field, support, exposure."""
+    frozen_fps: float
+    """Frozen frames per second, one instant, all outputs (colour, alpha, depth, mattes)."""
+    heldout_psnr_db: float | None
+    """On frames of the clip kept out of training, each at its own time."""
+    rows: list[FrameScore]
+    jod: dict[str, float | None] = field(default_factory=dict)
+    """t* -> ColorVideoVDP of its poses as a sequence."""
+    pictures: list[Picture] = field(default_factory=list)
+    two_instants: list[Picture] = field(default_factory=list)
+    """One pose at two instants."""
+    plates: dict[str, str] = field(default_factory=dict)
+    """Frame number -> plate on disk, of those two instants."""
+    missing: dict[str, str] = field(default_factory=dict)
+    """Metric -> sentence why it was not measured."""
+    machine: dict[str, Any] = field(default_factory=dict)
+    """Processor, cores, load and versions, see `machine_facts`."""
+    command: str = ""
+    """What to type to repeat it."""
+    finished: str = ""
+    """Date and time, UTC."""
+    version: int = RECORD_VERSION
+
+    @property
+    def setting(self) -> tuple[str, str, str, str, str]:
+        """What is compared: (host, supervision, preset, variant, cameras)."""
+        return self.host, self.supervision, self.preset, self.variant, self.cameras
+
+    def values(self, metric: str, region: str = WHOLE) -> dict[Key, float | None]:
+        """A metric by frame, ready for `metrics.paired`."""
+        at = (self.scene, self.cameras, self.seed)
+        return {(*at, row.t_star, row.pose): row.value(metric, region) for row in self.rows}
+
+    def per_frame(self, read: Callable[[FrameScore], float | None]) -> list[float | None]:
+        """Any figure of every frame."""
+        return [read(row) for row in self.rows]
+
+
+def save_record(folder: str | Path, record: RunRecord) -> Path:
+    """Writes results/<run_id>.json, whole or not at all."""
+    path = Path(folder) / f"{record.run_id}.json"
+    write_json(path, dataclasses.asdict(record))
+    return path
+
+
+def load_record(path: str | Path) -> RunRecord:
+    """Inverse of `save_record`. FileNotFoundError, or ValueError naming the file and what is wrong."""
+    data = read_json(path)
+    check_version(data, str(path), RECORD_VERSION)
+    try:
+        data["rows"] = [from_dict(FrameScore, row) for row in data["rows"]]
+        for name in ("pictures", "two_instants"):
+            data[name] = [from_dict(Picture, row) for row in data[name]]
+        return from_dict(RunRecord, data)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path} is no record of a benchmark run: {error}") from error
+
+
+def finished(folder: str | Path, run_id: str) -> bool:
+    """True if a record of this version stands there."""
+    path = Path(folder) / f"{run_id}.json"
+    return path.is_file() and read_json(path).get("version") == RECORD_VERSION
+
+
+def load_records(folder: str | Path, run_ids: Iterable[str] | None = None) -> list[RunRecord]:
+    """The records of a folder (those of `run_ids`, if given), by name."""
+    wanted = None if run_ids is None else set(run_ids)
+    paths = sorted(p for p in Path(folder).glob("*.json") if wanted is None or p.stem in wanted)
+    return [load_record(path) for path in paths]
+
+
+def machine_facts() -> dict[str, Any]:
+    """Processor, cores, load average and the versions of what computes."""
+    import importlib.metadata
+    import os
+    import sys
+
+    versions = {}
+    for name in ("torch", "warp-lang", "numpy", "flip-evaluator", "stlpips-pytorch", "cvvdp", "opencv-python-headless"):
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = None
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": sys.version.split()[0],
+        "load_1min": load,
+        "versions": versions,
+    }
+
+
+def _processor() -> str:
+    """The processor's name, as the system gives it."""
+    path = Path("/proc/cpuinfo")
+    if path.is_file():
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,158 @@
+"""Scenes that a freeze can be judged on: rendered truth in a folder, or a real clip where nothing moves.
+
+A folder of truth (written by benchmarks/synthetic, or by whoever has some):
+
+    truth.json                     version, name, cameras, shot, fps, t_stars, poses, regions
+    truth/<t*>_<pose>.png          the scene frozen at frame t*, seen from the pose of frame `pose`
+    regions/<t*>_<pose>_<name>.png white where the region is, one per name in `regions`
+
+`shot` is the solved shot folder to train on, relative to truth.json; frame numbers are those of its clip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from ..contract import check_version, frame_file, read_json
+from ..footage.images import read_png, resize
+from ..scene import load_scene, read_image
+from ..shot import Shot, atomic_path, content_key
+from .real import far_from, rigid_mask
+
+TRUTH_VERSION = 1
+REGIONS = ("seen", "never_seen", "moving", "static")
+"""By truth: visible in the clip's frame at t*; not; on something that moves in the clip; on nothing that does."""
+RIGID = "rigid"
+"""The region of a real clip in which the plate is the truth."""
+_FLOW_WIDTH = 640
+"""Optical flow is computed on plates of at most this width."""
+
+
+class TruthScene(Protocol):
+    """What a scene is asked for."""
+
+    name: str
+    kind: str
+    """synthetic or real."""
+    cameras: str
+    """exact or solved."""
+    shot: Shot
+    """The solved shot to train on."""
+    key: str
+    """Identifies shot and truth by content."""
+    fps: float
+    """Poses per second, when the poses of an instant are shown as a sequence; 0 if they are none."""
+    t_stars: list[int]
+    """Frame numbers of the instants."""
+    judged: str
+    """Region whose PSNR ranks frames."""
+
+    def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
+        """Frame numbers of the poses that test a freeze at t*, given the frames that were kept out of training."""
+        ...
+
+    def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
+        """[height, width, 3] display-referred in [0, 1]."""
+        ...
+
+    def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """name -> bool [height, width]."""
+        ...
+
+
+class TruthFolder:
+    """A folder of truth, see the module."""
+
+    kind = "synthetic"
+    judged = "whole"
+
+    def __init__(self, folder: str | Path) -> None:
+        """FileNotFoundError or ValueError if the folder is none."""
+        self.folder = Path(folder).absolute()
+        facts = read_json(self.folder / "truth.json")
+        check_version(facts, str(self.folder / "truth.json"), TRUTH_VERSION)
+        try:
+            self.name, self.cameras = str(facts["name"]), str(facts["cameras"])
+            self.shot = Shot.open(self.folder / facts["shot"])
+            self.fps = float(facts["fps"])
+            self.t_stars, self._poses = [int(t) for t in facts["t_stars"]], [int(p) for p in facts["poses"]]
+            self._regions = [str(name) for name in facts["regions"]]
+        except KeyError as error:
+            raise ValueError(f"{self.folder / 'truth.json'} has no {error}") from error
+        self.key = content_key(facts, read_json(self.shot.solve / "cameras.json"))
+
+    def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
+        """All poses that have a truth."""
+        return list(self._poses)
+
+    def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
+        """The rendered truth, as `TruthScene` says."""
+        return read_image(self.folder / "truth" / f"{t_star:06d}_{pose:06d}.png", width, height)
+
+    def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """The regions by truth; a pixel belongs to one if more than half of it does."""
+        named = {name: self.folder / "regions" / f"{t_star:06d}_{pose:06d}_{name}.png" for name in self._regions}
+        return {name: read_image(path, width, height).mean(2) > 0.5 for name, path in named.items()}
+
+
+class RealScene:
+    """A real clip: the plate is the truth on the pixels that stay on their epipolar lines through the clip."""
+
+    kind = "real"
+    cameras = "solved"
+    fps = 0.0
+    judged = RIGID
+
+    def __init__(self, shot: Shot, cache: str | Path, instants: int = 8) -> None:
+        """Args:
+            shot: a solved shot.
+            cache: folder that keeps the masks between runs.
+            instants: how many t*, evenly spread over the solved frames.
+
+        JobError if the shot is not solved.
+        """  # fmt: skip
+        self.shot, self.name = shot, shot.info().name
+        self._scene = load_scene(shot)
+        solved = [self._scene.frames[i] for i in self._scene.solved]
+        picked = np.linspace(0, len(solved) - 1, min(instants, len(solved))).round().astype(int)
+        self.t_stars = [solved[i] for i in picked]
+        self.key = content_key(read_json(shot.solve / "cameras.json"), self.t_stars)
+        self._cache = Path(cache) / f"rigid-{self.key}.npz"
+        self._masks: dict[int, Tensor] = {}
+
+    def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
+        """Held-out frames more than a quarter of the clip away from t*."""
+        return far_from(held_out, t_star, self._scene.frames[-1] - self._scene.frames[0] + 1)
+
+    def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
+        """The plate at the pose."""
+        return read_image(self.shot.frames / frame_file(pose, ".png"), width, height)
+
+    def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """The rigid pixels of the plate; one counts if nearly all of it is."""
+        if not self._masks:
+            self._masks = self._load_masks()
+        mask = self._masks[pose].float()[None, None]
+        return {RIGID: F.interpolate(mask, (height, width), mode="area")[0, 0] > 0.95}
+
+    def _load_masks(self) -> dict[int, Tensor]:
+        """The masks of all solved frames, from the cache or from optical flow."""
+        scene = self._scene
+        if not self._cache.is_file():
+            width = min(_FLOW_WIDTH, scene.width)
+            height = round(scene.height * width / scene.width)
+            plates = np.stack([resize(read_png(scene.image_path(i)), width, height) for i in scene.solved])
+            plates = plates if plates.dtype == np.uint8 else (plates >> 8).astype(np.uint8)
+            Ks = scene.camera_at(width, height)[scene.solved].numpy()
+            masks = rigid_mask(plates, scene.viewmats[scene.solved].numpy(), Ks)
+            with atomic_path(self._cache) as beside:
+                np.savez_compressed(beside, masks=masks, frames=[scene.frames[i] for i in scene.solved])
+        with np.load(self._cache, allow_pickle=False) as stored:
+            return {int(f): torch.from_numpy(m) for f, m in zip(stored["frames"], stored["masks"], strict=True)}
