@@ -180,6 +180,8 @@ def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
     args.n_colors = 0 if scene.colors is None else scene.colors.shape[1]
     args.n_sh, args.bands = (0, 0) if scene.sh is None else (3, (scene.sh_degree + 1) ** 2)
     args.sh_stride = 0 if scene.sh is None else 3 * scene.sh.shape[1]
+    # 16-byte words: rows of 4 or 16 harmonics, unless a view begins between two words.
+    args.sh_aligned = int(scene.sh is not None and args.sh_stride % 12 == 0 and scene.sh.data_ptr() % 16 == 0)
     args.channels = channels
     # Whole 32-byte sectors a record, whole warps' halves a gradient.
     args.record_stride = -(-(source.HEAD + channels) // 8) * 8

@@ -40,7 +40,7 @@ POINTERS = {
 }
 SIZES = ("n", "cameras", "width", "height", "tiles_x", "tiles_y", "capacity", "n_colors", "n_sh", "bands",
          "sh_stride", "channels", "record_stride", "grad_stride", "antialiased", "want_depth", "want_weights",
-         "want_top", "want_abs", "want_view", "wide")
+         "want_top", "want_abs", "want_view", "wide", "sh_aligned")
 FIELDS = {**{name: "uint64" for names in POINTERS.values() for name in names}, **dict.fromkeys(SIZES, "int32"),
           "near": "float32"}
 """Fields of the parameter structure and their Warp types; pointers travel as integers."""
@@ -166,16 +166,38 @@ _HARMONICS = [
 """Harmonic and its derivatives by the unit direction dx, dy, dz, where they are not 0."""
 
 
-def _harmonics(per_band: str) -> str:
-    """`per_band` for every harmonic, with @i@, @Y@ and its derivatives @dY@ put in; a branch for each degree."""
+# Twelve coefficients (four harmonics) at a time, as three 16-byte words where the array allows it.
+_TWELVE = r"""
+auto load12 = [&](const float* p, int limit, float* f) -> void {
+    if (P.sh_aligned) {
+        UNROLL for (int i = 0; i < 3; i++) {
+            const float4 word = ((const float4*)p)[i];
+            f[4 * i] = word.x; f[4 * i + 1] = word.y; f[4 * i + 2] = word.z; f[4 * i + 3] = word.w; }
+    } else { UNROLL for (int i = 0; i < 12; i++) f[i] = i < limit ? p[i] : 0.f; } };
+auto store12 = [&](float* p, int limit, const float* f) -> void {
+    if (P.sh_aligned) {
+        UNROLL for (int i = 0; i < 3; i++)
+            ((float4*)p)[i] = float4{f[4 * i], f[4 * i + 1], f[4 * i + 2], f[4 * i + 3]};
+    } else { UNROLL for (int i = 0; i < 12; i++) if (i < limit) p[i] = f[i]; } };
+"""
+
+
+def _harmonics(before: str, per_band: str, after: str) -> str:
+    """`per_band` for every harmonic there is, with @Y@ and what its derivatives @dY@ add put in, a degree at a time.
+
+    Four at a time stand between `before` and `after`, whose @q@ is where their coefficients begin; @i@ counts in those.
+    """
     text = ""
-    for degree in range(4):
-        text += f"if (P.bands > {degree * degree}) {{\n"
-        for i in range(degree * degree, (degree + 1) ** 2):
+    for four in range(0, 16, 4):
+        text += f"if (P.bands > {four}) {{\n" + before.replace("@q@", str(3 * four))
+        for i in range(four, four + 4):
             value, *slope = _HARMONICS[i]
             along = "".join(f"gd{axis} += through * ({part});" for axis, part in zip("xyz", slope, strict=True) if part)
-            text += per_band.replace("@i@", str(3 * i)).replace("@Y@", value).replace("@dY@", along) + "\n"
-    return text + "}" * 4 + "\n"
+            text += f"if (P.bands > {i}) {{\n" if i in (1, 9) else ""
+            text += per_band.replace("@i@", str(3 * (i - four))).replace("@Y@", value).replace("@dY@", along) + "\n"
+            text += "}\n" if i in (3, 11) else ""
+        text += after.replace("@q@", str(3 * four)) + "}\n"
+    return text
 
 
 # Tile spans of one slot: calls visit(tile row, first tile column, last tile column).
@@ -185,8 +207,9 @@ auto first_at = [&](float v, float limit) -> int {
 auto last_at = [&](float v, float limit) -> int { return v < 0.f ? -1 : (int)smin(v, limit); };
 struct Extent { float mx, my, A, kk, R, lop, y0, y1, hx, dyr; };
 auto extent = [&](long long slot) -> Extent {
-    const float* r = P.record + slot * P.record_stride;
-    return Extent{r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], P.aux[2 * slot], P.aux[2 * slot + 1]}; };
+    const float4* r = (const float4*)(P.record + slot * P.record_stride);
+    const float4 a = r[0], b = r[1];
+    return Extent{a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, P.aux[2 * slot], P.aux[2 * slot + 1]}; };
 auto first_row = [&](const Extent& e) -> int { return first_at(e.y0 - 0.5f, (float)P.height) >> 4; };
 auto last_row = [&](const Extent& e) -> int {
     int y0 = first_at(e.y0 - 0.5f, (float)P.height), y1 = last_at(e.y1 - 0.5f, (float)P.height - 1.f);
@@ -201,7 +224,7 @@ auto columns_of = [&](const Extent& e, int ty, int& c0, int& c1) -> void {
 """
 
 # A thread per slot: project, cull, colour, count tile hits.
-_STAGE_PROJECT = _SPANS + r"""
+_STAGE_PROJECT = _SPANS + _TWELVE + r"""
 const long long slot = task;
 if (slot >= (long long)P.n * P.cameras) return;
 const int camera = task / P.n;
@@ -220,15 +243,15 @@ if (P.antialiased) lop += 0.5f * log2f(smax(dr / det, @COMPENSATION2_MIN@f));
 float level = smax(lop - PMIN, 0.f) * (2.f * LN2), hx = sqrtf(level * xx), hy = sqrtf(level * yy);
 ok = level > 0.f && xx + yy < @VARIANCE_MAX@f && mx + hx >= 0.5f && mx - hx <= W - 0.5f;
 if (!(ok && my + hy >= 0.5f && my - hy <= H - 0.5f)) return;
-float* r = P.record + slot * P.record_stride; float* channel = r + @HEAD@;
+float* channel = P.record + slot * P.record_stride + @HEAD@;
 if (P.n_sh) {
 """ + _DIRECTION + r"""
-    float c0 = 0.5f, c1 = 0.5f, c2 = 0.5f;
+    float c0 = 0.5f, c1 = 0.5f, c2 = 0.5f, f[12];
     const float* from = P.sh + g * P.sh_stride;
-""" + _harmonics("{ const float b = @Y@; c0 += b * from[@i@]; c1 += b * from[@i@ + 1]; c2 += b * from[@i@ + 2]; }"
-                 ) + r"""
+""" + _harmonics("load12(from + @q@, 3 * P.bands - @q@, f);\n",
+                 "{ const float b = @Y@; c0 += b * f[@i@]; c1 += b * f[@i@ + 1]; c2 += b * f[@i@ + 2]; }", "") + r"""
     if (!(finite(c0) && finite(c1) && finite(c2))) return;
-    channel[0] = smax(c0, 0.f); channel[1] = smax(c1, 0.f); channel[2] = smax(c2, 0.f);
+    *(float4*)channel = float4{smax(c0, 0.f), smax(c1, 0.f), smax(c2, 0.f), pz};
     channel += 3;
 }
 for (int c = 0; c < P.n_colors; c++) {
@@ -236,9 +259,11 @@ for (int c = 0; c < P.n_colors; c++) {
     ok = ok && finite(value); channel[c] = value; }
 if (!ok) return;
 if (P.want_depth) channel[P.n_colors] = pz;
-r[0] = mx; r[1] = my; r[2] = -0.5f * LOG2E * yy / det; r[3] = xy / yy; r[4] = -0.5f * LOG2E / yy; r[5] = lop;
-r[6] = my - hy; r[7] = my + hy; P.aux[2 * slot] = hx; P.aux[2 * slot + 1] = xy / xx * hx;
-const Extent e = {mx, my, r[2], r[3], r[4], lop, my - hy, my + hy, hx, xy / xx * hx};
+const Extent e = {mx, my, -0.5f * LOG2E * yy / det, xy / yy, -0.5f * LOG2E / yy, lop, my - hy, my + hy, hx,
+                  xy / xx * hx};
+float4* head = (float4*)(P.record + slot * P.record_stride);
+head[0] = float4{e.mx, e.my, e.A, e.kk}; head[1] = float4{e.R, e.lop, e.y0, e.y1};
+P.aux[2 * slot] = e.hx; P.aux[2 * slot + 1] = e.dyr;
 int hits = 0;
 for (int ty = first_row(e), end = last_row(e); ty <= end; ty++) {
     int c0, c1; columns_of(e, ty, c0, c1);
@@ -364,9 +389,10 @@ while (at < stop) {
     }
     at += @BLOCK@;
     if (slot >= 0) {
-        const float* r = P.record + (long long)slot * P.record_stride;
-        float* to = batch + place * STRIDE;
-        const float mx = r[0] - x0, my = r[1] - y0, A = -r[2], kk = r[3], R = -r[4], L = r[5] - PMIN;
+        const float4* r = (const float4*)(P.record + (long long)slot * P.record_stride);
+        float4* to = (float4*)(batch + place * STRIDE);
+        const float4 a = r[0], b = r[1];
+        const float mx = a.x - x0, my = a.y - y0, A = -a.z, kk = a.w, R = -b.x, L = b.y - PMIN;
         const float q = A * kk * kk + R, tip = kk * sqrtf(L / R);
         const float xu = smin(smax(tip, 0.5f - mx), 15.5f - mx), xd = smin(smax(-tip, 0.5f - mx), 15.5f - mx);
         const float hi = A * kk * xu + sqrtf(smax(L * q - A * R * xu * xu, 0.f));
@@ -375,9 +401,9 @@ while (at < stop) {
         const float from = smin(smax(my - 0.502f + lo / q, 0.f), 16.f);
         const float till = smin(smax(my + 0.502f + hi / q, 0.f), 16.f);
         int top = (int)from; top += (float)top < from;
-        to[0] = mx; to[1] = my; to[2] = r[2]; to[3] = kk; to[4] = r[4]; to[5] = r[5];
-        to[6] = as_float(top | ((int)till << 8)); to[7] = as_float(slot);
-        UNROLL for (int c = 0; c < NCH; c++) to[@HEAD@ + c] = r[@HEAD@ + c];
+        to[0] = float4{mx, my, a.z, kk};
+        to[1] = float4{b.x, b.y, as_float(top | ((int)till << 8)), as_float(slot)};
+        UNROLL for (int c = 2; c < STRIDE / 4; c++) to[c] = r[c];
     }
     WP_TILE_SYNC();
     for (int j = 0; j < m; j++) {
@@ -482,11 +508,10 @@ UNROLL for (int s = 0; s < SLOTS; s++) {
 """
 
 # A thread per Gaussian, camera after camera: gradients of the projection from those of the moments.
-_STAGE_PROJECT_BACKWARD = _SHUFFLE + r"""
+_STAGE_PROJECT_BACKWARD = _SHUFFLE + _TWELVE + r"""
 const long long g = task < P.n ? task : 0;
 const bool mine = task < P.n;
 """ + _GAUSSIAN + r"""
-const int moments = @MOMENTS@;
 bool seen = false;
 float aX[3] = {0.f, 0.f, 0.f}, aq[4] = {0.f, 0.f, 0.f, 0.f}, as[3] = {0.f, 0.f, 0.f}, al = 0.f;
 float* sh_to = P.grad_sh + g * P.sh_stride; float* color_to = P.grad_colors + g * P.n_colors;
@@ -499,14 +524,15 @@ for (int camera = 0; camera < P.cameras; camera++) {
 """ + _CAMERA + r"""
         const float pz = V[8] * X + V[9] * Y + V[10] * Z + V[11];
 """ + _PROJECT + r"""
-        const float* m = P.grad + slot * P.grad_stride;
-        const float* gc = m + moments;
-        const float m0 = m[0];
+        const float4 ma = ((const float4*)(P.grad + slot * P.grad_stride))[0];
+        const float4 mb = ((const float4*)(P.grad + slot * P.grad_stride))[1];
+        const float* gc = P.grad + slot * P.grad_stride + @MOMENTS@;
+        const float m0 = ma.x;
         // log alpha = log opacity - (e^2 / xc + dy^2 / yy) / 2 with e = dx - k dy, k = xy / yy, xc = det / yy.
         // Gradients by way of xc, yy and k lose no digits on long thin Gaussians; by way of the conic they do.
         float kk = xy / yy, ic = yy / det, iy = 1.f / yy;
-        float gmx = m[1] * ic, gmy = m[2] * iy - kk * gmx;
-        float g2c = m[3] * ic * ic, gk = m[4] * ic * iy, g2y = m[5] * iy * iy;
+        float gmx = ma.y * ic, gmy = ma.z * iy - kk * gmx;
+        float g2c = ma.w * ic * ic, gk = mb.x * ic * iy, g2y = mb.y * iy * iy;
         float ga0[3] = {0.f, 0.f, 0.f}, ga1[3] = {0.f, 0.f, 0.f};
         if (P.antialiased) {
             const bool free = dr > @COMPENSATION2_MIN@f * det;
@@ -556,9 +582,14 @@ for (int camera = 0; camera < P.cameras; camera++) {
             const float h1 = shown[1] > 0.f || gc[1] < 0.f ? gc[1] : 0.f;
             const float h2 = shown[2] > 0.f || gc[2] < 0.f ? gc[2] : 0.f;
             float gdx = 0.f, gdy = 0.f, gdz = 0.f;
-            auto put = [&](int at, float value) -> void { sh_to[at] = seen ? sh_to[at] + value : value; };
-""" + _harmonics("{ const float b = @Y@, through = h0 * from[@i@] + h1 * from[@i@ + 1] + h2 * from[@i@ + 2]; @dY@ "
-                 "put(@i@, b * h0); put(@i@ + 1, b * h1); put(@i@ + 2, b * h2); (void)through; }") + r"""
+            float f[12], o[12];
+""" + _harmonics(
+            "load12(from + @q@, 3 * P.bands - @q@, f); UNROLL for (int i = 0; i < 12; i++) o[i] = 0.f;\n"
+            "if (seen) load12(sh_to + @q@, 3 * P.bands - @q@, o);\n",
+            "{ const float b = @Y@; "
+            "[[maybe_unused]] const float through = h0 * f[@i@] + h1 * f[@i@ + 1] + h2 * f[@i@ + 2]; @dY@ "
+            "o[@i@] += b * h0; o[@i@ + 1] += b * h1; o[@i@ + 2] += b * h2; }",
+            "store12(sh_to + @q@, 3 * P.bands - @q@, o);") + r"""
             const float radial = dx * gdx + dy * gdy + dz * gdz;
             gcx = -(gdx - dx * radial) * inv; gcy = -(gdy - dy * radial) * inv; gcz = -(gdz - dz * radial) * inv;
             aX[0] -= gcx; aX[1] -= gcy; aX[2] -= gcz;
@@ -569,7 +600,7 @@ for (int camera = 0; camera < P.cameras; camera++) {
         seen = true;
         float op = expf(-fabsf(smin(smax(logit, -80.f), 80.f)));
         al += m0 * ((logit > 0.f ? op : 1.f) / (1.f + op));
-        P.grad_norm[slot] = sqrtf(gmx * gmx + gmy * gmy); P.grad_abs[slot] = sqrtf(m[6] * m[6] + m[7] * m[7]);
+        P.grad_norm[slot] = sqrtf(gmx * gmx + gmy * gmy); P.grad_abs[slot] = sqrtf(mb.z * mb.z + mb.w * mb.w);
         const float gp[3] = {gpx, gpy, gpz}, world[3] = {X, Y, Z}, gCam[3] = {gcx, gcy, gcz};
         UNROLL for (int r = 0; r < 3; r++) {
             UNROLL for (int c = 0; c < 3; c++) {
@@ -591,7 +622,10 @@ if (!mine) return;
 UNROLL for (int c = 0; c < 3; c++) { P.grad_means[3 * g + c] = aX[c]; P.grad_log_scales[3 * g + c] = as[c]; }
 UNROLL for (int c = 0; c < 4; c++) P.grad_quats[4 * g + c] = aq[c];
 P.grad_logits[g] = al;
-if (P.n_sh) for (int i = seen ? 3 * P.bands : 0; i < P.sh_stride; i++) sh_to[i] = 0.f;
+// What no camera saw, and the bands that were not used.
+if (P.n_sh && P.sh_aligned) for (int i = seen ? (P.bands + 3) / 4 * 12 : 0; i < P.sh_stride; i += 4)
+    *(float4*)(sh_to + i) = float4{0.f, 0.f, 0.f, 0.f};
+if (P.n_sh && !P.sh_aligned) for (int i = seen ? 3 * P.bands : 0; i < P.sh_stride; i++) sh_to[i] = 0.f;
 if (!seen) for (int c = 0; c < P.n_colors; c++) color_to[c] = 0.f;
 """
 
@@ -602,7 +636,7 @@ def _field(match: re.Match) -> str:
 
 
 def _assemble(stage: str, **extra: object) -> str:
-    """The snippet of one stage, with the constants of `constants.py` put in. Its arguments: args, and task, the thread's number."""
+    """The snippet of one stage, with the constants of `constants.py` put in. Arguments: args, task (thread number)."""
     values = {name: getattr(k, name) for name in dir(k) if name.isupper() and not name.startswith("SH_")}
     values |= {"BLOCK": BLOCK, "HEAD": HEAD, "MOMENTS": MOMENTS, "WEIGHT_SCALE": WEIGHT_SCALE} | extra
     text = _COMMON + stage
