@@ -6,6 +6,7 @@ everything that moves), textures/*.png, and plan.json, last: what render_bpy.py 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -82,7 +83,7 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, samples: int,
         movers.append(Mover(person.name, body.vertices, mesh, f"{person.name}.png"))
         write_png(folder / "textures" / f"{person.name}.png", body.texture)
         if body.seat:
-            furnisher.stool(*person.place, body.seat, person.heading)
+            furnisher.stool(*body.seat, person.heading)
     place, static = furnisher.room() if place_of(seed) == "room" else furnisher.ground()
     if kind == "fast-mover":
         movers.append(_thrown_ball(folder, seed, seconds))
@@ -244,7 +245,7 @@ def _bands(size: Size, camera: CameraMove, index: int) -> list[dict[str, Any]]:
     """Strips of rows, each at its own time around the frame's, in frames; the middle row is on time."""
     edges = np.linspace(0, size.height, min(SHUTTER_BANDS, size.height) + 1).round().astype(int)
     bands = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         late = (0.5 * (low + high) / size.height - 0.5) * SHUTTER_SECONDS
         view = camera.world_to_camera(np.array([index / size.fps + late]))[0]
         time = float(np.clip(index + late * size.fps, 0, size.frames - 1))

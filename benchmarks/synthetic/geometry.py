@@ -74,7 +74,9 @@ class Builder:
         up = np.array([0.0, 0.0, height])
         for i in range(sides):
             low, high = base + ring[i], base + ring[i + 1]
-            self._quad(np.array([low, high, high + up, low + up]), length, height, material, (i * length, 0.0), sides * length)
+            self._quad(
+                np.array([low, high, high + up, low + up]), length, height, material, (i * length, 0.0), sides * length
+            )
             self._quad(np.array([base + up, low + up, high + up, base + up]), radius, length, material)
 
     def ball(self, centre: ArrayLike, radii: ArrayLike, material: int, sides: int = 20, rings: int = 12) -> None:

@@ -33,7 +33,9 @@ def bumps(rng: np.random.Generator, seconds: Array, every: float, width: float) 
     return np.exp(-((nearest / (0.5 * width)) ** 4))
 
 
-def fractal(rng: np.random.Generator, size: int, slope: float = 1.6, stretch: tuple[float, float] = (1.0, 1.0)) -> Array:
+def fractal(
+    rng: np.random.Generator, size: int, slope: float = 1.6, stretch: tuple[float, float] = (1.0, 1.0)
+) -> Array:
     """[size, size] tiling noise in (0, 1) whose amplitude falls with frequency^-slope; `stretch` is along (y, x)."""
     fy = np.fft.fftfreq(size)[:, None] * size * stretch[0]
     fx = np.fft.rfftfreq(size)[None] * size * stretch[1]
@@ -61,7 +63,9 @@ def solid(seed: int, points: Array, scale: float) -> Array:
 def _hash(cell: NDArray[np.int64], seed: int) -> Array:
     """[P] in [0, 1) from integer cells [P, 3]: multiply and xorshift on 64 bits."""
     keys = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    x = (cell.astype(np.uint64) * keys).sum(axis=1, dtype=np.uint64) + np.uint64(seed * 0xD6E8FEB86659FD93 & 0xFFFFFFFFFFFFFFFF)
+    x = (cell.astype(np.uint64) * keys).sum(axis=1, dtype=np.uint64) + np.uint64(
+        seed * 0xD6E8FEB86659FD93 & 0xFFFFFFFFFFFFFFFF
+    )
     for shift in (32, 29, 32):
         x ^= x >> np.uint64(shift)
         x *= np.uint64(0xD6E8FEB86659FD93)

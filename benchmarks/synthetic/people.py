@@ -102,8 +102,8 @@ class Body:
     """[F, 3, 2]."""
     texture: Picture
     """[N, N, 3] sRGB."""
-    seat: float
-    """Height of the seat in metres; 0 if the person stands."""
+    seat: tuple[float, float, float] | None
+    """x, y and height of the seat in metres; None if the person stands."""
 
 
 class Bodies:
@@ -114,9 +114,10 @@ class Bodies:
 
         self.model = anny.Anny(facial_actions=list(FACE))
         self.bones: list[str] = list(self.model.bone_labels)
+        coordinates, corners = self.model.texture_coordinates, self.model.face_texture_coordinate_indices
+        assert coordinates is not None and corners is not None
         self.triangles = self.model.faces.numpy().astype(np.int32)
-        coordinates = self.model.texture_coordinates.numpy()
-        self.uv = coordinates[self.model.face_texture_coordinate_indices.numpy()].astype(np.float32)
+        self.uv = coordinates.numpy()[corners.numpy()].astype(np.float32)
         self.rest = self._rest(
             {"gender": 0.5, "age": 0.67, "muscle": 0.5, "weight": 0.5, "height": 0.5, "proportions": 0.5}
         )
@@ -147,7 +148,6 @@ class Bodies:
             "feet": of("foot", "toe"),
             "head": of("head", "neck02", "neck03"),
             "eyes": of("eye."),
-            "hand.R": of("wrist.R", "finger", "metacarpal"),
         }
 
     def _regions(self) -> dict[str, Array]:
@@ -196,19 +196,22 @@ class Bodies:
         lift = 0.004 * person.restless * self.influence["chest"][None] * breath[:, None]
         vertices = vertices + normals * (thickness[None] + lift)[..., None]
         vertices[..., 2] -= vertices[0, :, 2].min()
-        seat = 0.0
-        if person.pose in SEATED:
-            under = (self.influence["hips"] + self.influence["thighs"] > 0.9) & (self.rest[:, 2] > -0.25)
-            seat = float(vertices[:, under, 2].min())
         vertices = self._sway(person, stream(seed, person.name, "sway"), seconds, vertices)
         world = vertices @ turn(person.heading).T + np.array([*person.place, 0.0])
+        seat = None
+        if person.pose in SEATED:
+            under = world[:, (self.influence["hips"] + self.influence["thighs"] > 0.9) & (self.rest[:, 2] > -0.2)]
+            x, y = under[0, :, :2].mean(axis=0)
+            seat = float(x), float(y), float(under[..., 2].min())
         texture = self._texture(clothes, region, stream(seed, person.name, "colours"))
         return Body(world.astype(np.float32), self.triangles, self.uv, texture, seat)
 
     def _skinned(self, person: Person, rng: np.random.Generator, seconds: Array) -> Array:
         """[T, V, 3] in the body frame: the pose, with joints that wander and twitch."""
         count = len(seconds)
-        angles = {bone: np.tile(np.asarray(value, np.float64), (count, 1)) for bone, value in POSES[person.pose].items()}
+        angles = {
+            bone: np.tile(np.asarray(value, np.float64), (count, 1)) for bone, value in POSES[person.pose].items()
+        }
 
         def add(bone: str, degrees: Array) -> None:
             angles[bone] = angles.get(bone, np.zeros((count, 3))) + degrees
@@ -253,11 +256,11 @@ class Bodies:
         return out["vertices"].numpy().astype(np.float64)
 
     def _sway(self, person: Person, rng: np.random.Generator, seconds: Array, vertices: Array) -> Array:
-        """Tips the whole body about its feet by fractions of a degree; who sits does so by a fifth."""
+        """Tips the whole body about its feet, which come to the origin, by fractions of a degree; who sits, a fifth."""
         r = person.restless * (0.2 if person.pose in SEATED else 1.0)
         tilt = np.radians(r * np.array([0.45, 0.35, 0.25]) * wander(rng, seconds, 3.5, 3))
         feet = vertices[0, self.influence["feet"] > 0.5].mean(axis=0) * [1.0, 1.0, 0.0]
-        return np.einsum("tij,tvj->tvi", _rotations(tilt), vertices - feet) + [0.0, 0.0, feet[2]]
+        return np.einsum("tij,tvj->tvi", _rotations(tilt), vertices - feet)
 
     def _dressed(self, clothes: Clothes, rng: np.random.Generator) -> tuple[Array, Array]:
         """(soft fields [V, 6] per region, thickness [V] of cloth and hair in metres)."""

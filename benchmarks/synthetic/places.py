@@ -122,19 +122,30 @@ class Furnisher:
         for i in (-1, 1):
             for j in (-1, 1):
                 dx, dy = i * (width / 2 - 0.06), j * (depth / 2 - 0.06)
-                self.build.box([x + c * dx - s * dy, y + s * dx + c * dy, (height - 0.04) / 2], [0.06, 0.06, height - 0.04], wood, yaw)
+                self.build.box(
+                    [x + c * dx - s * dy, y + s * dx + c * dy, (height - 0.04) / 2],
+                    [0.06, 0.06, height - 0.04],
+                    wood,
+                    yaw,
+                )
         for dx in np.linspace(-0.4, 0.4, 4) * width:
             px, py, kind = x + c * dx, y + s * dx, int(self.rng.integers(4))
             if kind == 0:
                 size = self.rng.uniform(0.1, 0.22, 3)
-                self.build.box([px, py, height + size[2] / 2], size, self.material("cardboard"), float(self.rng.uniform(0, 3)))
+                self.build.box(
+                    [px, py, height + size[2] / 2], size, self.material("cardboard"), float(self.rng.uniform(0, 3))
+                )
             elif kind == 1:
-                self.build.cylinder([px, py, height], 0.05, float(self.rng.uniform(0.12, 0.3)), self.material("fabric"), 16)
+                self.build.cylinder(
+                    [px, py, height], 0.05, float(self.rng.uniform(0.12, 0.3)), self.material("fabric"), 16
+                )
             elif kind == 2:
                 radius = float(self.rng.uniform(0.06, 0.1))
                 self.build.ball([px, py, height + radius], [radius] * 3, self.material("fabric"))
             else:
-                self.build.box([px, py, height + 0.03], [0.2, 0.28, 0.06], self.material("poster"), float(self.rng.uniform(0, 3)))
+                self.build.box(
+                    [px, py, height + 0.03], [0.2, 0.28, 0.06], self.material("poster"), float(self.rng.uniform(0, 3))
+                )
 
     def sofa(self, x: float, y: float, yaw: float) -> None:
         """Seat, back, arms and two cushions; it looks towards local -y."""
@@ -197,7 +208,9 @@ class Furnisher:
             middle = origin + along * (start + width / 2) + normal * 0.011 + [0, 0, z + height / 2]
             self.build.box(middle, [width + 0.06, 0.022, height + 0.06], self.material("planks", False), yaw)
 
-    def wall(self, origin: Array, along: Array, length: float, height: float, window: tuple[float, float] | None) -> None:
+    def wall(
+        self, origin: Array, along: Array, length: float, height: float, window: tuple[float, float] | None
+    ) -> None:
         """A wall that faces the room (along x up points into it), with a window from `window[0]` to `window[1]`."""
         texture = ("plaster", "wallpaper", "bricks", "plaster", "concrete")[self.rng.integers(5)]
         skin, board = self.material(texture), self.material("planks", False)
@@ -317,7 +330,9 @@ class Furnisher:
         lawn = self.material(("grass", "gravel", "grass")[rng.integers(3)])
         # A fine grid is not needed: one quad, far enough for a horizon and near enough for depths in 16 bits.
         self.build.rect([-40, -40, 0], [80, 0, 0], [0, 80, 0], lawn)
-        self.build.rect([-4.2, -5.5, 0.012], [8.4, 0, 0], [0, 9.5, 0], self.material(("pavers", "tiles", "bricks")[rng.integers(3)]))
+        self.build.rect(
+            [-4.2, -5.5, 0.012], [8.4, 0, 0], [0, 9.5, 0], self.material(("pavers", "tiles", "bricks")[rng.integers(3)])
+        )
         for bearing in np.linspace(-2.2, 2.2, 9) + rng.uniform(-0.12, 0.12, 9):
             radius = rng.uniform(6.5, 10.0)
             x, y = radius * np.sin(bearing), radius * np.cos(bearing)

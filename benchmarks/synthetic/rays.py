@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """Exact visibility: rays against triangles with Warp, on the CPU. Everything here is in the world's metres."""
 
 from __future__ import annotations

@@ -42,8 +42,7 @@ def main(folder: Path, only: str = "", sample_factor: int = 1) -> None:
 
 
 def _say(**message: Any) -> None:
-    sys.__stdout__.write(json.dumps(message) + "\n")
-    sys.__stdout__.flush()
+    print(json.dumps(message), flush=True)
 
 
 def _die_with_parent() -> None:
@@ -290,4 +289,5 @@ def _metered(folder: Path, plan: dict[str, Any], stage: Stage) -> float:
 
 if __name__ == "__main__":
     arguments = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
-    main(Path(arguments[0]), *arguments[1:2], *map(int, arguments[2:3]))
+    folder, only, factor = (*arguments, "", "1")[:3] if len(arguments) == 1 else arguments
+    main(Path(folder), only, int(factor))

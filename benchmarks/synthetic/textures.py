@@ -54,7 +54,9 @@ def planks(rng: np.random.Generator, size: int) -> Picture:
     grain = fractal(rng, size, 1.2, (0.15, 3.0))
     base = hsv(rng.uniform(0.05, 0.1), rng.uniform(0.35, 0.6), rng.uniform(0.45, 0.8))
     tone = 0.62 + 0.5 * _per_cell(rng, row, board) + 0.55 * (grain - 0.5)
-    gap = np.minimum(np.minimum(y * rows % 1.0, 1.0 - y * rows % 1.0) / 0.04, np.minimum(along % 1.0, 1 - along % 1) / 0.006)
+    gap = np.minimum(
+        np.minimum(y * rows % 1.0, 1.0 - y * rows % 1.0) / 0.04, np.minimum(along % 1.0, 1 - along % 1) / 0.006
+    )
     return _picture(base * (tone * np.clip(gap, 0.25, 1.0))[..., None])
 
 
@@ -81,7 +83,9 @@ def tiles(rng: np.random.Generator, size: int) -> Picture:
     u, v = y * count % 1 - 0.5, x * count % 1 - 0.5
     a, b = colour(rng, (0.05, 0.3), (0.75, 0.92)), colour(rng, (0.2, 0.6), (0.3, 0.6))
     odd = ((i + j) % 2)[..., None]
-    ground = (a * (1 - odd) + b * odd) * (0.75 + 0.25 * _per_cell(rng, i, j) + 0.3 * (fractal(rng, size, 1.1) - 0.5))[..., None]
+    ground = (a * (1 - odd) + b * odd) * (0.75 + 0.25 * _per_cell(rng, i, j) + 0.3 * (fractal(rng, size, 1.1) - 0.5))[
+        ..., None
+    ]
     diamond = (np.abs(u) + np.abs(v) < 0.2)[..., None]
     joint = (np.maximum(np.abs(u), np.abs(v)) > 0.475)[..., None]
     return _picture(np.where(joint, 0.35, np.where(diamond, b * odd * 0.2 + a * 0.4, ground)))
@@ -98,7 +102,11 @@ def plaster(rng: np.random.Generator, size: int) -> Picture:
 def wallpaper(rng: np.random.Generator, size: int) -> Picture:
     """Stripes with a motif of irregular blossoms."""
     y, x = _grid(size)
-    a, b, c = colour(rng, (0.1, 0.3), (0.75, 0.9)), colour(rng, (0.2, 0.5), (0.55, 0.8)), colour(rng, (0.4, 0.8), (0.3, 0.7))
+    a, b, c = (
+        colour(rng, (0.1, 0.3), (0.75, 0.9)),
+        colour(rng, (0.2, 0.5), (0.55, 0.8)),
+        colour(rng, (0.4, 0.8), (0.3, 0.7)),
+    )
     stripe = (np.sin(2 * np.pi * 6 * x) > 0.2)[..., None]
     ground = np.where(stripe, a, b) * (0.9 + 0.2 * fractal(rng, size, 1.0))[..., None]
     motif = np.zeros((size, size), bool)
@@ -148,7 +156,9 @@ def pavers(rng: np.random.Generator, size: int) -> Picture:
 def gravel(rng: np.random.Generator, size: int) -> Picture:
     """Pebbles of many greys."""
     a, b = fractal(rng, size, 0.9), fractal(rng, size, 0.5)
-    return _picture((0.15 + 0.75 * np.round(5 * a) / 5 * (0.6 + 0.8 * b))[..., None] * colour(rng, (0.05, 0.3), (0.8, 1.0)))
+    return _picture(
+        (0.15 + 0.75 * np.round(5 * a) / 5 * (0.6 + 0.8 * b))[..., None] * colour(rng, (0.05, 0.3), (0.8, 1.0))
+    )
 
 
 def fabric(rng: np.random.Generator, size: int) -> Picture:
@@ -182,7 +192,9 @@ def cardboard(rng: np.random.Generator, size: int) -> Picture:
     board = np.where(tape[..., None], np.array([0.82, 0.72, 0.5]), board)
     for _ in range(14):
         cy, cx, h, w = rng.uniform(0.05, 0.9), rng.uniform(0.05, 0.9), rng.uniform(0.01, 0.06), rng.uniform(0.02, 0.2)
-        board = np.where(((np.abs(y - cy) < h) & (np.abs(x - cx) < w))[..., None], colour(rng, (0.0, 0.7), (0.1, 0.95)), board)
+        board = np.where(
+            ((np.abs(y - cy) < h) & (np.abs(x - cx) < w))[..., None], colour(rng, (0.0, 0.7), (0.1, 0.95)), board
+        )
     return _picture(board)
 
 
@@ -211,7 +223,9 @@ def poster(rng: np.random.Generator, size: int) -> Picture:
         cy, cx, r, turn = rng.uniform(), rng.uniform(), rng.uniform(0.03, 0.2), rng.uniform(0, np.pi)
         u = (x - cx) * np.cos(turn) + (y - cy) * np.sin(turn)
         v = (y - cy) * np.cos(turn) - (x - cx) * np.sin(turn)
-        shape = (np.hypot(u, v) < r, np.maximum(np.abs(u), 2.5 * np.abs(v)) < r, np.abs(u) + np.abs(v) < r)[rng.integers(3)]
+        shape = (np.hypot(u, v) < r, np.maximum(np.abs(u), 2.5 * np.abs(v)) < r, np.abs(u) + np.abs(v) < r)[
+            rng.integers(3)
+        ]
         ground = np.where(shape[..., None], colour(rng, (0.2, 0.9), (0.1, 1.0)), ground)
     ink = colour(rng, (0.0, 0.4), (0.02, 0.2))
     for line in range(int(rng.integers(2, 6))):

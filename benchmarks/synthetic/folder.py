@@ -1,0 +1,129 @@
+"""Reads a finished scene. numpy and the product's PNG reader; nothing that renders.
+
+scene.json               format version, cameras, instants, how it was made
+frames/NNNNNN.png        the clip: 8-bit sRGB, frame n at time n, numbered from 1
+masks/NNNNNN.npz         depth_mm, moving: of the clip's frame
+truth/<t*>/NNNNNN.png    the scene frozen at t*, from the camera of frame NNNNNN
+truth/<t*>/NNNNNN.npz    depth_mm, seen, moving: of that picture
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_backend.footage.images import read_png
+
+from .sizes import FORMAT_VERSION
+
+
+@dataclass(frozen=True)
+class Regions:
+    """What is known of the pixels of one picture of the truth."""
+
+    depth: NDArray[np.float32]
+    """[H, W] metres along the camera's axis, to a millimetre; inf for sky."""
+    moving: NDArray[np.bool_]
+    """[H, W] the surface point is at some frame of the clip elsewhere in this view, by more than `moving_px`."""
+    seen: NDArray[np.bool_]
+    """[H, W] the surface point is visible in the clip's own frame t*."""
+
+
+@dataclass(frozen=True)
+class SyntheticScene:
+    """A clip with exact cameras, and the truth at some instants. Frames are known by their numbers, from 1."""
+
+    root: Path
+    name: str
+    seed: int
+    kind: str
+    """plain, or one of the limits."""
+    size: str
+    width: int
+    height: int
+    fps: float
+    frames: list[int]
+    """Numbers of the clip's frames."""
+    K: NDArray[np.float64]
+    """[3, 3] pixels, centres at +0.5."""
+    world_to_camera: dict[int, NDArray[np.float64]]
+    """{frame: [4, 4]}, OpenCV axes, metres."""
+    t_stars: list[int]
+    """Instants that have a truth."""
+    poses: list[int]
+    """Frames at whose camera each truth was rendered."""
+    info: dict[str, Any]
+    """All of scene.json."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> SyntheticScene:
+        """A finished scene. FileNotFoundError if it is not (yet) one, ValueError if it is from a newer version."""
+        root = Path(path)
+        record = root / "scene.json"
+        if not record.is_file():
+            raise FileNotFoundError(f"{root} is not a finished synthetic scene: it has no scene.json")
+        data = json.loads(record.read_text(encoding="utf-8"))
+        if data.get("version") != FORMAT_VERSION:
+            raise ValueError(f"{record} has format version {data.get('version')}, this program reads {FORMAT_VERSION}")
+        cameras = {c["frame"]: np.array(c["world_to_camera"]) for c in data["cameras"]}
+        return cls(
+            root,
+            data["name"],
+            data["seed"],
+            data["kind"],
+            data["size"],
+            data["width"],
+            data["height"],
+            data["fps"],
+            sorted(cameras),
+            np.array(data["K"]),
+            cameras,
+            data["t_stars"],
+            data["poses"],
+            data,
+        )
+
+    def frame_path(self, frame: int) -> Path:
+        """Picture of a frame of the clip."""
+        return self.root / "frames" / f"{frame:06d}.png"
+
+    def truth_path(self, t_star: int, pose: int) -> Path:
+        """Picture of the scene frozen at `t_star` from the camera of frame `pose`."""
+        return self.root / "truth" / f"{t_star:06d}" / f"{pose:06d}.png"
+
+    def frame(self, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] uint8 sRGB."""
+        return read_png(self.frame_path(frame))
+
+    def truth(self, t_star: int, pose: int) -> NDArray[np.uint8]:
+        """[H, W, 3] uint8 sRGB."""
+        return read_png(self.truth_path(t_star, pose))
+
+    def regions(self, t_star: int, pose: int) -> Regions:
+        """Depth and regions of a picture of the truth."""
+        with np.load(self.truth_path(t_star, pose).with_suffix(".npz"), allow_pickle=False) as data:
+            return Regions(_metres(data["depth_mm"]), data["moving"], data["seen"])
+
+    def frame_depth(self, frame: int) -> NDArray[np.float32]:
+        """[H, W] metres, inf for sky, of a frame of the clip."""
+        with np.load(self.root / "masks" / f"{frame:06d}.npz", allow_pickle=False) as data:
+            return _metres(data["depth_mm"])
+
+    def frame_moving(self, frame: int) -> NDArray[np.bool_]:
+        """[H, W] what moves in a frame of the clip: see Regions.moving."""
+        with np.load(self.root / "masks" / f"{frame:06d}.npz", allow_pickle=False) as data:
+            return data["moving"]
+
+    def centres(self) -> NDArray[np.float64]:
+        """[T, 3] exact camera centres in metres, in the order of `frames`."""
+        views = np.array([self.world_to_camera[f] for f in self.frames])
+        return -np.einsum("nji,nj->ni", views[:, :3, :3], views[:, :3, 3])
+
+
+def _metres(depth_mm: NDArray[np.uint16]) -> NDArray[np.float32]:
+    return np.where(depth_mm == 0, np.inf, depth_mm.astype(np.float32) / 1000.0).astype(np.float32)

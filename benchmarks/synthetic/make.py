@@ -1,0 +1,203 @@
+"""Makes whole scenes: geometry here, pictures in a bpy process, regions here. Each step goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch_backend.shot import content_key, need_disk, write_json
+
+from .cameras import intrinsics
+from .generate import EXPOSURE_RAMP_STOPS, SHUTTER_SECONDS, frame_number, frame_seconds, write_geometry
+from .regions import views_of, write_regions
+from .sizes import FORMAT_VERSION, MOVING_PX, Size, camera_move_of, place_of
+
+if TYPE_CHECKING:
+    from .people import Bodies
+
+GENERATOR_VERSION = 1
+"""Raised when the same seed would give another scene: a folder of another version is refused."""
+ROOT = Path(__file__).resolve().parents[2]
+RENDERER = Path(__file__).with_name("render_bpy.py")
+DEFAULT_BPY = ROOT / ".venv-bpy-5.0"
+_LAST_LINES = 5
+
+Say = Callable[[str], None]
+
+
+class BpyMissingError(RuntimeError):
+    """There is no Python with bpy; the message says what to do."""
+
+
+def default_folder() -> Path:
+    """Where scenes are kept unless told otherwise: the user's cache, outside of the repository."""
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return base / "splannequin" / "synthetic"
+
+
+def find_bpy(given: str | Path | None) -> Path:
+    """The Python of a bpy wheel's environment: `given` may be that Python or its environment's folder."""
+    place = Path(given) if given else DEFAULT_BPY
+    for python in (place, place / "bin" / "python", place / "Scripts" / "python.exe"):
+        if python.is_file():
+            return python
+    raise BpyMissingError(
+        f"There is no Python with bpy in {place}: make it with `python3 splannequin.py setup`, or name one by --bpy."
+    )
+
+
+def scene_name(seed: int, kind: str) -> str:
+    """Folder of a scene within its size."""
+    return f"seed-{seed:03d}" if kind == "plain" else f"{kind}-{seed:03d}"
+
+
+def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: Callable[[], Bodies], say: Say) -> Path:
+    """The folder of a finished scene under `out`/<size>/: made, completed, or left alone if it is finished.
+
+    `bodies` is called only if geometry is missing. ValueError if the folder holds another version's scene, RuntimeError
+    with the renderer's last lines if it dies.
+    """
+    folder = out / size.name / scene_name(seed, kind)
+    key = content_key(FORMAT_VERSION, GENERATOR_VERSION, size, seed, kind)
+    for name in ("scene.json", "plan.json"):
+        there = folder / name
+        if there.is_file() and json.loads(there.read_text(encoding="utf-8"))["key"] != key:
+            raise ValueError(
+                f"{folder} was made by another version of the generator: remove it or choose another --out."
+            )
+    if (folder / "scene.json").is_file():
+        say(f"{size.name}/{folder.name}: already there")
+        return folder
+    count = size.frames + len(size.t_star_indices()) * len(size.pose_indices())
+    need_disk(out, count * size.width * size.height * 3.5 + (300 << 20), "A synthetic scene")
+    began = time.perf_counter()
+    if not (folder / "plan.json").is_file():
+        for part in ("geometry", "textures"):
+            shutil.rmtree(folder / part, ignore_errors=True)
+        say(f"{size.name}/{folder.name}: geometry and textures")
+        write_geometry(folder, seed, kind, size, size.samples, key, bodies())
+    made = time.perf_counter()
+    _render(folder, bpy, lambda text: say(f"{size.name}/{folder.name}: {text}"))
+    rendered = time.perf_counter()
+    write_regions(folder, seed, size, _Eta(say, f"{size.name}/{folder.name}: regions"))
+    seconds = {"geometry": made - began, "pictures": rendered - made, "regions": time.perf_counter() - rendered}
+    _write_record(folder, size, seed, kind, key, seconds)
+    say(f"{size.name}/{folder.name}: finished, {sum(seconds.values()):.0f} s in this run")
+    return folder
+
+
+def _render(folder: Path, bpy: Path, say: Say) -> None:
+    """Runs the renderer as a child that ends when this process does."""
+    log = folder / "render.log"
+    last: list[str] = []
+    eta = _Eta(say, "pictures")
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
+    with open(log, "ab") as errors:
+        process = subprocess.Popen(
+            [str(bpy), str(RENDERER), str(folder)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env=environment,
+            encoding="utf-8",
+            errors="replace",
+        )
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                if line.startswith('{"done"'):
+                    message = json.loads(line)
+                    eta(message["done"], message["total"])
+                elif line.strip():
+                    last = [*last[1 - _LAST_LINES :], line.strip()]
+            code = process.wait()
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe:
+                    pipe.close()
+    if code != 0:
+        raise RuntimeError(f"The renderer ended with code {code}, see {log}: {' '.join(last)}")
+
+
+class _Eta:
+    """Progress in words, at most every few seconds, with an estimate from the pace so far."""
+
+    def __init__(self, say: Say, what: str, every: float = 5.0) -> None:
+        self.say, self.what, self.every = say, what, every
+        self.began = self.told = time.perf_counter()
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.perf_counter()
+        if done == total or now - self.told >= self.every:
+            self.told = now
+            left = (now - self.began) / done * (total - done)
+            self.say(f"{self.what} {done} of {total}" + (f", {left:.0f} s left" if done < total else ""))
+
+
+def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seconds: dict[str, float]) -> None:
+    """scene.json, which says that the scene is whole."""
+    meter = json.loads((folder / "meter.json").read_text(encoding="utf-8"))
+    plan: dict[str, Any] = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+    cameras = [
+        {"frame": frame_number(i), "seconds": float(t), "world_to_camera": view.matrix.tolist()}
+        for i, (t, view) in enumerate(zip(frame_seconds(size), views_of(seed, size), strict=True))
+    ]
+    record = {
+        "version": FORMAT_VERSION,
+        "generator": GENERATOR_VERSION,
+        "key": key,
+        "name": folder.name,
+        "seed": seed,
+        "kind": kind,
+        "size": size.name,
+        "place": place_of(seed),
+        "camera_move": camera_move_of(seed),
+        "width": size.width,
+        "height": size.height,
+        "fps": size.fps,
+        "K": intrinsics(size.width, size.height).tolist(),
+        "units": "metres, z up; world_to_camera in OpenCV axes; K in pixels with centres at +0.5",
+        "cameras": cameras,
+        "t_stars": [frame_number(i) for i in size.t_star_indices()],
+        "poses": [frame_number(i) for i in size.pose_indices()],
+        "moving_px": MOVING_PX,
+        "limits": _limits(kind),
+        "people": plan["people"],
+        "rendered": {
+            "bpy": meter["bpy"],
+            "samples": size.samples,
+            "denoiser": "OpenImageDenoise",
+            "view_transform": "Standard",
+            "exposure_stops": meter["stops"],
+            "seconds_of_last_run": {name: round(value, 2) for name, value in seconds.items()},
+            "size": asdict(size),
+        },
+    }
+    write_json(folder / "scene.json", record)
+
+
+def _limits(kind: str) -> dict[str, Any]:
+    """What a limit scene does, in numbers."""
+    if kind == "exposure-ramp":
+        return {"exposure_stops_over_clip": EXPOSURE_RAMP_STOPS, "truth": "with the exposure of frame t*"}
+    if kind == "rolling-shutter":
+        return {"readout_seconds": SHUTTER_SECONDS, "truth": "all rows at the time and the camera of the middle row"}
+    if kind == "moving-shadow":
+        return {"truth": "with the shadow of frame t*"}
+    return {}
