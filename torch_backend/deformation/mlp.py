@@ -147,9 +147,7 @@ class Mlp(Deformation):
         std = config.head_std or None
         widths = {"means": 6 if config.six_dof else 3, "quats": 4, "log_scales": 3}
         self.heads = nn.ModuleDict({n: linear(config.width, size, generator, std) for n, size in widths.items()})
-        self.rules = (
-            {"quats": add_to_unit_quat, "log_scales": add_to_scale} if config.published else {"quats": turn}
-        )
+        self.rules = {"quats": add_to_unit_quat, "log_scales": add_to_scale} if config.published else {"quats": turn}
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] scene units (detached here), times [M] or [1] in [0, 1]."""

@@ -37,7 +37,8 @@ class Deltas(NamedTuple):
 
     def detached(self) -> Deltas:
         """The same values without gradient."""
-        return Deltas(*(None if delta is None else delta.detach() for delta in self))
+        rest = (None if delta is None else delta.detach() for delta in self[1:])
+        return Deltas(self.means.detach(), *rest)
 
 
 def split_deltas(deltas: Deltas, first: int) -> tuple[Deltas, Deltas]:
@@ -194,7 +195,7 @@ def rate_scale(published: int, iterations: int) -> float:
     """Factor on published learning rates for a run shorter than the published one: the root of the ratio, at least 1.
 
     Adam moves a parameter by about a rate per step: a short run at the rates of a long one ends far from where that
-    one does, and a comparison would flatter ours. Where the published run is no longer than ours, rates are as published.
+    one does, and a comparison would flatter ours. In a run as long as the published one rates are as published.
     """
     return max(1.0, published / iterations) ** 0.5
 

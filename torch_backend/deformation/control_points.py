@@ -1,0 +1,471 @@
+"""Host C: sparse control points that carry the Gaussians round them (SC-GS; design: method-hosts 1.3).
+
+Nodes move by a small network of place and time; a Gaussian follows its 3 nearest nodes in a space of place and learnt
+hyper-coordinates, each turning it about itself. Corrected against the published code: nodes are drawn from the
+Gaussians that move, so that no separate stage has to find them and the host works behind the gate; scales change in
+the log and one rotation serves both the frame of a node and the Gaussians in it; nodes are added where more Gaussians
+open. Positions of nodes and of Gaussians are detached throughout, as published.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..gaussians.model import SH_C0
+from .geometry import farthest_points, near_identity, nearest, rigid_rotations, rotation_matrices
+from .mlp import Trunk, blurred, linear
+from .protocol import (
+    Deformation,
+    Deltas,
+    HostConfig,
+    HostSpec,
+    Owned,
+    Rehearsal,
+    Start,
+    add_to_scale,
+    rate_scale,
+    turn,
+)
+
+PUBLISHED_ITERATIONS = 80_000
+_FOLLOWED = 3
+"""Nodes that a Gaussian follows (K)."""
+_EDGES, _SURE_EDGES, _EDGE_RADIUS = 10, 3, 0.1
+"""ARAP: neighbours of a node; those always kept; the others only if nearer than this, scene units."""
+_WINDOW = 0.05
+"""ARAP: the two times lie within this."""
+_SURROGATES = 16
+"""Pre-stage: at most so many surrogate points per node."""
+_INSTANTS = 16
+"""Times at which a trajectory is sampled."""
+
+
+@dataclass
+class ControlPointsConfig(HostConfig):
+    """Sizes, learning rates and weights; SC-GS' numbers in brackets (arguments/__init__.py, utils/time_utils.py)."""
+
+    nodes: int = 192
+    """Most nodes at the start (512); fewer where there are few Gaussians to move."""
+    hyper: int = 2
+    """Hyper-coordinates (8; its readme advises 2 for large real scenes)."""
+    depth: int = 4
+    """Layers of the nodes' network (8)."""
+    width: int = 128
+    """Width of them (256)."""
+    position_frequencies: int = 6
+    """Octaves of the position's encoding (10)."""
+    time_frequencies: int = 6
+    """Octaves of the time's encoding (10)."""
+    published: bool = False
+    """Raw coordinates, scale deltas after activation, rotation added, a rotation of its own for a node's frame (on)."""
+    lr: float = 1e-3
+    """Start learning rate of the network (8e-4)."""
+    lr_end: float = 5e-5
+    """End learning rate of the network (1.6e-6)."""
+    until: float = 1.0
+    """Share of the run at which that rate has ended."""
+    lr_nodes: float = 1e-3
+    """Learning rate of radii, weights and hyper-coordinates of nodes (8e-4, constant)."""
+    lr_hyper: float = 2.5e-3
+    """Learning rate of the Gaussians' hyper-coordinates (2.5e-3)."""
+    arap: float = 1e-3
+    """Weight of the as-rigid-as-possible energy (1e-4)."""
+    arap_end: float = 1e-4
+    """Weight it falls to (1e-5)."""
+    arap_fall: tuple[float, float] = (0.5, 1.0)
+    """Shares of the run between which it falls, in the log (5000 and 10,000 of stage two)."""
+    arap_until: float = 1.0
+    """Share of the run after which it is off (20,000 of stage two)."""
+    noise: float = 0.0
+    """Training times are blurred by this many frames, falling to nothing (0.1)."""
+    noise_until: float = 0.5
+    """Share of the run at which the blur is gone."""
+    rehearsal: float = 0.0
+    """Share of the run for the nodes' own stage (10,000 of 80,000); 0: nodes are drawn from the moving Gaussians."""
+
+
+def _reference(iterations: int) -> ControlPointsConfig:
+    """The published host: stage one 10,000 of 80,000 steps, then its schedules; node rate constant, as published."""
+    scale, whole = rate_scale(PUBLISHED_ITERATIONS, iterations), float(PUBLISHED_ITERATIONS)
+    return ControlPointsConfig(
+        start=0.0,
+        detached=13_000 / whole,
+        nodes=512,
+        hyper=8,
+        depth=8,
+        width=256,
+        position_frequencies=10,
+        time_frequencies=10,
+        published=True,
+        lr=5 * 1.6e-4 * scale,
+        lr_end=1.6e-6 * scale,
+        until=50_000 / whole,
+        lr_nodes=8e-4 * scale,
+        lr_hyper=2.5e-3 * scale,
+        arap=1e-4,
+        arap_end=1e-5,
+        arap_fall=(15_000 / whole, 20_000 / whole),
+        arap_until=30_000 / whole,
+        noise=0.1,
+        noise_until=30_000 / whole,
+        rehearsal=10_000 / whole,
+    )
+
+
+class _Motion(NamedTuple):
+    """How rows (a node at a time) move: shift [R, 3], frame [R, 4], quats [R, 4], log_scales [R, 3]."""
+
+    shift: Tensor
+    frame: Tensor
+    quats: Tensor
+    log_scales: Tensor
+
+
+class ControlPoints(Deformation):
+    """The field. Nodes: places [M, 3] at rest, scene units; hyper [M, H]; log_radii [M]; weights [M], logits."""
+
+    def __init__(
+        self, config: ControlPointsConfig, places: Tensor, box: Tensor, frames: int, generator: torch.Generator
+    ):
+        super().__init__()
+        if not len(places):
+            raise ValueError("control points need at least one place to stand")
+        self.config, count = config, len(places)
+        self.box: Tensor
+        self.frames: Tensor
+        self.places: Tensor
+        self.register_buffer("box", box.float())
+        self.register_buffer("frames", torch.tensor(float(frames)))
+        self.register_buffer("places", places.float())
+        self.hyper = nn.Parameter(places.new_full((count, config.hyper), 1e-2))
+        self.log_radii = nn.Parameter(_radii(places, config.published).log())
+        self.weights = nn.Parameter(places.new_zeros(count))
+        octaves = (config.position_frequencies, config.time_frequencies)
+        self.trunk = Trunk(config.depth, config.width, octaves, generator, kaiming=True)
+        stds = {"means": (3, 1e-5), "quats": (4, 1e-5), "log_scales": (3, 1e-8)}
+        if config.published:
+            stds["frame"] = (4, 1e-4)
+        self.heads = nn.ModuleDict({n: linear(config.width, size, generator, std) for n, (size, std) in stds.items()})
+        # The published host adds its rotation to the raw quaternion, which is what no rule does.
+        self.rules = {"log_scales": add_to_scale} if config.published else {"quats": turn}
+        self.owned = {"hyper": Owned((config.hyper,), -1e-2, config.lr_hyper, 0.1 * config.lr_hyper)}
+
+    @property
+    def rehearsal(self) -> float:
+        """Share of the run that the nodes' own stage takes."""
+        return self.config.rehearsal
+
+    # ------------------------------------------------------------------ motion
+
+    def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
+        """Deltas of M Gaussians; means [M, 3] scene units (detached here), times [M] or [1] in [0, 1].
+
+        own: hyper [M, H]; without it every Gaussian has the starting value.
+        """
+        x = means.detach()
+        hyper = (own or {}).get("hyper")
+        if hyper is None:
+            hyper = x.new_full((len(x), self.config.hyper), self.owned["hyper"].value)
+        index, share = self._skin(x, hyper)
+        motion, at = self._motions(index, times)
+        frame = rotation_matrices(near_identity(motion.frame))
+        place = self.places[index]
+        moved = (frame[at] @ (x[:, None] - place)[..., None])[..., 0] + place + motion.shift[at]
+        share = share[..., None]
+        return Deltas(
+            means=(share * moved).sum(1) - x,
+            quats=(share * motion.quats[at]).sum(1),
+            log_scales=(share * motion.log_scales[at]).sum(1),
+        )
+
+    def _skin(self, x: Tensor, hyper: Tensor) -> tuple[Tensor, Tensor]:
+        """(nodes followed [M, K], their shares [M, K]) of Gaussians at x [M, 3] with hyper [M, H]."""
+        joint, nodes = torch.cat([x, hyper], dim=1), torch.cat([self.places, self.hyper], dim=1)
+        index = nearest(joint, nodes, min(_FOLLOWED, len(nodes)))
+        squared = (joint[:, None] - nodes[index]).square().sum(2)
+        reach = torch.exp(-0.5 * squared * torch.exp(-2.0 * self.log_radii[index]))
+        share = reach * torch.sigmoid(self.weights[index]) + 1e-7
+        return index, share / share.sum(1, keepdim=True)
+
+    def _motions(self, index: Tensor, times: Tensor) -> tuple[_Motion, Tensor]:
+        """Motions that index [M, K] needs at times [M] or [1], each (node, time) once, and where each stands [M, K]."""
+        if times.shape[0] == 1:
+            return self.node_motion(self.places, times), index
+        instants, which = times.unique(return_inverse=True)
+        pairs, at = (index * len(instants) + which[:, None]).unique(return_inverse=True)
+        return self.node_motion(self.places[pairs // len(instants)], instants[pairs % len(instants)]), at
+
+    def node_motion(self, places: Tensor, times: Tensor) -> _Motion:
+        """The network at places [R, 3] (detached) and times [R] or [1]."""
+        where, when = places.detach(), times
+        if not self.config.published:
+            where = 2.0 * (where - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
+            when = 2.0 * when - 1.0
+        hidden = self.trunk(where, when)
+        out = {name: head(hidden) for name, head in self.heads.items()}
+        return _Motion(out["means"], out.get("frame", out["quats"]), out["quats"], out["log_scales"])
+
+    def trajectories(self, places: Tensor, times: Tensor) -> Tensor:
+        """[T, R, 3]: where nodes at places [R, 3] are at times [T]."""
+        rows = places.detach().repeat(len(times), 1)
+        shift = self.node_motion(rows, times.repeat_interleave(len(places))).shift
+        return places + shift.view(len(times), len(places), 3)
+
+    def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:
+        """Blurred as in Host B."""
+        return blurred(time, float(self.frames), progress, self.config.noise, self.config.noise_until, generator)
+
+    # ------------------------------------------------------------------ training
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Two groups: the nodes and the network. Published: the nodes' rate does not decay."""
+        c = self.config
+        own = [self.hyper, self.log_radii, self.weights]
+        network = [*self.trunk.parameters(), *self.heads.parameters()]
+        end = c.lr_nodes if c.published else 0.1 * c.lr_nodes
+        return [
+            {"params": own, "lr": c.lr_nodes, "lr_end": end, "name": "nodes"},
+            {"params": network, "lr": c.lr, "lr_end": c.lr_end, "until": c.until, "name": "field"},
+        ]
+
+    def regularisation(self, progress: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
+        """As rigid as possible, over at most 512 nodes at two near times; weighted by the schedule."""
+        weight = self._arap_weight(progress)
+        if weight <= 0.0 or len(self.places) < 2:
+            return self.places.new_zeros(())
+        places = self.places
+        if len(places) > 512:
+            places = places[torch.randperm(len(places), generator=generator, device="cpu")[:512].to(places.device)]
+        times = _near_times(2, _WINDOW, generator).to(places.device)
+        return weight * arap_energy(*self.trajectories(places, times))
+
+    def _arap_weight(self, progress: float) -> float:
+        c = self.config
+        if progress > c.arap_until:
+            return 0.0
+        first, last = c.arap_fall
+        share = min(max((progress - first) / max(last - first, 1e-9), 0.0), 1.0)
+        return c.arap * (c.arap_end / c.arap) ** share if c.arap > 0 else 0.0
+
+    @torch.no_grad()
+    def cover(self, means: Tensor, optimizer: torch.optim.Optimizer) -> None:
+        """Adds nodes where open Gaussians [N, 3] stand farther from every node than two radii.
+
+        Farthest points of trajectories, up to the configured number of nodes again for each call.
+        """
+        distance = torch.cdist(means, self.places).amin(1)
+        lost = means[distance > 2.0 * self.log_radii.exp().median()]
+        if not len(lost) or self.config.published:
+            return
+        fresh = lost[farthest_points(self._paths(lost), self.config.nodes, self._paths(self.places))]
+        places = torch.cat([self.places, fresh])
+        radii = _radii(places, published=False)[len(self.places) :].log()
+        self.places = places
+        for name, rows in (
+            ("hyper", self.hyper.new_full((len(fresh), self.config.hyper), 1e-2)),
+            ("log_radii", radii),
+            ("weights", self.weights.new_zeros(len(fresh))),
+        ):
+            old = getattr(self, name)
+            new = nn.Parameter(torch.cat([old.detach(), rows]))
+            setattr(self, name, new)
+            state = optimizer.state.pop(old, None)
+            if state is not None:
+                optimizer.state[new] = {
+                    key: torch.cat([value, torch.zeros_like(rows)]) if value.shape == old.shape else value
+                    for key, value in state.items()
+                }
+            for group in optimizer.param_groups:
+                group["params"] = [new if p is old else p for p in group["params"]]
+
+    def _paths(self, places: Tensor) -> Tensor:
+        """[R, 3 * 16]: trajectories of places [R, 3] as features, in which distance is root mean square distance."""
+        times = torch.linspace(0.0, 1.0, _INSTANTS, device=places.device)
+        paths = torch.cat([self.trajectories(chunk, times) for chunk in places.split(1024)], dim=1)
+        return paths.transpose(0, 1).flatten(1) / math.sqrt(_INSTANTS)
+
+    def rehearse(self, stage: Rehearsal) -> None:
+        """SC-GS' stage one: surrogate balls of one size move point-wise; farthest paths become the nodes.
+
+        A fifth of the steps with motion off, nodes drawn at three quarters, the rest with the nodes alone. Departure:
+        surrogates do not multiply; as many as the published limit on real data are there from the start.
+        """
+        _Surrogates(self, stage).run()
+
+    @torch.no_grad()
+    def place(self, places: Tensor) -> None:
+        """Puts the nodes at places [M, 3]; M may differ from before only while no optimiser holds them."""
+        self.places = places.detach().clone()
+        count = len(places)
+        self.hyper = nn.Parameter(self.hyper.new_full((count, self.config.hyper), 1e-2))
+        self.log_radii = nn.Parameter(_radii(places, self.config.published).log())
+        self.weights = nn.Parameter(self.weights.new_zeros(count))
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of `state`, whatever the number of nodes."""
+        self.place(tensors["field.places"])
+        super().load_state(tensors)
+
+
+# ---------------------------------------------------------------------- penalties
+
+
+def arap_energy(before: Tensor, after: Tensor) -> Tensor:
+    """Sum over nodes and edges of |e' - R e|^2: before, after [M, 3] at two times.
+
+    Edges lead to the 10 nearest nodes of `before`; beyond the third only within 0.1. R is each node's best rotation,
+    without gradient; nodes with collapsed edges are left out.
+    """
+    count = min(_EDGES, len(before) - 1)
+    index = nearest(before, before, count + 1)[:, 1:]
+    old, new = before[index] - before[:, None], after[index] - after[:, None]
+    valid = old.detach().norm(dim=2) < _EDGE_RADIUS
+    valid[:, :_SURE_EDGES] = True
+    rotation, usable = rigid_rotations(old.detach(), new.detach(), valid)
+    gap = (new - old @ rotation.transpose(1, 2)).square().sum(2)
+    return (gap * (valid & usable[:, None])).sum()
+
+
+def elastic_energy(paths: Tensor) -> Tensor:
+    """Variance over T times of the edges to the 2 nearest nodes, each by its own value: paths [T, M, 3]."""
+    index = nearest(paths[0], paths[0], min(3, paths.shape[1]))[:, 1:]
+    edges = paths[:, index] - paths[:, :, None]
+    # The added 1e-20 keeps the root's gradient finite where two nodes meet.
+    variance = (edges.square().sum(3) + 1e-20).sqrt().var(0)
+    return (variance / (variance.detach() + 1e-8)).mean()
+
+
+def acceleration_energy(paths: Tensor) -> Tensor:
+    """Mean |x(t - d) + x(t + d) - 2 x(t)|, each by its own value: paths [3, M, 3]."""
+    length = ((paths[0] + paths[2] - 2.0 * paths[1]).square().sum(1) + 1e-20).sqrt()
+    return (length / (length.detach() + 1e-8)).mean()
+
+
+def _near_times(count: int, window: float, generator: torch.Generator | None) -> Tensor:
+    """[count] times in [0, 1] within a window round a random one."""
+    draw = torch.rand(1 + count, generator=generator, device="cpu")
+    return (draw[0] + window * (draw[1:] - 0.5)).clamp(0.0, 1.0)
+
+
+def _radii(places: Tensor, published: bool) -> Tensor:
+    """[M] what nodes reach at the start: published a tenth of the scene's range, ours the distance to 3 neighbours."""
+    if published or len(places) < 2:
+        return torch.full_like(places[:, 0], max(0.1 * float(places.max() - places.min()), 1e-3))
+    index = nearest(places, places, min(4, len(places)))[:, 1:]
+    return (places[index] - places[:, None]).norm(dim=2).mean(1).clamp_min(1e-3)
+
+
+# ---------------------------------------------------------------------- stage one of the published host
+
+
+class _Surrogates:
+    """Balls of one common size, SH degree 0, that find the motion before any Gaussian has to follow it."""
+
+    def __init__(self, field: ControlPoints, stage: Rehearsal) -> None:
+        self.field, self.stage = field, stage
+        points, colors = stage.points, stage.colors
+        limit = _SURROGATES * field.config.nodes
+        if len(points) > limit:
+            kept = torch.randperm(len(points), generator=stage.generator, device="cpu")[:limit].to(points.device)
+            points, colors = points[kept], colors[kept]
+        # Mean spacing of the points: the common size of the balls.
+        near = nearest(points, points, min(4, len(points)))[:, 1:]
+        spacing = (points[near] - points[:, None]).norm(dim=2).median().clamp_min(1e-3)
+        self.scale = nn.Parameter(spacing.log().reshape(1))
+        self.params = {
+            "means": nn.Parameter(points.clone()),
+            "opacity_logits": nn.Parameter(points.new_full((len(points),), math.log(0.1 / 0.9))),
+            "sh0": nn.Parameter(((colors - 0.5) / SH_C0)[:, None, :].clone()),
+        }
+        self.optimizer = self._optimiser()
+
+    def run(self) -> None:
+        """All steps; the field's nodes are placed at the end."""
+        stage, field = self.stage, self.field
+        warm, sampling = round(0.2 * stage.steps), round(0.75 * stage.steps)
+        for step in range(stage.steps):
+            if step == sampling:
+                self._draw_nodes()
+            frame = int(torch.randint(len(stage.times), (1,), generator=stage.generator, device="cpu"))
+            loss = stage.loss(self._state(frame, moving=step >= warm), frame)
+            if step >= warm:
+                loss = loss + self._penalties()
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            if bool(torch.isfinite(loss)):
+                self.optimizer.step()
+        field.place(self.params["means"].detach())
+
+    def _state(self, frame: int, moving: bool) -> dict[str, Tensor]:
+        means = self.params["means"]
+        if moving:
+            time = torch.tensor([self.stage.times[frame]], device=means.device)
+            means = means + self.field.node_motion(means, time).shift
+        count = len(means)
+        quats = means.new_zeros(count, 4)
+        quats[:, 0] = 1.0
+        return {
+            **self.params,
+            "means": means,
+            "quats": quats,
+            "log_scales": self.scale.expand(count, 3),
+            "shN": means.new_zeros(count, 0, 3),
+        }
+
+    def _penalties(self) -> Tensor:
+        generator, means = self.stage.generator, self.params["means"]
+        if len(means) > 512:
+            means = means[torch.randperm(len(means), generator=generator, device="cpu")[:512].to(means.device)]
+        frame = 1.0 / float(self.field.frames)
+        middle = _near_times(1, 0.0, generator)
+        around = middle + 3.0 * frame * torch.tensor([-1.0, 0.0, 1.0])
+        times = torch.cat(
+            [_near_times(2, _WINDOW, generator), _near_times(8, frame, generator), around.clamp(0.0, 1.0)]
+        )
+        paths = self.field.trajectories(means, times.to(means.device))
+        return (
+            1e-2 * arap_energy(paths[0], paths[1])
+            + 1e-3 * elastic_energy(paths[2:10])
+            + 1e-5 * acceleration_energy(paths[10:])
+        )
+
+    @torch.no_grad()
+    def _draw_nodes(self) -> None:
+        rows = farthest_points(self.field._paths(self.params["means"].detach()), self.field.config.nodes)
+        self.params = {name: nn.Parameter(value.detach()[rows]) for name, value in self.params.items()}
+        self.optimizer = self._optimiser()
+
+    def _optimiser(self) -> torch.optim.Adam:
+        network = [p for group in self.field.parameter_groups() if group["name"] == "field" for p in group["params"]]
+        rate = self.field.config.lr / (5 * 1.6e-4)
+        groups = [
+            {"params": network, "lr": self.field.config.lr},
+            {"params": [self.params["means"]], "lr": 8e-4 * rate},
+            {"params": [self.scale], "lr": 5e-3 * rate},
+            {"params": [self.params["opacity_logits"]], "lr": 5e-2},
+            {"params": [self.params["sh0"]], "lr": 2.5e-3 * rate},
+        ]
+        return torch.optim.Adam(groups, eps=1e-15)
+
+
+def _create(config: ControlPointsConfig, start: Start) -> ControlPoints:
+    """Nodes at the farthest of the means that move; a pre-stage, if there is one, moves them later."""
+    count = max(1, min(config.nodes, len(start.means) // 8))
+    places = start.means[farthest_points(start.means, count)] if len(start.means) else start.box.mean(0)[None]
+    return ControlPoints(config, places, start.box, start.frames, start.generator)
+
+
+def _restore(config: ControlPointsConfig, tensors: dict[str, Tensor]) -> ControlPoints:
+    generator = torch.Generator().manual_seed(0)
+    field = ControlPoints(config, tensors["field.places"], tensors["field.box"], 1, generator)
+    field.load_state(tensors)
+    return field
+
+
+HOST = HostSpec("control_points", ControlPointsConfig, _reference, _create, _restore)
