@@ -1,12 +1,12 @@
 """How near blending comes to the limit of its inner loops: `python benchmarks/hot_loop.py [W1 W2 W3] [--json FILE]`.
 
 The limit: the very text of the forward and the backward row loop (`cpu_source.FORWARD_ROW`, `BACKWARD_ROW`), compiled
-the same way, over one tile of 16 full rows and 16 Gaussians, all of it in the first-level cache, every row lit and every
-branch predictable. It leaves out what blending does besides: fetching Gaussians, row ranges, sums over lanes, mispredicted
-branches, tile set-up and images. The best of many short runs counts, so that an interruption cannot flatter the share.
+the same way, over one tile of 16 full rows and 16 Gaussians, all of it in the first-level cache, every row lit and
+every branch predictable. It leaves out what blending does besides: fetching Gaussians, row masks, sums over lanes,
+mispredicted branches, tile set-up and images. The best of many short runs counts.
 
-Lanes: 16 for every row of a hit that is worked on, counted by blending built with a counter. Cycles: core clock, measured
-beside by a chain of dependent additions and exclusive ors, one cycle each.
+Lanes: 16 for every row of a hit that is worked on, counted by blending built with a counter. Cycles: core clock,
+measured beside by a chain of dependent additions and exclusive ors, one cycle each.
 
 Share = (limit in cycles per lane x lanes) / (seconds of the blending stage x clock x threads).
 """
@@ -252,8 +252,8 @@ def main() -> None:
     parser.add_argument("--json", type=pathlib.Path, metavar="FILE")
     arguments = parser.parse_args()
     limit = limits()
-    print(f"limit: forward {limit.forward_cycles_per_lane:.2f}, backward {limit.backward_cycles_per_lane:.2f} cycles per "
-          f"lane at {limit.clock_hz / 1e9:.2f} GHz")
+    print(f"limit: forward {limit.forward_cycles_per_lane:.2f}, backward {limit.backward_cycles_per_lane:.2f} cycles "
+          f"per lane at {limit.clock_hz / 1e9:.2f} GHz")
     results = []
     for name in arguments.workloads:
         work = room(*WORKLOADS[name])
@@ -262,9 +262,10 @@ def main() -> None:
             ahead, back = times.shares(limit)
             results.append({"workload": name, **asdict(times), "forward_share": ahead, "backward_share": back})
             per = times.threads * limit.clock_hz
-            print(f"{name}  {threads} threads  forward {times.forward_s * 1e3:6.2f} ms, "
-                  f"{times.forward_s * per / times.forward_lanes:.2f} cycles per lane, {ahead:.0%} of the limit   backward "
-                  f"{times.backward_s * 1e3:6.2f} ms, {times.backward_s * per / times.backward_lanes:.2f}, {back:.0%}")
+            print(f"{name}  {threads} threads  "
+                  f"forward {times.forward_s * 1e3:6.2f} ms, {times.forward_s * per / times.forward_lanes:.2f} cycles "
+                  f"per lane, {ahead:.0%} of the limit   backward {times.backward_s * 1e3:6.2f} ms, "
+                  f"{times.backward_s * per / times.backward_lanes:.2f}, {back:.0%}")
     if arguments.json:
         arguments.json.write_text(json.dumps({"limit": asdict(limit), "results": results}, indent=1) + "\n")
 

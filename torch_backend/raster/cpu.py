@@ -63,7 +63,7 @@ def _import_warp():
 
 
 def build(name: str, text: str) -> Callable[[int, int, int], None]:
-    """Compile the C++ `text`, or load it from Warp's cache, as a module of its own. Called as f(block, stage, worker)."""
+    """Compile C++ `text` as a module of its own, or load it from Warp's cache. Called as f(block, stage, worker)."""
     wp = _import_warp()
 
     def run(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...

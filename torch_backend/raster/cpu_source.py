@@ -34,9 +34,9 @@ _FIELDS: list[tuple[str, type, str]] = [
     *[(n, _P, "const float*") for n in ("means", "quats", "log_scales", "logits", "colors", "sh", "background",
                                         "grad_image", "grad_alpha")],
     *[(n, _P, "float*") for n in (
-        "record", "aux", "hit_weight", "hit_grad", "image", "alpha", "median", "top_weights", "means2d", "weight_sum", "weight_max",
-        "grad_means", "grad_quats", "grad_log_scales", "grad_logits", "grad_colors", "grad_sh", "grad_view",
-        "grad_norm", "grad_abs")],
+        "record", "aux", "hit_weight", "hit_grad", "image", "alpha", "median", "top_weights", "means2d", "weight_sum",
+        "weight_max", "grad_means", "grad_quats", "grad_log_scales", "grad_logits", "grad_colors", "grad_sh",
+        "grad_view", "grad_norm", "grad_abs")],
     *[(n, _P, "int*") for n in (
         "index", "hit_count", "hit_start", "chunk_count", "order", "order2", "key", "key2", "histogram", "tile_start",
         "tile_end", "hit_slot", "hit_place", "radii", "top_ids", "span", "span_start", "span_count")],
@@ -552,6 +552,9 @@ _BATCH = r"""
         float dys[16][16], shifts[16][16], levels[16][16];
         for (int l = 0; l < m; l++) {
             slots[l] = P.hit_slot[b + l];
+            // The next batch's record, and where this hit's result goes.
+            __builtin_prefetch(P.record + P.hit_slot[b + 16 + l < stop ? b + 16 + l : stop - 1] * RS);
+            prefetch_result(P.hit_place[b + l]);
             const float* r = P.record + slots[l] * RS;
             // Exponent of alpha on a row: level + A e^2, e = column + shift.
             F dy = LANE + 0.5f - (r[1] - y0), shift = (0.5f - (r[0] - x0)) - r[3] * dy;
@@ -610,6 +613,8 @@ BACKWARD_ROW = _ALPHA + r"""
 # Blend stage 0: forward. Parallel over tiles.
 _STAGE_BLEND = _TILE + r"""
 const bool want_depth = P.want_depth != 0, want_top = P.want_top != 0, want_weights = P.want_weights != 0;
+auto prefetch_result = FN(long long place) -> void {
+    if (want_weights) __builtin_prefetch(P.hit_weight + 2 * place, 1); };
 for (long long tile; (tile = take()) < tiles;) {
     long long tx = tile % P.tiles_x, ty = tile / P.tiles_x, start = P.tile_start[tile], stop = P.tile_start[tile + 1];
     float x0 = tx * 16.f, y0 = ty * 16.f;
@@ -671,6 +676,7 @@ for (long long tile; (tile = take()) < tiles;) {
 _STAGE_BLEND_BACKWARD = _TILE + r"""
 const long long GS = P.grad_stride;
 const bool want_abs = P.want_abs != 0;
+auto prefetch_result = FN(long long place) -> void { __builtin_prefetch(P.hit_grad + place * GS, 1); };
 for (long long tile; (tile = take()) < tiles;) {
     long long tx = tile % P.tiles_x, ty = tile / P.tiles_x, start = P.tile_start[tile], stop = P.tile_end[tile];
     float x0 = tx * 16.f, y0 = ty * 16.f;

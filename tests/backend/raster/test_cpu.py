@@ -90,14 +90,55 @@ def test_sh_degree_uses_the_first_bands_only(tools):
 
 
 def test_one_thread_and_many_agree_bitwise(tools):
-    scene = tools.cloud(3000, 130, 70, degree=1, with_depth=True, with_contributions=True)
+    scene = tools.cloud(3000, 130, 70, degree=1, with_depth=True, with_contributions=True, with_top=True)
     one, one_grads = scene.gradients("cpu", settings=RasterSettings(threads=1))
     for threads in (2, 5):
         many, many_grads = scene.gradients("cpu", settings=RasterSettings(threads=threads))
-        for name, value in vars(one).items():
+        filled = {name: value for name, value in vars(one).items() if name != "hits"}  # of the CUDA body alone
+        for name, value in filled.items():
             assert torch.equal(value, getattr(many, name)), name
         for name, grad in one_grads.items():
             assert torch.equal(grad, many_grads[name]), name
+
+
+def test_top_contributor_is_the_largest_weight(tools):
+    # Brute force in float64: alpha T of every Gaussian at every pixel, from renderings of one Gaussian at a time.
+    n, width, height = 40, 37, 21
+    scene = tools.cloud(n, width, height, seed=3)
+    alphas = []
+    for i in range(n):
+        names = ("means", "quats", "log_scales", "opacity_logits", "colors")
+        one = {name: value[i:i + 1] if name in names else value for name, value in scene.tensors.items()}
+        alphas.append(tools.Scene(one, scene.Ks, width, height, scene.options).run("reference").alphas[0].detach())
+    rotation, shift = scene.tensors["viewmats"][0, 2, :3], scene.tensors["viewmats"][0, 2, 3]
+    order = torch.argsort(scene.tensors["means"] @ rotation + shift, stable=True)
+    alpha = torch.stack(alphas)[order]
+    before = torch.cat((torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]))
+    weights = torch.where(before > 1e-4, alpha * before, torch.zeros_like(alpha))
+    out = scene.run("cpu", with_top=True)
+    assert out.top_ids.shape == out.top_weights.shape == (1, height, width)
+    assert out.top_ids.dtype == torch.int32
+    assert ((out.top_weights[0] - weights.amax(0)).abs() > 1e-4).float().mean() < 2e-3
+    expected = torch.where(weights.amax(0) > 0, order[weights.argmax(0)], torch.full_like(order[:1], -1))
+    # Near equals may swap, and a pixel may fall to the other side of the alpha cut.
+    assert (out.top_ids[0] != expected).float().mean() < 5e-3
+    empty = out.alphas == 0
+    assert empty.any()
+    assert torch.equal(out.top_ids == -1, empty)
+    assert torch.equal(out.top_weights == 0, empty)
+    plain = scene.run("cpu")
+    assert plain.top_ids is None
+    assert plain.top_weights is None
+    assert torch.equal(plain.colors, out.colors)
+
+
+def test_of_twins_the_front_one_is_top(tools):
+    scene = tools.single(logit=0.0)
+    twice = {name: torch.cat((value, value)) if name in ("means", "quats", "log_scales", "opacity_logits", "colors")
+             else value for name, value in scene.tensors.items()}
+    out = tools.Scene(twice, scene.Ks, 16, 16).run("cpu", with_top=True)
+    assert set(out.top_ids.unique().tolist()) <= {-1, 0}
+    assert (out.top_ids == 0).any()
 
 
 def test_workspace_reuse_leaves_no_trace(tools):
