@@ -2,7 +2,7 @@
 
 SHOT is a solved shot folder (nothing is written into it). One run of the preset trains with the tuning split (every 8th
 frame held out, four frames off); steps are timed in two windows: before the gate opens, with `--at` of the run done, and
-after, each of `--steps` steps. Times are medians over the steps of a window, in ms; every part is timed on its own, and
+after, each of `--steps` steps. Parts are means over the steps of a window, in ms; every part is timed on its own, and
 what no part covers is listed as the rest. Parts of the backward pass are told apart by the moment at which the gradients
 of the images and of the Gaussians arrive: autograd works through the graph in the reverse order of its making.
 """

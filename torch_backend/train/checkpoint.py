@@ -55,7 +55,7 @@ def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) 
     tensors = {}
     for name, parameter in named.items():
         for key, value in optimizer.state.get(parameter, {}).items():
-            tensors[f"adam.{key}.{name}"] = torch.as_tensor(value)
+            tensors[f"adam.{key}.{name}"] = value
     return tensors
 
 

@@ -1,0 +1,17 @@
+"""Starting scales: the distance to the three nearest neighbours."""
+
+import pytest
+import torch
+
+from torch_backend.gaussians.initialise import neighbour_distance
+
+
+def test_root_mean_square_of_three_nearest():
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 50, 50]])
+    assert float(neighbour_distance(points)[0]) == pytest.approx((14 / 3) ** 0.5)
+    assert neighbour_distance(points).dtype == torch.float32
+
+
+def test_twins_count_each_other_at_no_distance():
+    points = torch.tensor([[1.0, 2, 3]]).repeat(6, 1)
+    assert neighbour_distance(points).tolist() == [0.0] * 6  # `initialise` clamps to its smallest scale

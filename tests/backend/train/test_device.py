@@ -1,0 +1,123 @@
+"""A run lives on one device: what can be said about that on a machine without a GPU, and the run itself on one with."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._device import _device_constructors
+
+import torch_backend
+from torch_backend.contract import FreezeParams, JobError, TrainParams
+from torch_backend.freeze import freeze_shot
+from torch_backend.scene import load_images, load_scene
+from torch_backend.train import choose_device, config_from_params, load_run, train_shot
+from torch_backend.train.device import cuda_refusal
+from torch_backend.train.trainer import Trainer
+
+ROOT = Path(torch_backend.__file__).parent
+STATIONS = [str(ROOT / name) for name in ("train", "gaussians", "deformation", "supervision", "freeze")]
+needs_gpu = pytest.mark.skipif(bool(cuda_refusal()), reason="no GPU")
+
+
+class NamedDevices(TorchFunctionMode):
+    """Notes each call by a station that makes a tensor without saying where."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = set()
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if func in _device_constructors() and kwargs.get("device") is None:
+            frame = sys._getframe(1)
+            while frame and "/torch/" in frame.f_code.co_filename.replace("\\", "/"):
+                frame = frame.f_back
+            if frame and frame.f_code.co_filename.startswith(tuple(STATIONS)):
+                self.found.add(f"{frame.f_code.co_filename}:{frame.f_lineno} {func.__name__}")
+        return func(*args, **kwargs)
+
+
+def test_the_checker_sees_a_tensor_made_anywhere(monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "STATIONS", [__file__])
+    with NamedDevices() as mode:
+        torch.zeros(3, device="cpu")
+        torch.zeros(2)
+    assert len(mode.found) == 1
+
+
+@pytest.mark.parametrize(("method", "supervision"), [("auto", "support"), ("hexplane", "paper")])
+def test_stations_say_where_every_tensor_is_made(world, quiet, method, supervision):
+    name = f"named-{method}"
+    params = TrainParams(run=name, iterations=60, max_gaussians=1500, method=method, supervision=supervision)
+    with NamedDevices() as mode:
+        train_shot(world.shot, params, quiet())
+        freeze_shot(world.shot, FreezeParams(run=name, take=name, first=101, last=102), quiet())
+    assert mode.found == set()
+
+
+def test_choice_of_device():
+    assert choose_device("cpu").type == "cpu"
+    assert choose_device("auto").type == ("cpu" if cuda_refusal() else "cuda")
+    with pytest.raises(ValueError, match="tpu"):
+        choose_device("tpu")
+
+
+@pytest.mark.skipif(not cuda_refusal(), reason="there is a GPU")
+def test_cuda_without_a_gpu_is_refused_in_words(world, quiet):
+    with pytest.raises(JobError, match="GPU"):
+        train_shot(world.shot, TrainParams(run="gpu", device="cuda"), quiet())
+
+
+@needs_gpu
+def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
+    scene = load_scene(world.shot)
+    images = load_images(scene, scene.solved, 64, 48)
+    config = config_from_params(TrainParams(iterations=60, max_gaussians=1500))
+    trainer = Trainer(scene, images.cuda(), scene.solved, config, quiet(), {}, "cuda")
+    for _ in range(30):
+        trainer._milestones()
+        trainer.step()
+        trainer.iteration += 1
+    path = world.shot.root / "gpu.safetensors"
+    trainer.save(path)
+    for device in ("cpu", "cuda"):
+        other = Trainer(scene, images.to(device), scene.solved, config, quiet(), {}, device)
+        other.restore(path)
+        assert torch.equal(other.generator.get_state(), trainer.generator.get_state())
+        for _ in range(10):
+            other._milestones()
+            loss = other.step()
+            other.iteration += 1
+        assert loss.device.type == device and bool(torch.isfinite(loss))
+
+
+@needs_gpu
+def test_a_gpu_run_is_as_good_as_a_cpu_run(world, quiet):
+    found = {}
+    for device in ("cpu", "cuda"):
+        params = TrainParams(run=f"on-{device}", iterations=600, max_gaussians=1500, holdout=8, device=device)
+        found[device] = train_shot(world.shot, params, quiet())["heldout_psnr_db"]
+        run = load_run(world.shot, params.run, choose_device(device))
+        assert run.model.device.type == device
+        freeze_shot(world.shot, FreezeParams(run=params.run, take=params.run, device=device), quiet())
+    assert found["cuda"] > found["cpu"] - 0.5
+
+
+@needs_gpu
+def test_bad_frames_are_left_out_on_the_gpu_too(world, quiet):
+    scene = load_scene(world.shot)
+    images = load_images(scene, scene.solved, 64, 48).cuda()
+    report = quiet()
+    trainer = Trainer(scene, images * float("nan"), scene.solved, config_from_params(TrainParams()), report, {}, "cuda")
+    before = {name: p.detach().clone() for name, p in trainer.model.gaussians.params.items()}
+    for _ in range(9):
+        trainer.step()
+    trainer._look()
+    assert any(e[0] == "warning" and "not finite" in e[1] for e in report.events)
+    assert all(torch.equal(before[name], p) for name, p in trainer.model.gaussians.params.items())
+    for _ in range(12):
+        trainer.step()
+    with pytest.raises(JobError, match="unstable"):
+        trainer._look()
