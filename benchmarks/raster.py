@@ -1,17 +1,27 @@
 """Times the rasteriser on four seeded workloads: `python benchmarks/raster.py [W0 W1 ...] [--json FILE]`.
 
+Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). `--limit`,
+`--scaling`, `--memory` and `--errors` add tables.
+
 A workload is a furnished room seen from inside: points on walls, boxes and spheres with the noise of a solve, scales
 from the distance to the neighbours, flat along the normal, 3 % large Gaussians in the background, mixed opacities.
 Bodies are run in turn, round by round, so that whatever else the machine does falls on all of them alike.
 """
 
 import argparse
+import datetime
+import importlib
 import json
+import multiprocessing
 import os
 import pathlib
+import platform
 import sys
 import time
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
@@ -21,6 +31,7 @@ import torch
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from benchmarks.peers import Peer, Prepared
 from torch_backend.raster import RasterSettings, rasterize
 
 WORKLOADS = {"W0": (400, 64, 48), "W1": (20_000, 320, 180), "W2": (50_000, 640, 360), "W3": (200_000, 640, 360)}
@@ -139,82 +150,292 @@ def room(count: int, width: int, height: int, seed: int = 1234) -> Workload:
     return Workload(**arrays, width=width, height=height)
 
 
-class _Case:
-    """One workload held as tensors, run by one body."""
+SLOW_MS = 1000.0
+"""A body whose first frame takes longer is given SLOW_ROUNDS rounds at most."""
+SLOW_ROUNDS = 5
+SCALING = {"N": [(n, 640, 360) for n in (5_000, 20_000, 50_000, 100_000, 200_000)],
+           "pixels": [(50_000, 160 * s, 90 * s) for s in (1, 2, 4, 8)]}
+"""Gaussians, width, height along which `--scaling` goes."""
 
-    def __init__(self, work: Workload, backend: str, threads: int, degree: int | None):
-        scales, opacities = np.log(work.scales), np.log(work.opacities) - np.log1p(-work.opacities)
-        inputs = [torch.tensor(a) for a in (work.means, work.quats, scales, opacities, work.viewmat[None])]
-        generator = torch.Generator().manual_seed(1)
-        bands = None if degree is None else (degree + 1) ** 2
-        self.sh = None if bands is None else 0.2 * torch.randn(len(work.means), bands, 3, generator=generator)
-        self.colors = torch.tensor(work.colors) if degree is None else None
-        self.leaves = [t.requires_grad_() for t in (*inputs, self.sh, self.colors) if t is not None]
-        self.inputs, self.K, self.g = inputs, torch.tensor(work.K)[None], torch.tensor(work.g)[None]
-        self.size = {"width": work.width, "height": work.height}
-        self.options = {"backend": backend, "settings": RasterSettings(threads=threads), "with_contributions": True}
+
+@dataclass(frozen=True)
+class Body:
+    """One way to render: a body of this rasteriser, or a peer."""
+
+    backend: str
+    """`backend` of `rasterize`, or "peer"."""
+    device: str = "cpu"
+    threads: int = 1
+    degree: int | None = None
+    """Of the harmonics; None for plain colours."""
+    peer: str = ""
+    """Import path of the peer's module."""
+    dtype: torch.dtype = torch.float32
+
+    def prepare(self, work: Workload) -> Prepared:
+        if self.backend == "peer":
+            return _peer(self.peer).prepare(work, self.device)
+
+        def put(array: np.ndarray) -> torch.Tensor:
+            return torch.tensor(array).to(self.device, self.dtype)
+
+        leaves = {"means": put(work.means), "quats": put(work.quats), "log_scales": put(np.log(work.scales)),
+                  "opacity_logits": put(np.log(work.opacities) - np.log1p(-work.opacities)),
+                  "viewmats": put(work.viewmat[None])}
+        if self.degree is None:
+            leaves["colors"] = put(work.colors)
+        else:
+            generator = torch.Generator().manual_seed(1)
+            sh = 0.2 * torch.randn(len(work.means), (self.degree + 1) ** 2, 3, generator=generator)
+            leaves["sh"] = sh.to(self.device, self.dtype)
+        for leaf in leaves.values():
+            leaf.requires_grad_()
+        Ks, settings = torch.tensor(work.K)[None].to(self.device), RasterSettings(threads=self.threads)
+
+        def forward() -> torch.Tensor:
+            return rasterize(
+                leaves["means"], leaves["quats"], leaves["log_scales"], leaves["opacity_logits"], leaves.get("colors"),
+                leaves.get("sh"), viewmats=leaves["viewmats"], Ks=Ks, width=work.width, height=work.height,
+                backend=self.backend, settings=settings, with_contributions=True).colors[0]
+
+        return Prepared(forward, leaves)
+
+
+def _peer(module: str) -> Peer:
+    return importlib.import_module(module)  # type: ignore[return-value]
+
+
+class _Case:
+    """One workload held by one body."""
+
+    def __init__(self, work: Workload, body: Body):
+        self.body, self.prepared = body, body.prepare(work)
+        self.g = torch.tensor(work.g).to(body.device, body.dtype)
+
+    def image(self) -> torch.Tensor:
+        """Forward and backward, untimed; gradients are in the leaves afterwards."""
+        for leaf in self.prepared.leaves.values():
+            leaf.grad = None
+        image = self.prepared.forward()
+        torch.autograd.backward(image, self.g)
+        return image.detach()
 
     def run(self) -> tuple[float, float]:
         """Milliseconds of (forward, forward and backward)."""
-        for leaf in self.leaves:
+        for leaf in self.prepared.leaves.values():
             leaf.grad = None
+        if self.body.device == "cuda":
+            torch.cuda.synchronize()
+            events = [torch.cuda.Event(enable_timing=True) for _ in range(3)]
+            events[0].record()
+            image = self.prepared.forward()
+            events[1].record()
+            torch.autograd.backward(image, self.g)
+            events[2].record()
+            torch.cuda.synchronize()
+            return events[0].elapsed_time(events[1]), events[0].elapsed_time(events[2])
         start = time.perf_counter()
-        means, quats, log_scales, logits, viewmats = self.inputs
-        out = rasterize(means, quats, log_scales, logits, self.colors, self.sh, viewmats=viewmats, Ks=self.K,
-                        **self.size, **self.options)
+        image = self.prepared.forward()
         middle = time.perf_counter()
-        torch.autograd.backward(out.colors, self.g)
+        torch.autograd.backward(image, self.g)
         return (middle - start) * 1e3, (time.perf_counter() - start) * 1e3
 
 
-def _figures(times: list[float]) -> dict[str, float]:
+def _figures(values: list[float]) -> dict[str, float]:
     """Median, and the quartiles around it."""
-    low, middle, high = np.percentile(times, [25, 50, 75]) if len(times) > 1 else (times[0],) * 3
-    return {"median_ms": round(float(middle), 2), "low_ms": round(float(low), 2), "high_ms": round(float(high), 2),
-            "min_ms": round(min(times), 2), "rounds": len(times)}
+    low, middle, high = (float(v) for v in np.percentile(values, [25, 50, 75]))
+    return {"median": middle, "low": low, "high": high, "min": min(values), "rounds": len(values)}
 
 
-def measure(name: str, rounds: int, threads: list[int], reference: bool) -> dict[str, object]:
-    """All bodies on one workload, interleaved; times per body in ms."""
-    count, width, height = WORKLOADS[name]
-    work = room(count, width, height)
-    cases = {f"cpu, {t} threads{', SH 2' if d else ''}": _Case(work, "cpu", t, d) for t in threads for d in (None, 2)}
-    few = {"torch reference, float32"} if reference else set()
-    cases |= {label: _Case(work, "reference", threads[-1], None) for label in few}
+def interleaved(work: Workload, bodies: dict[str, Body], rounds: int) -> dict[str, list[tuple[float, float]]]:
+    """Milliseconds (forward, forward and backward) per body and round: one body after the other, round by round."""
+    cases = {label: _Case(work, body) for label, body in bodies.items()}
+    slow = {label for label, case in cases.items() if case.run()[1] > SLOW_MS}  # the first frame compiles and warms up
+    slow = {label for label in slow if cases[label].run()[1] > SLOW_MS}
     times: dict[str, list[tuple[float, float]]] = {label: [] for label in cases}
-    for label in cases.keys() - few:
-        cases[label].run()
     for number in range(rounds):
         for label, case in cases.items():
-            if label not in few or number < 2:
+            if label not in slow or number < SLOW_ROUNDS:
                 times[label].append(case.run())
-    bodies = {label: {"forward": _figures([f for f, _ in t]), "forward_backward": _figures([b for _, b in t])}
-              for label, t in times.items()}
-    return {"workload": name, "gaussians": count, "width": width, "height": height, "bodies": bodies}
+    return times
 
 
-def main() -> None:
+def measure(size: tuple[int, int, int], bodies: dict[str, Body], rivals: list[str], rounds: int) -> dict[str, Any]:
+    """Figures of all bodies on `room(*size)`, and how many times each rival's time each of our bodies takes less."""
+    times = interleaved(room(*size), bodies, rounds)
+    result: dict[str, Any] = {"gaussians": size[0], "width": size[1], "height": size[2], "bodies": {}, "ratios": {}}
+    for label, pairs in times.items():
+        forward, both = zip(*pairs, strict=True)
+        result["bodies"][label] = {"forward_ms": _figures(list(forward)), "forward_backward_ms": _figures(list(both))}
+    for rival in rivals:
+        for label in bodies:
+            if label not in rivals and bodies[label].degree is None:
+                pairs = list(zip(times[rival], times[label], strict=False))  # the same round for both
+                result["ratios"][f"{rival} / {label}"] = {
+                    name: _figures([theirs[i] / ours[i] for theirs, ours in pairs])
+                    for i, name in enumerate(("forward", "forward_backward"))}
+    return result
+
+
+def limit(name: str, threads: list[int], rounds: int) -> list[dict[str, Any]]:
+    """Cycles per lane of blending on the CPU, and their share of the hot loop's limit, per number of threads."""
+    from benchmarks import hot_loop
+
+    hot, work, rows = hot_loop.limits(), room(*WORKLOADS[name]), []
+    for count in threads:
+        blend = hot_loop.blend_times(work, count, rounds)
+        ahead, back = blend.shares(hot)
+        cycles = count * hot.clock_hz
+        rows.append({"threads": count, "limit": asdict(hot), "forward_share": ahead, "backward_share": back,
+                     "forward_cycles_per_lane": blend.forward_s * cycles / blend.forward_lanes,
+                     "backward_cycles_per_lane": blend.backward_s * cycles / blend.backward_lanes})
+    return rows
+
+
+def errors(name: str, bodies: dict[str, Body]) -> dict[str, Any]:
+    """Against the float64 oracle: PSNR of the image (dB), relative L2 of the gradient of each input."""
+    work = room(*WORKLOADS[name])
+    oracle = _Case(work, Body("reference", dtype=torch.float64))
+    truth, result = oracle.image(), {}
+    for label, body in bodies.items():
+        case = _Case(work, body)
+        error = case.image().cpu().double() - truth
+        gradients = {key: leaf.grad.cpu().double() for key, leaf in case.prepared.leaves.items()
+                     if leaf.grad is not None}
+        expected = {key: leaf.grad for key, leaf in oracle.prepared.leaves.items() if leaf.grad is not None}
+        result[label] = {"psnr_db": float(-10 * error.square().mean().log10()), "gradient_relative_l2": {
+            key: float((value - expected[key]).norm() / expected[key].norm())
+            for key, value in gradients.items() if key in expected}}
+    return result
+
+
+def _peak(size: tuple[int, int, int], body: Body) -> float:
+    """MiB by which two frames raise this process's peak (CUDA: the most that torch held)."""
+    torch.set_num_threads(body.threads)
+    case = _Case(room(*size), body)
+    if body.device == "cuda":
+        case.image()
+        case.image()
+        return torch.cuda.max_memory_allocated() / 2**20
+    import resource
+
+    _Case(room(100, 32, 32), body).image()  # compiler and libraries are no part of a frame
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    case.image()
+    case.image()
+    units = 2**20 if sys.platform == "darwin" else 2**10  # macOS counts bytes, Linux kibibytes
+    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / units
+
+
+def memory(size: tuple[int, int, int], bodies: dict[str, Body]) -> dict[str, float]:
+    """Peak MiB of each body, each in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
+        return {label: pool.submit(_peak, size, body).result() for label, body in bodies.items()}
+
+
+def machine(device: str) -> dict[str, Any]:
+    """What the figures were measured on, and when."""
+    model = platform.processor()
+    if pathlib.Path("/proc/cpuinfo").exists():
+        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+        model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
+    packages = ("torch", "warp-lang", "numpy", "gsplat")
+    versions = {d.name: d.version for d in metadata.distributions() if d.name in packages}
+    return {"date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"), "system": platform.platform(),
+            "cpu": model, "cores": os.cpu_count(), "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
+            "python": platform.python_version(), "versions": versions}
+
+
+def _print_times(title: str, result: dict[str, Any]) -> None:
+    for label, figures in result["bodies"].items():
+        f, b = figures["forward_ms"], figures["forward_backward_ms"]
+        print(f"{title}  {label:24s} forward {f['median']:8.2f} [{f['low']:.2f}, {f['high']:.2f}] ms   "
+              f"forward+backward {b['median']:8.2f} [{b['low']:.2f}, {b['high']:.2f}] ms   {b['rounds']} rounds")
+    for label, ratio in result["ratios"].items():
+        f, b = ratio["forward"], ratio["forward_backward"]
+        print(f"{title}  {label}: forward {f['median']:.1f} [{f['low']:.1f}, {f['high']:.1f}]   "
+              f"forward+backward {b['median']:.1f} [{b['low']:.1f}, {b['high']:.1f}] times")
+
+
+def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workloads", nargs="*", default=["W0", "W1", "W2"], metavar="W",
                         help="W0 to W3 (default: W0 W1 W2)")
     parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, os.cpu_count() or 1}))
-    parser.add_argument("--reference", action="store_true", help="time the torch reference too (slow, two rounds)")
-    parser.add_argument("--json", type=pathlib.Path, metavar="FILE")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, os.cpu_count() or 1}),
+                        help="of the CPU body; torch (reference, peers) gets the most of them")
+    parser.add_argument("--reference", action="store_true", help="time the torch reference in float32 too (slow)")
+    parser.add_argument("--peer", action="append", default=[], metavar="MODULE",
+                        help="time this peer too, e.g. benchmarks.peers.gsplat; may be given again")
+    parser.add_argument("--limit", action="store_true",
+                        help="also measure blending's cycles per lane against benchmarks/hot_loop.py (CPU only)")
+    parser.add_argument("--scaling", action="store_true", help="also time along N, pixels and threads")
+    parser.add_argument("--memory", action="store_true", help="also measure the peak memory of each body")
+    parser.add_argument("--errors", action="store_true", help="also compare with the float64 oracle on W0 and W1")
+    parser.add_argument("--json", type=pathlib.Path, metavar="FILE", help="write all figures there as well")
     arguments = parser.parse_args()
     unknown = [w for w in arguments.workloads if w not in WORKLOADS]
     if unknown:
         parser.error(f"no such workload: {', '.join(unknown)}; there are {', '.join(WORKLOADS)}")
-    results = []
+    if arguments.device == "cuda" and not torch.cuda.is_available():
+        parser.error("--device cuda: torch finds no CUDA device on this machine")
+    if arguments.limit and arguments.device != "cpu":
+        parser.error("--limit: the hot loop is the CPU body's")
+    return arguments
+
+
+def main() -> None:
+    arguments = _arguments()
+    device, most = arguments.device, max(arguments.threads)
+    torch.set_num_threads(most)
+    if device == "cuda":
+        plain = {"cuda": Body("auto", device)}
+        ours = plain | {"cuda, SH 2": Body("auto", device, degree=2)}
+    else:
+        plain = {f"cpu, {t} threads": Body("cpu", threads=t) for t in arguments.threads}
+        ours = plain | {f"{label}, SH 2": Body("cpu", threads=body.threads, degree=2) for label, body in plain.items()}
+    rivals = {"torch reference": Body("reference", device, most)} if arguments.reference else {}
+    for module in arguments.peer:
+        missing = _peer(module).missing(device)
+        if missing:
+            print(missing)
+        else:
+            rivals[_peer(module).NAME] = Body("peer", device, most, peer=module)
+    report: dict[str, Any] = {"machine": machine(device), "workloads": {}}
     for name in arguments.workloads:
-        result = measure(name, arguments.rounds, arguments.threads, arguments.reference)
-        results.append(result)
-        for label, figures in result["bodies"].items():  # type: ignore[attr-defined]
-            f, b = figures["forward"], figures["forward_backward"]
-            print(f"{name}  {label:28s} forward {f['median_ms']:8.2f} [{f['low_ms']:.2f}, {f['high_ms']:.2f}] ms   "
-                  f"forward+backward {b['median_ms']:8.2f} [{b['low_ms']:.2f}, {b['high_ms']:.2f}] ms")
+        result = measure(WORKLOADS[name], ours | rivals, list(rivals), arguments.rounds)
+        report["workloads"][name] = result
+        _print_times(name, result)
+        if arguments.limit:
+            result["limit"] = limit(name, arguments.threads, arguments.rounds)
+            for row in result["limit"]:
+                print(f"{name}  blending, {row['threads']} threads, cycles per lane and share of the hot-loop limit: "
+                      f"forward {row['forward_cycles_per_lane']:.2f}, {row['forward_share']:.0%}; "
+                      f"backward {row['backward_cycles_per_lane']:.2f}, {row['backward_share']:.0%}")
+        if arguments.memory:
+            result["peak_mib"] = memory(WORKLOADS[name], ours | rivals)
+            for label, peak in result["peak_mib"].items():
+                print(f"{name}  {label:24s} peak memory {peak:8.1f} MiB")
+    if arguments.scaling:
+        fastest = list(plain)[-1]
+        report["scaling"] = {axis: [measure(size, {fastest: plain[fastest]}, [], arguments.rounds) for size in sizes]
+                             for axis, sizes in SCALING.items()}
+        if device == "cpu":
+            every = {f"cpu, {t} threads": Body("cpu", threads=t) for t in range(1, (os.cpu_count() or 1) + 1)}
+            report["scaling"]["threads"] = [measure(WORKLOADS["W2"], every, [], arguments.rounds)]
+        for axis, results in report["scaling"].items():
+            for result in results:
+                _print_times(f"{axis}: {result['gaussians']} at {result['width']}x{result['height']}", result)
+    if arguments.errors:
+        report["errors"] = {name: errors(name, plain | rivals) for name in ("W0", "W1")}
+        for name, rows in report["errors"].items():
+            for label, row in rows.items():
+                gradients = ", ".join(f"{k} {v:.1e}" for k, v in row["gradient_relative_l2"].items())
+                print(f"{name}  {label:24s} PSNR {row['psnr_db']:.1f} dB; gradients' relative L2: {gradients}")
     if arguments.json:
-        arguments.json.write_text(json.dumps({"cores": os.cpu_count(), "results": results}, indent=1) + "\n")
+        arguments.json.write_text(json.dumps(report, indent=1) + "\n")
 
 
 if __name__ == "__main__":
