@@ -1,10 +1,10 @@
-"""Breakdown of one training step before and after the gate opens: `python benchmarks/training_step.py SHOT [--json FILE]`.
+"""Breakdown of one training step before and after the gate opens: `python benchmarks/training_step.py SHOT`.
 
-SHOT is a solved shot folder (nothing is written into it). One run of the preset trains with the tuning split (every 8th
-frame held out, four frames off); steps are timed in two windows: before the gate opens, with `--at` of the run done, and
-after, each of `--steps` steps. Parts are means over the steps of a window, in ms; every part is timed on its own, and
-what no part covers is listed as the rest. Parts of the backward pass are told apart by the moment at which the gradients
-of the images and of the Gaussians arrive: autograd works through the graph in the reverse order of its making.
+SHOT is a solved shot folder; nothing is written into it. One run of the preset trains with the tuning split (every 8th
+frame held out, four frames off); `--steps` steps are timed at each share of the run in `--at`. Parts are means over
+these steps, in ms; a part inside another is taken off the outer one, and what no part covers is listed as the rest.
+Parts of the backward pass are told apart by the moment at which the gradients of the images and of the Gaussians
+arrive: autograd works through the graph in the reverse order of its making.
 """
 
 import argparse
@@ -28,7 +28,8 @@ from torch_backend.raster.cpu import warm_up
 from torch_backend.raster.settings import default_threads
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot
-from torch_backend.train import config_from_params, trainer as trainer_module
+from torch_backend.train import config_from_params
+from torch_backend.train import trainer as trainer_module
 from torch_backend.train.run import training_size
 from torch_backend.train.trainer import Trainer
 
@@ -89,14 +90,20 @@ def watch(trainer: Trainer, parts: Parts) -> None:
             patched.add((id(owner), name))
 
     for owner, name, label in (
-        (model, "deltas", "field, forward"), (module, "apply_deltas", "deltas applied"),
-        (model.exposure, "apply", "exposure, forward"), (module, "photometric", "L1 + SSIM, forward"),
-        (trainer, "_regularisers", "penalties, forward"), (module, "support_loss", "support loss, forward"),
-        (trainer.optimizer, "zero_grad", "gradients cleared"), (trainer.optimizer, "step", "Adam"),
-        (trainer, "_gradients_finite", "gradients checked"), (trainer, "_after_step", "scales clamped"),
-        (trainer.densifier, "observe", "densifier observes"), (module, "mark_seen", "support marked"),
-        (trainer, "_schedule", "learning rates"), (trainer, "_milestones", "densification and gate"), (trainer, "_next_frame", "frame drawn"),
-    ):  # fmt: skip
+        (model, "deltas", "field, forward"),
+        (module, "apply_deltas", "deltas applied"),
+        (model.exposure, "apply", "exposure, forward"),
+        (module, "photometric", "L1 + SSIM, forward"),
+        (trainer, "_regularisers", "penalties, forward"),
+        (module, "support_loss", "support loss, forward"),
+        (trainer.optimizer, "zero_grad", "gradients cleared"),
+        (trainer.optimizer, "step", "Adam"),
+        (trainer.densifier, "observe", "densifier observes"),
+        (module, "mark_seen", "support marked"),
+        (trainer, "_schedule", "learning rates"),
+        (trainer, "_milestones", "densification and gate"),
+        (trainer, "_next_frame", "frame drawn"),
+    ):
         if hasattr(owner, name):
             patch(owner, name, label)
     if model.field is not None:
