@@ -16,6 +16,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -203,7 +204,7 @@ def plan(
 
 
 def _phase(scene: TruthScene) -> int:
-    """The hold-out phase that keeps the fewest instants out of training; 0, what is reported elsewhere, if it can be."""
+    """The hold-out phase that keeps the fewest instants out of training; 0 (used elsewhere) if it can be."""
     if scene.kind == "real":
         return 0
     loaded = load_scene(scene.shot)
@@ -254,6 +255,7 @@ def _child(spec: RunSpec, results: Path) -> int:
 
 def work(request: Path, results: Path) -> int:
     """The child: trains, freezes, scores, writes the record. Returns an exit code."""
+    _die_with(os.getppid())
     spec: RunSpec = from_dict(RunSpec, read_json(request))
     truth = load_source(spec.source, results)
     run_name = spec.run_name
@@ -263,7 +265,7 @@ def work(request: Path, results: Path) -> int:
     known = PRESETS[spec.preset]
     PRESETS[spec.preset] = lambda: _overridden(known(), spec)
     since = time.process_time()
-    code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print)
+    code, _ = run_job(new_job(truth.shot, "train", spec.params(run_name)), print)
     cpu_seconds = round(time.process_time() - since, 2)
     facts = folder / "bench.json"
     if code != ExitCode.OK:
@@ -271,6 +273,20 @@ def work(request: Path, results: Path) -> int:
     if whole and not facts.is_file():
         write_json(facts, {"version": 1, "train_cpu_seconds": cpu_seconds, "machine": machine_facts()})
     return _judge(spec, truth, run_name, results, read_json(facts) if facts.is_file() else {})
+
+
+def _die_with(parent: int) -> None:
+    """Ends this process at its next checkpoint when the benchmark that started it is gone, however it went.
+
+    Two children of two benchmarks must not train one run.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="watch", daemon=True).start()
 
 
 def _overridden(config: TrainConfig, spec: RunSpec) -> TrainConfig:

@@ -1,5 +1,6 @@
-"""The first frame of the bundled clip, and what is done to it."""
+"""The first frame of the bundled clip and what is done to it; the tiny world as a folder of truth."""
 
+import sys
 from pathlib import Path
 
 import av
@@ -7,6 +8,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter
+
+from torch_backend.footage.images import write_png
+from torch_backend.raster import rasterize
+from torch_backend.shot import write_json
 
 CLIP = Path(__file__).parents[3] / "examples" / "sitting.mp4"
 
@@ -27,3 +32,43 @@ def damaged(frame):
         return torch.from_numpy(gaussian_filter(frame.numpy().astype(np.float64), (sigma, sigma, 0))).float()
 
     return {"blur1": blur(1), "blur3": blur(3), "ghost": 0.5 * (frame + frame.roll(6, 1))}
+
+
+@pytest.fixture(scope="session")
+def write_truth(quiet):
+    """Makes a folder of truth of the tiny world: `write_truth(folder)` -> World. Two instants, four poses."""
+    build_world, module = sys.modules[quiet.__module__].build_world, sys.modules[quiet.__module__]
+
+    def write(folder: Path):
+        world = build_world(folder)
+        first, count = module.FIRST, module.FRAMES
+        instants, poses = [2, 12], [2, 5, 9, 13]
+        for t in instants:
+            for p in poses:
+                name = f"{first + t:06d}_{first + p:06d}"
+                save(folder / "truth" / f"{name}.png", world.image(p, t / (count - 1)))
+                for region, mask in regions_of(world, module, t, p).items():
+                    save(folder / "regions" / f"{name}_{region}.png", mask[..., None].expand(-1, -1, 3).float())
+        facts = {"version": 1, "name": "tiny", "cameras": "exact", "shot": "tiny.splannequin", "fps": 2.5}
+        facts |= {"t_stars": [first + t for t in instants], "poses": [first + p for p in poses]}
+        write_json(folder / "truth.json", {**facts, "regions": ["seen", "never_seen", "moving", "static"]})
+        return world
+
+    return write
+
+
+def save(path: Path, image: torch.Tensor) -> None:
+    write_png(path, (image * 255 + 0.5).to(torch.uint8).contiguous().numpy())
+
+
+def regions_of(world, module, t: int, p: int) -> dict[str, torch.Tensor]:
+    """The regions by truth; the wall is 4 away, which is where pixels of another pose come to lie at t*."""
+    without = {k: v[~world.moving] for k, v in world.at(t / (module.FRAMES - 1)).items()}
+    pose = {"viewmats": world.viewmats[p : p + 1], "Ks": world.K[None], "background": torch.full((3,), 0.5)}
+    wall = rasterize(**without, **pose, width=module.WIDTH, height=module.HEIGHT).colors[0].clamp(0, 1)
+    moving = (wall - world.image(p, t / (module.FRAMES - 1))).abs().amax(2) > 0.05
+    y, x = torch.meshgrid(torch.arange(module.HEIGHT) + 0.5, torch.arange(module.WIDTH) + 0.5, indexing="ij")
+    shift = 60 / 4 * (world.viewmats[t, :2, 3] - world.viewmats[p, :2, 3])
+    x, y = x + shift[0], y + shift[1]
+    seen = (x >= 0) & (x < module.WIDTH) & (y >= 0) & (y < module.HEIGHT)
+    return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving}

@@ -1,0 +1,178 @@
+"""The benchmark on the tiny world: children train, freeze, score and are killed; the report reads what they left."""
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from benchmarks.bench import ABLATIONS, HOLDOUT, ROOT, RunSpec, override, plan, run_plan
+from torch_backend.report.records import finished, load_record, load_records
+from torch_backend.report.truth import RealScene, TruthFolder
+from torch_backend.report.write import write_report
+from torch_backend.scene import load_scene, split_frames
+from torch_backend.train.config import METHODS
+
+SIZE = {"iterations": 60, "max_gaussians": 900}
+
+
+def only(runs, *settings):
+    return [r for r in runs if (r.host, r.supervision) in settings and r.variant == "default"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory, write_truth):
+    folder = tmp_path_factory.mktemp("truth") / "tiny"
+    return folder, write_truth(folder)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory, scene):
+    """Results of static and auto, run by children."""
+    results = tmp_path_factory.mktemp("results")
+    runs, said = plan([f"truth:{scene[0]}"], results, **SIZE)
+    runs = only(runs, ("auto", "support"), ("static", "none"))
+    assert run_plan(runs, results) == []
+    return results, runs, said
+
+
+def test_the_plan_is_every_host_with_and_without_and_says_what_is_missing(scene, tmp_path):
+    runs, said = plan([f"truth:{scene[0]}"], tmp_path, presets=("preview", "standard"), seeds=(0, 1), ablations=True)
+    assert len({r.run_id for r in runs}) == len(runs)
+    kept = {(r.host, r.supervision) for r in runs if r.variant == "default"}
+    hosts = [h for h in ("hexplane", "mlp", "control_points") if h in METHODS]
+    with_anchors = {(h, s) for h in hosts for s in ("none", "paper", "support")}
+    assert kept == with_anchors | {("auto", "support"), ("static", "none")}
+    for host in {"hexplane", "mlp", "control_points"} - set(hosts):
+        assert sum(repr(host) in sentence for sentence in said) == 1
+    variants = {r.variant for r in runs} - {"default"}
+    assert {"no hidden loss", "no defective loss", "no confidence weighting", "no exposure"} <= variants
+    assert len(variants) + sum("ablation" in sentence for sentence in said) == len(ABLATIONS)
+    assert not only(plan([f"truth:{scene[0]}"], tmp_path)[0], ("auto", "none"))
+
+
+def test_instants_are_trained_on(scene, tmp_path):
+    runs, _ = plan([f"truth:{scene[0]}"], tmp_path)
+    truth = TruthFolder(scene[0])
+    loaded = load_scene(truth.shot)
+    _, test = split_frames(loaded.solved, HOLDOUT, runs[0].holdout_phase)
+    assert test and not {loaded.frames[i] for i in test} & set(truth.t_stars)
+
+
+def test_a_run_is_named_after_scene_and_settings():
+    spec = RunSpec("truth:/a/tiny", "abc", "auto", "support", "preview")
+    assert spec.run_id == dataclasses.replace(spec).run_id
+    changed = [{"scene_key": "abd"}, {"seed": 1}, {"query": "plain"}, {"overrides": {"exposure.on": False}}]
+    assert len({spec.run_id, *(dataclasses.replace(spec, **c).run_id for c in changed)}) == 5
+    assert dataclasses.replace(spec, query="plain").run_name == spec.run_name  # trained once, asked twice
+
+
+def test_an_override_that_does_not_exist_is_refused():
+    config = RunSpec("", "", "auto", "support", "preview").config()
+    override(config, "supervision.tau", 0.0)
+    assert config.supervision.tau == 0.0
+    for path in ("supervision.taw", "supervisor.tau", "tau"):
+        with pytest.raises(ValueError, match=path):
+            override(config, path, 0.0)
+
+
+def test_a_record_holds_every_frame_and_its_regions(done, scene):
+    results, runs, _ = done
+    truth = TruthFolder(scene[0])
+    for spec in runs:
+        record = load_record(results / f"{spec.run_id}.json")
+        assert [(r.t_star, r.pose) for r in record.rows] == [(t, p) for t in truth.t_stars for p in truth.poses(t, [])]
+        whole = record.values("psnr_db")
+        assert all(10 < v < 50 for v in whole.values())
+        unseen = {key[3:]: value for key, value in record.values("psnr_db", "never_seen").items()}
+        assert unseen[103, 103] is None and unseen[103, 114] > 5  # t*'s own pose sees nothing new
+        assert record.host == spec.host and record.iterations == 60 and record.heldout_psnr_db is not None
+        assert record.frozen_fps > 0 and 1e4 < record.model_bytes < 1e7 and record.train_cpu_seconds > 0
+        assert all((results / p.ours).is_file() and (results / p.truth).is_file() for p in record.pictures)
+        assert [p.psnr_db for p in record.pictures] == sorted(p.psnr_db for p in record.pictures)
+        one, other = record.two_instants
+        assert one.pose == other.pose and {one.t_star, other.t_star} == set(truth.t_stars) == {*map(int, record.plates)}
+
+
+def test_a_finished_plan_runs_nothing(done, capsys):
+    results, runs, _ = done
+    before = {p: p.stat().st_mtime_ns for p in results.glob("*.json")}
+    assert run_plan(runs, results) == []
+    assert capsys.readouterr().out == ""
+    assert {p: p.stat().st_mtime_ns for p in results.glob("*.json")} == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the parent's end is seen by its pid, which Windows keeps")
+def test_killed_twice_it_ends_as_if_it_had_not_been(done, tmp_path, write_truth):
+    results, runs, _ = done
+    folder = tmp_path / "tiny"
+    write_truth(folder)
+    again = tmp_path / "results"
+    spec = dataclasses.replace(only(runs, ("auto", "support"))[0], source=f"truth:{folder}")
+    assert spec.run_id in {r.run_id for r in runs}
+    log = again / "logs" / f"{spec.run_id}.txt"
+    code = (
+        "import json, sys; from pathlib import Path; from benchmarks.bench import *\n"
+        "run_plan([RunSpec(**json.loads(sys.argv[1]))], Path(sys.argv[2]))"
+    )
+    for stage in ("loading frames", "stage='training'"):
+        command = [sys.executable, "-c", code, json.dumps(dataclasses.asdict(spec)), str(again)]
+        bench = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and not (log.is_file() and stage in log.read_text().replace('"', "'")):
+            if finished(again, spec.run_id):
+                break
+            time.sleep(0.01)
+        bench.send_signal(signal.SIGKILL)
+        bench.wait()
+        log.unlink(missing_ok=True)
+    deadline = time.monotonic() + 60  # its child notices, and ends
+    while time.monotonic() < deadline and working(spec.run_id):
+        time.sleep(0.2)
+    assert not working(spec.run_id)
+    assert run_plan([spec], again) == []
+    one, other = (load_record(folder / f"{spec.run_id}.json") for folder in (results, again))
+    for a, b in zip(one.rows, other.rows, strict=True):
+        assert b.value("psnr_db") == pytest.approx(a.value("psnr_db"), abs=0.01)
+        assert b.regions.keys() == a.regions.keys()
+
+
+def working(run_id: str) -> bool:
+    """True if a child of that run is alive."""
+    found = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True)
+    return any(run_id in line and "--work" in line for line in found.stdout.splitlines())
+
+
+def test_a_run_that_fails_is_told_and_the_rest_goes_on(scene, tmp_path):
+    runs, _ = plan([f"truth:{scene[0]}"], tmp_path, **SIZE)
+    bad = dataclasses.replace(only(runs, ("static", "none"))[0], overrides={"sh_degree": "two"})
+    failures = run_plan([bad], tmp_path)
+    assert len(failures) == 1 and bad.run_id in failures[0]
+    assert (tmp_path / "logs" / f"{bad.run_id}.txt").is_file() and not finished(tmp_path, bad.run_id)
+
+
+def test_the_report_is_written_from_what_the_runs_left(done, tmp_path):
+    results, runs, said = done
+    path = write_report(results, tmp_path / "report", [r.run_id for r in runs], said, "bench --quick")
+    text = path.read_text()
+    assert "auto (ours)" in text and "static 3DGS" in text and "never seen at t*" in text
+    assert all(sentence in text for sentence in said)
+    figures = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert {r["run_id"] for r in figures["runs"]} == {r.run_id for r in load_records(results)}
+
+
+def test_a_real_clip_is_judged_where_nothing_moves_far_from_the_instant(scene, tmp_path):
+    pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
+    truth = RealScene(scene[1].shot, tmp_path, instants=3)
+    assert truth.t_stars == [101, 109, 116]
+    assert truth.poses(101, [103, 105, 106, 115]) == [106, 115]
+    mask = truth.regions(101, 109, 32, 24)["rigid"]
+    assert mask.shape == (24, 32) and mask.dtype == torch.bool
+    (kept,) = tmp_path.glob("rigid-*.npz")
+    before = kept.stat().st_mtime_ns
+    again = RealScene(scene[1].shot, tmp_path, instants=3)
+    assert bool((again.regions(116, 109, 32, 24)["rigid"] == mask).all()) and kept.stat().st_mtime_ns == before

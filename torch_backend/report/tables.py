@@ -1,0 +1,307 @@
+"""Records into tables: means as the paper gives them, regions, costs, paired comparisons, ablations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .metrics import METRICS, WHOLE, Paired, Summary, paired, summarise
+from .records import FrameScore, RunRecord
+from .truth import REGIONS, RIGID
+
+HOST_NAMES = {
+    "hexplane": "4DGaussians",
+    "mlp": "Deformable 3DGS",
+    "control_points": "SC-GS",
+    "auto": "auto (ours)",
+    "static": "static 3DGS",
+}
+"""TrainConfig.method -> what it is called."""
+METRIC_NAMES = {"psnr_db": "PSNR, dB", "ssim": "SSIM", "st_lpips": "ST-LPIPS", "flip": "FLIP", "jod": "JOD"}
+REGION_NAMES = {
+    WHOLE: "whole frame",
+    "seen": "seen at t*",
+    "never_seen": "never seen at t*",
+    "moving": "moving",
+    "static": "static",
+    RIGID: "what never moves",
+}
+_DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
+NONE = "–"
+
+
+@dataclass
+class Table:
+    """A table of text, for Markdown and for the page."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    note: str = ""
+    marks: dict[int, str] = field(default_factory=dict)
+    """Row -> win, loss or best, which the page shows in colour beside the words."""
+
+
+@dataclass
+class Setting:
+    """All runs of one way of doing it, on one kind of scene."""
+
+    label: str
+    host: str
+    supervision: str
+    preset: str
+    variant: str
+    cameras: str
+    runs: list[RunRecord]
+
+    def summary(self, metric: str, region: str = WHOLE) -> Summary | None:
+        """Over all frames of all runs."""
+        return self.of_frames(lambda row: row.value(metric, region), METRICS[metric])
+
+    def of_frames(self, read: Callable[[FrameScore], float | None], more_is_better: bool = True) -> Summary | None:
+        """Any figure of a frame, over all runs."""
+        return summarise([v for run in self.runs for v in run.per_frame(read)], more_is_better)
+
+    def of_runs(self, read: Callable[[RunRecord], float | None]) -> float | None:
+        """Mean of any figure of a run; None if any run lacks it."""
+        values = [read(run) for run in self.runs]
+        there = [v for v in values if v is not None]
+        return float(np.mean(there)) if there and len(there) == len(values) else None
+
+    def jod(self) -> float | None:
+        """Mean over instants of all runs."""
+        values = [v for run in self.runs for v in run.jod.values() if v is not None]
+        return float(np.mean(values)) if values else None
+
+    def against(self, other: Setting, metric: str, region: str = WHOLE) -> Paired | None:
+        """Frame by frame against another setting."""
+        mine, theirs = ({k: v for run in s.runs for k, v in run.values(metric, region).items()} for s in (self, other))
+        return paired(mine, theirs, METRICS[metric])
+
+
+def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
+    """The records of synthetic or real scenes by setting, hosts in the order of `HOST_NAMES`."""
+    chosen = [r for r in records if r.kind == kind]
+    presets, cameras = {r.preset for r in chosen}, {r.cameras for r in chosen}
+    groups: dict[tuple[str, ...], list[RunRecord]] = {}
+    for record in chosen:
+        groups.setdefault(record.setting, []).append(record)
+    hosts, supervisions = list(HOST_NAMES), ["none", "paper", "support"]
+
+    def order(setting: tuple[str, ...]) -> tuple[Any, ...]:
+        host, supervision, preset, variant, camera = setting
+        at = hosts.index(host) if host in hosts else len(hosts)
+        return camera, preset, variant != "default", at, supervisions.index(supervision), variant
+
+    found = []
+    for key in sorted(groups, key=order):
+        host, supervision, preset, variant, camera = key
+        label = _label(host, supervision, variant)
+        extra = [preset] * (len(presets) > 1) + [f"{camera} cameras"] * (len(cameras) > 1)
+        label += f" ({', '.join(extra)})" if extra else ""
+        found.append(Setting(label, host, supervision, preset, variant, camera, groups[key]))
+    return found
+
+
+def _label(host: str, supervision: str, variant: str) -> str:
+    name = HOST_NAMES.get(host, host)
+    if supervision != "none" and not (host == "auto" and supervision == "support"):
+        name += f" + {supervision}"
+    elif supervision == "none" and host == "auto":
+        name += ", no anchors"
+    return name if variant == "default" else f"{name}: {variant}"
+
+
+# ------------------------------------------------------------------------------------------------- tables
+
+
+def all_tables(records: Sequence[RunRecord]) -> list[Table]:
+    """Every table that the records have figures for."""
+    synthetic, real = settings_of(records, "synthetic"), settings_of(records, "real")
+    main = [s for s in synthetic if s.variant in ("default", "reference")]
+    tables = []
+    if main:
+        tables += [
+            _quality(main, WHOLE, "Frozen frames against the rendered truth, whole frame"),
+            _regions(main),
+            _comparisons(main, (WHOLE, *REGIONS), "Without and with, frame by frame"),
+        ]
+    ablations = [s for s in synthetic if s.variant not in ("default", "reference")]
+    if ablations:
+        tables.append(_ablations(ablations, main))
+    if real:
+        tables += [
+            _quality(real, RIGID, "Real clips, where nothing moves: frozen frames against held-out plates"),
+            _real_extra(real),
+            _comparisons(real, (RIGID,), "Real clips: without and with, frame by frame"),
+        ]
+    tables += [_costs(s) for s in (main, real) if s]
+    return tables
+
+
+def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
+    header = ["method", "runs", "frames", "PSNR mean", "bottom 75 %", "50 %", "25 %", "worst frame"]
+    header += ["SSIM", "ST-LPIPS", "FLIP", "JOD"]
+    rows, means = [], []
+    for s in settings:
+        psnr = s.summary("psnr_db", region)
+        shares = [psnr.mean, psnr.bottom_75, psnr.bottom_50, psnr.bottom_25, psnr.worst] if psnr else [None] * 5
+        others = [(m, s.summary(m, region)) for m in ("ssim", "st_lpips", "flip")]
+        means.append(shares[0])
+        rows.append(
+            [
+                s.label,
+                str(len(s.runs)),
+                str(psnr.count if psnr else 0),
+                *(number(v, "psnr_db") for v in shares),
+                *(number(summary and summary.mean, m) for m, summary in others),
+                number(s.jod(), "jod"),
+            ]
+        )
+    note = (
+        "PSNR in dB; bottom shares are means of the worst frames, as in the paper's tables. SSIM and JOD "
+        "(ColorVideoVDP, 10 is no difference): more is better; ST-LPIPS and FLIP: less is better."
+    )
+    return Table(title, header, rows, note, _best(means))
+
+
+def _regions(settings: Sequence[Setting]) -> Table:
+    rows = []
+    for s in settings:
+        found = [s.summary("psnr_db", region) for region in (WHOLE, *REGIONS)]
+        rows.append([s.label, *(number(f and f.mean, "psnr_db") for f in found)])
+    header = ["method", *(REGION_NAMES[region] for region in (WHOLE, *REGIONS))]
+    note = "Mean PSNR in dB over frames in which the region is at least 0.2 % of the picture."
+    return Table("By region", header, rows, note)
+
+
+def _costs(settings: Sequence[Setting]) -> Table:
+    header = ["method", "held-out PSNR, dB", "training, s", "processor, s", "steps", "frozen frames / s", "model, MB"]
+    header += ["Gaussians", "moving, %"]
+    rows = []
+    for s in settings:
+        rows.append(
+            [
+                s.label,
+                number(s.of_runs(lambda r: r.heldout_psnr_db), "psnr_db"),
+                plain(s.of_runs(lambda r: r.train_seconds), 1),
+                plain(s.of_runs(lambda r: r.train_cpu_seconds), 1),
+                plain(s.of_runs(lambda r: r.iterations), 0),
+                plain(s.of_runs(lambda r: r.frozen_fps), 1),
+                plain(s.of_runs(lambda r: r.model_bytes / 1e6), 2),
+                plain(s.of_runs(lambda r: r.gaussians), 0),
+                plain(s.of_runs(lambda r: 100 * r.moving_share), 1),
+            ]
+        )
+    loads = [r.machine.get("load_1min") for s in settings for r in s.runs]
+    there = [load for load in loads if load is not None]
+    note = "Means over runs. Held-out: frames of the clip kept out of training, each at its own time."
+    if there:
+        note += f" Load of the machine after the runs: {min(there):.1f} to {max(there):.1f}; wall times include it."
+    kind = "real clips" if settings[0].runs[0].kind == "real" else "synthetic scenes"
+    return Table(f"What it cost ({kind})", header, rows, note)
+
+
+def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
+    """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static."""
+    by_place: dict[tuple[str, str, str], list[Setting]] = {}
+    for s in settings:
+        by_place.setdefault((s.cameras, s.preset, s.variant), []).append(s)
+    pairs = []
+    for group in by_place.values():
+        at = {(s.host, s.supervision): s for s in group}
+        for host in dict.fromkeys(s.host for s in group):
+            for a, b in (("paper", "none"), ("support", "none"), ("support", "paper")):
+                if (host, a) in at and (host, b) in at:
+                    pairs.append((at[host, a], at[host, b]))
+        ours = at.get(("auto", "support"))
+        if ours:
+            pairs += [(ours, s) for s in group if s.supervision == "none" and s.host != "auto"]
+    return pairs
+
+
+def _comparisons(settings: Sequence[Setting], regions: Sequence[str], title: str) -> Table:
+    header = ["a against b", "region", "PSNR a - b, dB", "standard error", "independent units", "frames", "verdict"]
+    rows: list[list[str]] = []
+    marks = {}
+    for a, b in comparisons(settings):
+        for region in regions:
+            result = a.against(b, "psnr_db", region)
+            if result is None:
+                continue
+            if result.verdict != "undecided":
+                marks[len(rows)] = result.verdict
+            rows.append([f"{a.label} against {b.label}", REGION_NAMES[region], *_paired_cells(result)])
+    note = (
+        "A win or a loss: the mean difference over frames exceeds twice its standard error. Frames of one run fail "
+        "together, so the error is taken over runs (scene and seed) where there are at least four, else over freezes "
+        "(and t*), else over frames, which is too small an error."
+    )
+    return Table(title, header, rows, note, marks)
+
+
+def _paired_cells(result: Paired) -> list[str]:
+    error = NONE if result.se is None else f"{result.se:.3f}"
+    return [f"{result.mean:+.3f}", error, f"{result.units} {result.unit}", str(result.frames), result.verdict]
+
+
+def _ablations(ablations: Sequence[Setting], main: Sequence[Setting]) -> Table:
+    header = ["ablation", "of", "region", "PSNR a - b, dB", "standard error", "independent units", "frames", "verdict"]
+    rows: list[list[str]] = []
+    marks = {}
+    for s in ablations:
+        same = [m for m in main if (m.cameras, m.preset, m.host) == (s.cameras, s.preset, s.host)]
+        base = next((m for m in same if m.supervision == s.supervision), same[-1] if same else None)
+        if base is None:
+            continue
+        for region in (WHOLE, "never_seen", "moving"):
+            result = s.against(base, "psnr_db", region)
+            if result is not None:
+                if result.verdict != "undecided":
+                    marks[len(rows)] = result.verdict
+                rows.append([s.variant, base.label, REGION_NAMES[region], *_paired_cells(result)])
+    note = "Below zero: what was taken away helped."
+    return Table("Ablations", header, rows, note, marks)
+
+
+def _real_extra(settings: Sequence[Setting]) -> Table:
+    rows = []
+    for s in settings:
+        whole, best = s.summary("psnr_db"), s.of_frames(lambda row: row.best_90_psnr_db)
+        energy = s.of_frames(lambda row: row.gradient_ratio)
+        cells = [number(whole and whole.mean, "psnr_db"), number(best and best.mean, "psnr_db")]
+        rows.append([s.label, *cells, plain(energy and energy.mean, 3)])
+    header = ["method", "PSNR whole frame, dB", "PSNR best 90 % of the pixels, dB", "gradient energy of the plate's"]
+    note = (
+        "The whole frame holds people who moved since, whom no freeze at another instant can match. Gradient energy: "
+        "mean squared luma differences over what never moves, of the plate's; below 1 is softer."
+    )
+    return Table("Real clips: whole frame and sharpness", header, rows, note)
+
+
+def number(value: float | None, metric: str) -> str:
+    """A figure of a metric with its digits."""
+    return plain(value, _DIGITS[metric])
+
+
+def plain(value: float | None, digits: int) -> str:
+    """A number, or a dash for one that was not measured."""
+    return NONE if value is None else f"{value:.{digits}f}"
+
+
+def _best(values: Sequence[float | None]) -> dict[int, str]:
+    there = [(v, i) for i, v in enumerate(values) if v is not None]
+    return {max(there)[1]: "best"} if len(there) > 1 else {}
+
+
+def markdown(table: Table) -> str:
+    """The table in Markdown, title and note included."""
+    lines = [f"### {table.title}", "", "| " + " | ".join(table.header) + " |"]
+    lines += ["|" + "|".join("---" if i == 0 else "---:" for i in range(len(table.header))) + "|"]
+    for i, row in enumerate(table.rows):
+        cells = [f"**{c}**" if table.marks.get(i) == "best" else c for c in row]
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join([*lines, "", table.note, ""])

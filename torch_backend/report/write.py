@@ -1,0 +1,143 @@
+"""The report's folder from a folder of records: report.json, report.md, plots and strips, report.html."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..shot import write_atomic, write_json
+from . import plots
+from .metrics import WHOLE
+from .page import page
+from .records import RunRecord, load_records, machine_facts
+from .tables import Setting, Table, all_tables, markdown, settings_of
+from .truth import RIGID
+
+TITLE = "Frozen time: speed against error"
+
+
+def write_report(
+    results: Path, folder: Path, run_ids: Sequence[str] | None = None, said: Sequence[str] = (), command: str = ""
+) -> Path:
+    """Writes the report of the records in `results` (those of `run_ids`, if given) and returns its Markdown file.
+
+    Args:
+        folder: made if it is not there; files of an older report are replaced.
+        said: sentences about what is missing, besides the metrics that the records lack.
+        command: what to type to repeat it all.
+
+    ValueError if there is no record, or a damaged one. Without matplotlib there are no pictures, and a sentence.
+    """
+    records = load_records(results, run_ids)
+    if not records:
+        raise ValueError(f"{results} holds no record of a finished run: there is nothing to report")
+    said = [*said, *sorted({sentence for r in records for sentence in r.missing.values()})]
+    folder.mkdir(parents=True, exist_ok=True)
+    tables = all_tables(records)
+    settings = [s for kind in ("synthetic", "real") for s in settings_of(records, kind)]
+    drawn: list[tuple[str, Path, Path]] = []
+    figures: list[tuple[str, Path]] = []
+    if plots.available():
+        drawn, figures = _plots(records, folder), _figures(settings, results, folder)
+    else:
+        said.append("There are no plots: matplotlib is not installed (requirements/bench.txt).")
+    facts = _facts(records, command)
+    write_json(folder / "report.json", _json(records, tables, said, command))
+    _write(folder / "report.md", _markdown(facts, said, tables, drawn, figures, folder))
+    if plots.available():
+        _write(folder / "report.html", page(TITLE, facts, said, tables, drawn, figures, settings, results))
+    return folder / "report.md"
+
+
+def _facts(records: Sequence[RunRecord], command: str) -> list[str]:
+    """Lines of HTML (which Markdown takes as well): runs, machines, dates, command."""
+    machines = sorted({f"{r.machine['processor']}, {r.machine['cores']} cores" for r in records if r.machine})
+    dates = sorted(r.finished for r in records if r.finished)
+    scenes = sorted({f"{r.scene} ({r.kind}, {r.cameras} cameras)" for r in records})
+    lines = [f"{len(records)} runs on {len(scenes)} scenes: {', '.join(scenes)}"]
+    lines += [f"Machine: {'; '.join(machines)}"] if machines else []
+    lines += [f"Runs finished {dates[0]} to {dates[-1]} UTC"] if dates else []
+    lines = [html.escape(line) for line in lines]
+    return [*lines, f"Command: <code>{html.escape(command)}</code>"] if command else lines
+
+
+def _plots(records: Sequence[RunRecord], folder: Path) -> list[tuple[str, Path, Path]]:
+    drawn = []
+    for kind, region in (("synthetic", WHOLE), ("real", RIGID)):
+        settings = [s for s in settings_of(records, kind) if s.variant in ("default", "reference")]
+        for cost, (axis, _) in plots.COSTS.items():
+            paths = [
+                plots.cost_plot(folder / f"{kind}_{cost}{suffix}.png", settings, cost, region, theme)
+                for suffix, theme in (("", "light"), ("_dark", "dark"))
+            ]
+            if paths[0] and paths[1]:
+                drawn.append((f"PSNR of frozen frames ({kind}) against {axis}", paths[0], paths[1]))
+    return drawn
+
+
+def _figures(settings: Sequence[Setting], results: Path, folder: Path) -> list[tuple[str, Path]]:
+    """Per scene: every method on one frame, our worst frames, one pose at two instants."""
+    figures = []
+    scenes = dict.fromkeys((run.scene, run.cameras) for s in settings for run in s.runs)
+    for scene, cameras in scenes:
+        named = [
+            (s.label, run)
+            for s in settings
+            for run in s.runs
+            if (run.scene, run.cameras, run.variant) == (scene, cameras, "default")
+        ]
+        if not named:
+            continue
+        seed = min(run.seed for _, run in named)
+        named = [(label, run) for label, run in named if run.seed == seed]
+        label, ours = next(((n, r) for n, r in named if r.host == "auto"), named[-1])
+        stem = re.sub(r"[^\w-]+", "-", f"{scene}-{cameras}")
+        parts = {
+            f"{stem}_methods.png": plots.methods_strip(folder / f"{stem}_methods.png", results, named, scene),
+            f"{stem}_worst.png": plots.strip(folder / f"{stem}_worst.png", results, ours, f"{scene}, {label}: worst"),
+            f"{stem}_two_instants.png": plots.two_instants(
+                folder / f"{stem}_two_instants.png", results, ours, f"{scene}, {label}: one pose, two instants"
+            ),
+        }
+        figures += [(name.removesuffix(".png").replace("_", ": "), path) for name, path in parts.items() if path]
+    return figures
+
+
+def _markdown(
+    facts: Sequence[str],
+    said: Sequence[str],
+    tables: Sequence[Table],
+    drawn: Sequence[tuple[str, Path, Path]],
+    figures: Sequence[tuple[str, Path]],
+    folder: Path,
+) -> str:
+    lines = [f"# {TITLE}", "", "  \n".join(facts), ""]
+    if said:
+        lines += ["## What is missing", "", *(f"- {sentence}" for sentence in said), ""]
+    lines += ["## Tables", "", *(markdown(table) for table in tables)]
+    pictures = [(name, light) for name, light, _ in drawn] + list(figures)
+    if pictures:
+        lines += ["## Pictures", ""]
+        lines += [f"![{name}]({path.relative_to(folder).as_posix()})\n" for name, path in pictures]
+    return "\n".join(lines) + "\n"
+
+
+def _json(records: Sequence[RunRecord], tables: Sequence[Table], said: Sequence[str], command: str) -> dict[str, Any]:
+    return {
+        "version": 1,
+        "written": time.strftime("%Y-%m-%d %H:%M", time.gmtime()),
+        "command": command,
+        "machine": machine_facts(),
+        "missing": list(said),
+        "tables": [dataclasses.asdict(table) for table in tables],
+        "runs": [dataclasses.asdict(record) for record in records],
+    }
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomic(path, text.encode("utf-8"))
