@@ -52,7 +52,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         bpy = find_bpy(options.bpy)
         for seed, kind in scenes:
-            print(make_scene(options.out, size, seed, kind, bpy, _bodies, say))
+            print(make_scene(options.out, size, seed, kind, bpy, lambda: _bodies(size.texture_step), say))
     except (BpyMissingError, JobError, ModuleNotFoundError, RuntimeError, ValueError) as problem:
         print(problem, file=sys.stderr)
         return 1
@@ -60,11 +60,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 @functools.cache
-def _bodies() -> Bodies:
+def _bodies(texture_step: int) -> Bodies:
     try:
         from .people import Bodies
 
-        return Bodies()
+        return Bodies(texture_step)
     except ModuleNotFoundError as missing:
         raise ModuleNotFoundError(
             f"{missing.name} is missing: `python -m pip install --no-deps -r requirements/bench.txt` installs it."

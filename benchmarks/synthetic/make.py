@@ -50,12 +50,13 @@ def default_folder() -> Path:
 
 def find_bpy(given: str | Path | None) -> Path:
     """The Python of a bpy wheel's environment: `given` may be that Python or its environment's folder."""
-    place = Path(given) if given else DEFAULT_BPY
-    for python in (place, place / "bin" / "python", place / "Scripts" / "python.exe"):
-        if python.is_file():
-            return python
+    places = [Path(given)] if given else [DEFAULT_BPY, *sorted(ROOT.glob(".venv-bpy-*"), reverse=True)]
+    for place in places:
+        for python in (place, place / "bin" / "python", place / "Scripts" / "python.exe"):
+            if python.is_file():
+                return python
     raise BpyMissingError(
-        f"There is no Python with bpy in {place}: make it with `python3 splannequin.py setup`, or name one by --bpy."
+        f"No Python with bpy in {places[0]}: make it with `python3 splannequin.py setup`, or name one by --bpy."
     )
 
 

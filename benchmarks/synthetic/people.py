@@ -20,6 +20,8 @@ from .rays import RayScene
 from .textures import Picture, colour, hsv
 
 TEXTURE_SIZE = 1024
+WAIST, KNEE = -0.06, -0.42
+"""Heights on the rest body, whose origin lies in its pelvis, in metres."""
 SKIN, SHIRT, TROUSERS, SHOES, HAIR, EYES = range(6)
 FACE = ("eyeBlinkLeft", "eyeBlinkRight", "jawOpen", "mouthSmileLeft", "mouthSmileRight")
 BLINK_SECONDS, FLIP_SECONDS = 0.3, 0.35
@@ -109,25 +111,24 @@ class Body:
 class Bodies:
     """The body model and what is derived from its topology once. The first time on a machine takes a minute."""
 
-    def __init__(self) -> None:
+    def __init__(self, texture_step: int = 1) -> None:
         import anny
 
+        self.texture_size = TEXTURE_SIZE // texture_step
         self.model = anny.Anny(facial_actions=list(FACE))
         self.bones: list[str] = list(self.model.bone_labels)
         coordinates, corners = self.model.texture_coordinates, self.model.face_texture_coordinate_indices
         assert coordinates is not None and corners is not None
         self.triangles = self.model.faces.numpy().astype(np.int32)
         self.uv = coordinates.numpy()[corners.numpy()].astype(np.float32)
-        self.rest = self._rest(
-            {"gender": 0.5, "age": 0.67, "muscle": 0.5, "weight": 0.5, "height": 0.5, "proportions": 0.5}
-        )
+        rest = self.model(phenotype_kwargs={**dict.fromkeys(self.model.phenotype_labels, 0.5), "age": 0.67})
+        self.rest: Array = rest["vertices"][0].numpy()
+        """[V, 3] the unposed body of an adult: the space in which clothes are cut and painted."""
+        self.eye: Array = rest["bone_poses"][0, self.bones.index("eye.L"), :3, 3].numpy()
+        """[3] middle of its left eye."""
         self.influence = self._influence()
         self.regions = self._regions()
         self.texels = self._texels()
-
-    def _rest(self, phenotype: dict[str, float]) -> Array:
-        """[V, 3] the unposed body of an adult, or of a phenotype."""
-        return self.model(phenotype_kwargs=phenotype)["vertices"][0].numpy().astype(np.float64)
 
     def _influence(self) -> dict[str, Array]:
         """{group: [V] skinning weight} of groups of bones."""
@@ -138,13 +139,13 @@ class Bodies:
             return np.where(wanted[bones], weights, 0.0).sum(axis=1)
 
         return {
-            "torso": of("spine", "clavicle", "shoulder"),
+            "arms": of("upperarm", "lowerarm", "wrist", "finger", "metacarpal"),
             "chest": of("spine01", "spine02", "spine03"),
             "hips": of("root", "pelvis"),
             "upper_arms": of("upperarm"),
             "forearms": of("lowerarm"),
+            "neck": of("neck", "head", "eye."),
             "thighs": of("upperleg"),
-            "shins": of("lowerleg"),
             "feet": of("foot", "toe"),
             "head": of("head", "neck02", "neck03"),
             "eyes": of("eye."),
@@ -154,29 +155,32 @@ class Bodies:
         """{name: [V]} soft fields over the body: clothes and hair begin where they pass 0.5."""
         z, y = self.rest[:, 2], self.rest[:, 1]
         w = self.influence
-        top = float(z.max())
-        # From the hair line on the forehead down to the nape; lengths are those of the 1.62 m rest body.
-        hair_line = (z - (top - 0.065)) - 0.75 * (-0.115 - y)
+        # The hair line falls from the forehead to the nape; the unit is half the distance of the eyes.
+        unit = self.eye[0]
+        hair_line = (z - self.eye[2] - 1.9 * unit) + 0.8 * (self.eye[1] - 0.3 * unit - y)
+        above_waist = np.clip((z - WAIST) / 0.02 + 0.5, 0.0, 1.0)
+        body = 1.0 - np.maximum(w["arms"], w["neck"])
         return {
-            "sleeveless": w["torso"] + w["hips"] * np.clip((z + 0.02) / 0.05, 0, 1),
+            "sleeveless": body * above_waist,
             "upper_arms": w["upper_arms"],
             "forearms": w["forearms"],
-            "hips": w["hips"] + w["thighs"],
-            "shins": w["shins"],
+            "legs": body * (1.0 - above_waist) - w["feet"],
+            "thighs": body * (1.0 - above_waist) * np.clip((z - KNEE) / 0.02 + 0.5, 0.0, 1.0),
             "feet": w["feet"],
-            "hair": np.where(w["head"] + w["eyes"] > 0.5, np.clip(0.5 + hair_line / 0.02, 0.0, 1.0), 0.0),
+            "hair": np.where(w["head"] + w["eyes"] > 0.5, np.clip(0.5 + hair_line / 0.015, 0.0, 1.0), 0.0),
             "eyes": w["eyes"],
         }
 
     def _texels(self) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int64]]:
         """Which triangle covers each texel: (face [N*N], barycentric [N*N, 3], nearest covered texel [N*N])."""
         flat = np.concatenate([self.uv.reshape(-1, 2), np.zeros((3 * len(self.uv), 1), np.float32)], axis=1)
-        at = ((np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE).astype(np.float32)
+        size = self.texture_size
+        at = ((np.arange(size) + 0.5) / size).astype(np.float32)
         v, u = np.meshgrid(1.0 - at, at, indexing="ij")
         origins = np.stack([u.ravel(), v.ravel(), np.ones(u.size, np.float32)], axis=1)
         down = np.broadcast_to(np.array([0, 0, -1], np.float32), origins.shape)
         hits = RayScene(flat, np.arange(len(flat), dtype=np.int32).reshape(-1, 3)).cast(origins, down)
-        empty = (hits.face < 0).reshape(TEXTURE_SIZE, TEXTURE_SIZE)
+        empty = (hits.face < 0).reshape(size, size)
         nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
         assert nearest is not None
         return hits.face, hits.barycentric, np.ravel_multi_index(tuple(nearest), empty.shape).ravel()
@@ -266,9 +270,9 @@ class Bodies:
         """(soft fields [V, 6] per region, thickness [V] of cloth and hair in metres)."""
         f = self.regions
         shirt = f["sleeveless"] + f["upper_arms"] * (clothes.sleeves > 0) + f["forearms"] * (clothes.sleeves > 1)
-        trousers = f["hips"] + f["shins"]
+        trousers = f["legs"]
         if clothes.dress:
-            shirt, trousers = np.maximum(shirt, f["hips"]), np.zeros_like(trousers)
+            shirt, trousers = shirt + f["thighs"], np.zeros_like(trousers)
         hair = np.zeros_like(f["hair"]) if clothes.bald else f["hair"]
         fields = np.stack([np.full(len(shirt), 0.5), shirt, trousers, f["feet"], hair, f["eyes"]], axis=1)
         folds = solid(int(rng.integers(1 << 30)), self.rest * [1.0, 1.0, 0.6], 0.06)
@@ -299,10 +303,11 @@ class Bodies:
         for index, paint in enumerate((_skin, _cloth, _cloth, _leather, _hair, _eyes)):
             inside = region == index
             if inside.any():
-                rgb[inside] = paint(rng, at[inside])
-        picture = np.zeros((TEXTURE_SIZE * TEXTURE_SIZE, 3))
+                rgb[inside] = paint(rng, at[inside], self.eye)
+        size = self.texture_size
+        picture = np.zeros((size * size, 3))
         picture[used] = rgb
-        picture = picture[nearest].reshape(TEXTURE_SIZE, TEXTURE_SIZE, 3)
+        picture = picture[nearest].reshape(size, size, 3)
         return np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
 
 
@@ -328,21 +333,20 @@ def _rotations(vectors: Array) -> Array:
     return np.eye(3) + first * k + second * (k @ k)
 
 
-def _skin(rng: np.random.Generator, at: Array) -> Array:
-    """Skin with freckles, brows and lips (rest body: eyes at x = 0.03, y = -0.107, z = 0.649)."""
+def _skin(rng: np.random.Generator, at: Array, eye: Array) -> Array:
+    """Skin with freckles, brows and lips; `eye` is the middle of the left eye."""
     tone = hsv(rng.uniform(0.05, 0.08), rng.uniform(0.35, 0.55), rng.uniform(0.45, 0.9))
     patches = 0.85 + 0.3 * solid(int(rng.integers(1 << 30)), at, 0.04)
     freckles = np.where(solid(int(rng.integers(1 << 30)), at, 0.008) > 0.8, 0.8, 1.0)
     rgb = tone * (patches * freckles)[:, None]
-    front = at[:, 1] < -0.06
-    brow = front & (np.abs(np.abs(at[:, 0]) - 0.032) < 0.02) & (np.abs(at[:, 2] - 0.674) < 0.005)
-    lips = front & ((at[:, 0] / 0.026) ** 2 + ((at[:, 2] - 0.583) / 0.009) ** 2 < 1.0)
-    rgb[brow] = tone * 0.25
-    rgb[lips] = tone * [0.95, 0.55, 0.55]
+    across, up = np.abs(at[:, 0]) / eye[0], (at[:, 2] - eye[2]) / eye[0]
+    front = at[:, 1] < eye[1] + eye[0]
+    rgb[front & (np.abs(across - 1.05) < 0.65) & (np.abs(up - 0.85) < 0.16)] = tone * 0.25
+    rgb[front & ((across / 0.8) ** 2 + ((up + 2.15) / 0.28) ** 2 < 1.0)] = tone * [0.95, 0.55, 0.55]
     return rgb
 
 
-def _cloth(rng: np.random.Generator, at: Array) -> Array:
+def _cloth(rng: np.random.Generator, at: Array, _eye: Array) -> Array:
     """One of several patterns, in the space of the rest body, so that it moves with the wearer."""
     a, b, c = (colour(rng, (0.2, 0.85), (0.2, 0.95)) for _ in range(3))
     kind, pitch = rng.integers(5), rng.uniform(0.045, 0.08)
@@ -365,19 +369,19 @@ def _cloth(rng: np.random.Generator, at: Array) -> Array:
     return rgb * (0.8 + 0.35 * solid(seed + 2, at, 0.006))[:, None]
 
 
-def _leather(rng: np.random.Generator, at: Array) -> Array:
+def _leather(rng: np.random.Generator, at: Array, _eye: Array) -> Array:
     tone = colour(rng, (0.0, 0.6), (0.12, 0.6))
     return tone * (0.7 + 0.6 * solid(int(rng.integers(1 << 30)), at, 0.02))[:, None]
 
 
-def _hair(rng: np.random.Generator, at: Array) -> Array:
+def _hair(rng: np.random.Generator, at: Array, _eye: Array) -> Array:
     tone = hsv(rng.uniform(0.03, 0.12), rng.uniform(0.1, 0.7), rng.uniform(0.12, 0.7))
     return tone * (0.45 + 0.9 * solid(int(rng.integers(1 << 30)), at * [2.5, 1.0, 0.5], 0.008))[:, None]
 
 
-def _eyes(rng: np.random.Generator, at: Array) -> Array:
+def _eyes(rng: np.random.Generator, at: Array, eye: Array) -> Array:
     """White with a dark iris that looks ahead."""
-    out = np.hypot(np.abs(at[:, 0]) - 0.0305, at[:, 2] - 0.6485)
+    out = np.hypot(np.abs(at[:, 0]) - eye[0], at[:, 2] - eye[2])
     rgb = np.full((len(at), 3), 0.92)
     rgb[out < 0.0062] = colour(rng, (0.3, 0.7), (0.2, 0.6))
     rgb[out < 0.003] = 0.03

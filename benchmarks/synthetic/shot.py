@@ -1,0 +1,244 @@
+"""From a synthetic scene to a product's shot folder: cameras solved by COLMAP, or the exact ones.
+
+`solved_shot` puts the clip through the product's own import and solve. Its freezes are rendered at the solved poses of
+the clip's frames, as the product does, and compared with the truth of the same frames: `truth_as_solved` takes the
+truth's pictures and maps through the undistortion that the clip's frames went through. `similarity_to_exact` says how
+far the solved cameras are from the exact ones.
+
+`exact_shot` writes the same folder from the exact cameras; units are metres. Its points are triangulated by COLMAP
+with the poses held (triangulate.py, a child process). Where that finds too few (`tiny`), they are sampled from the
+exact surfaces that some frames see, displaced by half a pixel of noise: `points_from` in solve.json says which.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_backend.contract import CameraFrame, CameraPath, Reporter, frame_file, read_json
+from torch_backend.footage import FootageConfig, import_footage, load_frames
+from torch_backend.shot import Shot, atomic_path, content_key, write_atomic, write_json
+from torch_backend.solve import SolveConfig, SolveResult, solve_shot
+from torch_backend.solve.poses import camera_centre
+from torch_backend.solve.solving import LEAST_POINTS, SOLVE_VERSION, filter_points, quality_words
+from torch_backend.solve.undistort import Undistorter
+
+from .folder import Regions, SyntheticScene
+from .noise import stream
+
+SURFACE_FRAMES = 6
+SURFACE_POINTS = 3000
+SURFACE_NOISE_PX = 0.5
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_exact = scale * rotation @ x_solved + translation."""
+
+    scale: float
+    """Metres per solve unit."""
+    rotation: NDArray[np.float64]
+    """[3, 3]."""
+    translation: NDArray[np.float64]
+    """[3] metres."""
+    rms: float
+    """Metres between the mapped solved camera centres and the exact ones, root mean square."""
+    rotation_error_deg: float
+    """Median angle between the mapped solved orientations and the exact ones."""
+
+
+def import_clip(scene: SyntheticScene, folder: str | Path, report: Reporter) -> Shot:
+    """A shot with the clip's frames imported; every frame is solved and trained on."""
+    shot = Shot.create(folder, scene.name)
+    import_footage(shot, str(scene.root / "frames"), FootageConfig(step=1, fps=scene.fps), report)
+    return shot
+
+
+def solved_shot(scene: SyntheticScene, folder: str | Path, report: Reporter) -> Shot:
+    """A shot whose cameras COLMAP found. JobError if it cannot."""
+    shot = import_clip(scene, folder, report)
+    solve_shot(shot, SolveConfig(), report)
+    return shot
+
+
+def exact_shot(scene: SyntheticScene, folder: str | Path, report: Reporter) -> Shot:
+    """A shot with the exact cameras, in metres; left alone if it is there already."""
+    shot = import_clip(scene, folder, report)
+    frames = load_frames(shot)
+    # The product's own key: its solve step finds this shot solved and leaves it so.
+    key = content_key(SOLVE_VERSION, SolveConfig(), frames["key"])
+    record = shot.solve / "solve.json"
+    if record.is_file() and read_json(record).get("key") == key and read_json(record).get("cameras") == "exact":
+        return shot
+    record.unlink(missing_ok=True)
+    names = [Path(f["file"]).name for f in frames["frames"]]
+    for name in names:
+        write_atomic(shot.frames / name, (shot.frames / "raw" / name).read_bytes())
+    points, origin = _triangulated(scene, shot, names), "triangulation"
+    if points is None or len(points["xyz"]) < LEAST_POINTS:
+        points, origin = surface_points(scene), "surfaces"
+    with atomic_path(shot.solve / "points.npz") as beside:
+        np.savez(beside, xyz=points["xyz"], rgb=points["rgb"], error=points["error"], track=points["track"])
+    write_json(shot.solve / "cameras.json", exact_cameras(scene).to_json())
+    error = float(points["error"].mean())
+    result = SolveResult(
+        frames=len(names),
+        solved_frames=len(names),
+        registered=len(names),
+        localised=0,
+        interpolated=0,
+        reprojection_error_px=round(error, 4),
+        points=len(points["xyz"]),
+        focal_px=float(scene.K[0, 0]),
+        quality=quality_words(len(names), len(names), error),
+    )
+    about: dict[str, Any] = {
+        "version": SOLVE_VERSION,
+        "key": key,
+        "cameras": "exact",
+        "points_from": origin,
+        "total_frames": len(names),
+        "camera_model": "PINHOLE",
+        "distortion": [],
+        "warnings": [],
+        **{k: result[k] for k in ("registered", "solved_frames", "reprojection_error_px", "points", "focal_px")},
+        "quality": result["quality"],
+        "result": result,
+    }
+    write_json(record, about)
+    return shot
+
+
+def exact_cameras(scene: SyntheticScene, similarity: Similarity | None = None) -> CameraPath:
+    """The exact cameras of the clip in metres, or in the solve units of a shot that `similarity` maps to them."""
+    intrinsics = [scene.K[0, 0], scene.K[1, 1], scene.K[0, 2], scene.K[1, 2]]
+    cameras = []
+    for frame in scene.frames:
+        matrix = scene.world_to_camera[frame].copy()
+        if similarity is not None:
+            # camera = R_e (s R x + t) + t_e, in units of s metres
+            turned, moved = matrix[:3, :3] @ similarity.rotation, matrix[:3, :3] @ similarity.translation
+            matrix[:3, 3] = (moved + matrix[:3, 3]) / similarity.scale
+            matrix[:3, :3] = turned
+        cameras.append(CameraFrame(frame, matrix.ravel().tolist(), [float(v) for v in intrinsics], "registered"))
+    return CameraPath(scene.width, scene.height, cameras)
+
+
+def similarity_to_exact(scene: SyntheticScene, shot: Shot) -> Similarity:
+    """Maps a solved shot to the exact world by the centres of its registered cameras (Umeyama, PAMI 1991)."""
+    solved = [c for c in CameraPath.load(shot.solve / "cameras.json").frames if c.source == "registered"]
+    views = np.array([c.viewmat for c in solved]).reshape(-1, 4, 4)
+    source = np.array([camera_centre(v) for v in views])
+    exact = np.array([scene.world_to_camera[c.frame] for c in solved])
+    target = np.array([camera_centre(v) for v in exact])
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a / len(a))
+    flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * flip) @ vt
+    scale = float((s * flip).sum() / (a**2).sum(axis=1).mean())
+    translation = target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+    rms = np.sqrt(((source @ (scale * rotation).T + translation - target) ** 2).sum(axis=1).mean())
+    traces = np.einsum("nij,nij->n", views[:, :3, :3], exact[:, :3, :3] @ rotation)
+    angles = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
+    return Similarity(scale, rotation, translation, float(rms), float(np.median(angles)))
+
+
+class SolvedPixels:
+    """What a solved shot did to the clip's pixels, for the truth's pictures and maps."""
+
+    def __init__(self, shot: Shot) -> None:
+        """ValueError if the shot was not solved with SIMPLE_RADIAL or exact cameras."""
+        record = read_json(shot.solve / "solve.json")
+        if record["camera_model"] not in ("SIMPLE_RADIAL", "PINHOLE"):
+            raise ValueError(f"the undistortion of {record['camera_model']} is not known here, only SIMPLE_RADIAL's")
+        path = CameraPath.load(shot.solve / "cameras.json")
+        fx, fy, cx, cy = path.frames[0].K
+        k = record["distortion"][0] if record["distortion"] else 0.0
+        x, y = np.meshgrid(np.arange(path.width) + 0.5, np.arange(path.height) + 0.5)
+        u, v = (x - cx) / fx, (y - cy) / fy
+        # K is that of the undistorted frames, `focal_px` that of the clip as it was filmed.
+        focal = record["focal_px"]
+        radial = 1.0 + k * (u**2 + v**2)
+        where = np.stack([cx + focal * u * radial, cy + focal * v * radial], axis=-1)
+        self._resample = Undistorter(where.astype(np.float32))
+        self._column = np.clip(np.floor(where[..., 0]).astype(np.int64), 0, path.width - 1)
+        self._row = np.clip(np.floor(where[..., 1]).astype(np.int64), 0, path.height - 1)
+
+    def picture(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[H, W, 3] as the solve resamples the clip's frames."""
+        return self._resample(pixels)
+
+    def regions(self, regions: Regions) -> Regions:
+        """Maps of the nearest pixel."""
+        at = self._row, self._column
+        return Regions(regions.depth[at], regions.moving[at], regions.seen[at])
+
+
+def _triangulated(scene: SyntheticScene, shot: Shot, names: list[str]) -> dict[str, NDArray] | None:
+    """points.npz's arrays from the child process, filtered as the product does; None if it found nothing."""
+    scratch = shot.solve / "scratch"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    config = SolveConfig()
+    request = {
+        "images": str(shot.frames / "raw"),
+        "solved": names,
+        "others": [],
+        "camera_model": "PINHOLE",
+        "neighbours": 0,
+        "threads": max(1, min(os.cpu_count() or 1, 16)),
+        **{name: value for name, value in asdict(config).items() if name in ("overlap", "features")},
+        "K": [float(scene.K[0, 0]), float(scene.K[1, 1]), float(scene.K[0, 2]), float(scene.K[1, 2])],
+        "width": scene.width,
+        "height": scene.height,
+        "cameras": {frame_file(f, ".png"): scene.world_to_camera[f].tolist() for f in scene.frames},
+    }
+    path = scratch / "request.json"
+    path.write_text(json.dumps(request), encoding="utf-8")
+    root = str(Path(__file__).resolve().parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))}
+    environment.setdefault("OMP_WAIT_POLICY", "passive")
+    try:
+        with open(shot.solve / "colmap.log", "wb") as log:
+            command = [sys.executable, "-m", "benchmarks.synthetic.triangulate", str(path)]
+            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment) as child:
+                code = child.wait()
+        if code != 0 or not (scratch / "points.npz").is_file():
+            return None
+        with np.load(scratch / "points.npz", allow_pickle=False) as data:
+            return filter_points({name: data[name] for name in data.files}, scene.centres())
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def surface_points(scene: SyntheticScene) -> dict[str, NDArray]:
+    """Points on what some frames of the clip see, each half a pixel off: xyz [P, 3] metres, rgb, error px, track."""
+    rng = stream(scene.seed, "surface points")
+    chosen = [scene.frames[i] for i in np.linspace(0, len(scene.frames) - 1, SURFACE_FRAMES).round().astype(int)]
+    xyz, rgb = [], []
+    for frame in chosen:
+        depth, picture = scene.frame_depth(frame), scene.frame(frame)
+        rows, columns = np.nonzero(np.isfinite(depth))
+        picked = rng.choice(len(rows), min(len(rows), SURFACE_POINTS // SURFACE_FRAMES), replace=False)
+        rows, columns = rows[picked], columns[picked]
+        pixels = np.stack([columns, rows], 1) + 0.5 + rng.normal(0.0, SURFACE_NOISE_PX, (len(rows), 2))
+        rays = np.column_stack([(pixels - scene.K[:2, 2]) / scene.K[[0, 1], [0, 1]], np.ones(len(rows))])
+        matrix = scene.world_to_camera[frame]
+        xyz.append((rays * depth[rows, columns, None] - matrix[:3, 3]) @ matrix[:3, :3])
+        rgb.append(picture[rows, columns])
+    count = sum(map(len, xyz))
+    return {
+        "xyz": np.concatenate(xyz).astype(np.float32),
+        "rgb": np.concatenate(rgb),
+        "error": np.full(count, SURFACE_NOISE_PX, np.float32),
+        "track": np.full(count, SURFACE_FRAMES, np.uint16),
+    }
