@@ -1,7 +1,8 @@
 """The benchmark of the method: hosts x supervision x presets on scenes with truth, and the report of it.
 
     python3 splannequin.py bench [--quick] [--ablations]
-    python -m benchmarks.bench --truth FOLDER ... --shot SHOT ... --results DIR
+    python -m benchmarks.bench --size medium --seeds 2 --results DIR
+    python -m benchmarks.bench --truth FOLDER --shot SHOT --results DIR    scenes of one's own
 
 Every run is a child process: it trains (or goes on from its checkpoint), freezes, scores, and writes
 RESULTS/<run-id>.json whole. A run that has its file is not run again, so an interrupted benchmark goes on where it was.
@@ -25,18 +26,21 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
 
-from torch_backend.contract import ExitCode, TrainParams, from_dict, read_json
+from benchmarks.sources import ROOT, Log, load_source, make_scenes
+from benchmarks.synthetic.make import default_folder
+from benchmarks.synthetic.sizes import SIZES
+from torch_backend.contract import ExitCode, JobError, TrainParams, from_dict, read_json
 from torch_backend.job import new_job, run_job
 from torch_backend.report.records import RECORD_VERSION, RunRecord, finished, machine_facts, save_record
-from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
+from torch_backend.report.truth import TruthScene
 from torch_backend.scene import load_scene, split_frames
-from torch_backend.shot import Shot, content_key, write_json
+from torch_backend.shot import content_key, write_json
 from torch_backend.train import PRESETS, TrainConfig, config_from_params
 from torch_backend.train.config import METHODS, SUPERVISIONS, config_to_json
 
-ROOT = Path(__file__).resolve().parents[1]
 HOSTS = {"hexplane": "4DGaussians", "mlp": "Deformable 3DGS", "control_points": "SC-GS"}
 """TrainConfig.method of each published host -> its name."""
+QUICK_GAUSSIANS = 5000
 HOLDOUT = 8
 """Every how many frames one is kept out of training."""
 
@@ -50,6 +54,8 @@ class Ablation:
     supervision: str
     overrides: Mapping[str, Any] = field(default_factory=dict)
     """Dotted field of TrainConfig -> value."""
+    training: Mapping[str, Any] = field(default_factory=dict)
+    """Field of TrainParams -> value."""
     query: str = "nearest"
 
 
@@ -57,15 +63,14 @@ ABLATIONS = (
     Ablation("no hidden loss", "hexplane", "paper", {"supervision.weight_hidden": 0.0}),
     Ablation("no defective loss", "hexplane", "paper", {"supervision.weight_defective": 0.0}),
     Ablation("no confidence weighting", "hexplane", "paper", {"supervision.tau": 0.0}),
-    Ablation("detector: weight", "hexplane", "paper", {"supervision.detector": "weight"}),
-    Ablation("detector: grad_norm", "hexplane", "paper", {"supervision.detector": "grad_norm"}),
-    Ablation("detector: grad_signed", "hexplane", "paper", {"supervision.detector": "grad_signed"}),
+    Ablation("detector: weight", "hexplane", "paper", training={"detector": "weight"}),
+    Ablation("detector: grad_signed", "hexplane", "paper", training={"detector": "grad_signed"}),
     Ablation("gate, no anchors", "auto", "none"),
     Ablation("gate, paper's anchors", "auto", "paper"),
     Ablation("asked at t* itself", "auto", "support", query="plain"),
     Ablation("no exposure", "auto", "support", {"exposure.on": False}),
 )
-"""The paper's and ours. Without the gate, `support` is the host's own row of the main table."""
+"""The paper's and ours. The main table's detector is grad_norm; its hosts with `support` are those without a gate."""
 
 
 @dataclass
@@ -73,7 +78,7 @@ class RunSpec:
     """One run of the plan: what its child process is told."""
 
     source: str
-    """Where the scene is: truth:FOLDER or shot:FOLDER."""
+    """Where the scene is, see `load_source`."""
     scene_key: str
     """Content of the scene."""
     host: str
@@ -84,15 +89,22 @@ class RunSpec:
     query: str = "nearest"
     overrides: dict[str, Any] = field(default_factory=dict)
     """Dotted field of TrainConfig -> value."""
+    training: dict[str, Any] = field(default_factory=dict)
+    """Field of TrainParams -> value."""
     iterations: int = 0
     """0: the preset's; the same for the next two."""
     width: int = 0
     max_gaussians: int = 0
     holdout_phase: int = 0
     """Which of every `HOLDOUT` frames is kept out: one that spares the instants."""
+    device: str = "auto"
+    """cpu, cuda or auto."""
 
     def params(self, run: str) -> TrainParams:
-        """The training job's parameters."""
+        """The training job's parameters. ValueError if one of `training` does not exist."""
+        unknown = set(self.training) - {f.name for f in dataclasses.fields(TrainParams)}
+        if unknown:
+            raise ValueError(f"a training job has no parameter {min(unknown)}")
         return TrainParams(
             run=run,
             preset=self.preset,
@@ -103,6 +115,8 @@ class RunSpec:
             max_gaussians=self.max_gaussians,
             holdout=HOLDOUT,
             seed=self.seed,
+            device=self.device,
+            **self.training,
         )
 
     def config(self) -> TrainConfig:
@@ -121,7 +135,7 @@ class RunSpec:
     def run_id(self) -> str:
         """Name of the record: readable, and hashed from scene and settings, not from the code."""
         words = f"{Path(self.source).stem}-{self.host}-{self.supervision}-{self.preset}-{self.variant}-s{self.seed}"
-        key = content_key(RECORD_VERSION, self.scene_key, config_to_json(self.config()), self.query)
+        key = content_key(RECORD_VERSION, self.scene_key, config_to_json(self.config()), self.query, self.device)
         return re.sub(r"[^\w-]+", "-", words).strip("-")[:80] + f"-{key}"
 
 
@@ -135,16 +149,6 @@ def override(config: Any, path: str, value: Any) -> None:
     setattr(config, name, value)
 
 
-def load_source(source: str, results: Path) -> TruthScene:
-    """The scene of `truth:FOLDER` or `shot:FOLDER`. ValueError for anything else."""
-    kind, _, folder = source.partition(":")
-    if kind == "truth":
-        return TruthFolder(folder)
-    if kind == "shot":
-        return RealScene(Shot.open(folder), results)
-    raise ValueError(f"scene {source!r}: it should be truth:FOLDER or shot:FOLDER")
-
-
 # ------------------------------------------------------------------------------------------------- the plan
 
 
@@ -154,21 +158,27 @@ def plan(
     *,
     presets: Sequence[str] = ("preview",),
     seeds: Sequence[int] = (0,),
+    reference: bool = False,
     ablations: bool = False,
-    **size: int,
+    **common: Any,
 ) -> tuple[list[RunSpec], list[str]]:
     """(runs, sentences about what is missing): hosts x {none, paper, support}, auto and static, then ablations.
 
     Runs are ordered so that an interrupted benchmark has compared something on every scene: by setting, then scene.
-    `size` goes to `RunSpec`: iterations, width, max_gaussians.
+    `reference` adds the hosts with the published sizes, rates and schedules. `common` goes to every `RunSpec`:
+    iterations, width, max_gaussians, device.
     """
-    settings = [
-        RunSpec("", "", host, supervision, "preview")
-        for host in HOSTS
-        for supervision in ("none", "paper", "support")
-        if host in METHODS and supervision in SUPERVISIONS
-    ]
+    offered = [host for host in HOSTS if host in METHODS]
+    supervised = [s for s in ("none", "paper", "support") if s in SUPERVISIONS]
+    settings = [RunSpec("", "", host, supervision, "preview") for host in offered for supervision in supervised]
     settings += [RunSpec("", "", "auto", "support", "preview"), RunSpec("", "", "static", "none", "preview")]
+    if reference:
+        published = {"host_config": "reference"}
+        settings += [
+            RunSpec("", "", host, supervision, "preview", "reference", training=published)
+            for host in offered
+            for supervision in supervised
+        ]
     said = [
         f"{name} is not in this report: the trainer has no host {host!r}."
         for host, name in HOSTS.items()
@@ -176,7 +186,8 @@ def plan(
     ]
     if ablations:
         for a in ABLATIONS:
-            spec = RunSpec("", "", a.host, a.supervision, "preview", a.name, 0, a.query, dict(a.overrides))
+            spec = RunSpec("", "", a.host, a.supervision, "preview", a.name, query=a.query)
+            spec = dataclasses.replace(spec, overrides=dict(a.overrides), training=dict(a.training))
             try:
                 spec.config()
             except ValueError as error:
@@ -197,7 +208,7 @@ def plan(
                             preset=preset,
                             seed=seed,
                             holdout_phase=_phase(scene),
-                            **size,
+                            **common,
                         )
                     )
     return runs, said
@@ -222,7 +233,7 @@ def _phase(scene: TruthScene) -> int:
 def run_plan(runs: Iterable[RunSpec], results: Path) -> list[str]:
     """Runs what has no record yet, one child at a time. Returns sentences about runs that failed.
 
-    KeyboardInterrupt ends the child at its next checkpoint and is raised again.
+    KeyboardInterrupt ends the child at its next checkpoint and is raised again; so does the end of this process.
     """
     failures = []
     todo = [spec for spec in runs if not finished(results, spec.run_id)]
@@ -264,15 +275,17 @@ def work(request: Path, results: Path) -> int:
     # The job's parameters name a preset; this process knows one more, with the plan's overrides in it.
     known = PRESETS[spec.preset]
     PRESETS[spec.preset] = lambda: _overridden(known(), spec)
+    if config_from_params(spec.params(run_name)) != spec.config():
+        raise ValueError(f"an override of {spec.run_id} is set by the job's parameters: give it there")
     since = time.process_time()
-    code, _ = run_job(new_job(truth.shot, "train", spec.params(run_name)), print)
+    code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print)
     cpu_seconds = round(time.process_time() - since, 2)
     facts = folder / "bench.json"
     if code != ExitCode.OK:
         return int(code)
     if whole and not facts.is_file():
         write_json(facts, {"version": 1, "train_cpu_seconds": cpu_seconds, "machine": machine_facts()})
-    return _judge(spec, truth, run_name, results, read_json(facts) if facts.is_file() else {})
+    return _judge(spec, truth, run_name, results, read_json(facts) if facts.is_file() else {}, summary["device"])
 
 
 def _die_with(parent: int) -> None:
@@ -295,11 +308,13 @@ def _overridden(config: TrainConfig, spec: RunSpec) -> TrainConfig:
     return config
 
 
-def _judge(spec: RunSpec, truth: TruthScene, run_name: str, results: Path, trained: dict[str, Any]) -> int:
-    """Scores the trained run and writes its record."""
+def _judge(
+    spec: RunSpec, truth: TruthScene, run_name: str, results: Path, trained: dict[str, Any], trained_on: str
+) -> int:
+    """Scores the trained run, on the device that trained it, and writes its record."""
     from torch_backend.report.evaluate import evaluate_run
 
-    measured = evaluate_run(truth, run_name, spec.query, results, spec.run_id, _Log())
+    measured = evaluate_run(truth, run_name, spec.query, results, spec.run_id, Log(), trained_on)
     record = RunRecord(
         run_id=spec.run_id,
         scene=truth.name,
@@ -314,35 +329,12 @@ def _judge(spec: RunSpec, truth: TruthScene, run_name: str, results: Path, train
         train_cpu_seconds=trained.get("train_cpu_seconds"),
         machine=machine_facts(),
         command=f"python -m benchmarks.bench --work requests/{spec.run_id}.json",
+        device=trained_on,
         finished=time.strftime("%Y-%m-%d %H:%M", time.gmtime()),
         **measured,
     )
     save_record(results, record)
     return int(ExitCode.OK)
-
-
-class _Log:
-    """A reporter that says one line per stage."""
-
-    def __init__(self) -> None:
-        self._stage = ""
-
-    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        if stage != self._stage:
-            print(stage, flush=True)
-            self._stage = stage
-
-    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
-        print(stage, dict(values), flush=True)
-
-    def image(self, label: str, path: str | Path) -> None:
-        print(label, path, flush=True)
-
-    def warning(self, message: str, hint: str = "") -> None:
-        print(f"note: {message} {hint}", flush=True)
-
-    def check_cancelled(self) -> None:
-        """Ctrl-C and SIGTERM end scoring by their own exceptions."""
 
 
 # ------------------------------------------------------------------------------------------------- command line
@@ -357,22 +349,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     from torch_backend.report.write import write_report
 
     results.mkdir(parents=True, exist_ok=True)
+    quick = {"max_gaussians": args.max_gaussians or QUICK_GAUSSIANS} if args.quick else {}
     sources = [f"truth:{Path(p).absolute()}" for p in args.truth] + [f"shot:{Path(p).absolute()}" for p in args.shot]
-    if not sources:
-        print("Error: no scene: name folders with --truth or --shot.", file=sys.stderr)
-        return int(ExitCode.USAGE)
-    runs, said = plan(
-        sources,
-        results,
-        presets=args.preset or ("preview",),
-        seeds=range(args.seeds),
-        ablations=args.ablations,
-        iterations=args.iterations,
-        width=args.width,
-        max_gaussians=args.max_gaussians,
-    )
     try:
+        if not sources or args.size or args.quick:
+            cameras = ("exact", "solved") if args.cameras == "both" else (args.cameras,)
+            size = args.size or ("quick" if args.quick else "medium")
+            sources += make_scenes(size, args.tuning, cameras, Path(args.scenes).absolute())
+        runs, said = plan(
+            sources,
+            results,
+            presets=args.preset or ("preview",),
+            seeds=range(args.seeds),
+            reference=args.reference,
+            ablations=args.ablations,
+            **{"iterations": args.iterations, "width": args.width, "max_gaussians": args.max_gaussians, **quick},
+            device=args.device,
+        )
         said += run_plan(runs, results)
+    except (RuntimeError, JobError, FileNotFoundError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return int(ExitCode.USAGE)
     except KeyboardInterrupt:
         print("Interrupted. The same command goes on from here.", flush=True)
         return int(ExitCode.CANCELLED)
@@ -384,15 +381,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="bench", description="Hosts and supervisions against truth.")
+    parser.add_argument("--quick", action="store_true", help="quick scenes, exact cameras, at most 5,000 Gaussians")
+    parser.add_argument("--size", choices=tuple(SIZES), help="synthetic scenes (medium, if no scene is named)")
+    parser.add_argument("--cameras", choices=("exact", "solved", "both"), default="exact", help="of synthetic scenes")
+    parser.add_argument("--scenes", default=str(default_folder()), metavar="DIR", help="of synthetic scenes")
+    parser.add_argument("--tuning", action="store_true", help="scenes to tune on instead of those to report on")
     parser.add_argument("--truth", action="append", default=[], metavar="FOLDER", help="scene with rendered truth")
     parser.add_argument("--shot", action="append", default=[], metavar="SHOT", help="solved shot of a real clip")
     parser.add_argument("--results", default="bench", metavar="DIR", help="records, pictures and report")
     parser.add_argument("--preset", action="append", choices=tuple(PRESETS), help="default: preview")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="training seeds 0 to N - 1")
+    parser.add_argument("--reference", action="store_true", help="hosts with the published settings as well")
     parser.add_argument("--ablations", action="store_true", help="the paper's and ours")
     parser.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
     parser.add_argument("--width", type=int, default=0, help="width of training images in pixels (0: the preset's)")
     parser.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
     parser.add_argument("--work", help=argparse.SUPPRESS)
     return parser
 

@@ -48,7 +48,9 @@ class _Frozen:
         return (image.color + (1.0 - image.alpha[..., None]) * 0.5).clamp(0.0, 1.0)
 
 
-def evaluate_run(truth: TruthScene, run_name: str, query: str, results: Path, run_id: str, report: Reporter) -> dict:
+def evaluate_run(
+    truth: TruthScene, run_name: str, query: str, results: Path, run_id: str, report: Reporter, device: str = "cpu"
+) -> dict[str, Any]:
     """Everything in a `RunRecord` that comes from the trained run, by field name.
 
     Args:
@@ -57,10 +59,11 @@ def evaluate_run(truth: TruthScene, run_name: str, query: str, results: Path, ru
         query: how Gaussians are asked at t*: nearest or plain.
         results: folder of the records; pictures go into `PICTURES` there.
         run_id: names this run's pictures.
+        device: what renders.
 
     JobError if there is no such run; `Cancelled` if a stop was asked for.
     """
-    run, scene = load_run(truth.shot, run_name), load_scene(truth.shot)
+    run, scene = load_run(truth.shot, run_name, device), load_scene(truth.shot)
     held_out = _held_out(run, scene)
     size = (run.width, run.height)
     rows: list[FrameScore] = []

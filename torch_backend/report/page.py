@@ -40,11 +40,11 @@ a { color: var(--accent); }
 table { border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .65rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th { color: var(--quiet); font-weight: 600; vertical-align: bottom; white-space: normal; min-width: 4rem; }
-th:first-child, td:first-child, td.word { text-align: left; }
+th:first-child, td:first-child, .word { text-align: left; }
 tr.best td { font-weight: 700; } tr.win td:last-child { color: var(--win); font-weight: 600; }
 tr.loss td:last-child { color: var(--loss); font-weight: 600; }
 figure { margin: 1rem 0; } figure img { max-width: 100%; height: auto; border-radius: 4px; }
-.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(22rem, 1fr)); gap: 1rem; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(30rem, 100%), 1fr)); gap: 1rem; }
 .plots figure { margin: 0; }
 details { border: 1px solid var(--line); border-radius: 6px; margin: .6rem 0; }
 summary { cursor: pointer; padding: .5rem .8rem; font-weight: 600; }
@@ -141,7 +141,11 @@ def page(
 
 
 def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in table.header)
+    words = [bool(_word(table.rows[0][i])) if table.rows else False for i in range(len(table.header))]
+    head = "".join(
+        f'<th scope="col"{" class=word" * word}>{html.escape(name)}</th>'
+        for name, word in zip(table.header, words, strict=True)
+    )
     rows = []
     for i, row in enumerate(table.rows):
         mark = f' class="{table.marks[i]}"' if i in table.marks else ""
@@ -168,7 +172,10 @@ def _plot(name: str, light: Path, dark: Path) -> str:
 
 
 def _figure(name: str, path: Path) -> str:
-    return f'<figure><img src="{_uri(path.read_bytes(), "png")}" alt="{html.escape(name)}" loading="lazy"></figure>'
+    data = path.read_bytes()
+    width = int.from_bytes(data[16:20], "big")  # of a PNG's header
+    style = f'style="width: {round(width / 1.7)}px"'
+    return f'<figure><img src="{_uri(data, "png")}" alt="{html.escape(name)}" loading="lazy" {style}></figure>'
 
 
 def _sliders(settings: Sequence[Setting], results: Path, pictures: dict[str, str]) -> list[str]:

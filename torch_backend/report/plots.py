@@ -80,6 +80,8 @@ def _limits(axes: Any, prices: Sequence[float]) -> None:
 
 def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
     """Names to the right of points, pushed apart where they would lie on one another; (x, y, name, colour)."""
+    from matplotlib.patheffects import withStroke
+
     low, high = axes.get_ylim()
     pad = 0.06 * max(high - low, 0.2)
     axes.set_ylim(low - pad, high + pad)
@@ -90,7 +92,9 @@ def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
         at = max([y, *(v + gap for v in near if v + gap > y)], default=y)
         placed.append((x, at))
         line = {"arrowstyle": "-", "color": colour, "lw": 0.5} if at - y > gap / 2 else None
-        axes.annotate(name, (x, y), (x * 1.06, at), fontsize=8, color=colour, va="center", arrowprops=line)
+        halo = [withStroke(linewidth=3, foreground=axes.get_facecolor())]
+        text = axes.annotate(name, (x, y), (x * 1.06, at), fontsize=8, color=colour, va="center", arrowprops=line)
+        text.set_path_effects(halo)
 
 
 def strip(path: Path, results: Path, record: RunRecord, title: str, most: int = 6) -> Path | None:
@@ -156,8 +160,10 @@ def _grid(
     columns = max(len(row) for row in pictures.values())
     width = 12.0 / max(columns, 3)
     per_picture = bool(heads) and isinstance(heads[0], list)
-    tall = width * first.shape[0] / first.shape[1] + (0.45 if per_picture else 0.06)
-    height = tall * len(pictures) + 0.85
+    tall = width * first.shape[0] / first.shape[1] + (0.42 if per_picture else 0.06)
+    lines = max(str(head).count("\n") + 1 for head in (heads[0] if per_picture else heads))
+    top = 0.34 + 0.15 * lines
+    height = tall * len(pictures) + top
     with plt.rc_context({"font.size": 8}):
         figure, axes = plt.subplots(
             len(pictures), columns, figsize=(width * columns + 0.5 * named, height), squeeze=False, facecolor="white"
@@ -180,9 +186,9 @@ def _grid(
             left=0.5 * named / (width * columns + 0.5) + 0.004,
             right=0.996,
             bottom=0.01,
-            top=1 - 0.75 / height,
+            top=1 - top / height,
             wspace=0.03,
-            hspace=0.45 / tall if per_picture else 0.04,
+            hspace=0.42 / tall if per_picture else 0.04,
         )
         return _save(figure, path)
 

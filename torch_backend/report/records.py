@@ -107,6 +107,8 @@ class RunRecord:
     """Metric -> sentence why it was not measured."""
     machine: dict[str, Any] = field(default_factory=dict)
     """Processor, cores, load and versions, see `machine_facts`."""
+    device: str = "cpu"
+    """What trained and rendered: cpu or cuda."""
     command: str = ""
     """What to type to repeat it."""
     finished: str = ""

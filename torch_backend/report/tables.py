@@ -207,17 +207,17 @@ def _costs(settings: Sequence[Setting]) -> Table:
 
 def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
     """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static."""
-    by_place: dict[tuple[str, str, str], list[Setting]] = {}
+    by_place: dict[tuple[str, str], list[Setting]] = {}
     for s in settings:
-        by_place.setdefault((s.cameras, s.preset, s.variant), []).append(s)
+        by_place.setdefault((s.cameras, s.preset), []).append(s)
     pairs = []
     for group in by_place.values():
-        at = {(s.host, s.supervision): s for s in group}
-        for host in dict.fromkeys(s.host for s in group):
+        at = {(s.variant, s.host, s.supervision): s for s in group}
+        for variant, host in dict.fromkeys((s.variant, s.host) for s in group):
             for a, b in (("paper", "none"), ("support", "none"), ("support", "paper")):
-                if (host, a) in at and (host, b) in at:
-                    pairs.append((at[host, a], at[host, b]))
-        ours = at.get(("auto", "support"))
+                if (variant, host, a) in at and (variant, host, b) in at:
+                    pairs.append((at[variant, host, a], at[variant, host, b]))
+        ours = at.get(("default", "auto", "support"))
         if ours:
             pairs += [(ours, s) for s in group if s.supervision == "none" and s.host != "auto"]
     return pairs

@@ -1,0 +1,123 @@
+"""Scenes for the benchmark: folders of truth, real clips, and the synthetic scenes of benchmarks/synthetic."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.synthetic.folder import SyntheticScene
+from benchmarks.synthetic.make import scene_name
+from benchmarks.synthetic.shot import SolvedPixels, exact_shot, solved_shot
+from benchmarks.synthetic.sizes import REPORT_SEEDS, SIZES, TUNING_SEEDS
+from torch_backend.contract import read_json
+from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
+from torch_backend.shot import SHOT_SUFFIX, Shot, content_key
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def load_source(source: str, results: Path) -> TruthScene:
+    """The scene of `truth:FOLDER`, `shot:FOLDER`, `exact:FOLDER` or `solved:FOLDER`. ValueError for anything else.
+
+    The last two are scenes of benchmarks/synthetic with their cameras exact, or solved by COLMAP: the shot to train on
+    is made in RESULTS/shots if it is not there.
+    """
+    kind, _, folder = source.partition(":")
+    if kind == "truth":
+        return TruthFolder(folder)
+    if kind == "shot":
+        return RealScene(Shot.open(folder), results)
+    if kind in ("exact", "solved"):
+        return SyntheticTruth(folder, kind, results / "shots")
+    raise ValueError(f"scene {source!r}: it should be truth:FOLDER, shot:FOLDER, exact:FOLDER or solved:FOLDER")
+
+
+class SyntheticTruth:
+    """A scene of benchmarks/synthetic, as `TruthScene` asks for it."""
+
+    kind = "synthetic"
+    judged = "whole"
+
+    def __init__(self, folder: str | Path, cameras: str, shots: Path) -> None:
+        """FileNotFoundError if the scene is not finished; JobError if its cameras cannot be solved."""
+        self._scene = SyntheticScene.load(folder)
+        self.cameras = cameras
+        self.name = f"{self._scene.size} {self._scene.name}"
+        place = shots / f"{self._scene.size}-{self._scene.name}-{cameras}{SHOT_SUFFIX}"
+        self.shot = (exact_shot if cameras == "exact" else solved_shot)(self._scene, place, Log())
+        self._pixels = SolvedPixels(self.shot)
+        self.t_stars, self._poses = list(self._scene.t_stars), list(self._scene.poses)
+        steps = np.diff(self._poses)
+        self.fps = self._scene.fps / float(steps[0]) if len(steps) and (steps == steps[0]).all() else 0.0
+        made = {name: self._scene.info[name] for name in ("version", "key") if name in self._scene.info}
+        self.key = content_key(made, read_json(self.shot.solve / "cameras.json"))
+
+    def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
+        """All poses that have a truth and a camera."""
+        return [pose for pose in self._poses if pose in self._scene.world_to_camera]
+
+    def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
+        """The rendered truth, through the undistortion that the clip's frames went through."""
+        pixels = self._pixels.picture(self._scene.truth(t_star, pose))
+        image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]
+        if image.shape[-2:] != (height, width):
+            image = torch.nn.functional.interpolate(image, (height, width), mode="bicubic", antialias=True)
+        return image[0].permute(1, 2, 0).clamp(0.0, 1.0)
+
+    def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """By truth: seen at t* or not, moving or static; of the nearest pixel."""
+        regions = self._pixels.regions(self._scene.regions(t_star, pose))
+        seen, moving = (_nearest(mask, width, height) for mask in (regions.seen, regions.moving))
+        return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving}
+
+
+def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
+    """A mask at another size."""
+    values = torch.from_numpy(mask.astype(np.float32))[None, None]
+    return torch.nn.functional.interpolate(values, (height, width), mode="nearest-exact")[0, 0] > 0.5
+
+
+def make_scenes(size: str, tuning: bool, cameras: Sequence[str], folder: Path) -> list[str]:
+    """Sources of the synthetic scenes of a size, rendered first where they are not there (a child process).
+
+    RuntimeError with the child's own last words if a scene cannot be made.
+    """
+    seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: SIZES[size].scenes]
+    command = [sys.executable, "-m", "benchmarks.synthetic", "--size", size, "--out", str(folder)]
+    made = subprocess.run([*command, "--seeds", *map(str, seeds)], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    if made.returncode:
+        last = made.stderr.strip().splitlines()[-1:] or ["no output"]
+        raise RuntimeError(f"the synthetic scenes could not be made: {last[0]}")
+    return [f"{c}:{folder / size / scene_name(seed, 'plain')}" for c in cameras for seed in seeds]
+
+
+class Log:
+    """A reporter that says one line per stage."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
+        if stage != self._stage:
+            print(stage, flush=True)
+            self._stage = stage
+
+    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
+        print(stage, dict(values), flush=True)
+
+    def image(self, label: str, path: str | Path) -> None:
+        print(label, path, flush=True)
+
+    def warning(self, message: str, hint: str = "") -> None:
+        print(f"note: {message} {hint}", flush=True)
+
+    def check_cancelled(self) -> None:
+        """Ctrl-C and SIGTERM end scoring by their own exceptions."""
