@@ -10,6 +10,7 @@ import dataclasses
 import io
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -167,6 +168,9 @@ def _train_params(args: argparse.Namespace) -> contract.TrainParams:
         run=args.run,
         preset=args.preset,
         method=args.method,
+        host=args.host,
+        host_config=args.host_config,
+        detector=args.detector,
         supervision=args.supervision,
         iterations=args.iterations,
         width=args.width,
@@ -258,11 +262,27 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
         to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
 
 
+def host_names() -> tuple[str, ...]:
+    """Names of the hosts, read from their files: help and wrong names need no torch."""
+    files = sorted((Path(__file__).parent / "deformation").glob("*.py"))
+    found = (re.search(r'^HOST = HostSpec\(\s*"(\w+)"', f.read_text(encoding="utf-8"), re.MULTILINE) for f in files)
+    return tuple(sorted(match[1] for match in found if match))
+
+
 def _add_train_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--run", default="main", help="name of the run")
     to.add_argument("--preset", default="preview", choices=("preview", "standard", "final"))
-    to.add_argument("--method", default="auto", choices=("auto", "hexplane", "static"))
+    names = host_names()
+    to.add_argument("--method", default="auto", choices=("auto", *names, "static"), help="a host's name: all move")
+    to.add_argument("--host", default="hexplane", choices=names, help="which host `auto` puts behind the gate")
+    to.add_argument(
+        "--host-config", default="default", choices=("default", "reference"), help="our numbers or the published ones"
+    )
     to.add_argument("--supervision", default="support", choices=("support", "paper", "none"))
+    to.add_argument(
+        "--detector", default="grad_norm", choices=("weight", "grad_norm", "grad_signed"),
+        help="paper: what tells an ill-supervised Gaussian",
+    )  # fmt: skip
     to.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
     to.add_argument("--width", type=int, default=0, help="width of the training images in pixels (0: the preset's)")
     to.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")

@@ -119,9 +119,15 @@ class TrainParams:
     preset: str = "preview"
     """preview, standard or final."""
     method: str = "auto"
-    """auto (HexPlane field, gate, support), hexplane (field for all, no gate) or static."""
+    """auto (the host behind the gate), static, or a host whose field moves all: hexplane, mlp, control_points."""
+    host: str = "hexplane"
+    """Which host `auto` puts behind the gate."""
+    host_config: str = "default"
+    """default (ours) or reference (the published sizes, rates and schedules, as shares of the run)."""
     supervision: str = "support"
     """support, paper or none: which anchoring losses hold ill-supervised Gaussians."""
+    detector: str = "grad_norm"
+    """`paper`, who is ill-supervised: weight, grad_norm, or grad_signed (the published code's signed sum)."""
     iterations: int = 0
     """Training steps; 0: the preset's."""
     width: int = 0

@@ -84,3 +84,13 @@ def test_wrong_input_is_one_sentence(tmp_path, arguments, code, word):
     assert done.returncode in (code, ExitCode.FOOTAGE)
     assert word in text
     assert "Traceback" not in text
+
+
+def test_hosts_are_known_by_their_files_alone():
+    from torch_backend.cli import host_names
+    from torch_backend.deformation import hosts
+
+    assert host_names() == tuple(hosts())
+    refused = run("train", "no.splannequin", "--method", "nerf")
+    assert refused.returncode == ExitCode.USAGE
+    assert "control_points" in refused.stderr

@@ -2,15 +2,24 @@
 
 from .gate import GateConfig, open_gate, residual_per_gaussian
 from .hexplane import HexPlane, HexPlaneConfig
-from .protocol import Deformation, Deltas, apply_deltas, split_deltas
+from .protocol import Deformation, Deltas, HostConfig, Rehearsal, Start, apply_deltas, field_box, split_deltas
+from .registry import CONFIGURATIONS, host, host_config, hosts
 
 __all__ = [
+    "CONFIGURATIONS",
     "Deformation",
     "Deltas",
     "GateConfig",
     "HexPlane",
     "HexPlaneConfig",
+    "HostConfig",
+    "Rehearsal",
+    "Start",
     "apply_deltas",
+    "field_box",
+    "host",
+    "host_config",
+    "hosts",
     "open_gate",
     "residual_per_gaussian",
     "split_deltas",

@@ -140,8 +140,8 @@ class ControlPoints(Deformation):
         self.box: Tensor
         self.frames: Tensor
         self.places: Tensor
-        self.register_buffer("box", box.float())
-        self.register_buffer("frames", torch.tensor(float(frames)))
+        self.register_buffer("box", box.float().cpu())
+        self.register_buffer("frames", torch.tensor(float(frames), device="cpu"))
         self.register_buffer("places", places.float())
         self.hyper = nn.Parameter(places.new_full((count, config.hyper), 1e-2))
         self.log_radii = nn.Parameter(_radii(places, config.published).log())
@@ -231,7 +231,14 @@ class ControlPoints(Deformation):
         end = c.lr_nodes if c.published else 0.1 * c.lr_nodes
         return [
             {"params": own, "lr": c.lr_nodes, "lr_end": end, "name": "nodes"},
-            {"params": network, "lr": c.lr, "lr_end": c.lr_end, "until": c.until, "name": "field"},
+            {
+                "params": network,
+                "lr": c.lr,
+                "lr_end": c.lr_end,
+                "since": c.rehearsal,
+                "until": c.until,
+                "name": "field",
+            },
         ]
 
     def regularisation(self, progress: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
@@ -424,7 +431,7 @@ class _Surrogates:
             means = means[torch.randperm(len(means), generator=generator, device="cpu")[:512].to(means.device)]
         frame = 1.0 / float(self.field.frames)
         middle = _near_times(1, 0.0, generator)
-        around = middle + 3.0 * frame * torch.tensor([-1.0, 0.0, 1.0])
+        around = middle + 3.0 * frame * torch.tensor([-1.0, 0.0, 1.0], device="cpu")
         times = torch.cat(
             [_near_times(2, _WINDOW, generator), _near_times(8, frame, generator), around.clamp(0.0, 1.0)]
         )
@@ -462,7 +469,7 @@ def _create(config: ControlPointsConfig, start: Start) -> ControlPoints:
 
 
 def _restore(config: ControlPointsConfig, tensors: dict[str, Tensor]) -> ControlPoints:
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator(device="cpu").manual_seed(0)
     field = ControlPoints(config, tensors["field.places"], tensors["field.box"], 1, generator)
     field.load_state(tensors)
     return field

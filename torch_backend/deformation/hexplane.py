@@ -3,12 +3,13 @@
 Corrected against the published code (design: method-hosts 1.1): time is mapped to the whole plane, the heads' last
 layers start at zero so that the field starts as the identity, learning rates do not follow the scene's extent
 (the scene is normalised), smoothness acts along both axes of a spatial plane, and sampling coordinates are detached:
-the field says how things move, the image says where they are.
+the field says how things move, the image says where they are. `published` brings back all but the last.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,14 +17,17 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from . import planes as compiled
-from .protocol import Deltas
+from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, field_box, rate_scale
 
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
+PUBLISHED_ITERATIONS = 33_000
+_EXTENT = 1.1
+"""Published rates are times the scene's extent: 1.1 camera extents, and ours is 1."""
 _WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "sh0": 3}
 
 
 @dataclass
-class HexPlaneConfig:
+class HexPlaneConfig(HostConfig):
     """Sizes, learning rates and regularisers; defaults in brackets are 4DGaussians' (arguments/__init__.py)."""
 
     features: int = 16
@@ -32,8 +36,8 @@ class HexPlaneConfig:
     """Nodes per spatial axis of the coarsest level (64)."""
     levels: tuple[int, ...] = (1, 2)
     """Multipliers of the spatial resolution (dynerf: 1, 2)."""
-    time_nodes: int = 37
-    """Nodes on the time axis; about half the trained frames."""
+    time_nodes: int = 0
+    """Nodes on the time axis (150); 0: about half the trained frames."""
     width: int = 64
     """Width of the trunk and the heads (64)."""
     lr_grid: float = 1e-2
@@ -48,15 +52,35 @@ class HexPlaneConfig:
     """Weight of the squared second difference along time on the time planes (1e-3)."""
     time_l1: float = 1e-4
     """Weight of mean |1 - plane| on the time planes (1e-4)."""
+    until: float = 1.0
+    """Share of the run at which the learning rates have ended."""
+    published: bool = False
+    """Times fed as they are to a sampler of [-1, 1], heads that start as noise, smoothness down the planes only (so
+    never along x), the box of the first points, and all harmonics move (on)."""
 
 
-class HexPlane(nn.Module):
+def _reference(iterations: int) -> HexPlaneConfig:
+    """The published host with the sizes of its Splannequin configuration: 3000 static steps, 30,000 with the field."""
+    scale, whole = _EXTENT * rate_scale(PUBLISHED_ITERATIONS, iterations), float(PUBLISHED_ITERATIONS)
+    return HexPlaneConfig(
+        start=3000 / whole,
+        time_nodes=150,
+        width=128,
+        lr_grid=1.6e-3 * scale,
+        lr_heads=1.6e-4 * scale,
+        until=23_000 / whole,
+        published=True,
+    )
+
+
+class HexPlane(Deformation):
     """The field. `box` [2, 3] is the part of the scene it resolves; outside it the rim's feature holds.
 
-    Made on the CPU, so that a seed means one start on every device; `to` moves it.
+    Made on the CPU, so that a seed means one start on every device; `to` moves it. `harmonics`: how many SH bases
+    beyond the constant one the published field moves.
     """
 
-    def __init__(self, config: HexPlaneConfig, box: Tensor, generator: torch.Generator) -> None:
+    def __init__(self, config: HexPlaneConfig, box: Tensor, generator: torch.Generator, harmonics: int = 0) -> None:
         super().__init__()
         if not bool((box[1] > box[0]).all()):
             raise ValueError(f"box {box.tolist()} should have its maximum above its minimum on every axis")
@@ -74,16 +98,20 @@ class HexPlane(nn.Module):
                 still = torch.ones(1, config.features, config.time_nodes, nodes, device="cpu")
                 self.temporal.append(_plane(still))
         self.trunk = _linear(config.features * len(config.levels), config.width, generator)
-        self.hidden = nn.ModuleDict({name: _linear(config.width, config.width, generator) for name in _WIDTHS})
-        self.out = nn.ModuleDict({name: nn.Linear(config.width, size, device="cpu") for name, size in _WIDTHS.items()})
+        widths = {**_WIDTHS, "shN": 3 * harmonics} if config.published and harmonics else _WIDTHS
+        self.hidden = nn.ModuleDict({name: _linear(config.width, config.width, generator) for name in widths})
+        self.out = nn.ModuleDict({n: nn.Linear(config.width, size, device="cpu") for n, size in widths.items()})
         for head in self.out.values():
-            nn.init.zeros_(head.weight)  # type: ignore[arg-type]
+            if config.published:
+                nn.init.xavier_uniform_(head.weight, generator=generator)  # type: ignore[arg-type]
+            else:
+                nn.init.zeros_(head.weight)  # type: ignore[arg-type]
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
 
     def features_at(self, means: Tensor, times: Tensor) -> Tensor:
         """Product of the six planes' samples, levels concatenated: [M, features * levels]."""
         where = 2.0 * (means.detach() - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
-        when = (2.0 * times - 1.0).expand(len(means))
+        when = (times if self.config.published else 2.0 * times - 1.0).expand(len(means))
         planes = self._by_level()
         if compiled.supports(planes) and where.dtype == torch.float32:
             return compiled.features(torch.cat([where, when[:, None]], dim=1), planes)
@@ -97,16 +125,17 @@ class HexPlane(nn.Module):
             parts.append(product)
         return torch.cat(parts, dim=1)
 
-    def forward(self, means: Tensor, times: Tensor) -> Deltas:
+    def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] scene units (detached here), times [M] or [1] in [0, 1]."""
         hidden = F.relu(self.trunk(self.features_at(means, times)))
-        out = {name: self.out[name](F.relu(self.hidden[name](hidden))) for name in _WIDTHS}
+        out = {name: head(F.relu(self.hidden[name](hidden))) for name, head in self.out.items()}
         return Deltas(
             means=out["means"],
             quats=out["quats"],
             log_scales=out["log_scales"],
             opacity_logits=out["opacity_logits"][:, 0],
             sh0=out["sh0"][:, None, :],
+            shN=out["shN"].unflatten(1, (-1, 3)) if "shN" in out else None,
         )
 
     def _by_level(self) -> list[Tensor]:
@@ -133,35 +162,39 @@ class HexPlane(nn.Module):
                 _resample(self.temporal[3 * level + axis], old[:, axis], when)
         self.box.copy_(box)
 
+    @torch.no_grad()
+    def cover(self, means: Tensor, optimizer: torch.optim.Optimizer) -> None:
+        """Refits the planes if more than 1 % of the means lie outside the box; the published field keeps its box."""
+        if self.config.published or self.outside(means) <= 0.01 * len(means):
+            return
+        wanted = field_box(means)
+        self.refit(torch.stack([torch.minimum(self.box[0], wanted[0]), torch.maximum(self.box[1], wanted[1])]))
+        for plane in [*self.spatial, *self.temporal]:
+            optimizer.state.pop(plane, None)
+
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Two groups: the planes and the network."""
+        """Two groups: the planes and the network. Published: their schedule begins when the field does."""
         c = self.config
+        span = {"since": c.start if c.published else 0.0, "until": c.until}
         planes = [*self.spatial, *self.temporal]
         known = {id(p) for p in planes}
         heads = [p for p in self.parameters() if id(p) not in known]
         return [
-            {"params": planes, "lr": c.lr_grid, "lr_end": c.lr_grid * c.lr_end, "name": "field"},
-            {"params": heads, "lr": c.lr_heads, "lr_end": c.lr_heads * c.lr_end, "name": "heads"},
+            {"params": planes, "lr": c.lr_grid, "lr_end": c.lr_grid * c.lr_end, "name": "field", **span},
+            {"params": heads, "lr": c.lr_heads, "lr_end": c.lr_heads * c.lr_end, "name": "heads", **span},
         ]
 
-    def regularisation(self) -> Tensor:
+    def regularisation(self, progress: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
         """Smoothness of the planes and closeness of the time planes to 1, weighted, summed over planes."""
         c, planes = self.config, self._by_level()
+        along = 0.0 if c.published else c.smooth_space
         if compiled.supports(planes):
-            space, time = (c.smooth_space, c.smooth_space, 0.0), (c.smooth_time, 0.0, c.time_l1)
+            space, time = (c.smooth_space, along, 0.0), (c.smooth_time, 0.0, c.time_l1)
             return compiled.penalty(planes, [*[space] * 3, *[time] * 3] * len(c.levels))
-        space = torch.stack([_bend(p, 2) + _bend(p, 3) for p in self.spatial]).sum()
+        space = torch.stack([c.smooth_space * _bend(p, 2) + along * _bend(p, 3) for p in self.spatial]).sum()
         time = torch.stack([_bend(p, 2) for p in self.temporal]).sum()
         still = torch.stack([(1.0 - p).abs().mean() for p in self.temporal]).sum()
-        return c.smooth_space * space + c.smooth_time * time + c.time_l1 * still
-
-    def state(self) -> dict[str, Tensor]:
-        """Tensors for a checkpoint, names starting with `field.`."""
-        return {f"field.{name}": value.detach() for name, value in self.state_dict().items()}
-
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Inverse of `state`; RuntimeError names what does not fit."""
-        self.load_state_dict({k.removeprefix("field."): v for k, v in tensors.items() if k.startswith("field.")})
+        return space + c.smooth_time * time + c.time_l1 * still
 
 
 def _plane(values: Tensor) -> nn.Parameter:
@@ -196,3 +229,23 @@ def _bend(plane: Tensor, axis: int) -> Tensor:
         return plane.new_zeros(())
     before, here, after = (plane.narrow(axis, start, count - 2) for start in (0, 1, 2))
     return (before - 2.0 * here + after).square().mean()
+
+
+def _create(config: HexPlaneConfig, start: Start) -> HexPlane:
+    config = replace(config, time_nodes=config.time_nodes or max(4, round(start.frames / 2)))
+    box = start.box
+    if config.published:
+        box = torch.stack([start.points.amin(0), start.points.amax(0)])
+        box[1] = torch.maximum(box[1], box[0] + 1e-3)
+    return HexPlane(config, box, start.generator, start.harmonics)
+
+
+def _restore(config: HexPlaneConfig, tensors: dict[str, Tensor]) -> HexPlane:
+    config = replace(config, time_nodes=tensors["field.temporal.0"].shape[2])
+    harmonics = len(tensors["field.out.shN.bias"]) // 3 if "field.out.shN.bias" in tensors else 0
+    field = HexPlane(config, tensors["field.box"], torch.Generator(device="cpu").manual_seed(0), harmonics)
+    field.load_state(tensors)
+    return field
+
+
+HOST = HostSpec("hexplane", HexPlaneConfig, _reference, _create, _restore)

@@ -88,7 +88,7 @@ def encode(values: Tensor, octaves: int) -> Tensor:
 
 def linear(inputs: int, outputs: int, generator: torch.Generator, std: float | None = None) -> nn.Linear:
     """A layer that starts as torch's own do (std None), or normal with `std` and without bias."""
-    layer = nn.Linear(inputs, outputs)
+    layer = nn.Linear(inputs, outputs, device="cpu")
     with torch.no_grad():
         if std is None:
             bound = 1.0 / math.sqrt(inputs)
@@ -139,8 +139,8 @@ class Mlp(Deformation):
         self.config = config
         self.box: Tensor
         self.frames: Tensor
-        self.register_buffer("box", box.float())
-        self.register_buffer("frames", torch.tensor(float(frames)))
+        self.register_buffer("box", box.float().cpu())
+        self.register_buffer("frames", torch.tensor(float(frames), device="cpu"))
         self.trunk = Trunk(
             config.depth, config.width, (config.position_frequencies, config.time_frequencies), generator
         )
@@ -188,7 +188,7 @@ def _create(config: MlpConfig, start: Start) -> Mlp:
 
 
 def _restore(config: MlpConfig, tensors: dict[str, Tensor]) -> Mlp:
-    field = Mlp(config, tensors["field.box"], 1, torch.Generator().manual_seed(0))
+    field = Mlp(config, tensors["field.box"], 1, torch.Generator(device="cpu").manual_seed(0))
     field.load_state(tensors)
     return field
 

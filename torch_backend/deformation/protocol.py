@@ -1,7 +1,7 @@
 """What a host of the method is: (means, times) -> deltas, with its own parameters, learning rates and regularisers.
 
 A host stands in one file: a subclass of `Deformation`, a dataclass of its numbers, and a `HOST` that names both
-(`hosts.py` finds it).
+(`registry.py` finds it).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -21,8 +22,8 @@ from .geometry import near_identity, quat_product
 class Deltas(NamedTuple):
     """Changes of M Gaussians at their times; None for what a host does not move.
 
-    means [M, 3] scene units, quats [M, 4], log_scales [M, 3], opacity_logits [M], sh0 [M, 1, 3]. How they
-    meet the canonical parameters is the host's `rules`; without a rule they are added.
+    means [M, 3] scene units, quats [M, 4], log_scales [M, 3], opacity_logits [M], sh0 [M, 1, 3], shN [M, K - 1, 3].
+    How they meet the canonical parameters is the host's `rules`; without a rule they are added.
     """
 
     means: Tensor
@@ -30,6 +31,7 @@ class Deltas(NamedTuple):
     log_scales: Tensor | None = None
     opacity_logits: Tensor | None = None
     sh0: Tensor | None = None
+    shN: Tensor | None = None  # noqa: N815 - the field's name
 
     def moved(self) -> dict[str, Tensor]:
         """Those that are there, by the name of the parameter they change."""
@@ -103,6 +105,8 @@ class Start:
     """[P, 3] the solve's points."""
     frames: int
     """How many frames are trained."""
+    harmonics: int
+    """K - 1, how many SH bases beyond the constant one a Gaussian has."""
     generator: torch.Generator
     """Source of every random draw."""
 
@@ -147,7 +151,7 @@ class Deformation(nn.Module):
         return time
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Optimiser groups: params, lr (start), lr_end, name; `until`: the share of the run that ends the decay."""
+        """Optimiser groups: params, lr (start), lr_end, name; the rate falls between the shares `since` and `until`."""
         raise NotImplementedError
 
     def regularisation(self, progress: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
@@ -177,7 +181,7 @@ class Deformation(nn.Module):
 
 @dataclass(frozen=True)
 class HostSpec:
-    """A host as `hosts.py` finds it: a module's `HOST`."""
+    """A host as `registry.py` finds it: a module's `HOST`."""
 
     name: str
     """What the command line and config.json call it."""
@@ -189,6 +193,14 @@ class HostSpec:
     """A new field from its numbers."""
     restore: Callable[[Any, dict[str, Tensor]], Deformation]
     """The field of a checkpoint, from its numbers and the checkpoint's tensors."""
+
+
+def field_box(means: Tensor) -> Tensor:
+    """Box [2, 3] that a field should resolve for the Gaussians means [M, 3]: robust bounds and a margin."""
+    low, high = np.quantile(means.cpu().numpy(), (0.01, 0.99), axis=0)
+    low, high = torch.from_numpy(low).float().to(means.device), torch.from_numpy(high).float().to(means.device)
+    margin = 0.15 * (high - low).clamp_min(1e-2)
+    return torch.stack([low - margin, high + margin])
 
 
 def rate_scale(published: int, iterations: int) -> float:

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..deformation import apply_deltas
 from ..supervision import nearest_bin, support_confidence
 from ..train.exposure import Exposure
 from ..train.model import DynamicModel, render
@@ -68,7 +67,7 @@ def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "ne
     if query == "nearest" and len(rows):
         bins, known = nearest_bin(gaussians.support[rows], model.centres, time)
         times = torch.where(known, model.centres[bins], times)
-    state = apply_deltas(gaussians, rows, model.deltas(rows, times))
+    state = model.moved(rows, model.deltas(rows, times))
     moving = torch.zeros(len(gaussians), device=model.device)
     moving[rows] = 1.0
     support = support_confidence(gaussians.support, moving > 0, model.centres, time, SUPPORT_SECONDS / seconds)
@@ -129,9 +128,9 @@ def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray
     rank = np.argsort(np.argsort(sharpness)) / max(1, len(sharpness) - 1)
     if not len(rows) or model.field is None:
         return int(np.argmax(rank))
-    means = model.gaussians.params["means"][rows]
     instants = torch.linspace(0, 1, 12, device=model.device)
-    places = torch.stack([model.field(means, instants[n : n + 1]).means for n in range(len(instants))])
+    moves = [model.deltas(rows, instants[n : n + 1]) for n in range(len(instants))]
+    places = torch.stack([move.means for move in moves if move is not None])
     travel = (places - places.mean(0)).norm(dim=2).mean(0)
     support = model.gaussians.support[rows].float()
     seen = (travel[:, None] * support).sum(0) / travel.sum().clamp_min(1e-9)

@@ -25,8 +25,10 @@ class Gaussians:
     """N Gaussians in scene units. Scales as logs, opacities as logits, quaternions wxyz and not normalised.
 
     params: means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh0 [N, 1, 3], shN [N, K - 1, 3].
+    A host's own parameters, [N, ...] each, stand behind those in `params` (see `adopt`).
     open: bool [N], the gate: which Gaussians the deformation moves.
     support: bool [N, B], time bins in which a Gaussian contributed to a training frame.
+    hidden: bool [N, B], time bins in which it was out of the frame or behind what is seen, when last looked.
     """
 
     def __init__(self, params: dict[str, Tensor], bins: int) -> None:
@@ -34,10 +36,12 @@ class Gaussians:
         for name in PARAM_NAMES:
             if params[name].shape[0] != count:
                 raise ValueError(f"{name} has {params[name].shape[0]} rows, means has {count}")
-        self.params = {name: nn.Parameter(params[name].contiguous()) for name in PARAM_NAMES}
+        names = [*PARAM_NAMES, *(name for name in params if name not in PARAM_NAMES)]
+        self.params = {name: nn.Parameter(params[name].contiguous()) for name in names}
         device = params["means"].device
         self.open = torch.zeros(count, dtype=torch.bool, device=device)
         self.support = torch.zeros(count, bins, dtype=torch.bool, device=device)
+        self.hidden = torch.zeros(count, bins, dtype=torch.bool, device=device)
 
     def __len__(self) -> int:
         return self.params["means"].shape[0]
@@ -52,6 +56,17 @@ class Gaussians:
         if degree == 0:
             return self.params["sh0"]
         return torch.cat([self.params["sh0"], self.params["shN"][:, : sh_bases(degree) - 1]], dim=1)
+
+    def adopt(self, name: str, shape: tuple[int, ...], value: float) -> nn.Parameter:
+        """Gives every Gaussian a parameter of a host's own: [N, *shape], all `value`. ValueError for a taken name."""
+        if name in self.params:
+            raise ValueError(f"the Gaussians have a parameter {name!r} already")
+        self.params[name] = nn.Parameter(self.params["means"].new_full((len(self), *shape), value))
+        return self.params[name]
+
+    def own(self, rows: Tensor) -> dict[str, Tensor]:
+        """The host's own parameters of rows [M], by name."""
+        return {name: p[rows] for name, p in self.params.items() if name not in PARAM_NAMES}
 
     @torch.no_grad()
     def rebuild(self, parent: Tensor, fresh: Tensor, optimizer: torch.optim.Optimizer) -> None:
@@ -73,12 +88,14 @@ class Gaussians:
             group["params"] = [replaced.get(id(p), p) for p in group["params"]]
         self.open = self.open[parent].contiguous()
         self.support = self.support[parent].contiguous()
+        self.hidden = self.hidden[parent].contiguous()
 
     def state(self) -> dict[str, Tensor]:
         """Tensors for a checkpoint; the bitmap packed to bytes."""
         tensors = {f"gaussians.{name}": p.detach() for name, p in self.params.items()}
         tensors["gaussians.open"] = self.open
         tensors["gaussians.support"] = pack_bits(self.support)
+        tensors["gaussians.hidden"] = pack_bits(self.hidden)
         return tensors
 
     def to(self, device: torch.device) -> Gaussians:
@@ -86,15 +103,20 @@ class Gaussians:
         if self.open.device == device:
             return self
         model = Gaussians({name: p.detach().to(device) for name, p in self.params.items()}, self.support.shape[1])
-        model.open, model.support = self.open.to(device), self.support.to(device)
+        model.open, model.support, model.hidden = (t.to(device) for t in (self.open, self.support, self.hidden))
         return model
 
     @staticmethod
     def from_state(tensors: dict[str, Tensor], bins: int) -> Gaussians:
         """Inverse of `state`; KeyError names a missing tensor."""
-        model = Gaussians({name: tensors[f"gaussians.{name}"] for name in PARAM_NAMES}, bins)
+        flags = ("open", "support", "hidden")
+        names = [name.removeprefix("gaussians.") for name in tensors if name.startswith("gaussians.")]
+        own = [name for name in names if name not in (*PARAM_NAMES, *flags)]
+        model = Gaussians({name: tensors[f"gaussians.{name}"] for name in (*PARAM_NAMES, *own)}, bins)
         model.open = tensors["gaussians.open"].clone()
         model.support = unpack_bits(tensors["gaussians.support"], bins)
+        if "gaussians.hidden" in tensors:  # earlier checkpoints did not look
+            model.hidden = unpack_bits(tensors["gaussians.hidden"], bins)
         return model
 
 

@@ -1,19 +1,31 @@
 """Who was seen when, and what holds a Gaussian at times at which nobody saw it."""
 
-from .anchors import Anchored, PaperView, SupervisionConfig, draw_anchored, paper_loss, support_loss
-from .support import bin_of, bin_times, mark_seen, nearest_bin, nearest_supported, support_confidence
+from .anchors import (
+    DETECTORS,
+    Anchored,
+    PaperView,
+    SupervisionConfig,
+    draw_anchored,
+    paper_loss,
+    support_loss,
+    well_supervised,
+)
+from .support import bin_of, bin_times, mark_hidden, mark_seen, nearest_bin, nearest_supported, support_confidence
 
 __all__ = [
+    "DETECTORS",
     "Anchored",
     "PaperView",
     "SupervisionConfig",
     "bin_of",
     "bin_times",
     "draw_anchored",
+    "mark_hidden",
     "mark_seen",
     "nearest_bin",
     "nearest_supported",
     "paper_loss",
     "support_confidence",
     "support_loss",
+    "well_supervised",
 ]

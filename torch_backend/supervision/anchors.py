@@ -16,7 +16,9 @@ from torch.nn import functional as F
 
 from ..deformation import Deformation, Deltas
 from ..gaussians import Gaussians
-from .support import nearest_supported
+from .support import SEEN_WEIGHT, nearest_supported
+
+DETECTORS = ("weight", "grad_norm", "grad_signed")
 
 
 @dataclass
@@ -39,6 +41,9 @@ class SupervisionConfig:
     """`paper`: lambda_defective (paper: 10)."""
     defective_gradient: float = 1e-9
     """`paper`: a visible Gaussian with a screen gradient of at most this is defective (paper: 1e-9)."""
+    detector: str = "grad_norm"
+    """`paper`, which Gaussians an image acts on. grad_norm: by the norm of the screen gradient, as the paper says;
+    grad_signed: by its signed sum over x and y, as the published code does; weight: by what they contribute."""
     support_every: int = 2
     """`support` acts every so many iterations."""
     support_weight: float = 0.2
@@ -47,17 +52,19 @@ class SupervisionConfig:
     """`support`: (Gaussian, time) pairs drawn each time."""
     support_seconds: float = 4.0
     """`support`: confidence in an anchor decays as exp(-|dt| / this)."""
+    look_every: int = 4
+    """`support` looks every so many iterations who could not be seen in the frame; only those are anchored there."""
 
 
-_ATTRIBUTE_WEIGHTS = (5.0, 0.2, 0.2, 0.1, 0.2)
-"""Weights of means, quats, log_scales, opacity_logits and sh0 in `support`, so that typical deltas of each count alike; means in scene units."""
+_ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
+"""Weights of the attributes in `support`, so that typical deltas of each count alike; means in scene units."""
 _KNEE = 0.02
 """Below this the support loss is quadratic, above it linear (Charbonnier)."""
 
 
 @dataclass
 class Anchored:
-    """(Gaussian, time) pairs that no frame supports, and so need an anchor."""
+    """(Gaussian, time) pairs that no frame supports and none denies, and so need an anchor."""
 
     rows: Tensor
     """[S] int64 rows of the model."""
@@ -77,8 +84,7 @@ def draw_anchored(
     """
     if not len(rows):
         return None
-    support = model.support[rows]
-    picked, bins, valid = _draw(support, config.support_samples, generator)
+    picked, bins, valid = _draw(model.support[rows], model.hidden[rows], config.support_samples, generator)
     rows = rows[picked]
     if rows.device.type == "cpu":
         rows, bins = rows[valid], bins[valid]
@@ -108,7 +114,8 @@ def support_loss(
     left, has_left, right, has_right = nearest_supported(model.support[rows], bins)
     with torch.no_grad():
         means = model.params["means"][rows]
-        there = field(torch.cat([means, means]), torch.cat([centres[left], centres[right]]))
+        own = model.own(torch.cat([rows, rows]))
+        there = field(torch.cat([means, means]), torch.cat([centres[left], centres[right]]), own)
         near_left = (centres[bins] - centres[left]) * seconds
         near_right = (centres[right] - centres[bins]) * seconds
         share = (near_left / (near_left + near_right).clamp_min(1e-6)).clamp(0.0, 1.0)
@@ -118,17 +125,16 @@ def support_loss(
         )
         confidence = torch.exp(-distance / config.support_seconds)
     total = torch.zeros_like(confidence)
-    for weight, value, anchors in zip(_ATTRIBUTE_WEIGHTS, here, there, strict=True):
-        if value is None or anchors is None:  # not every host moves every attribute
-            continue
-        first, second = anchors.reshape(2, len(rows), -1)
+    held = there.moved()
+    for name, value in here.moved().items():
+        first, second = held[name].reshape(2, len(rows), -1)
         gap = value.reshape(len(rows), -1) - torch.lerp(first, second, share[:, None])
-        total = total + weight * (torch.sqrt(gap.square() + _KNEE**2) - _KNEE).sum(1)
+        total = total + _ATTRIBUTE_WEIGHTS[name] * (torch.sqrt(gap.square() + _KNEE**2) - _KNEE).sum(1)
     return config.support_weight * (pairs.weights * confidence * total).sum() / pairs.weights.sum().clamp_min(1.0)
 
 
-def _draw(support: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """(row, bin, valid) of 2 `count` pairs; up to `count` are valid: unsupported, of a row with support [M, B].
+def _draw(support: Tensor, hidden: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """(row, bin, valid) of 2 `count` pairs; up to `count` are valid: hidden [M, B], without support, in a row with it.
 
     The first half lies anywhere, the second at a log-uniform distance from support.
 
@@ -149,7 +155,7 @@ def _draw(support: Tensor, count: int, generator: torch.Generator) -> tuple[Tens
     valid = (chosen >= 0) & (chosen < bins)
     chosen = chosen.clamp(0, bins - 1)
     own = support[picked]
-    valid &= own.any(1) & ~own.gather(1, chosen[:, None])[:, 0]
+    valid &= own.any(1) & (hidden[picked] & ~own).gather(1, chosen[:, None])[:, 0]
     return picked, chosen, valid & (valid.cumsum(0) <= count)
 
 
@@ -163,15 +169,43 @@ class PaperView:
     """Deformed parameters of M Gaussians (means, quats, log_scales, opacity_logits, sh0)."""
     inside: Tensor
     """bool [M]: the centre is inside the camera's frustum; False is the paper's `hidden`."""
-    gradient: Tensor
-    """[M] norm of the screen-space gradient of the reconstruction loss."""
+    acted: Tensor
+    """bool [M]: the view's image acts on it (`well_supervised`)."""
+
+
+def well_supervised(
+    config: SupervisionConfig, weight: Tensor, norm: Tensor, pull: Tensor, K: Tensor, viewmat: Tensor, means: Tensor,
+    size: tuple[int, int],
+) -> Tensor:  # fmt: skip
+    """bool [M]: on which Gaussians an image acts, by the configured detector (method-hosts 2.2).
+
+    grad_signed adds the components of the screen gradient in NDC, as the published code does, so that about half of
+    the Gaussians that an image does act on fail. The rasteriser tells the gradient's norm; its components are those of
+    the gradient of the 3D means across the line of sight, to the first order in the Gaussian's size over its depth.
+
+    Args:
+        weight: [M] sum of alpha * T over the image.
+        norm: [M] norm of the screen gradient of the image's loss, 1/px.
+        pull: [M, 3] gradient of the image's loss in the means.
+        K: [3, 3] px; viewmat: [4, 4]; means: [M, 3]; size: (width, height) px of the image.
+    """
+    if config.detector == "weight":
+        return weight > SEEN_WEIGHT
+    if config.detector == "grad_norm":
+        return norm > config.defective_gradient
+    if config.detector != "grad_signed":
+        raise ValueError(f"detector is {config.detector!r}: it should be one of {', '.join(DETECTORS)}")
+    across = pull @ viewmat[:3, :3].T
+    depth = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
+    ndc = [0.5 * size[axis] * across[:, axis] * depth / K[axis, axis] for axis in (0, 1)]
+    return ndc[0] + ndc[1] > config.defective_gradient
 
 
 def paper_loss(one: PaperView, two: PaperView, progress: float, config: SupervisionConfig) -> Tensor | None:
     """The paper's two terms for a pair of views; None if no valid anchor was found.
 
     The later view's hidden Gaussians are held to the earlier view, the earlier view's defective ones to the later;
-    the reference must be well supervised (inside the frustum, with gradient) and is detached. Mean over the selected
+    the reference must be well supervised (inside the frustum, acted on) and is detached. Mean over the selected
     Gaussians, summed over the attributes.
     """
     early, late = (one, two) if one.time < two.time else (two, one)
@@ -179,10 +213,8 @@ def paper_loss(one: PaperView, two: PaperView, progress: float, config: Supervis
         return None
     phi = math.exp(-config.tau * (late.time - early.time))
     linear = progress >= config.switch
-    well_early = early.inside & (early.gradient > config.defective_gradient)
-    well_late = late.inside & (late.gradient > config.defective_gradient)
-    hidden = ~late.inside & well_early
-    defective = early.inside & ~(early.gradient > config.defective_gradient) & well_late
+    hidden = ~late.inside & early.inside & early.acted
+    defective = early.inside & ~early.acted & late.inside & late.acted
     terms = []
     if bool(hidden.any()):
         terms.append(config.weight_hidden * phi * _discrepancy(late.state, early.state, hidden, linear))

@@ -13,6 +13,8 @@ from torch import Tensor
 from ..gaussians import Gaussians
 
 MAX_BINS = 256
+_BEHIND = 0.02
+"""Share of the depth by which a centre must lie behind what is seen, beyond its own size, to count as hidden."""
 SEEN_WEIGHT = 0.1
 """Sum of alpha * T over a frame's pixels above which a Gaussian counts as seen in it."""
 
@@ -36,6 +38,38 @@ def bin_of(centres: Tensor, time: float) -> int:
 def mark_seen(model: Gaussians, time_bin: int, weight_sum: Tensor) -> None:
     """Notes who contributed to a training frame; weight_sum [N] is the sum of alpha * T over its pixels."""
     model.support[:, time_bin] |= weight_sum > SEEN_WEIGHT
+
+
+@torch.no_grad()
+def mark_hidden(
+    model: Gaussians,
+    rows: Tensor,
+    time_bin: int,
+    state: dict[str, Tensor],
+    viewmat: Tensor,
+    K: Tensor,
+    depth: Tensor,
+) -> None:
+    """Notes who of `rows` [M] could not have been seen in a frame: out of it, or behind what is there.
+
+    A Gaussian in plain view that does not contribute is not unsupervised: the frame says that it is not there. It may
+    have faded, or its owner moved on; it is not to be drawn back to where it was seen (`anchors.draw_anchored`).
+
+    Args:
+        state: the Gaussians at the frame's time.
+        viewmat: [4, 4]; K: [3, 3] px.
+        depth: [H, W] median depth of the frame's render, 1e10 where there is nothing.
+    """
+    height, width = depth.shape
+    camera = state["means"].detach()[rows] @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = camera[:, 2]
+    pixels = camera[:, :2] / z.clamp_min(1e-6)[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
+    inside = (z > 1e-6) & (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+    at = torch.nan_to_num(pixels).long()
+    seen = depth.detach()[at[:, 1].clamp(0, height - 1), at[:, 0].clamp(0, width - 1)]
+    size = state["log_scales"].detach()[rows].amax(1).exp()
+    behind = z > (1.0 + _BEHIND) * seen + size
+    model.hidden[rows, time_bin] = ~inside | behind
 
 
 def nearest_supported(support: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from ..contract import TrainParams
-from ..deformation import GateConfig, HexPlaneConfig
+from ..deformation import GateConfig, HexPlaneConfig, HostConfig, host, host_config, hosts
 from ..gaussians import DensifyConfig, InitConfig
-from ..supervision import SupervisionConfig
+from ..supervision import DETECTORS, SupervisionConfig
 from .exposure import ExposureConfig
 
 
@@ -29,7 +29,11 @@ class TrainConfig:
     holdout_phase: int = 0
     """Which of every `holdout` frames: 0 is what is reported; tuning uses another, so as not to tune on the judge."""
     method: str = "auto"
-    """auto: HexPlane behind the gate. hexplane: HexPlane for all. static: no deformation."""
+    """auto: the host behind the gate. A host's name: all Gaussians move. static: no deformation."""
+    host: str = "hexplane"
+    """Which host moves them (`deformation.registry`)."""
+    host_config: str = "default"
+    """What the host's numbers in `field` started as: default (ours) or reference (published)."""
     seed: int = 0
     """Seed of every random draw."""
     dssim: float = 0.2
@@ -62,17 +66,17 @@ class TrainConfig:
     """Share of the run between two measurements on held-out frames."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints."""
-    init: InitConfig = field(default_factory=InitConfig)
+    init: InitConfig = dataclasses.field(default_factory=InitConfig)
     """Start of the Gaussians."""
-    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    densify: DensifyConfig = dataclasses.field(default_factory=DensifyConfig)
     """Growth of the Gaussians."""
-    hexplane: HexPlaneConfig = field(default_factory=HexPlaneConfig)
-    """Host A."""
-    gate: GateConfig = field(default_factory=GateConfig)
+    field: HostConfig = dataclasses.field(default_factory=HexPlaneConfig)
+    """The host's numbers, of its own class."""
+    gate: GateConfig = dataclasses.field(default_factory=GateConfig)
     """Which Gaussians move."""
-    supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
+    supervision: SupervisionConfig = dataclasses.field(default_factory=SupervisionConfig)
     """Anchoring."""
-    exposure: ExposureConfig = field(default_factory=ExposureConfig)
+    exposure: ExposureConfig = dataclasses.field(default_factory=ExposureConfig)
     """Brightness and tint that drift along the clip."""
 
 
@@ -106,7 +110,7 @@ def _final() -> TrainConfig:
 
 PRESETS = {"preview": _preview, "standard": _standard, "final": _final}
 """Name -> a fresh configuration."""
-METHODS = ("auto", "hexplane", "static")
+METHODS = ("auto", *hosts(), "static")
 SUPERVISIONS = ("support", "paper", "none")
 
 
@@ -116,6 +120,7 @@ def config_from_params(params: TrainParams) -> TrainConfig:
         ("preset", params.preset, tuple(PRESETS)),
         ("method", params.method, METHODS),
         ("supervision", params.supervision, SUPERVISIONS),
+        ("detector", params.detector, DETECTORS),
     ):
         if value not in allowed:
             raise ValueError(f"{name} is {value!r}: it should be one of {', '.join(allowed)}")
@@ -124,7 +129,10 @@ def config_from_params(params: TrainParams) -> TrainConfig:
     config.iterations = params.iterations or config.iterations
     config.width = params.width or config.width
     config.densify.budget = params.max_gaussians or config.densify.budget
-    config.supervision.preset = params.supervision
+    config.supervision.preset, config.supervision.detector = params.supervision, params.detector
+    config.host = params.method if params.method in hosts() else params.host
+    config.host_config = params.host_config
+    config.field = host_config(config.host, config.host_config, config.iterations)
     if params.holdout >= 0:
         config.holdout = params.holdout
     if config.iterations < 10:
@@ -140,11 +148,14 @@ def config_to_json(config: TrainConfig) -> dict[str, Any]:
 def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     """Inverse of `config_to_json`; ValueError names an unknown field."""
     nested = {
-        "init": InitConfig, "densify": DensifyConfig, "hexplane": HexPlaneConfig,
-        "gate": GateConfig, "supervision": SupervisionConfig, "exposure": ExposureConfig,
+        "init": InitConfig, "densify": DensifyConfig, "gate": GateConfig,
+        "supervision": SupervisionConfig, "exposure": ExposureConfig,
     }  # fmt: skip
     values = dict(data)
+    if "hexplane" in values:  # written before there were other hosts
+        values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))
     try:
+        nested["field"] = host(values["host"]).settings
         for name, cls in nested.items():
             inner = {k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()}
             values[name] = cls(**inner)

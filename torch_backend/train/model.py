@@ -6,11 +6,10 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ..deformation import Deltas, HexPlane, apply_deltas
+from ..deformation import Deformation, Deltas, apply_deltas
 from ..gaussians import Gaussians, sh_bases
 from ..raster import RasterOutput, rasterize
 from .exposure import Exposure
@@ -22,8 +21,8 @@ class DynamicModel:
 
     gaussians: Gaussians
     """Canonical Gaussians with gate and support."""
-    field: HexPlane | None
-    """Host A, once the gate has opened."""
+    field: Deformation | None
+    """The host's field, once something moves."""
     centres: Tensor
     """[B] normalised times of the support bins."""
     sh_degree: int
@@ -51,12 +50,16 @@ class DynamicModel:
         """The field at the canonical means of `rows` [M]; times [M] or [1]. None without a field or rows."""
         if self.field is None or not len(rows):
             return None
-        return self.field(self.gaussians.params["means"][rows], times)
+        return self.field(self.gaussians.params["means"][rows], times, self.gaussians.own(rows))
+
+    def moved(self, rows: Tensor, deltas: Deltas | None) -> dict[str, Tensor]:
+        """All parameters where `deltas` have met those of rows [M], with gradients."""
+        return apply_deltas(self.gaussians, rows, deltas, None if self.field is None else self.field.rules)
 
     def state_at(self, time: float) -> dict[str, Tensor]:
         """All parameters at a normalised time, with gradients."""
         rows = self.open_rows()
-        return apply_deltas(self.gaussians, rows, self.deltas(rows, torch.tensor([time], device=self.device)))
+        return self.moved(rows, self.deltas(rows, torch.tensor([time], device=self.device)))
 
 
 def render(
@@ -87,11 +90,3 @@ def render(
         background=background,
         **options,
     )
-
-
-def field_box(means: Tensor) -> Tensor:
-    """Box [2, 3] that a field should resolve for the Gaussians means [M, 3]: robust bounds and a margin."""
-    low, high = np.quantile(means.cpu().numpy(), (0.01, 0.99), axis=0)
-    low, high = torch.from_numpy(low).float().to(means.device), torch.from_numpy(high).float().to(means.device)
-    margin = 0.15 * (high - low).clamp_min(1e-2)
-    return torch.stack([low - margin, high + margin])

@@ -181,6 +181,8 @@ def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, ke
         "run": name,
         "preset": trainer.config.preset,
         "method": trainer.config.method,
+        "host": trainer.config.host,
+        "host_config": trainer.config.host_config,
         "supervision": trainer.config.supervision.preset,
         "iterations": trainer.iteration,
         "width_px": trainer.width,

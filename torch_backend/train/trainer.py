@@ -12,8 +12,19 @@ import torch
 from torch import Tensor
 
 from ..contract import Cancelled, ExitCode, JobError, Reporter
-from ..deformation import Deltas, HexPlane, apply_deltas, open_gate, residual_per_gaussian, split_deltas
+from ..deformation import (
+    Deformation,
+    Deltas,
+    Rehearsal,
+    Start,
+    field_box,
+    host,
+    open_gate,
+    residual_per_gaussian,
+    split_deltas,
+)
 from ..gaussians import Densifier, Gaussians, initialise
+from ..raster import RasterOutput
 from ..scene import Scene
 from ..supervision import (
     Anchored,
@@ -21,16 +32,18 @@ from ..supervision import (
     bin_of,
     bin_times,
     draw_anchored,
+    mark_hidden,
     mark_seen,
     paper_loss,
     support_loss,
+    well_supervised,
 )
 from .adam import FusedAdam
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
 from .losses import photometric, psnr
-from .model import DynamicModel, field_box, render
+from .model import DynamicModel, render
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
@@ -75,7 +88,6 @@ class Trainer:
         centres = bin_times(scene.times[train])
         self._bins = [bin_of(centres, time) for time in self.times]
         self.centres = centres.to(self.device)
-        config.hexplane.time_nodes = max(4, round(len(train) / 2))
         budget = config.densify.budget
         gaussians = initialise(scene, images, train, len(self.centres), config.init, self.generator, budget)
         gaussians = gaussians.to(self.device)
@@ -131,10 +143,16 @@ class Trainer:
         rows = self.model.open_rows()
         pairs = self._pairs_to_anchor(rows)
         deltas, anchored = self._deltas(rows, frame, pairs)
-        state = apply_deltas(self.model.gaussians, rows, deltas)
+        if deltas is not None and self.progress < self.config.field.detached:
+            deltas = deltas.detached()
+        state = self.model.moved(rows, deltas)
         # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         background = torch.rand(3, generator=self.generator, device="cpu").to(self.device, non_blocking=True)
-        out = self._render(state, frame, background=background)
+        look = self._is_to_look()
+        out = self._render(state, frame, background=background, with_depth=look)
+        paper = self._paper_is_due()
+        if paper and len(rows):
+            state["means"].retain_grad()
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
         loss = photometric(exposed, self._image(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
@@ -142,8 +160,8 @@ class Trainer:
             total = total + self._support_loss(pairs, anchored)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        if self._paper_is_due():
-            self._paper_step(frame, rows, state, out.means2d_grad[0].clone())
+        if paper and len(rows):
+            self._paper_step(frame, rows, state, out)
         self.optimizer.step(guard=[total])
         applied = self.optimizer.applied
         if self.device.type == "cpu" and not bool(applied):
@@ -157,11 +175,20 @@ class Trainer:
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
         mark_seen(self.model.gaussians, self._bins[frame], weight)
+        if look:
+            index = self.train_ids[frame]
+            view = (self.viewmats[index], self.Ks[index], out.depth_median[0])
+            mark_hidden(self.model.gaussians, rows, self._bins[frame], state, *view)
         return loss.detach()
 
     def _deltas(self, rows: Tensor, frame: int, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
         """The field for the frame's Gaussians and for the pairs to anchor, in one call: (of `rows`, of `pairs`)."""
-        when = self._when[frame : frame + 1]
+        when, field = self._when[frame : frame + 1], self.model.field
+        if field is None:
+            return None, None
+        time = field.training_time(self.times[frame], self.progress, self.generator)
+        if time != self.times[frame]:
+            when = torch.full_like(when, time)
         if pairs is None:
             return self.model.deltas(rows, when), None
         times = torch.cat([when.expand(len(rows)), self.centres[pairs.bins]])
@@ -180,14 +207,12 @@ class Trainer:
             self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress)
         if c.method == "static":
             return
-        if c.method == "hexplane":
-            if self.model.field is None and self.progress >= c.gate.start:
-                self.model.gaussians.open[:] = True
-                self._create_field()
-            elif self.model.field is not None:
-                self.model.gaussians.open[:] = True
-        elif any(self.iteration == round(share * c.iterations) for share in c.gate.rounds):
-            self._gate_round()
+        if c.method == "auto":
+            if any(self.iteration == round(share * c.iterations) for share in c.gate.rounds):
+                self._gate_round()
+        elif self.model.field is None and self.progress >= c.field.start:
+            self.model.gaussians.open[:] = True
+            self._create_field()
 
     # ------------------------------------------------------------------ the gate
 
@@ -200,7 +225,8 @@ class Trainer:
         if self.model.field is None:
             self._create_field()
         else:
-            self._widen_field(self.model.field)
+            is_open = self.model.gaussians.open
+            self.model.field.cover(self.model.gaussians.params["means"].detach()[is_open], self.optimizer)
 
     def _residual_of(self, frame: int) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
         self.report.check_cancelled()
@@ -220,21 +246,39 @@ class Trainer:
         return error, pull, out.weight_sum[0]
 
     def _create_field(self) -> None:
-        model = self.model.gaussians
-        box = field_box(model.params["means"].detach()[model.open])
-        self.model.field = HexPlane(self.config.hexplane, box, self.generator).to(self.device)
-        for group in self.model.field.parameter_groups():
-            self.optimizer.add_param_group({**group, "lr_start": group["lr"]})
+        model, c = self.model.gaussians, self.config
+        means = model.params["means"].detach()[model.open].cpu()
+        harmonics = model.params["shN"].shape[1]
+        start = Start(means, field_box(means), self.scene.points, len(self.train_ids), harmonics, self.generator)
+        field = host(c.host).create(c.field, start).to(self.device)
+        # Behind the gate the Gaussians that open say where the motion is.
+        if field.rehearsal > 0 and c.method != "auto":
+            self._rehearse(field)
+        for name, owned in field.owned.items():
+            model.adopt(name, owned.shape, owned.value)
+        self.model.field = field
+        self._add_field_groups(field)
 
-    def _widen_field(self, field: HexPlane) -> None:
-        """Lets the field resolve what later rounds opened: outside its box it cannot tell one place from another."""
-        means = self.model.gaussians.params["means"].detach()[self.model.gaussians.open]
-        if field.outside(means) <= 0.01 * len(means):
-            return
-        wanted = field_box(means)
-        field.refit(torch.stack([torch.minimum(field.box[0], wanted[0]), torch.maximum(field.box[1], wanted[1])]))
-        for plane in [*field.spatial, *field.temporal]:
-            self.optimizer.state.pop(plane, None)
+    def _add_field_groups(self, field: Deformation) -> None:
+        for group in field.parameter_groups():
+            self.optimizer.add_param_group({**group, "lr_start": group["lr"]})
+        for name, owned in field.owned.items():
+            params = [self.model.gaussians.params[name]]
+            rates = {"lr": owned.lr, "lr_start": owned.lr, "lr_end": owned.lr_end}
+            self.optimizer.add_param_group({"params": params, "name": name, "rows": True, **rates})
+
+    def _rehearse(self, field: Deformation) -> None:
+        """The host's pre-stage; its steps are steps of the run. Interrupted, it starts again."""
+        steps = round(field.rehearsal * self.config.iterations)
+
+        def loss(state: dict[str, Tensor], frame: int) -> Tensor:
+            self.report.check_cancelled()
+            out = self._render(state, frame, sh_degree=0, with_contributions=False)
+            return photometric(out.colors[0], self._image(frame), self.config.dssim)
+
+        points, colors = (t.to(self.device) for t in (self.scene.points, self.scene.colors))
+        field.rehearse(Rehearsal(points, colors, self.times, steps, loss, self.generator))
+        self.iteration += steps
 
     # ------------------------------------------------------------------ one step's parts
 
@@ -247,9 +291,10 @@ class Trainer:
         index = self.train_ids[frame]
         options.setdefault("background", self.background)
         options.setdefault("with_contributions", True)
+        options.setdefault("with_depth", False)
+        degree = options.pop("sh_degree", self.model.sh_degree)
         return render(
-            state, self.model.sh_degree, self.viewmats[index], self.Ks[index], self.width, self.height,
-            with_depth=False, **options,
+            state, degree, self.viewmats[index], self.Ks[index], self.width, self.height, **options
         )  # fmt: skip
 
     def _next_frame(self) -> int:
@@ -265,8 +310,12 @@ class Trainer:
         if field is None or not len(rows):
             return total
         if self.iteration % c.field_every == 0:
-            total = total + c.field_every * field.regularisation()
+            total = total + c.field_every * field.regularisation(self.progress, self.generator)
         return total
+
+    def _is_to_look(self) -> bool:
+        s = self.config.supervision
+        return s.preset == "support" and self.model.field is not None and self.iteration % s.look_every == 0
 
     def _pairs_to_anchor(self, rows: Tensor) -> Anchored | None:
         s = self.config.supervision
@@ -287,28 +336,40 @@ class Trainer:
         on = s.preset == "paper" and self.progress >= s.start and self.model.field is not None
         return on and self.iteration % s.every == 0
 
-    def _paper_step(self, frame: int, rows: Tensor, state: dict[str, Tensor], gradient: Tensor) -> None:
+    def _paper_step(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> None:
         """Adds the paper's terms for this frame and a random other one; their gradients join the step's."""
         other = int(torch.randint(len(self.train_ids), (1,), generator=self.generator, device="cpu"))
-        if self.times[other] == self.times[frame] or not len(rows):
+        if self.times[other] == self.times[frame]:
             return
+        acted = self._acted(frame, rows, state, out)
         other_state = self.model.state_at(self.times[other])
-        out = self._render(other_state, other)
-        exposed = self.model.exposure.apply(out.colors[0], self.times[other])
+        other_state["means"].retain_grad()
+        other_out = self._render(other_state, other)
+        exposed = self.model.exposure.apply(other_out.colors[0], self.times[other])
         photometric(exposed, self._image(other), self.config.dssim).backward(retain_graph=True)
         views = [
-            self._paper_view(self.model.state_at(self.times[frame]), frame, rows, gradient),
-            self._paper_view(other_state, other, rows, out.means2d_grad[0]),
+            self._paper_view(self.model.state_at(self.times[frame]), frame, rows, acted),
+            self._paper_view(other_state, other, rows, self._acted(other, rows, other_state, other_out)),
         ]
         loss = paper_loss(views[0], views[1], self.progress, self.config.supervision)
         if loss is not None and bool(torch.isfinite(loss)):
             loss.backward()
 
-    def _paper_view(self, state: dict[str, Tensor], frame: int, rows: Tensor, gradient: Tensor) -> PaperView:
+    def _acted(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> Tensor:
+        """bool [M]: on which of `rows` the frame acted; `out` and `state` after the frame's own backward pass."""
+        index, pull = self.train_ids[frame], state["means"].grad
+        if pull is None or out.weight_sum is None:
+            raise RuntimeError("the frame was rendered without gradients or contributions")
+        return well_supervised(
+            self.config.supervision, out.weight_sum[0][rows], out.means2d_grad[0][rows], pull[rows],
+            self.Ks[index], self.viewmats[index], state["means"].detach()[rows], (self.width, self.height),
+        )  # fmt: skip
+
+    def _paper_view(self, state: dict[str, Tensor], frame: int, rows: Tensor, acted: Tensor) -> PaperView:
         index = self.train_ids[frame]
         means = state["means"][rows].detach()
         inside = inside_frustum(means, self.viewmats[index], self.Ks[index], self.width, self.height)
-        return PaperView(self.times[frame], {k: v[rows] for k, v in state.items()}, inside, gradient[rows])
+        return PaperView(self.times[frame], {k: v[rows] for k, v in state.items()}, inside, acted)
 
     def _left_out(self, frame: int) -> None:
         """Counts a step that was left out on the CPU; a run that keeps failing ends in words, its checkpoint in place.
@@ -362,9 +423,10 @@ class Trainer:
         return FusedAdam(groups, eps=1e-15)
 
     def _schedule(self) -> None:
-        """Log-linear learning rates from start to end over the run (3DGS get_expon_lr_func)."""
+        """Log-linear learning rates from start to end over the run or a host's part of it (3DGS get_expon_lr_func)."""
         for group in self.optimizer.param_groups:
-            share = self.progress
+            since, until = group.get("since", 0.0), group.get("until", 1.0)
+            share = min(max((self.progress - since) / (until - since), 0.0), 1.0)
             group["lr"] = group["lr_start"] * (group["lr_end"] / group["lr_start"]) ** share
 
     # ------------------------------------------------------------------ held-out frames
@@ -433,8 +495,7 @@ class Trainer:
         self.model = restore_model(tensors, meta, self.config, self.device)
         self.optimizer = self._gaussian_optimizer()
         if self.model.field is not None:
-            for group in self.model.field.parameter_groups():
-                self.optimizer.add_param_group({**group, "lr_start": group["lr"]})
+            self._add_field_groups(self.model.field)
         restore_optimizer(self._named(), self.optimizer, tensors)
         self.densifier = Densifier(self.config.densify, len(self.model.gaussians), self.device)
         for name in ("gradient", "seen"):
@@ -452,10 +513,8 @@ def restore_model(
     centres = tensors["centres"].to(device, copy=True)
     gaussians = Gaussians.from_state(tensors, len(centres)).to(torch.device(device))
     field = None
-    if "field.box" in tensors:
-        field = HexPlane(config.hexplane, tensors["field.box"], torch.Generator(device="cpu").manual_seed(0))
-        field.load_state(tensors)
-        field = field.to(device)
+    if any(name.startswith("field.") for name in tensors):
+        field = host(config.host).restore(config.field, tensors).to(device)
     exposure = Exposure(centres, config.exposure)
     exposure.values.data.copy_(tensors["exposure"])
     return DynamicModel(gaussians, field, centres, int(meta["sh_degree"]), exposure)

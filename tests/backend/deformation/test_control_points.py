@@ -13,7 +13,7 @@ from torch_backend.deformation.control_points import (
     elastic_energy,
 )
 from torch_backend.deformation.geometry import rotation_matrices
-from torch_backend.deformation.hosts import host_config
+from torch_backend.deformation.registry import host_config
 
 BOX = torch.tensor([[-2.0] * 3, [2.0] * 3])
 

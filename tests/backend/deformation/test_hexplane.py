@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torch_backend.deformation import HexPlane, HexPlaneConfig
+from torch_backend.deformation import HexPlane, HexPlaneConfig, Start, host, host_config
 
 BOX = torch.tensor([[-1.0, -2.0, 0.5], [1.0, 2.0, 3.0]])
 
@@ -29,13 +29,13 @@ def stir(module):
 
 def test_identity_at_construction():
     for t in (0.0, 0.3, 1.0):
-        for delta in field()(points(), torch.tensor([t])):
+        for delta in field()(points(), torch.tensor([t])).moved().values():
             assert not delta.any()
 
 
 def test_shapes_and_sizes():
     deltas = field()(points(7), torch.tensor([0.5]))
-    assert [tuple(d.shape) for d in deltas] == [(7, 3), (7, 4), (7, 3), (7,), (7, 1, 3)]
+    assert [tuple(d.shape) for d in deltas.moved().values()] == [(7, 3), (7, 4), (7, 3), (7,), (7, 1, 3)]
 
 
 def test_ends_of_time_hit_the_end_nodes():
@@ -57,7 +57,7 @@ def test_gradients_match_finite_differences_at_float64():
     parameters = [p for p in module.parameters() if p.numel() < 2000][:6]
 
     def loss(*_):
-        return torch.stack([d.sin().sum() for d in module(x, t)]).sum()
+        return torch.stack([d.sin().sum() for d in module(x, t).moved().values()]).sum()
 
     for parameter in parameters:
         assert torch.autograd.gradcheck(loss, (parameter,), eps=1e-6, atol=1e-7, rtol=1e-4)
@@ -66,8 +66,8 @@ def test_gradients_match_finite_differences_at_float64():
 def test_means_get_no_gradient_through_the_lookup():
     x = points().requires_grad_()
     deltas = stir(field())(x, torch.tensor([0.5]))
-    assert torch.stack([d.sum() for d in deltas]).sum().requires_grad
-    assert torch.autograd.grad(sum(d.sum() for d in deltas), x, allow_unused=True)[0] is None
+    assert torch.stack([d.sum() for d in deltas.moved().values()]).sum().requires_grad
+    assert torch.autograd.grad(sum(d.sum() for d in deltas.moved().values()), x, allow_unused=True)[0] is None
 
 
 def test_smoothness_sees_every_axis():
@@ -112,10 +112,68 @@ def test_state_round_trip():
     one = stir(field())
     two = HexPlane(one.config, BOX + 1.0, torch.Generator().manual_seed(5))
     two.load_state(one.state())
-    for a, b in zip(one(points(), torch.tensor([0.2])), two(points(), torch.tensor([0.2])), strict=True):
+    for a, b in zip(
+        one(points(), torch.tensor([0.2])).moved().values(),
+        two(points(), torch.tensor([0.2])).moved().values(),
+        strict=True,
+    ):
         assert torch.equal(a, b)
 
 
 def test_empty_box_is_refused():
     with pytest.raises(ValueError, match="box"):
         HexPlane(HexPlaneConfig(), torch.zeros(2, 3), torch.Generator())
+
+
+def published(iterations=33_000, harmonics=8):
+    start = Start(points(), BOX, points(20) * 2.0, 30, harmonics, torch.Generator().manual_seed(0))
+    return host("hexplane").create(host_config("hexplane", "reference", iterations), start), start
+
+
+def test_the_published_field_moves_everything_from_the_start():
+    module, start = published()
+    deltas = module(points(7), torch.tensor([0.5])).moved()
+    assert {n: tuple(d.shape[1:]) for n, d in deltas.items()} == {
+        "means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh0": (1, 3), "shN": (8, 3),
+    }  # fmt: skip
+    assert all(float(d.abs().max()) > 0 for d in deltas.values())
+    assert torch.equal(module.box, torch.stack([start.points.amin(0), start.points.amax(0)]))
+    assert module.temporal[0].shape[2] == 150
+    optimizer = torch.optim.Adam(module.parameters())
+    module.cover(points() + 100.0, optimizer)
+    assert torch.equal(module.box[0], start.points.amin(0))
+
+
+def test_the_published_field_reaches_only_the_upper_half_of_time():
+    module, _ = published()
+    with torch.no_grad():
+        for plane in module.temporal:
+            plane[:, :, :75] = 0.0
+    still = module.features_at(points(), torch.tensor([0.0]))
+    with torch.no_grad():
+        for plane in module.temporal:
+            plane[:, :, :74] = 7.0
+    assert torch.equal(module.features_at(points(), torch.tensor([0.0])), still)
+    assert torch.equal(
+        module.features_at(points(), torch.tensor([0.5])), module.features_at(points(), torch.tensor([0.5]))
+    )
+
+
+def test_the_published_smoothness_never_sees_x():
+    """Planes are [second axis, first axis]: only what bends down them counts, so x is never smoothed."""
+    for plane_index, axis, counts in ((0, 3, False), (0, 2, True), (1, 3, False), (2, 2, True), (2, 3, False)):
+        module, _ = published()
+        with torch.no_grad():
+            for p in module.spatial:
+                p.fill_(0.3)
+            flat = float(module.regularisation())
+            module.spatial[plane_index].select(axis, 4).add_(1.0)
+            assert (float(module.regularisation()) > flat + 1e-12) == counts
+
+
+def test_published_rates_are_times_the_extent_and_end_with_20_000_steps_of_the_field():
+    module, _ = published()
+    groups = {g["name"]: g for g in module.parameter_groups()}
+    assert groups["field"]["lr"] == pytest.approx(1.6e-3 * 1.1)
+    assert groups["heads"]["lr_end"] == pytest.approx(1.6e-5 * 1.1)
+    assert (groups["field"]["since"], groups["field"]["until"]) == pytest.approx((3 / 33, 23 / 33))

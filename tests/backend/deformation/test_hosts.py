@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from torch_backend.deformation import hosts as registry
+from torch_backend.deformation import registry
 from torch_backend.deformation.protocol import Rehearsal, Start, apply_deltas
 from torch_backend.gaussians import PARAM_NAMES, Gaussians
 
@@ -26,7 +26,7 @@ def cloud(count=120, seed=0):
 
 def start(means, seed=0):
     box = torch.stack([means.amin(0) - 0.1, means.amax(0) + 0.1])
-    return Start(means, box, means, 8, torch.Generator().manual_seed(seed))
+    return Start(means, box, means, 8, 3, torch.Generator().manual_seed(seed))
 
 
 def create(name, configuration="default", means=None, iterations=1000):
@@ -119,7 +119,9 @@ def test_coincident_gaussians_give_finite_gradients(name, configuration):
     means[10:] += torch.tensor([1e-3, 0, 0])
     box = torch.tensor([[-1.0] * 3, [1.0] * 3])
     config = registry.host_config(name, configuration, 1000)
-    field = registry.host(name).create(config, Start(means, box, means + box[0], 8, torch.Generator().manual_seed(0)))
+    field = registry.host(name).create(
+        config, Start(means, box, means + box[0], 8, 3, torch.Generator().manual_seed(0))
+    )
     own = own_rows(field, 20)
     deltas = field(means, torch.rand(20, generator=torch.Generator().manual_seed(4)), own)
     total = torch.stack([d.square().sum() for d in deltas.moved().values()]).sum()

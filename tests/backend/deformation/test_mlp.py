@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from torch_backend.deformation.geometry import quat_product
-from torch_backend.deformation.hosts import host_config
 from torch_backend.deformation.mlp import Mlp, MlpConfig, blurred, encode
 from torch_backend.deformation.protocol import MIN_SCALE, add_to_scale, add_to_unit_quat, turn
+from torch_backend.deformation.registry import host_config
 
 BOX = torch.tensor([[-2.0, -2, 0], [2, 2, 4]])
 

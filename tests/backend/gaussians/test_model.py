@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torch_backend.gaussians import Densifier, DensifyConfig, Gaussians
-from torch_backend.gaussians.model import pack_bits, unpack_bits
+from torch_backend.gaussians.model import PARAM_NAMES, pack_bits, unpack_bits
 
 
 def small_model(count=6, bins=11, sh=4):
@@ -99,3 +99,29 @@ def test_budget_is_never_exceeded_and_nan_is_pruned():
     assert len(model) <= 23
     assert split > 0
     assert torch.isfinite(model.params["means"]).all()
+
+
+def test_a_hosts_own_parameters_ride_through_growth_and_checkpoints():
+    model = small_model()
+    own = model.adopt("hyper", (2,), -0.01)
+    with torch.no_grad():
+        own += torch.arange(6.0)[:, None]
+    model.hidden[3, 5] = True
+    optimizer = adam(model)
+    own.grad = torch.ones_like(own)
+    optimizer.step()
+    values, moments = own.detach().clone(), optimizer.state[own]["exp_avg"].clone()
+    parent = torch.tensor([0, 3, 3, 5])
+    model.rebuild(parent, torch.tensor([False, False, True, False]), optimizer)
+    grown = model.params["hyper"]
+    assert torch.equal(grown.detach(), values[parent])
+    assert torch.equal(optimizer.state[grown]["exp_avg"][[0, 1, 3]], moments[[0, 3, 5]])
+    assert not bool(optimizer.state[grown]["exp_avg"][2].any())
+    assert torch.nonzero(model.hidden).tolist() == [[1, 5], [2, 5]]
+    assert torch.equal(model.own(torch.tensor([2]))["hyper"], grown[2:3])
+    again = Gaussians.from_state(model.state(), 11)
+    assert torch.equal(again.params["hyper"], grown)
+    assert torch.equal(again.hidden, model.hidden)
+    assert list(again.params)[: len(PARAM_NAMES)] == list(PARAM_NAMES)
+    with pytest.raises(ValueError, match="hyper"):
+        again.adopt("hyper", (), 0.0)

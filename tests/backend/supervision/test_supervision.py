@@ -14,12 +14,14 @@ from torch_backend.supervision import (
     bin_of,
     bin_times,
     draw_anchored,
+    mark_hidden,
     mark_seen,
     nearest_bin,
     nearest_supported,
     paper_loss,
     support_confidence,
     support_loss,
+    well_supervised,
 )
 
 
@@ -29,6 +31,7 @@ def model(support):
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh0": (1, 3), "shN": (3, 3)}
     m = Gaussians({n: torch.zeros(count, *shapes[n]) for n in PARAM_NAMES}, support.shape[1])
     m.support = support
+    m.hidden[:] = True
     m.open[:] = True
     return m
 
@@ -77,12 +80,12 @@ class Ramp:
     def __init__(self):
         self.slope = torch.tensor(1.0, requires_grad=True)
 
-    def __call__(self, means, times):
+    def __call__(self, means, times, own=None):
         count = len(means)
         shift = torch.zeros(count, 3)
         shift[:, 0] = 1.0
         moved = shift * (times.expand(count) * self.slope)[:, None]
-        return Deltas(moved, torch.zeros(count, 4), torch.zeros(count, 3), torch.zeros(count), torch.zeros(count, 1, 3))
+        return Deltas(moved, torch.zeros(count, 4), torch.zeros(count, 3))
 
 
 def anchor(m, field, bins):
@@ -102,6 +105,7 @@ def test_drawn_pairs_are_unsupported_and_half_of_them_near_support():
     pairs = draw_anchored(m, torch.arange(3), SupervisionConfig(), torch.Generator().manual_seed(1))
     assert 200 < len(pairs.rows) <= SupervisionConfig().support_samples
     assert not bool(m.support[pairs.rows, pairs.bins].any())
+    assert bool(m.hidden[pairs.rows, pairs.bins].all())
     assert set(pairs.rows.tolist()) == {0, 1}
     assert set(pairs.bins[pairs.rows == 0].tolist()) == {0, 1, 4, 5, 6, 7}
     assert bool((pairs.weights == 1).all())
@@ -131,6 +135,117 @@ def test_support_loss_needs_open_gaussians_that_were_seen():
     assert anchor(m, Ramp(), 3) is None
 
 
+def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
+    """Its owner moved on: the frames say that it is not there, and nothing pulls it back to where it was seen."""
+    m = model([[1, 1, 0, 0, 0, 0]] * 2)
+    m.hidden[0] = False
+    pairs = draw_anchored(m, torch.arange(2), SupervisionConfig(), torch.Generator().manual_seed(1))
+    assert set(pairs.rows.tolist()) == {1}
+    m.hidden[:] = False
+    assert draw_anchored(m, torch.arange(2), SupervisionConfig(), torch.Generator().manual_seed(1)) is None
+
+
+def test_hidden_is_out_of_the_frame_or_behind_what_is_seen():
+    K = torch.tensor([[10.0, 0, 16.0], [0, 10.0, 8.0], [0, 0, 1]])
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 1.0  # the camera stands one unit back
+    means = torch.tensor([[0.0, 0, 2], [0, 0, 1], [0, 0, 2.9], [9.0, 0, 2], [0, 0, -3], [1.0, 0, 4], [0, 0, 2.2]])
+    count = len(means)
+    m = model([[0, 0]] * count)
+    m.hidden[:] = False
+    m.hidden[0, 1] = True
+    state = {"means": means, "log_scales": torch.full((count, 3), math.log(0.05))}
+    state["log_scales"][6, 1] = math.log(0.5)
+    depth = torch.full((16, 32), 3.0)
+    depth[8, 18] = 1e10  # a hole in the picture
+    mark_hidden(m, torch.arange(count), 1, state, viewmat, K, depth)
+    # On the surface, before it, behind it, right of the frame, behind the camera, in the hole, large and half behind.
+    assert m.hidden[:, 1].tolist() == [False, False, True, True, True, False, False]
+    assert not bool(m.hidden[:, 0].any())
+
+
+@pytest.mark.parametrize(("moves_away", "anchored"), [(True, False), (False, True)])
+def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
+    """A dot on a wall fades, in plain view or behind a post that comes before it: only then is it a guess."""
+    from torch_backend.raster import rasterize
+
+    wall = torch.stack(torch.meshgrid(torch.linspace(-2, 2, 17), torch.linspace(-1.5, 1.5, 13), indexing="ij"), -1)
+    wall = torch.cat([wall.reshape(-1, 2), torch.full((221, 1), 4.0)], dim=1)
+    post = torch.tensor([[0.0, 0, 2.0]])
+    means = torch.cat([wall, torch.tensor([[0.0, 0, 3.9]]), post])
+    quats = torch.zeros(223, 4)
+    quats[:, 0] = 1
+    logits = torch.full((223,), 5.0)
+    logits[221] = -6.0  # the dot has faded
+    logits[222] = -9.0 if moves_away else 5.0
+    state = {
+        "means": means,
+        "quats": quats,
+        "log_scales": torch.full((223, 3), math.log(0.15)),
+        "opacity_logits": logits,
+    }
+    K = torch.tensor([[30.0, 0, 16.0], [0, 30.0, 12.0], [0, 0, 1]])
+    out = rasterize(
+        **state, colors=torch.rand(223, 3), viewmats=torch.eye(4)[None], Ks=K[None], width=32, height=24,
+        with_depth=True, with_contributions=True,
+    )  # fmt: skip
+    m = model([[1, 0]] * 223)
+    m.hidden[:] = False
+    mark_seen(m, 1, out.weight_sum[0])
+    mark_hidden(m, torch.tensor([221]), 1, state, torch.eye(4), K, out.depth_median[0])
+    assert not bool(m.support[221, 1])
+    assert bool(m.hidden[221, 1]) == anchored
+
+
+def test_detectors_against_gradients_made_by_hand():
+    K = torch.tensor([[10.0, 0, 16.0], [0, 20.0, 8.0], [0, 0, 1]])
+    means = torch.tensor([[0.0, 0, 2]] * 4)
+    # NDC gradient = pixel gradient * half the image; pixel gradient = gradient of the mean * depth / focal length.
+    pull = torch.tensor([[1.0, -1.0, 0], [-1.0, 1.0, 0], [-1.0, 3.0, 0], [0, 0, 7.0]])
+    sums = [1 * 2 / 10 * 16 - 1 * 2 / 20 * 8, -3.2 + 0.8, -3.2 + 2.4, 0.0]
+    norm = torch.tensor([0.5, 1e-8, 1e-10, 0.0])
+    weight = torch.tensor([0.0, 0.05, 3.0, 0.2])
+
+    def acted(detector, viewmat):
+        config = SupervisionConfig(detector=detector)
+        place = (means - viewmat[:3, 3]) @ viewmat[:3, :3]
+        turned = pull @ viewmat[:3, :3]
+        return well_supervised(config, weight, norm, turned, K, viewmat, place, (32, 16)).tolist()
+
+    straight = torch.eye(4)
+    assert acted("weight", straight) == [False, False, True, True]
+    assert acted("grad_norm", straight) == [True, True, False, False]
+    assert acted("grad_signed", straight) == [s > 0 for s in sums] == [True, False, False, False]
+    camera = torch.eye(4)
+    camera[:3, :3] = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    camera[:3, 3] = torch.tensor([0.3, -0.2, 0.5])
+    assert acted("grad_signed", camera) == acted("grad_signed", straight)
+    with pytest.raises(ValueError, match="grad_signed"):
+        acted("gradient", straight)
+
+
+def test_the_signed_sum_agrees_with_the_rasterisers_own_norm():
+    """The gradient of the means across the line of sight is the screen gradient, up to the Gaussian's shape."""
+    from torch_backend.raster import rasterize
+
+    g = torch.Generator().manual_seed(0)
+    count = 60
+    means = (torch.rand(count, 3, generator=g) - 0.5) * torch.tensor([2.0, 1.4, 1.0]) + torch.tensor([0, 0, 4.0])
+    means.requires_grad_()
+    quats = torch.randn(count, 4, generator=g)
+    K = torch.tensor([[40.0, 0, 24.0], [0, 40.0, 16.0], [0, 0, 1]])
+    out = rasterize(
+        means, quats, torch.full((count, 3), math.log(0.06)), torch.zeros(count), torch.rand(count, 3, generator=g),
+        viewmats=torch.eye(4)[None], Ks=K[None], width=48, height=32,
+    )  # fmt: skip
+    (out.colors[0] - torch.rand(32, 48, 3, generator=g)).square().mean().backward()
+    pixel = means.grad[:, :2] * means.detach()[:, 2:] / 40.0
+    norm = out.means2d_grad[0]
+    seen = norm > 1e-6
+    assert int(seen.sum()) > 40
+    assert float(((pixel.norm(dim=1) - norm).abs() / norm)[seen].median()) < 0.05
+
+
 def view(time, x, inside, gradient, flip=1.0):
     count = len(x)
     quats = torch.zeros(count, 4)
@@ -144,7 +259,7 @@ def view(time, x, inside, gradient, flip=1.0):
         "opacity_logits": torch.zeros(count),
         "sh0": torch.zeros(count, 1, 3),
     }
-    return PaperView(time, state, torch.tensor(inside), torch.tensor(gradient))
+    return PaperView(time, state, torch.tensor(inside), torch.tensor(gradient) > 1e-9)
 
 
 def test_paper_hidden_goes_to_the_past_defective_to_the_future():

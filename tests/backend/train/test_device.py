@@ -47,7 +47,10 @@ def test_the_checker_sees_a_tensor_made_anywhere(monkeypatch):
     assert len(mode.found) == 1
 
 
-@pytest.mark.parametrize(("method", "supervision"), [("auto", "support"), ("hexplane", "paper")])
+@pytest.mark.parametrize(
+    ("method", "supervision"),
+    [("auto", "support"), ("hexplane", "paper"), ("mlp", "paper"), ("control_points", "support")],
+)
 def test_stations_say_where_every_tensor_is_made(world, quiet, method, supervision):
     name = f"named-{method}"
     params = TrainParams(run=name, iterations=60, max_gaussians=1500, method=method, supervision=supervision)

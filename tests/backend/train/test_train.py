@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from torch_backend.contract import Cancelled, JobError, TrainParams
+from torch_backend.gaussians import PARAM_NAMES
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params, load_run, train_shot
-from torch_backend.train.checkpoint import load_checkpoint
+from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 from torch_backend.train.config import config_from_json, config_to_json
 from torch_backend.train.trainer import Trainer, inside_frustum
 
@@ -60,25 +61,98 @@ def test_a_finished_run_is_not_trained_again(world, quiet):
     assert ("progress", "training", 1, 1, "already trained") in report.events
 
 
-@pytest.mark.parametrize(("method", "supervision"), [("static", "none"), ("hexplane", "paper"), ("auto", "paper")])
-def test_every_method_and_preset_of_supervision_runs(world, quiet, method, supervision):
-    summary = train_shot(
-        world.shot, short(world, f"m-{method}-{supervision}", method=method, supervision=supervision), quiet()
-    )
+@pytest.mark.parametrize(
+    ("method", "supervision", "more"),
+    [
+        ("static", "none", {}),
+        ("auto", "paper", {}),
+        ("hexplane", "paper", {"detector": "weight"}),
+        ("hexplane", "support", {"host_config": "reference"}),
+        ("mlp", "paper", {"detector": "grad_signed"}),
+        ("mlp", "support", {"host_config": "reference"}),
+        ("control_points", "support", {}),
+        ("control_points", "paper", {"host_config": "reference"}),
+    ],
+)
+def test_every_method_and_preset_of_supervision_runs(world, quiet, method, supervision, more):
+    name = "-".join(["m", method, supervision, *more.values()])
+    report = quiet()
+    summary = train_shot(world.shot, short(world, name, method=method, supervision=supervision, **more), report)
     assert math.isfinite(summary["heldout_psnr_db"])
-    assert (summary["moving_share"] > 0) == (method != "static") or method == "auto"
+    assert not [e for e in report.events if e[0] == "warning" and "skipped" in e[1]]
+    assert summary["host_config"] == more.get("host_config", "default")
+    if method != "auto":
+        assert summary["moving_share"] == (method != "static")
+    again = load_run(world.shot, name).model
+    assert again.gaussians.params.keys() - PARAM_NAMES == ({"hyper"} if method == "control_points" else set())
+    with torch.no_grad():
+        assert all(bool(torch.isfinite(v).all()) for v in again.state_at(0.4).values())
+
+
+@pytest.mark.parametrize("host", ["mlp", "control_points"])
+def test_any_host_works_behind_the_gate_and_resumes(world, quiet, host):
+    """More Gaussians, split and pruned while the field is there: a host's own parameters grow with them."""
+
+    def params(run):
+        return TrainParams(run=f"{run}-{host}", iterations=200, max_gaussians=1500, host=host)
+
+    report = quiet()
+    summary = train_shot(world.shot, params("whole"), report)
+    assert 0 < summary["moving_share"] < 0.5
+    assert summary["host"] == host
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, params("broken"), quiet(cancel_at=("training", 0.7)))
+    train_shot(world.shot, params("broken"), quiet())
+    whole, _ = load_checkpoint(world.shot.run(f"whole-{host}") / "checkpoint.safetensors")
+    broken, _ = load_checkpoint(world.shot.run(f"broken-{host}") / "checkpoint.safetensors")
+    assert whole.keys() == broken.keys()
+    for name, value in whole.items():
+        torch.testing.assert_close(value, broken[name], rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_runs_of_before_there_were_hosts_are_read(world, quiet):
+    train_shot(world.shot, short(world, "old", method="hexplane"), quiet())
+    path = world.shot.run("old") / "checkpoint.safetensors"
+    tensors, meta = load_checkpoint(path)
+    config = meta["config"]
+    config["hexplane"] = {
+        k: v for k, v in config.pop("field").items() if k not in ("start", "detached", "until", "published")
+    }
+    config["hexplane"]["time_nodes"] = tensors["field.temporal.0"].shape[2]
+    for name in ("host", "host_config"):
+        config.pop(name)
+    for name in ("detector", "look_every"):
+        config["supervision"].pop(name)
+    tensors.pop("gaussians.hidden")
+    before = load_run(world.shot, "old").model.state_at(0.3)
+    save_checkpoint(path, tensors, meta)
+    run = load_run(world.shot, "old")
+    assert run.config.host == "hexplane"
+    assert not bool(run.model.gaussians.hidden.any())
+    for name, value in run.model.state_at(0.3).items():
+        assert torch.equal(value, before[name])
 
 
 def test_wrong_choices_are_named():
     with pytest.raises(ValueError, match="preset"):
         config_from_params(TrainParams(preset="fast"))
+    with pytest.raises(ValueError, match="detector"):
+        config_from_params(TrainParams(detector="loud"))
+    with pytest.raises(ValueError, match="control_points"):
+        config_from_params(TrainParams(host="nerf"))
+    with pytest.raises(ValueError, match="reference"):
+        config_from_params(TrainParams(host_config="published"))
     with pytest.raises(ValueError, match="iterations"):
         config_from_params(TrainParams(iterations=3))
 
 
 def test_config_round_trip():
-    config = config_from_params(TrainParams(preset="final", supervision="paper"))
-    assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config
+    for host in ("hexplane", "mlp", "control_points"):
+        for host_config in ("default", "reference"):
+            params = TrainParams(preset="final", supervision="paper", method=host, host_config=host_config)
+            config = config_from_params(params)
+            assert config.host == host
+            assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config
 
 
 def test_a_run_of_other_settings_is_not_taken_for_this_one(world, quiet):
