@@ -36,8 +36,12 @@ def for_all(strategy, body, usual, generated, holds):
 
 
 EXTREMES = [0.0, -0.0, 1e-45, -1e-45, 1e-38, 1e-8, 1e8, -1e8, 1e30, -1e30, 3e38, -3e38, math.inf, -math.inf, math.nan]
-ANY = st.one_of(st.floats(width=32), st.sampled_from(EXTREMES), st.floats(-3, 3, width=32))
+ANY = st.one_of(st.floats(width=32), st.sampled_from(EXTREMES), st.floats(-3, 3, width=32),
+                st.sampled_from([math.nan, math.inf, -math.inf]))
 UNIT = st.floats(-1, 1, width=32)
+IN_VIEW = [0.0, 0.0, 2.0, 0.3, 0.2, 3.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.2, 0.1, 0.3, -1.0, -1.0, -1.0, -1.0, -1.5, -1.0,
+           1.0, 0.0, 0.8, 0.4, 0.2, 0.1, 0.5, 0.9]
+"""Means, quaternions, log-scales, opacity logits and colours of two Gaussians."""
 SIZES = st.sampled_from([(1, 1), (7, 5), (16, 16), (17, 3), (20, 18), (1, 33)])
 NEAR = 0.0625
 """A float32 number, so that all bodies cull by the same plane."""
@@ -195,7 +199,11 @@ def test_any_numbers_give_sane_images_and_gradients(body, generated):
             assert not torch.isnan(leaf.grad).any(), name
             assert torch.isfinite(leaf.grad).all() or color.nan_to_num().abs().max() > 1e6, name
 
-    example = st.tuples(st.lists(ANY, min_size=28, max_size=28), st.sampled_from([None, 0, 1]), st.booleans())
+    # Two Gaussians in view with up to four of their numbers replaced by any; or nothing but any numbers.
+    replaced = st.dictionaries(st.integers(0, 27), ANY, max_size=4)
+    patched = replaced.map(lambda new: [new.get(i, value) for i, value in enumerate(IN_VIEW)])
+    values = st.one_of(patched, st.lists(ANY, min_size=28, max_size=28))
+    example = st.tuples(values, st.sampled_from([None, 0, 1]), st.booleans())
     for_all(example, body, 200, generated, holds)
 
 
