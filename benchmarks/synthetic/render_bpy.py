@@ -215,6 +215,7 @@ class Stage:
             self._take(job["bands"][0], beside)
         else:
             self._take_strips(job["bands"], beside)
+        beside.write_bytes(_bare(beside.read_bytes()))
         os.replace(beside, out)
 
     def _take(self, band: dict[str, Any], path: Path) -> None:
@@ -261,6 +262,17 @@ class Stage:
         light = np.concatenate(values)
         middle, bright = np.median(light), np.quantile(light, 0.92)
         return float(np.log2(min(METER_GREY / max(middle, 1e-6), METER_BRIGHT / max(bright, 1e-6))))
+
+
+def _bare(png: bytes) -> bytes:
+    """A PNG without its notes: Blender writes the date and how long it took, so that no two files are the same."""
+    kept, at = [png[:8]], 8
+    while at < len(png):
+        end = at + 12 + int.from_bytes(png[at : at + 4], "big")
+        if png[at + 4 : at + 8] in (b"IHDR", b"IDAT", b"IEND"):
+            kept.append(png[at:end])
+        at = end
+    return b"".join(kept)
 
 
 def _pixels(path: Path) -> np.ndarray:
