@@ -196,7 +196,7 @@ class Paired:
     frame_se: float | None
     """The standard error if every frame were independent, which frames of one run are not: too small."""
     verdict: str
-    """win: the difference is to a's favour by more than twice `se`; loss; undecided."""
+    """win: the difference is to a's favour by more than twice `se`; loss; undecided, as with fewer than four units."""
 
 
 def paired(a: Mapping[Key, float | None], b: Mapping[Key, float | None], more_is_better: bool = True) -> Paired | None:
@@ -219,7 +219,8 @@ def paired(a: Mapping[Key, float | None], b: Mapping[Key, float | None], more_is
     which = np.array([index[group] for group in groups])
     se, frame_se = _clustered_error(values, which), _clustered_error(values, np.arange(len(values)))
     gain = float(values.mean()) * (1 if more_is_better else -1)
-    verdict = "undecided" if se is None or abs(gain) <= 2.0 * se else "win" if gain > 0 else "loss"
+    open_still = se is None or len(index) < _LEAST_UNITS or abs(gain) <= 2.0 * se
+    verdict = "undecided" if open_still else "win" if gain > 0 else "loss"
     return Paired(float(values.mean()), se, unit, len(index), len(values), frame_se, verdict)
 
 

@@ -238,7 +238,7 @@ def _comparisons(settings: Sequence[Setting], regions: Sequence[str], title: str
     note = (
         "A win or a loss: the mean difference over frames exceeds twice its standard error. Frames of one run fail "
         "together, so the error is taken over runs (scene and seed) where there are at least four, else over freezes "
-        "(and t*), else over frames, which is too small an error."
+        "(and t*), else over frames, which is too small an error. Fewer than four units decide nothing."
     )
     return Table(title, header, rows, note, marks)
 

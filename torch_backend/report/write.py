@@ -59,7 +59,7 @@ def _facts(records: Sequence[RunRecord], command: str) -> list[str]:
     machines = sorted({f"{r.machine['processor']}, {r.machine['cores']} cores" for r in records if r.machine})
     dates = sorted(r.finished for r in records if r.finished)
     scenes = sorted({f"{r.scene} ({r.kind}, {r.cameras} cameras)" for r in records})
-    lines = [f"{len(records)} runs on {len(scenes)} scenes: {', '.join(scenes)}"]
+    lines = [f"Runs: {len(records)}; scenes: {', '.join(scenes)}"]
     lines += [f"Machine: {'; '.join(machines)}"] if machines else []
     lines += [f"Runs finished {dates[0]} to {dates[-1]} UTC"] if dates else []
     lines = [html.escape(line) for line in lines]

@@ -193,6 +193,8 @@ def test_few_runs_are_compared_by_freezes_then_by_frames():
     one = {("s", "exact", 0, 0, 0): 1.0}
     assert paired(one, {("s", "exact", 0, 0, 0): 0.0}).verdict == "undecided"
     assert paired(one, {}) is None
+    three = {("s", "exact", 0, 0, p): 5.0 + 0.01 * p for p in range(3)}  # 500 standard errors of three frames
+    assert paired(three, dict.fromkeys(three, 0.0)).verdict == "undecided"
 
 
 def test_the_error_of_equal_clusters_is_that_of_their_means():
