@@ -310,21 +310,24 @@ def errors(name: str, bodies: dict[str, Body]) -> dict[str, Any]:
 
 
 def _peak(size: tuple[int, int, int], body: Body) -> float:
-    """MiB by which two frames raise this process's peak (CUDA: the most that torch held)."""
+    """Most MiB that two frames hold beyond the workload itself (CUDA: the most that torch held)."""
     torch.set_num_threads(body.threads)
     case = _Case(room(*size), body)
     if body.device == "cuda":
         case.image()
         case.image()
         return torch.cuda.max_memory_allocated() / 2**20
-    import resource
-
     _Case(room(100, 32, 32), body).image()  # compiler and libraries are no part of a frame
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    def resident(name: str) -> float:  # not getrusage's ru_maxrss, which a child inherits
+        lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+        return next(float(line.split()[1]) for line in lines if line.startswith(name)) / 2**10
+
+    before = resident("VmRSS:")
+    pathlib.Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
     case.image()
     case.image()
-    units = 2**20 if sys.platform == "darwin" else 2**10  # macOS counts bytes, Linux kibibytes
-    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / units
+    return resident("VmHWM:") - before
 
 
 def memory(size: tuple[int, int, int], bodies: dict[str, Body]) -> dict[str, float]:
@@ -372,7 +375,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--limit", action="store_true",
                         help="also measure blending's cycles per lane against benchmarks/hot_loop.py (CPU only)")
     parser.add_argument("--scaling", action="store_true", help="also time along N, pixels and threads")
-    parser.add_argument("--memory", action="store_true", help="also measure the peak memory of each body")
+    parser.add_argument("--memory", action="store_true", help="also measure each body's peak memory (Linux, or CUDA)")
     parser.add_argument("--errors", action="store_true", help="also compare with the float64 oracle on W0 and W1")
     parser.add_argument("--json", type=pathlib.Path, metavar="FILE", help="write all figures there as well")
     arguments = parser.parse_args()
@@ -381,6 +384,8 @@ def _arguments() -> argparse.Namespace:
         parser.error(f"no such workload: {', '.join(unknown)}; there are {', '.join(WORKLOADS)}")
     if arguments.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch finds no CUDA device on this machine")
+    if arguments.memory and arguments.device == "cpu" and not pathlib.Path("/proc/self/clear_refs").exists():
+        parser.error("--memory: on the CPU it needs Linux's /proc")
     if arguments.limit and arguments.device != "cpu":
         parser.error("--limit: the hot loop is the CPU body's")
     return arguments
