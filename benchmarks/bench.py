@@ -388,7 +388,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--tuning", action="store_true", help="scenes to tune on instead of those to report on")
     parser.add_argument("--truth", action="append", default=[], metavar="FOLDER", help="scene with rendered truth")
     parser.add_argument("--shot", action="append", default=[], metavar="SHOT", help="solved shot of a real clip")
-    parser.add_argument("--results", default="bench", metavar="DIR", help="records, pictures and report")
+    parser.add_argument("--results", default="output/bench", metavar="DIR", help="records, pictures and report")
     parser.add_argument("--preset", action="append", choices=tuple(PRESETS), help="default: preview")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="training seeds 0 to N - 1")
     parser.add_argument("--reference", action="store_true", help="hosts with the published settings as well")

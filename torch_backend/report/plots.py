@@ -12,7 +12,7 @@ from ..footage.images import read_png
 from ..shot import atomic_path
 from .metrics import pareto_front
 from .records import Picture, RunRecord
-from .tables import Setting
+from .tables import HOST_NAMES, Setting
 
 COSTS = {
     "seconds": ("training, seconds", lambda run: run.train_seconds),
@@ -50,7 +50,7 @@ def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str, t
     if not points:
         return None
     ink, grid, ground = THEMES[theme]
-    figure, axes = _figure((7.2, 4.6), theme)
+    figure, axes = _figure((7.2, 5.0), theme)
     front = pareto_front([p[1] for p in points], [p[2] for p in points])
     axes.step([points[i][1] for i in front], [points[i][2] for i in front], where="post", color=ink, lw=1, ls=":")
     for i, (s, price, psnr) in enumerate(points):
@@ -59,7 +59,9 @@ def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str, t
                      facecolors=colour if i in front else ground)  # fmt: skip
     axes.set_xscale("log")
     _limits(axes, [p[1] for p in points])
-    _labels(axes, [(p[1], p[2], p[0].label, _COLOURS.get(p[0].host, ink)) for p in points])
+    named = [p for p in points if p[0].host == "auto" or p[0].variant != "default"]
+    _labels(axes, [(p[1], p[2], p[0].label, _COLOURS.get(p[0].host, ink)) for p in named])
+    _legend(figure, [p[0] for p in points], ink)
     axes.set_xlabel(axis + " (logarithmic, less is better)")
     axes.set_ylabel("PSNR of frozen frames, dB")
     axes.set_title("Filled and joined: no other is better in both", fontsize=9, color=ink, loc="left")
@@ -78,6 +80,21 @@ def _limits(axes: Any, prices: Sequence[float]) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
+def _legend(figure: Any, settings: Sequence[Setting], ink: str) -> None:
+    """Colours of the hosts and markers of the supervisions, under the plot."""
+    from matplotlib.lines import Line2D
+
+    plain = {"color": "none", "markersize": 7}
+    hosts = dict.fromkeys(s.host for s in settings)
+    keys = [Line2D([], [], marker="o", markerfacecolor=_COLOURS.get(h, ink), markeredgecolor="none", **plain,
+                   label=HOST_NAMES.get(h, h)) for h in hosts]  # fmt: skip
+    kinds = {"none": "no anchors", "paper": "paper", "support": "support"}
+    used = [name for name in kinds if any(s.supervision == name for s in settings)]
+    keys += [Line2D([], [], marker=_MARKERS[name], markerfacecolor="none", markeredgecolor=ink, **plain,
+                    label=kinds[name]) for name in used]  # fmt: skip
+    figure.legend(handles=keys, loc="outside lower center", ncols=4, frameon=False, fontsize=8, labelcolor=ink)
+
+
 def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
     """Names to the right of points, pushed apart where they would lie on one another; (x, y, name, colour)."""
     from matplotlib.patheffects import withStroke
@@ -93,7 +110,9 @@ def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
         placed.append((x, at))
         line = {"arrowstyle": "-", "color": colour, "lw": 0.5} if at - y > gap / 2 else None
         halo = [withStroke(linewidth=3, foreground=axes.get_facecolor())]
-        text = axes.annotate(name, (x, y), (x * 1.06, at), fontsize=8, color=colour, va="center", arrowprops=line)
+        text = axes.annotate(
+            name, (x, y), (x * 1.06, at), fontsize=8, color=colour, va="center", arrowprops=line, zorder=2
+        )
         text.set_path_effects(halo)
 
 
