@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from . import reference
+from . import cpu, reference
 from .constants import SIDE_MAX
 from .settings import RasterOutput, RasterSettings, Scene
 
@@ -136,6 +136,4 @@ def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: 
         from . import cuda
 
         return cuda.rasterize(scene)
-    from . import cpu
-
     return cpu.rasterize(scene)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from . import cpu_source as source
@@ -52,9 +53,7 @@ def _without_notice() -> Iterator[None]:
 
 
 def _import_warp():
-    """Import and initialise Warp without a word on the terminal."""
-    import warp as wp
-
+    """Warp, initialised without a word on the terminal."""
     if not _kernels:
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
         with _without_notice():
