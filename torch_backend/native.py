@@ -70,10 +70,16 @@ class Snippet:
         return launch
 
 
-@functools.lru_cache(maxsize=8)
+@functools.cache
 def _stream(device: str, handle: int) -> Any:
     wp = cpu._import_warp()
     return wp.Stream(wp.get_device(device), cuda_stream=handle)
+
+
+def warp_stream(device: torch.device) -> Any:
+    """Warp's name for torch's current stream of a CUDA device; kept for good, as torch keeps its streams."""
+    current = torch.cuda.current_stream(device)
+    return _stream(f"cuda:{current.device_index}", current.cuda_stream)
 
 
 def launch_on(kernel: Any, dim: Any, inputs: list[Any], device: torch.device) -> None:
@@ -82,5 +88,6 @@ def launch_on(kernel: Any, dim: Any, inputs: list[Any], device: torch.device) ->
     if device.type == "cpu":
         wp.launch(kernel, dim=dim, inputs=inputs, device="cpu")
         return
-    current = torch.cuda.current_stream(device)
-    wp.launch(kernel, dim=dim, inputs=inputs, stream=_stream(f"cuda:{current.device_index}", current.cuda_stream))
+    # Warp leaves its device current; the caller's may be another one.
+    with torch.cuda.device(device):
+        wp.launch(kernel, dim=dim, inputs=inputs, stream=warp_stream(device))

@@ -10,8 +10,9 @@ then search all Gaussians in depth order (see `cuda_source.py`), and a later cal
 says, on the device, how many hits a call had and how many its list held.
 
 **CUDA graphs.** `rasterize` and its backward pass can be captured, for instance by `torch.cuda.graph`, after a call of
-the same shapes outside (it compiles the kernels). The list then stays as large as it was at capture; look at `hits` now
-and then, and capture again when its first number has outgrown the second.
+the same shapes and its backward pass outside (they compile the kernels). The list then stays as large as it was at
+capture; look at `hits` now and then, and when its first number has outgrown the second, make a call outside, which
+learns of it, and capture again.
 """
 
 import threading
@@ -20,7 +21,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from ..native import warp_stream
 from . import cuda_source as source
 from .constants import TILE
 from .cpu import _import_warp
@@ -33,7 +36,6 @@ _HITS_MAX = 2**27
 _HITS_STEP = 2**12
 _lock = threading.RLock()
 _kernels: dict[tuple[str, int], Any] = {}
-_streams: dict[tuple[int, int], Any] = {}
 _demands: dict[tuple[torch.device, int, int, int], "_Demand"] = {}
 
 
@@ -50,24 +52,31 @@ def build(name: str, channels: int = 0):
     with _lock:
         if (name, channels) in _kernels:
             return _kernels[name, channels]
-        wp = _import_warp()
-        structure = _structure(wp)
-        text = (source.blending(channels) if channels else source.stages())[name]
-
-        def native(args, task): ...
-
-        native.__annotations__ = {"args": structure, "task": wp.int32}
-        native.__name__ = native.__qualname__ = f"{name}_native"
-        function = wp.func_native(text)(native)
-
-        def entry(args):
-            function(args, wp.tid())
-
-        entry.__annotations__ = {"args": structure}
-        _kernels[name, channels] = wp.Kernel(
-            entry, key=name, module=wp.get_module(module_name(name, channels)),
-            options={"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK})
+        # All kernels of a module at once: for one that came later Warp would compile the module again, and unload the
+        # code that CUDA graphs of the earlier ones still run.
+        texts = {name: source.blending(channels)[name]} if channels else source.stages()
+        for each, text in texts.items():
+            _kernels[each, channels] = _kernel(each, text, module_name(each, channels))
         return _kernels[name, channels]
+
+
+def _kernel(name: str, text: str, module: str):
+    """Warp kernel `name` with the body `text`."""
+    wp = _import_warp()
+    structure = _structure(wp)
+
+    def native(args, task): ...
+
+    native.__annotations__ = {"args": structure, "task": wp.int32}
+    native.__name__ = native.__qualname__ = f"{name}_native"
+    function = wp.func_native(text)(native)
+
+    def entry(args):
+        function(args, wp.tid())
+
+    entry.__annotations__ = {"args": structure}
+    return wp.Kernel(entry, key=name, module=wp.get_module(module),
+                     options={"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK})
 
 
 def module_name(name: str, channels: int = 0) -> str:
@@ -89,17 +98,8 @@ class _Launcher:
     """Launches kernels on torch's current stream of one device."""
 
     def __init__(self, device: torch.device):
-        self.wp = wp = _import_warp()
-        self.device = device
-        if device.type == "cuda":
-            handle = torch.cuda.current_stream(device).cuda_stream
-            key = (device.index or 0, handle)
-            with _lock:
-                if key not in _streams:
-                    _streams[key] = wp.stream_from_torch(torch.cuda.current_stream(device))
-            self.where: dict[str, Any] = {"stream": _streams[key]}
-        else:
-            self.where = {"device": "cpu"}
+        self.wp, self.device = _import_warp(), device
+        self.where = {"stream": warp_stream(device)} if device.type == "cuda" else {"device": "cpu"}
 
     def __call__(self, name: str, args: Any, threads: int, channels: int = 0) -> None:
         """Run kernel `name` on at least `threads` threads."""
@@ -132,8 +132,10 @@ class _Demand:
     """How many hits calls of one shape want: a running maximum on the device, and its echo on the host."""
 
     def __init__(self, device: torch.device):
-        self.most = torch.zeros(1, dtype=torch.int64, device=device)
-        self.echo = torch.zeros(1, dtype=torch.int64, pin_memory=device.type == "cuda")
+        # Made for all later calls, so not a tensor of the inference mode that the first one may be in.
+        with torch.inference_mode(False):
+            self.most = torch.zeros(1, dtype=torch.int64, device=device)
+            self.echo = torch.zeros(1, dtype=torch.int64, pin_memory=device.type == "cuda")
         self.host = self.echo.numpy()
         self.capacity = 0
 
@@ -155,20 +157,17 @@ def _capturing(device: torch.device) -> bool:
 
 
 def _demand(scene: Scene) -> _Demand:
-    """The demand of calls like this one, brought up to date unless a graph is being captured."""
+    """The demand of calls like this one, brought up to date."""
     device, cameras = scene.means.device, scene.viewmats.shape[0]
-    capturing = _capturing(device)
     with _lock:
         key = (device, cameras, scene.width, scene.height)
         if key not in _demands:
-            if capturing:
+            if _capturing(device):
                 raise RuntimeError("capture a rasterize call as a CUDA graph only after one of the same device, image "
                                    "size and number of cameras outside the capture")
             _demands[key] = _Demand(device)
-        demand = _demands[key]
-        if not capturing:
-            demand.grow(cameras * scene.means.shape[0])
-        return demand
+        _demands[key].grow(cameras * scene.means.shape[0])
+        return _demands[key]
 
 
 def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
@@ -279,6 +278,7 @@ class _Rasterize(torch.autograd.Function):
         return image, alpha, *extras
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, *grads):
         (means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, record, aux, hit_count,
          order, ends, sorted_slot, tile_start, tile_end, _) = ctx.saved_tensors
@@ -319,7 +319,7 @@ def warm_up(channels: int = 3, device: torch.device | str = "cuda") -> None:
     wp = _import_warp()
     names = [(name, 0) for name in source.stages()] + [(name, channels) for name in source.blending(channels)]
     modules = {module_name(*each): build(*each) for each in names}
-    with nullcontext() if device.type == "cuda" else _Fibers(wp):
+    with torch.cuda.device(device) if device.type == "cuda" else _Fibers(wp):
         for module in modules:
             wp.load_module(module, device=str(device), block_dim=source.BLOCK)
 
@@ -341,9 +341,11 @@ def rasterize(scene: Scene) -> RasterOutput:
         raise ValueError(f"{cameras} cameras of {scene.width} x {scene.height} px with {n} Gaussians are too much for "
                          "one call: split the cameras")
     norms = (torch.zeros(cameras, n, device=device), torch.zeros(cameras, n, device=device))
-    image, alphas, median, radii, means2d, weight_sum, weight_max, top_ids, top_weights, hits = _Rasterize.apply(
-        scene, norms, scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh,
-        scene.viewmats, scene.background)
+    # Warp leaves its device current; a caller's may be another one.
+    with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
+        image, alphas, median, radii, means2d, weight_sum, weight_max, top_ids, top_weights, hits = _Rasterize.apply(
+            scene, norms, scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh,
+            scene.viewmats, scene.background)
     colors, depth = image, None
     if scene.with_depth:
         colors, depth_sum = image[..., :-1], image[..., -1]

@@ -28,4 +28,6 @@ def cuda_refusal() -> str:
         return "PyTorch sees no NVIDIA GPU."
     if not _import_warp().is_cuda_available():
         return "PyTorch sees the NVIDIA GPU, but Warp does not: update the NVIDIA driver to version 580 or newer."
+    if torch.cuda.get_device_capability() < (7, 5):
+        return "The NVIDIA GPU is too old: it must be of the Turing generation (compute capability 7.5) or later."
     return ""

@@ -245,6 +245,33 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
     assert run(scene, device).hits[1] >= wanted
 
 
+def test_kernels_of_a_module_are_made_together(monkeypatch):
+    # One that came later would make Warp unload the others, under CUDA graphs that hold them.
+    wp = cuda._import_warp()
+    monkeypatch.setattr(cuda, "_kernels", {("", 0): cuda._structure(wp)})
+    monkeypatch.setattr(cuda, "module_name", lambda name, channels=0: "tests.raster.cuda.fresh")
+    cuda.build("raster_project")
+    assert set(wp.get_module("tests.raster.cuda.fresh").kernels) == set(cuda.source.stages())
+
+
+def test_training_follows_a_first_call_in_inference_mode(tools, device, monkeypatch):
+    monkeypatch.setattr(cuda, "_demands", {})
+    scene = tools.cloud(20, 24, 17)
+    with torch.inference_mode():
+        seen = on_host(run(scene, device))
+    out, grads = gradients(scene, device)
+    assert torch.equal(out.colors, seen.colors)
+    assert grads["means"].abs().sum() > 0
+
+
+def test_second_derivatives_are_refused(tools, device):
+    leaves = tools.cloud(20, 24, 17).leaves()
+    out = run(tools.cloud(20, 24, 17), device, leaves)
+    (grad,) = torch.autograd.grad(out.colors.square().sum(), leaves["means"], create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        grad.sum().backward()
+
+
 def test_wide_tile_numbers_sort_alike(tools, device, monkeypatch):
     scene = tools.cloud(60, 50, 40, seed=2)
     narrow = on_host(run(scene, device))
