@@ -124,11 +124,12 @@ class RealScene:
         picked = np.linspace(0, len(solved) - 1, min(instants, len(solved))).round().astype(int)
         self.t_stars = [solved[i] for i in picked]
         self.key = content_key(read_json(shot.solve / "cameras.json"), self.t_stars)
-        self._cache = Path(cache) / f"rigid-{self.key}.npz"
+        self._cache, self._asked = Path(cache), set[int]()
         self._masks: dict[int, Tensor] = {}
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
         """Held-out frames more than a quarter of the clip away from t*."""
+        self._asked |= set(held_out)
         return far_from(held_out, t_star, self._scene.frames[-1] - self._scene.frames[0] + 1)
 
     def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
@@ -137,22 +138,24 @@ class RealScene:
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
         """The rigid pixels of the plate; one counts if nearly all of it is."""
-        if not self._masks:
-            self._masks = self._load_masks()
+        if pose not in self._masks:
+            self._masks = self._load_masks(sorted({*self._asked, pose}))
         mask = self._masks[pose].float()[None, None]
         return {RIGID: F.interpolate(mask, (height, width), mode="area")[0, 0] > 0.95}
 
-    def _load_masks(self) -> dict[int, Tensor]:
-        """The masks of all solved frames, from the cache or from optical flow."""
+    def _load_masks(self, frames: list[int]) -> dict[int, Tensor]:
+        """The masks of `frames`, from the cache or from optical flow."""
         scene = self._scene
-        if not self._cache.is_file():
+        cached = self._cache / f"rigid-{content_key(self.key, frames)}.npz"
+        if not cached.is_file():
             width = min(_FLOW_WIDTH, scene.width)
             height = round(scene.height * width / scene.width)
             plates = np.stack([resize(read_png(scene.image_path(i)), width, height) for i in scene.solved])
             plates = plates if plates.dtype == np.uint8 else (plates >> 8).astype(np.uint8)
             Ks = scene.camera_at(width, height)[scene.solved].numpy()
-            masks = rigid_mask(plates, scene.viewmats[scene.solved].numpy(), Ks)
-            with atomic_path(self._cache) as beside:
-                np.savez_compressed(beside, masks=masks, frames=[scene.frames[i] for i in scene.solved])
-        with np.load(self._cache, allow_pickle=False) as stored:
-            return {int(f): torch.from_numpy(m) for f, m in zip(stored["frames"], stored["masks"], strict=True)}
+            wanted = [scene.solved.index(scene.frames.index(frame)) for frame in frames]
+            masks = rigid_mask(plates, scene.viewmats[scene.solved].numpy(), Ks, wanted)
+            with atomic_path(cached) as beside:
+                np.savez_compressed(beside, masks=masks)
+        with np.load(cached, allow_pickle=False) as stored:
+            return {frame: torch.from_numpy(mask) for frame, mask in zip(frames, stored["masks"], strict=True)}
