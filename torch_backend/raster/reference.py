@@ -102,47 +102,66 @@ def _colors(scene: Scene, index: Tensor, means: Tensor, viewmat: Tensor) -> Tens
     return torch.cat(parts, -1)
 
 
-def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
-    """Project Gaussians `candidates` (indices) into one camera, cull, and sort by depth."""
+@dataclass
+class _Footprint:
+    """Projections of V Gaussians into one camera."""
+
+    mean2d: Tensor
+    xx: Tensor
+    xy: Tensor
+    yy: Tensor
+    det: Tensor
+    opacity: Tensor
+    depth: Tensor
+
+
+def _footprint(scene: Scene, camera: int, index: Tensor) -> _Footprint:
+    """Project the Gaussians `index`, all of them at positive depth."""
     viewmat, K = scene.viewmats[camera], scene.Ks[camera].to(scene.means)
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    with torch.no_grad():
-        z = scene.means[candidates] @ R[2] + t[2]
-        candidates = candidates[(z > scene.settings.near) & z.isfinite()]
-    means = scene.means[candidates]
-    x, y, z = (means @ R.T + t).unbind(-1)
+    x, y, z = (scene.means[index] @ R.T + t).unbind(-1)
     mean2d = torch.stack((fx * x / z + cx, fy * y / z + cy), -1)
 
     x_low, x_high, y_low, y_high = camera_limits(scene.Ks[camera], scene.width, scene.height, k.FRUSTUM_MARGIN)
     u, v, zero = (x / z).clamp(x_low, x_high), (y / z).clamp(y_low, y_high), torch.zeros_like(z)
     J = torch.stack((fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z), -1).reshape(-1, 2, 3)
-    scales = scene.log_scales[candidates].clamp_min(k.LOG_SCALE_MIN).exp()
-    B = J @ R @ (rotation_matrices(scene.quats[candidates]) * scales[:, None, :])
+    scales = scene.log_scales[index].clamp_min(k.LOG_SCALE_MIN).exp()
+    B = J @ R @ (rotation_matrices(scene.quats[index]) * scales[:, None, :])
     raw = B @ B.transpose(-1, -2)
     xx, xy, yy = raw[:, 0, 0] + k.LOW_PASS, raw[:, 0, 1], raw[:, 1, 1] + k.LOW_PASS
     # |b0 x b1|^2 is det(B B^T) without the cancellation of xx yy - xy^2.
     det_raw = torch.linalg.cross(B[:, 0], B[:, 1]).square().sum(-1)
     det = det_raw + k.LOW_PASS * (raw[:, 0, 0] + raw[:, 1, 1]) + k.LOW_PASS**2
-    opacity = torch.sigmoid(scene.opacity_logits[candidates])
+    opacity = torch.sigmoid(scene.opacity_logits[index])
     if scene.settings.antialiased:
         opacity = opacity * (det_raw / det).clamp_min(k.COMPENSATION2_MIN).sqrt()
+    return _Footprint(mean2d, xx, xy, yy, det, opacity, z)
 
+
+def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
+    """Project Gaussians `candidates` (indices) into one camera, cull, and sort by depth."""
+    viewmat = scene.viewmats[camera]
     with torch.no_grad():
-        level = 2 * torch.log(opacity / k.ALPHA_MIN)
-        extent = torch.stack((xx, yy), -1).mul(level.clamp_min(0)[:, None]).sqrt()
+        z = scene.means[candidates] @ viewmat[2, :3] + viewmat[2, 3]
+        candidates = candidates[(z > scene.settings.near) & z.isfinite()]
+        f = _footprint(scene, camera, candidates)
+        level = 2 * torch.log(f.opacity / k.ALPHA_MIN)
+        extent = torch.stack((f.xx, f.yy), -1).mul(level.clamp_min(0)[:, None]).sqrt()
         size = torch.tensor((scene.width, scene.height), dtype=extent.dtype, device=extent.device)
-        keep = (level > 0) & (xx + yy < k.VARIANCE_MAX)
-        keep &= ((mean2d + extent >= 0.5) & (mean2d - extent <= size - 0.5)).all(-1)
-        half = 0.5 * (xx + yy)
-        radius = ((half + ((0.5 * (xx - yy)).square() + xy * xy).sqrt()) * level.clamp_min(0)).sqrt().ceil()
+        keep = (level > 0) & (f.xx + f.yy < k.VARIANCE_MAX)
+        keep &= ((f.mean2d + extent >= 0.5) & (f.mean2d - extent <= size - 0.5)).all(-1)
+        half = 0.5 * (f.xx + f.yy)
+        wide = half + ((0.5 * (f.xx - f.yy)).square() + f.xy * f.xy).sqrt()
+        radius = (wide * level.clamp_min(0)).sqrt().ceil()
         order = keep.nonzero()[:, 0]
-        order = order[torch.sort(z[order], stable=True).indices]
-    conic = torch.stack((yy, -xy, xx), -1) / det[:, None]
+        order = order[torch.sort(f.depth[order], stable=True).indices]
+    # Once more, those that stay alone: what overflowed and was culled would turn its zero gradient into NaN.
     index = candidates[order]
-    return _Projected(index, mean2d[order], conic[order], opacity[order], z[order],
-                      _colors(scene, index, means[order], viewmat), extent[order], radius[order],
-                      torch.zeros_like(mean2d[order]) if scene.settings.absgrad else None)
+    f = _footprint(scene, camera, index)
+    conic = torch.stack((f.yy, -f.xy, f.xx), -1) / f.det[:, None]
+    return _Projected(index, f.mean2d, conic, f.opacity, f.depth, _colors(scene, index, scene.means[index], viewmat),
+                      extent[order], radius[order], torch.zeros_like(f.mean2d) if scene.settings.absgrad else None)
 
 
 @torch.no_grad()

@@ -167,6 +167,19 @@ def test_extreme_scales(tools, log_scale, body):
 
 
 @on_every_body
+def test_what_overflows_and_is_culled_gets_zero_gradients(tools, body):
+    # Found by the property tests: zero times the infinite derivative of a determinant that overflows float32 is NaN.
+    scene = tools.cloud(6, 16, 16, settings=RasterSettings(threads=1, antialiased=True))
+    scene.tensors["means"][2:5] = torch.tensor([0.0, 0.0, 0.1]).double()
+    huge = torch.tensor([[18.4, 18.4, -1.0], [29.0, 29.0, 29.0], [18.4, -1.0, -1.0]]).double()
+    scene.tensors["log_scales"][2:5] = huge
+    out, grads = scene.gradients(body)
+    assert_sane(out, grads)
+    assert (out.radii[0, 2:5] == 0).all()
+    assert all((grads[name][2:5] == 0).all() for name in PER_GAUSSIAN if name in grads)
+
+
+@on_every_body
 def test_a_point_is_as_wide_as_the_low_pass(tools, body):
     # sigma^2 = 0.3 px^2: alpha of the pixel beside the mean is opacity * exp(-1 / 0.6).
     scene = tools.single(9, 9, mean=(0.5 / 16 * 2, 0.5 / 16 * 2, 2.0), scale=1e-9, logit=2.0)
