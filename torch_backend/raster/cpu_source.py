@@ -88,10 +88,9 @@ auto first_at = FN(float v, float limit) -> int {
 auto last_at = FN(float v, float limit) -> int { return v < 0.f ? -1 : (int)smin(v, limit); };
 // 2^p: nearest integer by the rounding of a large addend, degree-5 polynomial for the rest (relative error 2e-7).
 auto exp2v = FN(F p) -> F {
-    F z = p + 12582912.f, f = p - (z - 12582912.f);
-    F q = fma(f, (F)1.33389978e-3f, (F)9.61833261e-3f);
-    q = fma(q, f, (F)5.55044435e-2f); q = fma(q, f, (F)2.40226522e-1f);
-    q = fma(q, f, (F)6.93147182e-1f); q = fma(q, f, (F)1.f);
+    F z = p + 12582912.f, f = p - (z - 12582912.f), f2 = f * f;
+    F q = fma(fma(f, (F)1.33389978e-3f, (F)9.61833261e-3f), f2, fma(f, (F)5.55044435e-2f, (F)2.40226522e-1f));
+    q = fma(q, f2, fma(f, (F)6.93147182e-1f, (F)1.f));
     return __builtin_bit_cast(F, __builtin_bit_cast(I, q) + (__builtin_bit_cast(I, z) << 23)); };
 auto expv = FN(F x) -> F { return exp2v(vmin(vmax(x * LOG2E, (F)-125.f), (F)125.f)); };
 auto log2v = FN(F x) -> F {
@@ -103,21 +102,22 @@ auto log2v = FN(F x) -> F {
 const F LANE = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 // Sixteen vectors to one: lane i of the result is v[i] folded over its lanes. Every step is one cheap shuffle a side.
 #define FOLD(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-auto fold16 = FN(F* v, auto&& join) -> F {
+// Halves are joined first: that takes no shuffle where a vector of 16 is two registers or four.
+typedef float Half __attribute__((ext_vector_type(8)));
+auto fold16 = FN(const F* v, auto&& join) -> F {
+    Half h[16];
+    for (int i = 0; i < 16; i++)
+        h[i] = join(FOLD(v[i], v[i], 0,1,2,3,4,5,6,7), FOLD(v[i], v[i], 8,9,10,11,12,13,14,15));
     for (int i = 0; i < 8; i++)
-        v[i] = join(FOLD(v[i], v[i + 8], 0,1,2,3,4,5,6,7,16,17,18,19,20,21,22,23),
-                    FOLD(v[i], v[i + 8], 8,9,10,11,12,13,14,15,24,25,26,27,28,29,30,31));
+        h[i] = join(FOLD(h[i], h[i + 8], 0,1,2,3,8,9,10,11), FOLD(h[i], h[i + 8], 4,5,6,7,12,13,14,15));
     for (int i = 0; i < 4; i++)
-        v[i] = join(FOLD(v[i], v[i + 4], 0,1,2,3,8,9,10,11,16,17,18,19,24,25,26,27),
-                    FOLD(v[i], v[i + 4], 4,5,6,7,12,13,14,15,20,21,22,23,28,29,30,31));
+        h[i] = join(FOLD(h[i], h[i + 4], 0,1,8,9,4,5,12,13), FOLD(h[i], h[i + 4], 2,3,10,11,6,7,14,15));
     for (int i = 0; i < 2; i++)
-        v[i] = join(FOLD(v[i], v[i + 2], 0,1,16,17,4,5,20,21,8,9,24,25,12,13,28,29),
-                    FOLD(v[i], v[i + 2], 2,3,18,19,6,7,22,23,10,11,26,27,14,15,30,31));
-    F r = join(FOLD(v[0], v[1], 0,2,16,18,4,6,20,22,8,10,24,26,12,14,28,30),
-               FOLD(v[0], v[1], 1,3,17,19,5,7,21,23,9,11,25,27,13,15,29,31));
-    return FOLD(r, r, 0,2,1,3,8,10,9,11,4,6,5,7,12,14,13,15);
+        h[i] = join(FOLD(h[i], h[i + 2], 0,2,8,10,4,6,12,14), FOLD(h[i], h[i + 2], 1,3,9,11,5,7,13,15));
+    return FOLD(h[0], h[1], 0,8,2,10,1,9,3,11,4,12,6,14,5,13,7,15);
 };
-auto add = FN(F a, F b) -> F { return a + b; };
+auto add = FN(auto a, auto b) { return a + b; };
+auto larger = FN(auto a, auto b) { return a > b ? a : b; };
 auto sum = FN(F v) -> float {
     float a[16]; store(a, v);
     float b0 = (a[0] + a[8]) + (a[4] + a[12]), b1 = (a[1] + a[9]) + (a[5] + a[13]);
@@ -538,8 +538,14 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
 
 _TILE = r"""
 const int NCH = @NCH@;
+// A tile's row of pixels, `each` floats a pixel: memory beyond the image is neither written nor read; zeros are read.
+auto write = FN(float* to, const float* from, int columns, const int each) -> void {
+    if (columns == 16) __builtin_memcpy(to, from, 64 * each);
+    else for (int i = 0; i < columns * each; i++) to[i] = from[i]; };
+auto read = FN(float* to, const float* from, int columns, const int each) -> void {
+    if (columns == 16) __builtin_memcpy(to, from, 64 * each);
+    else for (int i = 0; i < 16 * each; i++) to[i] = i < columns * each ? from[i] : 0.f; };
 const long long RS = P.record_stride, W = P.width, H = P.height, tiles = P.tiles_x * P.tiles_y;
-typedef float Row __attribute__((ext_vector_type(16)));
 """
 
 # Sixteen hits at a time: the rows that each one touches, as bits, and what its ellipse is on each of the 16 rows.
@@ -549,7 +555,7 @@ _BATCH = r"""
         if (!live) break;
         int slots[16], m = stop - b < 16 ? (int)(stop - b) : 16;
         unsigned masks[16];
-        float dys[16][16], shifts[16][16], levels[16][16];
+        alignas(64) float dys[16][16], shifts[16][16], levels[16][16];
         for (int l = 0; l < m; l++) {
             slots[l] = P.hit_slot[b + l];
             // The next batch's record, and where this hit's result goes.
@@ -651,7 +657,7 @@ for (long long tile; (tile = take()) < tiles;) {
         }
         if (want_weights) {
             float sums[16], tops[16];
-            store(sums, fold16(totals, add)); store(tops, fold16(peaks, vmax));
+            store(sums, fold16(totals, add)); store(tops, fold16(peaks, larger));
             for (int l = 0; l < m; l++) {
                 float* to = P.hit_weight + 2 * (long long)P.hit_place[b + l];
                 to[0] = sums[l]; to[1] = tops[l]; }
@@ -663,11 +669,16 @@ for (long long tile; (tile = take()) < tiles;) {
         float* to = P.hit_weight + 2 * (long long)P.hit_place[b]; to[0] = 0.f; to[1] = 0.f; }
     for (int i = 0; i < rows; i++) {
         long long at = (ty * 16 + i) * W + tx * 16;
-        for (int l = 0; l < columns; l++) {
-            P.alpha[at + l] = 1.f - T[i][l];
-            if (want_depth) P.median[at + l] = median[i][l];
-            if (want_top) { P.top_ids[at + l] = top[i][l]; P.top_weights[at + l] = best[i][l]; }
-            for (int c = 0; c < NCH; c++) P.image[(at + l) * NCH + c] = C[c][i][l] + T[i][l] * P.background[c]; }
+        alignas(64) float each[16], pixels[16 * NCH];
+        for (int c = 0; c < NCH; c++) {
+            store(each, fma(T[i], (F)P.background[c], C[c][i]));
+            for (int l = 0; l < 16; l++) pixels[l * NCH + c] = each[l]; }
+        write(P.image + at * NCH, pixels, columns, NCH);
+        store(each, 1.f - T[i]); write(P.alpha + at, each, columns, 1);
+        if (want_depth) { store(each, median[i]); write(P.median + at, each, columns, 1); }
+        if (want_top) {
+            store(each, best[i]); write(P.top_weights + at, each, columns, 1);
+            store(each, __builtin_bit_cast(F, top[i])); write((float*)P.top_ids + at, each, columns, 1); }
     }
 }
 """
@@ -687,12 +698,14 @@ for (long long tile; (tile = take()) < tiles;) {
         for (int c = 0; c < NCH; c++) G[c][i] = (F)0.f;
         if (i >= rows) continue;
         long long at = (ty * 16 + i) * W + tx * 16;
-        for (int l = 0; l < columns; l++) {
-            float all = -P.grad_alpha[at + l] * (1.f - P.alpha[at + l]);
-            for (int c = 0; c < NCH; c++) {
-                float value = P.grad_image[(at + l) * NCH + c];
-                G[c][i][l] = value; all += value * P.image[(at + l) * NCH + c]; }
-            T[i][l] = 1.f; left[i][l] = all; }
+        alignas(64) float one[16], two[16], grads[16 * NCH], pixels[16 * NCH];
+        read(one, P.grad_alpha + at, columns, 1); read(two, P.alpha + at, columns, 1);
+        read(grads, P.grad_image + at * NCH, columns, NCH); read(pixels, P.image + at * NCH, columns, NCH);
+        T[i] = LANE < (F)(float)columns ? (F)1.f : (F)0.f;
+        left[i] = -load(one) * (1.f - load(two));
+        for (int c = 0; c < NCH; c++) {
+            for (int l = 0; l < 16; l++) { one[l] = grads[l * NCH + c]; two[l] = pixels[l * NCH + c]; }
+            G[c][i] = load(one); left[i] = fma(G[c][i], load(two), left[i]); }
     }
     long long b = start;
     for (; b < stop; b += 16) {
