@@ -29,7 +29,6 @@ from .protocol import (
     Rehearsal,
     Start,
     add_to_scale,
-    rate_scale,
     turn,
 )
 
@@ -64,9 +63,9 @@ class ControlPointsConfig(HostConfig):
     """Octaves of the time's encoding (10)."""
     published: bool = False
     """Raw coordinates, scale deltas after activation, rotation added, a rotation of its own for a node's frame (on)."""
-    lr: float = 1e-3
+    lr: float = 2e-4
     """Start learning rate of the network (8e-4)."""
-    lr_end: float = 5e-5
+    lr_end: float = 2e-5
     """End learning rate of the network (1.6e-6)."""
     until: float = 1.0
     """Share of the run at which that rate has ended."""
@@ -91,8 +90,8 @@ class ControlPointsConfig(HostConfig):
 
 
 def _reference(iterations: int) -> ControlPointsConfig:
-    """The published host: stage one 10,000 of 80,000 steps, then its schedules; node rate constant, as published."""
-    scale, whole = rate_scale(PUBLISHED_ITERATIONS, iterations), float(PUBLISHED_ITERATIONS)
+    """The published host: stage one 10,000 of 80,000 steps, then its schedules; rates as published (see Host B)."""
+    whole = float(PUBLISHED_ITERATIONS)
     return ControlPointsConfig(
         start=0.0,
         detached=13_000 / whole,
@@ -103,11 +102,11 @@ def _reference(iterations: int) -> ControlPointsConfig:
         position_frequencies=10,
         time_frequencies=10,
         published=True,
-        lr=5 * 1.6e-4 * scale,
-        lr_end=1.6e-6 * scale,
+        lr=5 * 1.6e-4,
+        lr_end=1.6e-6,
         until=50_000 / whole,
-        lr_nodes=8e-4 * scale,
-        lr_hyper=2.5e-3 * scale,
+        lr_nodes=8e-4,
+        lr_hyper=2.5e-3,
         arap=1e-4,
         arap_end=1e-5,
         arap_fall=(15_000 / whole, 20_000 / whole),
@@ -450,13 +449,12 @@ class _Surrogates:
 
     def _optimiser(self) -> torch.optim.Adam:
         network = [p for group in self.field.parameter_groups() if group["name"] == "field" for p in group["params"]]
-        rate = self.field.config.lr / (5 * 1.6e-4)
         groups = [
             {"params": network, "lr": self.field.config.lr},
-            {"params": [self.params["means"]], "lr": 8e-4 * rate},
-            {"params": [self.scale], "lr": 5e-3 * rate},
+            {"params": [self.params["means"]], "lr": 8e-4},
+            {"params": [self.scale], "lr": 5e-3},
             {"params": [self.params["opacity_logits"]], "lr": 5e-2},
-            {"params": [self.params["sh0"]], "lr": 2.5e-3 * rate},
+            {"params": [self.params["sh0"]], "lr": 2.5e-3},
         ]
         return torch.optim.Adam(groups, eps=1e-15)
 

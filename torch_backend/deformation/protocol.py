@@ -204,10 +204,10 @@ def field_box(means: Tensor) -> Tensor:
 
 
 def rate_scale(published: int, iterations: int) -> float:
-    """Factor on published learning rates for a run shorter than the published one: the root of the ratio, at least 1.
+    """Factor on a grid's published learning rates in a run shorter than the published one: the root of the ratio.
 
-    Adam moves a parameter by about a rate per step: a short run at the rates of a long one ends far from where that
-    one does, and a comparison would flatter ours. In a run as long as the published one rates are as published.
+    Adam moves a parameter by about a rate per step: in a short run at the rates of a long one a grid ends far from
+    where that one does, and a comparison would flatter ours. At least 1.
     """
     return max(1.0, published / iterations) ** 0.5
 

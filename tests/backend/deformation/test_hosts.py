@@ -155,12 +155,13 @@ def test_every_parameter_is_in_one_group_with_rates_that_fall(name):
         assert all(0 < g["lr_end"] <= g["lr"] and 0 < g.get("until", 1.0) <= 1.0 for g in groups)
 
 
-def test_published_rates_grow_by_the_root_of_what_a_run_is_shorter():
-    long, short = (registry.host_config("mlp", "reference", n) for n in (40_000, 10_000))
-    assert long.lr == pytest.approx(8e-4)
-    assert long.lr_end == pytest.approx(1.6e-6)
-    assert short.lr == pytest.approx(16e-4)
-    assert registry.host_config("mlp", "reference", 400_000).lr == pytest.approx(8e-4)
+def test_a_grids_published_rates_grow_by_the_root_of_what_a_run_is_shorter():
+    long, short = (registry.host_config("hexplane", "reference", n) for n in (33_000, 8250))
+    assert long.lr_grid == pytest.approx(1.76e-3)
+    assert short.lr_grid == pytest.approx(2 * 1.76e-3)
+    assert registry.host_config("hexplane", "reference", 400_000).lr_grid == pytest.approx(1.76e-3)
+    for name in ("mlp", "control_points"):
+        assert registry.host_config(name, "reference", 1000).lr == pytest.approx(8e-4)
 
 
 FOURTH = """
@@ -247,9 +248,9 @@ def test_rehearsal_finds_a_motion_and_places_the_nodes():
         gap = state["means"].mean(0) - means.mean(0) - times[frame] * shift
         return 50.0 * gap.square().sum()
 
-    field.rehearse(Rehearsal(means, torch.rand(300, 3), times, 160, loss, torch.Generator().manual_seed(0)))
-    assert asked[:120] == [300] * 120
-    assert asked[120:] == [40] * 40
+    field.rehearse(Rehearsal(means, torch.rand(300, 3), times, 200, loss, torch.Generator().manual_seed(0)))
+    assert asked[:150] == [300] * 150
+    assert asked[150:] == [40] * 50
     assert field.places.shape == (40, 3)
     paths = field.trajectories(field.places, torch.tensor([0.0, 1.0]))
     travel = (paths[1] - paths[0]).mean(0).detach()
