@@ -7,6 +7,7 @@ should be set before torch is imported (`torch_backend/__init__.py` does): spinn
 
 import contextlib
 import ctypes
+import functools
 import os
 import sys
 import tempfile
@@ -52,12 +53,12 @@ def _without_notice() -> Iterator[None]:
                 sys.stderr.writelines(line for line in lines if "CUDA driver" not in line)
 
 
+@functools.cache
 def _import_warp():
-    """Warp, initialised without a word on the terminal."""
-    if not _kernels:
-        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-        with _without_notice():
-            wp.init()
+    """Warp, initialised once without a word on the terminal."""
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    with _without_notice():
+        wp.init()
     return wp
 
 
