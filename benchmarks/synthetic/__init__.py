@@ -1,1 +1,5 @@
-"""Synthetic scenes with truth: people who hold still and drift, seen by a handheld camera."""
+"""Synthetic scenes with truth: people who hold still and drift, seen by a handheld camera (docs/synthetic.md)."""
+
+from .folder import Regions, SyntheticScene
+
+__all__ = ["Regions", "SyntheticScene"]

@@ -22,7 +22,7 @@ from .geometry import Builder, Mesh, turn
 from .noise import Array, stream
 from .places import Furnisher, Keepout, Place
 from .sizes import Size, camera_move_of, place_of
-from .textures import TEXTURES
+from .textures import TEXTURES, halved
 
 if TYPE_CHECKING:
     from .people import Bodies, Person
@@ -91,7 +91,9 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, samples: int,
         movers.append(_shadow_board(folder, place, seconds, camera.duration))
     for material in place.materials:
         texture, rng = TEXTURES[material.texture], stream(seed, "picture", material.texture, material.variant)
-        write_png(folder / "textures" / material.file, texture.draw(rng, texture.pixels // size.texture_step))
+        write_png(
+            folder / "textures" / material.file, halved(texture.draw(rng, 2 * texture.pixels // size.texture_step))
+        )
     _write_mesh(folder / "geometry" / "static.npz", static)
     for mover in movers:
         _write_mesh(folder / "geometry" / f"{mover.name}.npz", mover.mesh)

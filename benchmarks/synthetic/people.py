@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt
 from .geometry import turn
 from .noise import Array, bumps, solid, stream, wander
 from .rays import RayScene
-from .textures import Picture, colour, hsv
+from .textures import Picture, colour, halved, hsv
 
 TEXTURE_SIZE = 1024
 WAIST, KNEE = -0.06, -0.42
@@ -114,7 +114,7 @@ class Bodies:
     def __init__(self, texture_step: int = 1) -> None:
         import anny
 
-        self.texture_size = TEXTURE_SIZE // texture_step
+        self.texture_size = 2 * TEXTURE_SIZE // texture_step
         self.model = anny.Anny(facial_actions=list(FACE))
         self.bones: list[str] = list(self.model.bone_labels)
         coordinates, corners = self.model.texture_coordinates, self.model.face_texture_coordinate_indices
@@ -157,7 +157,7 @@ class Bodies:
         w = self.influence
         # The hair line falls from the forehead to the nape; the unit is half the distance of the eyes.
         unit = self.eye[0]
-        hair_line = (z - self.eye[2] - 1.9 * unit) + 0.8 * (self.eye[1] - 0.3 * unit - y)
+        hair_line = (z - self.eye[2] - 1.9 * unit) - 0.8 * (self.eye[1] - 0.3 * unit - y)
         above_waist = np.clip((z - WAIST) / 0.02 + 0.5, 0.0, 1.0)
         body = 1.0 - np.maximum(w["arms"], w["neck"])
         return {
@@ -308,7 +308,7 @@ class Bodies:
         picture = np.zeros((size * size, 3))
         picture[used] = rgb
         picture = picture[nearest].reshape(size, size, 3)
-        return np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
+        return halved(np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8))
 
 
 @dataclass(frozen=True)

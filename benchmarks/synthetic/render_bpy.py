@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import sys
 import threading
 import time
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
+OVERSIZE = 2
+"""Pictures are rendered and denoised at this many times their size, then averaged: the denoiser keeps finer edges."""
 METER_GREY = 0.20
 """Scene-linear value that the median of the metered pixels is exposed to."""
 METER_BRIGHT = 0.95
@@ -82,10 +86,11 @@ class Stage:
     def _settings(self, sample_factor: int) -> None:
         render, cycles = self.scene.render, self.scene.cycles
         render.engine = "CYCLES"
-        render.resolution_x, render.resolution_y = self.plan["width"], self.plan["height"]
+        render.resolution_x, render.resolution_y = OVERSIZE * self.plan["width"], OVERSIZE * self.plan["height"]
         render.resolution_percentage = 100
         render.use_persistent_data = True
-        render.dither_intensity = 0.0
+        render.border_min_x, render.border_max_x = 0.0, 1.0
+        render.use_crop_to_border = False
         render.use_motion_blur = False
         render.use_compositing = render.use_sequencer = False
         cycles.device = "CPU"
@@ -94,23 +99,16 @@ class Stage:
         cycles.use_denoising = True
         cycles.denoiser = "OPENIMAGEDENOISE"
         cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-        cycles.denoising_prefilter = "FAST"
+        cycles.denoising_prefilter = "NONE"
         cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 4, 3, 1
         cycles.transmission_bounces = cycles.volume_bounces = 0
         cycles.caustics_reflective = cycles.caustics_refractive = False
         cycles.sample_clamp_indirect = 4.0
         cycles.use_light_tree = True
         cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.3
-        self.scene.view_settings.view_transform = "Standard"
-        self.scene.view_settings.look = "None"
-        self._picture_format("PNG")
-
-    def _picture_format(self, name: str) -> None:
-        settings = self.scene.render.image_settings
-        settings.file_format = name
-        settings.color_mode = "RGB"
-        settings.color_depth = "8" if name == "PNG" else "32"
-        settings.compression = 30
+        settings = render.image_settings
+        settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGB", "32"
+        settings.exr_codec = "NONE"
 
     def _world(self) -> None:
         world = bpy.data.worlds.new("sky")
@@ -208,82 +206,77 @@ class Stage:
     def render(self, job: dict[str, Any], stops: float, out: Path) -> None:
         """One picture, in one piece or in strips of rows that have each their own time."""
         out.parent.mkdir(parents=True, exist_ok=True)
-        self.scene.view_settings.exposure = stops + job["stops"]
+        width, height = self.plan["width"], self.plan["height"]
+        render = self.scene.render
         self.scene.cycles.seed = job["noise"]
+        light = np.zeros((height, width, 3), np.float32)
+        for band in job["bands"]:
+            low, high = band["rows"]
+            render.use_border = high - low < height
+            # Blender counts rows from below.
+            render.border_min_y, render.border_max_y = 1.0 - high / height, 1.0 - low / height
+            light[low:high] = self._light_of(band)[low:high]
+        render.use_border = False
         beside = out.with_name(f".{out.stem}.{os.getpid()}.tmp.png")
-        if len(job["bands"]) == 1:
-            self._take(job["bands"][0], beside)
-        else:
-            self._take_strips(job["bands"], beside)
-        beside.write_bytes(_bare(beside.read_bytes()))
+        beside.write_bytes(png(srgb(light * 2.0 ** (stops + job["stops"]))))
         os.replace(beside, out)
 
-    def _take(self, band: dict[str, Any], path: Path) -> None:
+    def _light_of(self, band: dict[str, Any]) -> np.ndarray:
+        """[h, w, 3] scene-linear, rows downwards: the rendered pixels averaged to those of the picture."""
         self._go_to(band["time"])
         self._look(band["world_to_camera"])
+        path = self.folder / f".render.{os.getpid()}.exr"
         self.scene.render.filepath = str(path)
         bpy.ops.render.render(write_still=True)
-
-    def _take_strips(self, bands: list[dict[str, Any]], path: Path) -> None:
-        render, width, height = self.scene.render, self.plan["width"], self.plan["height"]
-        whole = np.zeros((height, width, 4), np.float32)
-        render.use_border, render.use_crop_to_border = True, False
-        render.border_min_x, render.border_max_x = 0.0, 1.0
-        for band in bands:
-            low, high = band["rows"]
-            render.border_min_y, render.border_max_y = 1.0 - high / height, 1.0 - low / height
-            self._take(band, path)
-            # Blender's rows run upwards.
-            whole[height - high : height - low] = _pixels(path)[height - high : height - low]
-        render.use_border = False
-        picture = bpy.data.images.new("strips", width, height, alpha=False)
+        picture = bpy.data.images.load(str(path))
         picture.colorspace_settings.name = "Non-Color"
-        picture.pixels.foreach_set(whole.ravel())
-        picture.filepath_raw, picture.file_format = str(path), "PNG"
-        picture.save()
+        width, height = picture.size
+        values = np.empty(width * height * 4, np.float32)
+        picture.pixels.foreach_get(values)
         bpy.data.images.remove(picture)
+        path.unlink()
+        fine = values.reshape(height // OVERSIZE, OVERSIZE, width // OVERSIZE, OVERSIZE, 4)
+        return fine.mean(axis=(1, 3))[::-1, :, :3]
 
     def meter(self) -> float:
         """Stops that bring the clip to a good exposure, as a camera would that is then locked."""
-        scene, plan = self.scene, self.plan
-        frames = [job for job in plan["jobs"] if job["out"].startswith("frames/")]
-        size = scene.render.resolution_x, scene.render.resolution_y
-        scene.render.resolution_x = METER_SIZE
-        scene.render.resolution_y = max(8, round(METER_SIZE * size[1] / size[0]))
-        self._picture_format("OPEN_EXR")
-        path = self.folder / f".meter.{os.getpid()}.exr"
+        render = self.scene.render
+        frames = [job for job in self.plan["jobs"] if job["out"].startswith("frames/")]
+        size = render.resolution_x, render.resolution_y
+        render.resolution_x = OVERSIZE * METER_SIZE
+        render.resolution_y = OVERSIZE * max(8, round(METER_SIZE * size[1] / size[0]))
         values = []
         for job in (frames[0], frames[len(frames) // 2], frames[-1]):
-            self._take({**job["bands"][0], "time": round(job["bands"][0]["time"])}, path)
-            values.append(_pixels(path)[..., :3].reshape(-1, 3) @ [0.2126, 0.7152, 0.0722])
-        path.unlink()
-        self._picture_format("PNG")
-        scene.render.resolution_x, scene.render.resolution_y = size
+            band = {**job["bands"][0], "time": round(job["bands"][0]["time"])}
+            values.append(self._light_of(band).reshape(-1, 3) @ [0.2126, 0.7152, 0.0722])
+        render.resolution_x, render.resolution_y = size
         light = np.concatenate(values)
         middle, bright = np.median(light), np.quantile(light, 0.92)
         return float(np.log2(min(METER_GREY / max(middle, 1e-6), METER_BRIGHT / max(bright, 1e-6))))
 
 
-def _bare(png: bytes) -> bytes:
-    """A PNG without its notes: Blender writes the date and how long it took, so that no two files are the same."""
-    kept, at = [png[:8]], 8
-    while at < len(png):
-        end = at + 12 + int.from_bytes(png[at : at + 4], "big")
-        if png[at + 4 : at + 8] in (b"IHDR", b"IDAT", b"IEND"):
-            kept.append(png[at:end])
-        at = end
-    return b"".join(kept)
+def srgb(light: np.ndarray) -> np.ndarray:
+    """Scene-linear [H, W, 3] to 8-bit sRGB (IEC 61966-2-1): Blender's view transform Standard."""
+    light = np.clip(light, 0.0, 1.0)
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-8) ** (1 / 2.4) - 0.055)
+    return np.round(255.0 * encoded).astype(np.uint8)
 
 
-def _pixels(path: Path) -> np.ndarray:
-    """[H, W, 4] float32 of a picture file as stored, rows upwards."""
-    picture = bpy.data.images.load(str(path))
-    picture.colorspace_settings.name = "Non-Color"
-    width, height = picture.size
-    values = np.empty(width * height * 4, np.float32)
-    picture.pixels.foreach_get(values)
-    bpy.data.images.remove(picture)
-    return values.reshape(height, width, 4)
+def png(pixels: np.ndarray) -> bytes:
+    """A PNG of [H, W, 3] uint8 with nothing but its pixels: Blender's own also tell when and how long it rendered."""
+    height, width, _ = pixels.shape
+    # Filter 1 (Sub) in every row: each byte less the one of the pixel before.
+    rows = pixels.copy()
+    rows[:, 1:] -= pixels[:, :-1]
+    data = np.concatenate([np.ones((height, 1), np.uint8), rows.reshape(height, -1)], axis=1).tobytes()
+    chunks = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
+        (b"sRGB", b"\0"),
+        (b"IDAT", zlib.compress(data, 6)),
+        (b"IEND", b""),
+    ]
+    whole = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(whole)
 
 
 def _metered(folder: Path, plan: dict[str, Any], stage: Stage) -> float:

@@ -32,6 +32,13 @@ def _picture(rgb: Array) -> Picture:
     return np.round(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
 
 
+def halved(picture: Picture) -> Picture:
+    """Half the size, by averaging 2x2: edges that were drawn hard become soft, as a camera's pixels want them."""
+    size = len(picture) // 2
+    mean = picture.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
+    return np.round(mean).astype(np.uint8)
+
+
 def _grid(size: int) -> tuple[Array, Array]:
     at = (np.arange(size) + 0.5) / size
     return np.meshgrid(at, at, indexing="ij")
