@@ -57,9 +57,9 @@ class ControlPointsConfig(HostConfig):
     """Layers of the nodes' network (8)."""
     width: int = 128
     """Width of them (256)."""
-    position_frequencies: int = 6
+    position_frequencies: int = 3
     """Octaves of the position's encoding (10)."""
-    time_frequencies: int = 6
+    time_frequencies: int = 4
     """Octaves of the time's encoding (10)."""
     published: bool = False
     """Raw coordinates, scale deltas after activation, rotation added, a rotation of its own for a node's frame (on)."""
