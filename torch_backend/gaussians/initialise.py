@@ -66,6 +66,8 @@ def initialise(
         points = torch.cat([points, *(s[0] for s in seeds)])
         colors = torch.cat([colors, *(s[1] for s in seeds)])
         opacity = torch.cat([opacity, opacity.new_full((len(points) - len(opacity),), config.seed_opacity)])
+    finite = points.isfinite().all(1)
+    points, colors, opacity = points[finite], colors[finite], opacity[finite]
     if len(points) > budget:
         kept = torch.randperm(len(points), generator=generator, device="cpu")[:budget]
         points, colors, opacity = points[kept], colors[kept], opacity[kept]
@@ -87,8 +89,17 @@ def initialise(
 
 
 def neighbour_distance(points: Tensor) -> Tensor:
-    """Root mean squared distance to the 3 nearest neighbours (3DGS create_from_pcd), [N]."""
-    distances = KDTree(points.numpy()).query(points.numpy(), k=4)[0][:, 1:]
+    """Root mean squared distance to the 3 nearest neighbours (3DGS create_from_pcd), float32 [N]; fewer if there are
+    fewer points, 0 for a point alone.
+
+    points [N, 3] on the CPU. ValueError if one is not finite.
+    """
+    if not bool(points.isfinite().all()):
+        raise ValueError("points must be finite")
+    others = min(3, len(points) - 1)
+    if others < 1:
+        return torch.zeros(len(points), device="cpu")
+    distances = KDTree(points.numpy()).query(points.numpy(), k=others + 1, workers=-1)[0][:, 1:]
     return torch.from_numpy(np.sqrt((distances**2).mean(1))).float()
 
 

@@ -15,3 +15,17 @@ def test_root_mean_square_of_three_nearest():
 def test_twins_count_each_other_at_no_distance():
     points = torch.tensor([[1.0, 2, 3]]).repeat(6, 1)
     assert neighbour_distance(points).tolist() == [0.0] * 6  # `initialise` clamps to its smallest scale
+
+
+def test_fewer_points_than_neighbours():
+    assert neighbour_distance(torch.zeros(0, 3)).tolist() == []
+    assert neighbour_distance(torch.ones(1, 3)).tolist() == [0.0]
+    assert neighbour_distance(torch.tensor([[0.0, 0, 0], [3, 4, 0]])).tolist() == [5.0, 5.0]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_points_that_are_nowhere_are_refused(bad):
+    points = torch.rand(6, 3)
+    points[2, 1] = bad
+    with pytest.raises(ValueError, match="finite"):
+        neighbour_distance(points)
