@@ -69,7 +69,7 @@ def camera_of(seed: int, size: Size) -> CameraMove:
     return CameraMove(camera_move_of(seed), seed, (size.frames - 1) / size.fps)
 
 
-def write_geometry(folder: Path, seed: int, kind: str, size: Size, samples: int, key: str, bodies: Bodies) -> None:
+def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bodies: Bodies) -> None:
     """Everything that rendering needs, plan.json last."""
     seconds = frame_seconds(size)
     camera = camera_of(seed, size)
@@ -106,15 +106,13 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, samples: int,
         "width": size.width,
         "height": size.height,
         "focal_per_width": FOCAL_PER_WIDTH,
-        "samples": samples,
+        "samples": size.samples,
+        "oversize": size.oversize,
         "sky": place.sky,
         "sky_strength": place.sky_strength,
         "sky_turn": place.sky_turn,
         "lights": place.lights,
-        "materials": [
-            {"file": m.file, "roughness": TEXTURES[m.texture].roughness, "emission": m.emission}
-            for m in place.materials
-        ],
+        "materials": [{"file": m.file, "emission": m.emission} for m in place.materials],
         "movers": [{"name": m.name, "texture": m.texture, "in_view": m.in_view} for m in movers],
         "people": [{"name": p.name, "pose": p.pose, "phenotype": p.phenotype, "place": p.place} for p in people],
         "jobs": _jobs(seed, kind, size, camera),

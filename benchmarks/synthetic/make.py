@@ -89,7 +89,7 @@ def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: C
         for part in ("geometry", "textures"):
             shutil.rmtree(folder / part, ignore_errors=True)
         say(f"{size.name}/{folder.name}: geometry and textures")
-        write_geometry(folder, seed, kind, size, size.samples, key, bodies())
+        write_geometry(folder, seed, kind, size, key, bodies())
     made = time.perf_counter()
     _render(folder, bpy, lambda text: say(f"{size.name}/{folder.name}: {text}"))
     rendered = time.perf_counter()
@@ -183,8 +183,8 @@ def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seco
         "rendered": {
             "bpy": meter["bpy"],
             "samples": size.samples,
-            "denoiser": "OpenImageDenoise",
-            "view_transform": "Standard",
+            "denoiser": "OpenImageDenoise on the light, before colours",
+            "view_transform": "Standard (sRGB)",
             "exposure_stops": meter["stops"],
             "seconds_of_last_run": {name: round(value, 2) for name, value in seconds.items()},
             "size": asdict(size),

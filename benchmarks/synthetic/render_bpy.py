@@ -22,26 +22,24 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-OVERSIZE = 2
-"""Pictures are rendered and denoised at this many times their size, then averaged: the denoiser keeps finer edges."""
 METER_GREY = 0.20
 """Scene-linear value that the median of the metered pixels is exposed to."""
 METER_BRIGHT = 0.95
 METER_SIZE = 64
 
 
-def main(folder: Path, only: str = "", sample_factor: int = 1) -> None:
-    """Renders what is missing; `only` and `sample_factor` serve the measurement of noise."""
+def main(folder: Path) -> None:
+    """Renders what is missing."""
     threading.Thread(target=_die_with_parent, daemon=True).start()
     plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
-    jobs = [job for job in plan["jobs"] if (job["out"] == only if only else not (folder / job["out"]).exists())]
+    jobs = [job for job in plan["jobs"] if not (folder / job["out"]).exists()]
     if not jobs:
         return
-    stage = Stage(folder, plan, sample_factor)
+    stage = Stage(folder, plan)
     stops = _metered(folder, plan, stage)
     for done, job in enumerate(jobs, start=1):
         began = time.perf_counter()
-        stage.render(job, stops, folder / (f"noise/{sample_factor}/" if only else "") / job["out"])
+        stage.render(job, stops, folder / job["out"])
         _say(done=done, total=len(jobs), seconds=time.perf_counter() - began, out=job["out"])
 
 
@@ -58,19 +56,20 @@ def _die_with_parent() -> None:
 class Stage:
     """The Blender scene."""
 
-    def __init__(self, folder: Path, plan: dict[str, Any], sample_factor: int) -> None:
-        self.folder, self.plan = folder, plan
+    def __init__(self, folder: Path, plan: dict[str, Any]) -> None:
+        self.folder, self.plan, self.oversize = folder, plan, plan["oversize"]
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
-        self._settings(sample_factor)
+        self._settings()
+        self._develop()
         self._world()
         for light in plan["lights"]:
             self._light(light)
-        surfaces = [self._material(m["file"], m["roughness"], m["emission"]) for m in plan["materials"]]
+        surfaces = [self._material(m["file"], m["emission"]) for m in plan["materials"]]
         self._mesh("static", surfaces, smooth=False)
         self.movers: list[tuple[Any, np.ndarray]] = []
         for mover in plan["movers"]:
-            made = self._mesh(mover["name"], [self._material(mover["texture"], 0.75, 0.0)], smooth=True)
+            made = self._mesh(mover["name"], [self._material(mover["texture"], 0.0)], smooth=True)
             made.visible_camera = mover["in_view"]
             path = folder / "geometry" / f"{mover['name']}.npy"
             self.movers.append((made.data, np.load(path, mmap_mode="r", allow_pickle=False)))
@@ -83,24 +82,25 @@ class Stage:
         self.scene.collection.objects.link(self.camera)
         self.scene.camera = self.camera
 
-    def _settings(self, sample_factor: int) -> None:
+    def _settings(self) -> None:
         render, cycles = self.scene.render, self.scene.cycles
         render.engine = "CYCLES"
-        render.resolution_x, render.resolution_y = OVERSIZE * self.plan["width"], OVERSIZE * self.plan["height"]
+        render.resolution_x, render.resolution_y = (
+            self.oversize * self.plan["width"],
+            self.oversize * self.plan["height"],
+        )
         render.resolution_percentage = 100
         render.use_persistent_data = True
         render.border_min_x, render.border_max_x = 0.0, 1.0
         render.use_crop_to_border = False
         render.use_motion_blur = False
-        render.use_compositing = render.use_sequencer = False
+        render.use_compositing, render.use_sequencer = True, False
         cycles.device = "CPU"
-        cycles.samples = self.plan["samples"] * sample_factor
+        cycles.samples = self.plan["samples"]
         cycles.use_adaptive_sampling = False
-        cycles.use_denoising = True
-        cycles.denoiser = "OPENIMAGEDENOISE"
-        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-        cycles.denoising_prefilter = "NONE"
-        cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 4, 3, 1
+        cycles.use_denoising = False
+        cycles.sampling_pattern = "BLUE_NOISE"
+        cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 3, 3, 0
         cycles.transmission_bounces = cycles.volume_bounces = 0
         cycles.caustics_reflective = cycles.caustics_refractive = False
         cycles.sample_clamp_indirect = 4.0
@@ -109,6 +109,35 @@ class Stage:
         settings = render.image_settings
         settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGB", "32"
         settings.exr_codec = "NONE"
+
+    def _develop(self) -> None:
+        """Compositor: denoises the light that falls on surfaces by itself, then multiplies by their colour.
+
+        Colours come almost free of noise; a denoiser that sees light and texture together mistakes one for the other.
+        """
+        layer = self.scene.view_layers[0]
+        for name in ("diffuse_direct", "diffuse_indirect", "diffuse_color", "emit", "environment"):
+            setattr(layer, f"use_pass_{name}", True)
+        layer.cycles.denoising_store_passes = True
+        tree = bpy.data.node_groups.new("develop", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        self.scene.compositing_node_group = tree
+        passes, output = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("NodeGroupOutput")
+        denoise = tree.nodes.new("CompositorNodeDenoise")
+
+        def mixed(kind: str, a: Any, b: Any) -> Any:
+            node = tree.nodes.new("ShaderNodeVectorMath")
+            node.operation = kind
+            tree.links.new(a, node.inputs[0])
+            tree.links.new(b, node.inputs[1])
+            return node.outputs[0]
+
+        light = mixed("ADD", passes.outputs["Diffuse Direct"], passes.outputs["Diffuse Indirect"])
+        tree.links.new(light, denoise.inputs["Image"])
+        tree.links.new(passes.outputs["Denoising Normal"], denoise.inputs["Normal"])
+        lit = mixed("MULTIPLY", denoise.outputs[0], passes.outputs["Diffuse Color"])
+        shining = mixed("ADD", passes.outputs["Emission"], passes.outputs["Environment"])
+        tree.links.new(mixed("ADD", lit, shining), output.inputs[0])
 
     def _world(self) -> None:
         world = bpy.data.worlds.new("sky")
@@ -148,15 +177,15 @@ class Stage:
         made.visible_camera = False
         self.scene.collection.objects.link(made)
 
-    def _material(self, file: str, roughness: float, emission: float) -> Any:
+    def _material(self, file: str, emission: float) -> Any:
         material = bpy.data.materials.new(file)
         material.use_nodes = True
         nodes, links = material.node_tree.nodes, material.node_tree.links
         surface, picture = nodes["Principled BSDF"], nodes.new("ShaderNodeTexImage")
         picture.image = bpy.data.images.load(str(self.folder / "textures" / file), check_existing=True)
         links.new(picture.outputs["Color"], surface.inputs["Base Color"])
-        surface.inputs["Roughness"].default_value = roughness
-        surface.inputs["Specular IOR Level"].default_value = 0.25
+        surface.inputs["Roughness"].default_value = 1.0
+        surface.inputs["Specular IOR Level"].default_value = 0.0
         if emission:
             surface.inputs["Emission Color"].default_value = (1.0, 0.97, 0.92, 1.0)
             surface.inputs["Emission Strength"].default_value = emission
@@ -235,7 +264,7 @@ class Stage:
         picture.pixels.foreach_get(values)
         bpy.data.images.remove(picture)
         path.unlink()
-        fine = values.reshape(height // OVERSIZE, OVERSIZE, width // OVERSIZE, OVERSIZE, 4)
+        fine = values.reshape(height // self.oversize, self.oversize, width // self.oversize, self.oversize, 4)
         return fine.mean(axis=(1, 3))[::-1, :, :3]
 
     def meter(self) -> float:
@@ -243,8 +272,8 @@ class Stage:
         render = self.scene.render
         frames = [job for job in self.plan["jobs"] if job["out"].startswith("frames/")]
         size = render.resolution_x, render.resolution_y
-        render.resolution_x = OVERSIZE * METER_SIZE
-        render.resolution_y = OVERSIZE * max(8, round(METER_SIZE * size[1] / size[0]))
+        render.resolution_x = self.oversize * METER_SIZE
+        render.resolution_y = self.oversize * max(8, round(METER_SIZE * size[1] / size[0]))
         values = []
         for job in (frames[0], frames[len(frames) // 2], frames[-1]):
             band = {**job["bands"][0], "time": round(job["bands"][0]["time"])}
@@ -294,5 +323,4 @@ def _metered(folder: Path, plan: dict[str, Any], stage: Stage) -> float:
 
 if __name__ == "__main__":
     arguments = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
-    folder, only, factor = (*arguments, "", "1")[:3] if len(arguments) == 1 else arguments
-    main(Path(folder), only, int(factor))
+    main(Path(arguments[0]))

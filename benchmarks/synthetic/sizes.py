@@ -36,7 +36,9 @@ class Size:
     pose_step: int
     """The truth is rendered at every such pose of the clip."""
     samples: int
-    """Cycles samples per rendered pixel; the picture is rendered at twice its size (render_bpy.OVERSIZE)."""
+    """Cycles samples per rendered pixel."""
+    oversize: int
+    """The picture is rendered and denoised at this many times its size, then averaged."""
     texture_step: int
     """Pictures on surfaces have their size divided by this: finer than the pixels they would only be noise."""
 
@@ -56,10 +58,10 @@ class Size:
 SIZES = {
     size.name: size
     for size in (
-        Size("tiny", 1, 12, 6.0, 96, 54, 1, 4, 4, 8),
-        Size("quick", 2, 48, 8.0, 240, 135, 3, 4, 16, 4),
-        Size("medium", 3, 64, 8.0, 256, 144, 4, 4, 16, 4),
-        Size("paper", 10, 240, 24.0, 640, 360, 30, 8, 8, 2),
+        Size("tiny", 1, 12, 6.0, 96, 54, 1, 4, 2, 4, 8),
+        Size("quick", 2, 48, 8.0, 240, 135, 3, 4, 3, 4, 4),
+        Size("medium", 3, 64, 8.0, 256, 144, 4, 4, 3, 4, 4),
+        Size("paper", 10, 240, 24.0, 640, 360, 30, 8, 6, 2, 2),
     )
 }
 

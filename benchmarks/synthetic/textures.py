@@ -264,26 +264,25 @@ class Texture:
     draw: Callable[[np.random.Generator, int], Picture]
     metres: float
     """Length of one side of the picture on the surface; 0: stretched over each face."""
-    roughness: float = 0.8
     pixels: int = 1024
     """Side of the picture."""
 
 
 TEXTURES = {
-    "planks": Texture(planks, 2.0, 0.45),
+    "planks": Texture(planks, 2.0),
     "bricks": Texture(bricks, 2.0),
-    "tiles": Texture(tiles, 1.8, 0.4),
+    "tiles": Texture(tiles, 1.8),
     "plaster": Texture(plaster, 2.4),
     "wallpaper": Texture(wallpaper, 2.0),
     "concrete": Texture(concrete, 2.5),
-    "grass": Texture(grass, 2.5, 1.0),
+    "grass": Texture(grass, 2.5),
     "pavers": Texture(pavers, 3.0),
-    "gravel": Texture(gravel, 2.0, 1.0),
-    "fabric": Texture(fabric, 0.9, 1.0, pixels=384),
-    "rug": Texture(rug, 0.0, 1.0, pixels=512),
+    "gravel": Texture(gravel, 2.0),
+    "fabric": Texture(fabric, 0.9, pixels=384),
+    "rug": Texture(rug, 0.0, pixels=512),
     "cardboard": Texture(cardboard, 0.0, pixels=384),
-    "books": Texture(books, 0.0, 0.6, pixels=384),
-    "poster": Texture(poster, 0.0, 0.5, pixels=512),
-    "leaves": Texture(leaves, 0.8, 1.0, pixels=384),
-    "bark": Texture(bark, 1.0, 1.0, pixels=384),
+    "books": Texture(books, 0.0, pixels=384),
+    "poster": Texture(poster, 0.0, pixels=512),
+    "leaves": Texture(leaves, 0.8, pixels=384),
+    "bark": Texture(bark, 1.0, pixels=384),
 }

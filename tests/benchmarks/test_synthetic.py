@@ -95,14 +95,14 @@ def unproject(scene: SyntheticScene, frame: int, depth: np.ndarray) -> np.ndarra
 
 def test_same_seed_gives_the_same_bytes(out, scene, bodies, tmp_path):
     key = read_json(scene.root / "plan.json")["key"]
-    write_geometry(tmp_path, SEED, "plain", TINY, TINY.samples, key, bodies)
+    write_geometry(tmp_path, SEED, "plain", TINY, key, bodies)
     again, first = contents(tmp_path, "."), contents(scene.root, "geometry", "textures")
     first["plan.json"] = (scene.root / "plan.json").read_bytes()
     assert {k: v == again[k] for k, v in first.items()} == dict.fromkeys(again, True)
 
 
 def test_another_seed_gives_another_scene(scene, bodies, tmp_path):
-    write_geometry(tmp_path, SEED + 1, "plain", TINY, TINY.samples, "", bodies)
+    write_geometry(tmp_path, SEED + 1, "plain", TINY, "", bodies)
     a, b = read_json(scene.root / "plan.json"), read_json(tmp_path / "plan.json")
     assert a["people"] != b["people"]
     assert a["jobs"][0]["bands"][0]["world_to_camera"] != b["jobs"][0]["bands"][0]["world_to_camera"]
@@ -241,7 +241,7 @@ def test_without_a_bpy_one_sentence_says_what_to_do(tmp_path, capfd):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_limit_breaks_what_it_says(kind, bodies, tmp_path):
-    write_geometry(tmp_path, SEED, kind, TINY, TINY.samples, "", bodies)
+    write_geometry(tmp_path, SEED, kind, TINY, "", bodies)
     plan = json.loads((tmp_path / "plan.json").read_text())
     clip = [job for job in plan["jobs"] if job["out"].startswith("frames/")]
     truth = [job for job in plan["jobs"] if job["out"].startswith("truth/")]
