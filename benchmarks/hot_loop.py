@@ -30,6 +30,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 import numpy as np
 import torch
 
+from torch_backend import native
 from torch_backend.raster import RasterSettings, cpu, rasterize
 from torch_backend.raster import cpu_source as source
 
@@ -131,7 +132,7 @@ class BlendTimes:
 @functools.cache
 def _limit_kernel():
     text = source.assemble([_CHAIN_TEXT, _FORWARD_TEXT, _BACKWARD_TEXT], {"NCH": CHANNELS})
-    return cpu.build("raster_hot_loop", text)
+    return native.build("raster_hot_loop", text)
 
 
 def limits(repeats: int = 60) -> HotLoop:
@@ -199,7 +200,7 @@ def _counting_kernel():
     text = source.blend_source(CHANNELS)
     assert text.count(source.ROWS) == 2, "blending does not hold its two row loops"
     text = text.replace(source.ROWS, source.ROWS + "((long long*)P.weight_sum)[stage]++;")
-    return cpu.build("raster_blend_counting", text)
+    return native.build("raster_blend_counting", text)
 
 
 def count_rows(frames: _Frames) -> list[int]:
@@ -222,7 +223,7 @@ def blend_times(work: "Workload", threads: int, rounds: int = 15) -> BlendTimes:
     """Time the blending stages of `rounds` forward and backward passes of `work` (three colours), and count rows."""
     rows, rows_back = count_rows(_Frames(work, 1))
     frames = _Frames(work, threads)
-    own, times = cpu._workers, {source.BLEND: [], source.BLEND_BACKWARD: []}
+    own, times = cpu.run_workers, {source.BLEND: [], source.BLEND_BACKWARD: []}
     blend = cpu._compile(CHANNELS)
 
     def timed(run, block: source.Block, stage: int, workers: int) -> None:
@@ -232,12 +233,12 @@ def blend_times(work: "Workload", threads: int, rounds: int = 15) -> BlendTimes:
             times[stage].append(time.perf_counter() - start)
 
     frames.run()
-    cpu._workers = timed
+    cpu.run_workers = timed
     try:
         for _ in range(rounds):
             frames.run()
     finally:
-        cpu._workers = own
+        cpu.run_workers = own
     return BlendTimes(float(np.median(times[source.BLEND])), float(np.median(times[source.BLEND_BACKWARD])),
                       16 * rows, 16 * rows_back, threads)
 

@@ -24,8 +24,8 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 import torch
 
 from torch_backend.contract import TrainParams
+from torch_backend.native import default_threads
 from torch_backend.raster.cpu import warm_up
-from torch_backend.raster.settings import default_threads
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot
 from torch_backend.train import config_from_params

@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 BLENDER = {"bpy", "bpy_extras", "mathutils", "gpu", "gpu_extras", "bl_ext", "addon_utils", "blf", "bmesh"}
 STATIONS = (
+    "native",
     "footage",
     "solve",
     "scene",

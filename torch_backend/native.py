@@ -1,19 +1,31 @@
-"""C++ snippets of the training step, compiled by Warp at first use and run by Python threads over units of work.
+"""C++ snippets: compiled by Warp at first use (seconds, cached on disk), run by Python threads over units of work.
 
-A launch runs on the calling thread and releases the GIL. Each snippet sees its parameter block as `P` and hands itself
-units by `take()`, an atomic counter; what a unit writes belongs to it alone, so results do not depend on the number of
-threads. `PRELUDE` gives 16-lane float vectors.
+A launch runs on the calling thread and releases the GIL, so workers are Python threads. A snippet sees its parameter
+block as `P` and hands itself units by `take()`, an atomic counter; what a unit writes belongs to it alone, so results
+do not depend on the number of threads. `PRELUDE` gives 16-lane float vectors.
+
+The environment variable OMP_WAIT_POLICY=passive should be set before torch is imported (`torch_backend/__init__.py`
+does): spinning OpenMP threads would take the cores.
 """
 
+import contextlib
 import ctypes
 import functools
+import os
+import sys
+import tempfile
 import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
+import warp as wp
 
-from .raster import cpu
-from .raster.settings import default_threads
+Launch = Callable[[int, int, int], None]
+"""A compiled snippet, called as f(address of the block, stage, worker)."""
+_lock = threading.RLock()
+_pools: dict[int, ThreadPoolExecutor] = {}
 
 PRELUDE = r"""
 typedef float F __attribute__((ext_vector_type(16)));
@@ -26,11 +38,92 @@ POINTER, INTEGER = (ctypes.c_uint64, "float*"), (ctypes.c_int64, "long long")
 """Kinds of a block's fields: (ctypes, C)."""
 
 
+def default_threads() -> int:
+    """Number of worker threads used unless told otherwise: all cores that this process may use, at most 16."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores, 16))
+
+
+@contextlib.contextmanager
+def _without_notice() -> Iterator[None]:
+    """Hold back what C code writes to standard error meanwhile; pass on all but Warp's notice of a missing GPU."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # a detached process may have no standard error at all
+        yield
+        return
+    with tempfile.TemporaryFile() as notice:
+        os.dup2(notice.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            notice.seek(0)
+            lines = notice.read().decode(errors="replace").splitlines(keepends=True)
+            if sys.stderr is not None:
+                sys.stderr.writelines(line for line in lines if "CUDA driver" not in line)
+
+
+@functools.cache
+def initialised_warp() -> Any:
+    """The module warp, initialised once without a word on the terminal."""
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    with _without_notice():
+        wp.init()
+    return wp
+
+
+def build(name: str, text: str) -> Launch:
+    """Compile C++ `text` as a module of its own, or load it from Warp's cache."""
+    initialised_warp()
+
+    def run(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
+
+    run.__name__ = run.__qualname__ = name
+    native = wp.func_native(text)(run)
+
+    def entry(block: wp.uint64, stage: wp.int32, worker: wp.int32):
+        native(block, stage, worker)
+
+    module = f"{__name__}.{name}"
+    kernel = wp.Kernel(entry, key=name, module=wp.get_module(module), options={"enable_backward": False})
+    wp.load_module(module, device="cpu")
+
+    def launch(block: int, stage: int, worker: int) -> None:
+        wp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
+
+    return launch
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    with _lock:
+        if threads not in _pools:
+            _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="native")
+        return _pools[threads]
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork; the child makes its own.
+    os.register_at_fork(after_in_child=_pools.clear)
+
+
+def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
+    """Run one stage of a block (a ctypes structure with a field `counter`) on `workers` threads, the caller's too."""
+    block.counter = 0
+    address = ctypes.addressof(block)
+    waiting = [_pool(workers - 1).submit(run, address, stage, w) for w in range(1, workers)] if workers > 1 else []
+    run(address, stage, 0)
+    for future in waiting:
+        future.result()
+
+
 class Snippet:
     """One compiled body. `fields` are those of its parameter block in order, name -> kind; `counter` is added."""
 
     def __init__(self, name: str, fields: dict[str, tuple[Any, str]], source: str) -> None:
-        self.name, self._launch, self._lock = name, None, threading.Lock()
+        self.name, self._lock = name, threading.Lock()
+        self._launch: Launch | None = None
         fields = {**fields, "counter": INTEGER}
         self._block = type("Block", (ctypes.Structure,), {"_fields_": [(n, kind) for n, (kind, _) in fields.items()]})
         struct = " ".join(f"{text} {n};" for n, (_, text) in fields.items())
@@ -40,39 +133,20 @@ class Snippet:
         """Compile, or load from the cache; threads that ask at once wait for one compilation."""
         with self._lock:
             if self._launch is None:
-                self._launch = self._build()
+                self._launch = build(self.name, self._source)
 
     def run(self, threads: int | None = None, stage: int = 0, **values: Any) -> None:
         """Runs the body on `threads` workers (default: all cores) with the block's fields as given."""
         if self._launch is None:
             self.warm_up()
         block: Any = self._block(**values)
-        cpu._workers(self._launch, block, stage, threads or default_threads())  # type: ignore[arg-type]
-
-    def _build(self) -> Any:
-        wp = cpu._import_warp()
-
-        def body(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
-
-        body.__name__ = body.__qualname__ = self.name
-        native = wp.func_native(self._source)(body)
-
-        def entry(block: wp.uint64, stage: wp.int32, worker: wp.int32):
-            native(block, stage, worker)
-
-        module = f"{__name__}.{self.name}"
-        kernel = wp.Kernel(entry, key=self.name, module=wp.get_module(module), options={"enable_backward": False})
-        wp.load_module(module, device="cpu")
-
-        def launch(block: int, stage: int, worker: int) -> None:
-            wp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
-
-        return launch
+        assert self._launch is not None
+        run_workers(self._launch, block, stage, threads or default_threads())
 
 
 @functools.cache
 def _stream(device: str, handle: int) -> Any:
-    wp = cpu._import_warp()
+    initialised_warp()
     return wp.Stream(wp.get_device(device), cuda_stream=handle)
 
 
@@ -84,7 +158,7 @@ def warp_stream(device: torch.device) -> Any:
 
 def launch_on(kernel: Any, dim: Any, inputs: list[Any], device: torch.device) -> None:
     """Launches a Warp kernel where a torch tensor's `device` is; on CUDA behind torch's work, on its current stream."""
-    wp = cpu._import_warp()
+    initialised_warp()
     if device.type == "cpu":
         wp.launch(kernel, dim=dim, inputs=inputs, device="cpu")
         return

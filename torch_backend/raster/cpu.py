@@ -1,90 +1,29 @@
 """CPU body of the rasteriser: C++ snippets compiled by Warp, Python threads over chunks and tiles, own backward.
 
-Warp compiles at first use (a few seconds, cached on disk); `warm_up` does that from the main thread. A launch runs on
-the calling thread and releases the GIL, so workers are Python threads. The environment variable OMP_WAIT_POLICY=passive
-should be set before torch is imported (`torch_backend/__init__.py` does): spinning OpenMP threads would take the cores.
+`native.py` says how snippets are compiled and run; `warm_up` compiles those of an image from the main thread.
 """
 
-import contextlib
 import ctypes
-import functools
-import os
-import sys
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 
 import torch
-import warp as wp
 from torch import Tensor
 
+from ..native import Launch, build, run_workers
 from . import cpu_source as source
 from .constants import FRUSTUM_MARGIN, TILE
 from .reference import expected_depth
 from .settings import RasterOutput, Scene, camera_limits
 
-_HITS_MAX = 2**31 - 1
+_HITS_MAX = 2**27
+"""So many hits take 1 GB, and 8 GB more for their gradients: beyond that a scene is broken rather than large."""
 _lock = threading.RLock()
-_kernels: dict[int, Callable[[int, int, int], None]] = {}
-_pools: dict[int, ThreadPoolExecutor] = {}
+_kernels: dict[int, Launch] = {}
 _idle: list["_Workspace"] = []
 _IDLE_MAX = 4
 
 
-@contextlib.contextmanager
-def _without_notice() -> Iterator[None]:
-    """Hold back what C code writes to standard error meanwhile; pass on all but Warp's notice of a missing GPU."""
-    try:
-        saved = os.dup(2)
-    except OSError:  # a detached process may have no standard error at all
-        yield
-        return
-    with tempfile.TemporaryFile() as notice:
-        os.dup2(notice.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
-            notice.seek(0)
-            lines = notice.read().decode(errors="replace").splitlines(keepends=True)
-            if sys.stderr is not None:
-                sys.stderr.writelines(line for line in lines if "CUDA driver" not in line)
-
-
-@functools.cache
-def _import_warp():
-    """Warp, initialised once without a word on the terminal."""
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    with _without_notice():
-        wp.init()
-    return wp
-
-
-def build(name: str, text: str) -> Callable[[int, int, int], None]:
-    """Compile C++ `text` as a module of its own, or load it from Warp's cache. Called as f(block, stage, worker)."""
-    wp = _import_warp()
-
-    def run(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
-
-    run.__name__ = run.__qualname__ = name
-    native = wp.func_native(text)(run)
-
-    def entry(block: wp.uint64, stage: wp.int32, worker: wp.int32):
-        native(block, stage, worker)
-
-    module = f"{__name__}.{name}"
-    kernel = wp.Kernel(entry, key=name, module=wp.get_module(module), options={"enable_backward": False})
-    wp.load_module(module, device="cpu")
-
-    def launch(block: int, stage: int, worker: int) -> None:
-        wp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
-
-    return launch
-
-
-def _compile(channels: int) -> Callable[[int, int, int], None]:
+def _compile(channels: int) -> Launch:
     """Kernel of the stages that know no channels (channels = 0), or of blending. Called as f(block, stage, worker)."""
     with _lock:
         if channels not in _kernels:
@@ -100,28 +39,6 @@ def warm_up(channels: int = 3) -> None:
     """
     _compile(0)
     _compile(channels)
-
-
-def _pool(threads: int) -> ThreadPoolExecutor:
-    with _lock:
-        if threads not in _pools:
-            _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="raster")
-        return _pools[threads]
-
-
-if hasattr(os, "register_at_fork"):
-    # Threads do not survive a fork; the child makes its own.
-    os.register_at_fork(after_in_child=_pools.clear)
-
-
-def _workers(run: Callable[[int, int, int], None], block: source.Block, stage: int, workers: int) -> None:
-    """Run one stage on `workers` threads, the calling one among them; 1 at least."""
-    block.counter = 0
-    address = ctypes.addressof(block)
-    waiting = [_pool(workers - 1).submit(run, address, stage, w) for w in range(1, workers)] if workers > 1 else []
-    run(address, stage, 0)
-    for future in waiting:
-        future.result()
 
 
 class _Workspace:
@@ -196,7 +113,7 @@ def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) ->
     stages, blend = _compile(0), _compile(image_channels)
     address = ctypes.addressof(block)
     by_chunk, by_tile = min(threads, block.chunks), min(threads, block.tiles_x * block.tiles_y)
-    _workers(stages, block, source.PROJECT, by_chunk)
+    run_workers(stages, block, source.PROJECT, by_chunk)
     stages(address, source.SORT, 0)
     if block.hits > _HITS_MAX:
         raise RuntimeError(f"{block.visible} Gaussians cover {block.hits} tiles of a {block.width}x{block.height} "
@@ -205,12 +122,12 @@ def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) ->
     workspace.need("hit_place", block.hits)
     if block.want_weights:
         workspace.need("hit_weight", 2 * block.hits)
-    _workers(stages, block, source.COUNT, block.workers)
+    run_workers(stages, block, source.COUNT, block.workers)
     stages(address, source.PREFIX, 0)
-    _workers(stages, block, source.EMIT, block.workers)
-    _workers(blend, block, source.BLEND, by_tile)
+    run_workers(stages, block, source.EMIT, block.workers)
+    run_workers(blend, block, source.BLEND, by_tile)
     if block.want_weights:
-        _workers(stages, block, source.WEIGHTS, by_chunk)
+        run_workers(stages, block, source.WEIGHTS, by_chunk)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -271,8 +188,8 @@ class _Rasterize(torch.autograd.Function):
                    grad_alpha=grad_alpha[c], grad_view=partial, grad_norm=ctx.norms[0][c], grad_abs=ctx.norms[1][c],
                    **out)
             threads = scene.settings.threads
-            _workers(blend, block, source.BLEND_BACKWARD, min(threads, block.tiles_x * block.tiles_y))
-            _workers(stages, block, source.PROJECT_BACKWARD, min(threads, block.chunks))
+            run_workers(blend, block, source.BLEND_BACKWARD, min(threads, block.tiles_x * block.tiles_y))
+            run_workers(stages, block, source.PROJECT_BACKWARD, min(threads, block.chunks))
             grad_view[c, :3] = partial.double().sum(0).reshape(3, 4).float()
         grad_background = None
         if background is not None and ctx.needs_input_grad[9]:

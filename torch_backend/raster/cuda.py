@@ -23,10 +23,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..native import warp_stream
+from ..native import initialised_warp, warp_stream
 from . import cuda_source as source
 from .constants import TILE
-from .cpu import _import_warp
 from .reference import expected_depth
 from .settings import RasterOutput, Scene
 
@@ -62,7 +61,7 @@ def build(name: str, channels: int = 0):
 
 def _kernel(name: str, text: str, module: str):
     """Warp kernel `name` with the body `text`."""
-    wp = _import_warp()
+    wp = initialised_warp()
     structure = _structure(wp)
 
     def native(args, task): ...
@@ -86,7 +85,7 @@ def module_name(name: str, channels: int = 0) -> str:
 
 def _refusal(device: torch.device) -> str | None:
     """Why Warp cannot use `device`, and what to do; None if it can."""
-    wp = _import_warp()
+    wp = initialised_warp()
     if device.type != "cuda" or (wp.is_cuda_available() and (device.index or 0) < wp.get_cuda_device_count()):
         return None
     return ("PyTorch sees the NVIDIA GPU, but Warp, which compiles the rasteriser, does not: update the NVIDIA driver "
@@ -98,7 +97,7 @@ class _Launcher:
     """Launches kernels on torch's current stream of one device."""
 
     def __init__(self, device: torch.device):
-        self.wp, self.device = _import_warp(), device
+        self.wp, self.device = initialised_warp(), device
         self.where = {"stream": warp_stream(device)} if device.type == "cuda" else {"device": "cpu"}
 
     def __call__(self, name: str, args: Any, threads: int, channels: int = 0) -> None:
@@ -316,7 +315,7 @@ def warm_up(channels: int = 3, device: torch.device | str = "cuda") -> None:
     device = torch.device(device)
     if refusal := _refusal(device):
         raise RuntimeError(refusal)
-    wp = _import_warp()
+    wp = initialised_warp()
     names = [(name, 0) for name in source.stages()] + [(name, channels) for name in source.blending(channels)]
     modules = {module_name(*each): build(*each) for each in names}
     with torch.cuda.device(device) if device.type == "cuda" else _Fibers(wp):

@@ -1,16 +1,11 @@
 """What a caller says to the rasteriser and what comes back."""
 
-import os
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-
-def default_threads() -> int:
-    """Number of worker threads used unless told otherwise: all cores that this process may use, at most 16."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, 16))
+from ..native import default_threads
 
 
 @dataclass(frozen=True)

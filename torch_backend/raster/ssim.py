@@ -13,15 +13,13 @@ with the value.
 import ctypes
 import functools
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from . import cpu
-from .settings import default_threads
+from ..native import Launch, build, default_threads, run_workers
 
 WINDOW, SIGMA = 11, 1.5
 _HALF = WINDOW // 2
@@ -171,27 +169,11 @@ _lock = threading.Lock()
 
 
 @functools.lru_cache(maxsize=1)
-def _build() -> Callable[[int, int, int], None]:
-    """Compile the kernel; called as f(block, stage, worker)."""
-    wp = cpu._import_warp()
-
-    def ssim_passes(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
-
-    native = wp.func_native(_source())(ssim_passes)
-
-    def entry(block: wp.uint64, stage: wp.int32, worker: wp.int32):
-        native(block, stage, worker)
-
-    kernel = wp.Kernel(entry, key="ssim_passes", module=wp.get_module(__name__), options={"enable_backward": False})
-    wp.load_module(__name__, device="cpu")
-
-    def launch(block: int, stage: int, worker: int) -> None:
-        wp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
-
-    return launch
+def _build() -> Launch:
+    return build("ssim_passes", _source())
 
 
-def _compile() -> Callable[[int, int, int], None]:
+def _compile() -> Launch:
     """The kernel; threads that ask for it at once wait for one compilation."""
     with _lock:
         return _build()
@@ -244,9 +226,9 @@ def _run(image: Tensor, target: Tensor, want_gradient: bool, threads: int) -> tu
         row_score=scores.data_ptr(), blurred=_local.blurred.data_ptr(), scratch=_local.scratch.data_ptr(),
         height=height, length=length, channels=channels, padded=padded, margin=margin, pitch=pitch,
         scratch_stride=stride, want_gradient=int(want_gradient))
-    cpu._workers(launch, block, 0, threads)
+    run_workers(launch, block, 0, threads)
     if want_gradient:
-        cpu._workers(launch, block, 1, threads)
+        run_workers(launch, block, 1, threads)
     return (scores.double().sum() / (height * length)).float(), gradient
 
 

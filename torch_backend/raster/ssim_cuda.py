@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..native import launch_on
-from . import cpu
+from ..native import initialised_warp, launch_on
 from .ssim import WINDOW, _taps
 
 _SOURCE = r"""
@@ -68,7 +67,7 @@ if (stage == 0) {
 @functools.lru_cache(maxsize=1)
 def kernel() -> Any:
     """The Warp kernel of all passes; compiled for a device at its first launch there."""
-    wp = cpu._import_warp()
+    wp = initialised_warp()
     taps = ", ".join(f"{tap:.9g}f" for tap in _taps())
     source = _SOURCE.replace("@HALF@", str(WINDOW // 2)).replace("@TAPS@", taps)
 

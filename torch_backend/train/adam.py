@@ -13,8 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..native import INTEGER, POINTER, Snippet, launch_on
-from ..raster import cpu
+from ..native import INTEGER, POINTER, Snippet, initialised_warp, launch_on
 
 _CHUNK = 4096
 """Elements per unit of work."""
@@ -128,7 +127,7 @@ m[i] = M; v[i] = V; p[i] = X < r[4] ? r[4] : (X > r[5] ? r[5] : X);
 @functools.lru_cache(maxsize=1)
 def _kernel() -> Any:
     """The Warp kernel of `_ELEMENT`, for CUDA; it runs on Warp's cpu device too, where tests compare it."""
-    wp = cpu._import_warp()
+    wp = initialised_warp()
     source = _ELEMENT.replace("@CHUNK@", str(_CHUNK)).replace("@WHOLE@", str(_WHOLE)).replace("@REAL@", str(_REAL))
 
     def adam_element(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..contract import DEVICES, ExitCode, JobError
-from ..raster.cpu import _import_warp
+from ..native import initialised_warp
 
 _HINT = "Choose --device cpu, or auto."
 
@@ -26,7 +26,7 @@ def cuda_refusal() -> str:
         return "This PyTorch is built for AMD GPUs, which the rasteriser has no body for."
     if not torch.cuda.is_available():
         return "PyTorch sees no NVIDIA GPU."
-    if not _import_warp().is_cuda_available():
+    if not initialised_warp().is_cuda_available():
         return "PyTorch sees the NVIDIA GPU, but Warp does not: update the NVIDIA driver to version 580 or newer."
     if torch.cuda.get_device_capability() < (7, 5):
         return "The NVIDIA GPU is too old: it must be of the Turing generation (compute capability 7.5) or later."

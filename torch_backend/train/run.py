@@ -13,9 +13,9 @@ from torch import Tensor
 from ..contract import ExitCode, JobError, Reporter, TrainParams, read_json
 from ..deformation import planes
 from ..footage.images import write_png
+from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
-from ..raster.settings import default_threads
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, write_json
 from . import adam

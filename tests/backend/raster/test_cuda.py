@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from torch_backend.native import initialised_warp
 from torch_backend.raster import RasterOutput, RasterSettings, cuda, rasterize
 
 GPU = torch.cuda.is_available()
@@ -247,7 +248,7 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
 
 def test_kernels_of_a_module_are_made_together(monkeypatch):
     # One that came later would make Warp unload the others, under CUDA graphs that hold them.
-    wp = cuda._import_warp()
+    wp = initialised_warp()
     monkeypatch.setattr(cuda, "_kernels", {("", 0): cuda._structure(wp)})
     monkeypatch.setattr(cuda, "module_name", lambda name, channels=0: "tests.raster.cuda.fresh")
     cuda.build("raster_project")

@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from torch_backend.native import initialised_warp
 from torch_backend.raster import cuda, cuda_source
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
@@ -13,7 +14,7 @@ MODULES |= {cuda.module_name(name, c): [(name, c)] for c in (3, 22) for name in 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_kernels_compile_for_every_architecture(module, tmp_path, capfd):
-    wp = cuda._import_warp()
+    wp = initialised_warp()
     for name, channels in MODULES[module]:
         cuda.build(name, channels)
     paths = wp.compile_aot_module(module, arch=ARCHITECTURES, module_dir=tmp_path, use_ptx=True)
@@ -32,7 +33,7 @@ def test_kernels_compile_for_every_architecture(module, tmp_path, capfd):
 def test_machine_code_is_made_too(arch, tmp_path):
     name = "raster_blend_backward"
     cuda.build(name, 3)
-    (path,) = cuda._import_warp().compile_aot_module(cuda.module_name(name, 3), arch=arch, module_dir=tmp_path,
+    (path,) = initialised_warp().compile_aot_module(cuda.module_name(name, 3), arch=arch, module_dir=tmp_path,
                                                      use_ptx=False)
     code = path.read_bytes()
     assert code[:4] == b"\x7fELF"

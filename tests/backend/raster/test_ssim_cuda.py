@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torch_backend.native import initialised_warp
 from torch_backend.raster import ssim as ssim_cpu
 from torch_backend.raster import ssim_cuda
 from torch_backend.train import adam, losses
@@ -60,7 +61,7 @@ def test_refuses_what_it_cannot_do():
 @pytest.mark.parametrize("arch", [75, 90, 120])
 def test_kernels_compile_for_gpus_that_are_not_here(tmp_path, arch):
     """NVRTC comes with Warp: a GPU's code is made without one. Adam's kernel too."""
-    wp = ssim_cpu.cpu._import_warp()
+    wp = initialised_warp()
     for kernel in (ssim_cuda.kernel(), adam._kernel()):
         folder = tmp_path / kernel.key
         wp.compile_aot_module(kernel.module, arch=arch, module_dir=str(folder), use_ptx=True)
