@@ -134,17 +134,20 @@ def exact_cameras(scene: SyntheticScene, similarity: Similarity | None = None) -
 
 
 def similarity_to_exact(scene: SyntheticScene, shot: Shot) -> Similarity:
-    """Maps a solved shot to the exact world by the centres of its registered cameras (Umeyama, PAMI 1991)."""
+    """Maps a solved shot to the exact world by its registered cameras.
+
+    Scale and translation fit the centres (Umeyama, PAMI 1991); the rotation fits the orientations, because the centres
+    of a camera that walks straight ahead leave the turn about that line open.
+    """
     solved = [c for c in CameraPath.load(shot.solve / "cameras.json").frames if c.source == "registered"]
     views = np.array([c.viewmat for c in solved]).reshape(-1, 4, 4)
     source = np.array([camera_centre(v) for v in views])
     exact = np.array([scene.world_to_camera[c.frame] for c in solved])
     target = np.array([camera_centre(v) for v in exact])
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a / len(a))
-    flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * flip) @ vt
-    scale = float((s * flip).sum() / (a**2).sum(axis=1).mean())
+    u, _, vt = np.linalg.svd(np.einsum("nki,nkj->ij", exact[:, :3, :3], views[:, :3, :3]))
+    rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    a, b = (source - source.mean(axis=0)) @ rotation.T, target - target.mean(axis=0)
+    scale = float((a * b).sum() / (a**2).sum())
     translation = target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
     rms = np.sqrt(((source @ (scale * rotation).T + translation - target) ** 2).sum(axis=1).mean())
     traces = np.einsum("nij,nij->n", views[:, :3, :3], exact[:, :3, :3] @ rotation)
