@@ -278,5 +278,8 @@ def test_quality_in_words(registered, error, expected):
 
 
 def test_the_worker_loads_colmap_without_what_collides_with_it():
-    code = "import sys, torch_backend.solve.worker; assert 'pycolmap' in sys.modules; assert 'OpenImageIO' not in sys.modules"
+    code = """
+import sys, torch_backend.solve.worker
+assert "pycolmap" in sys.modules and "OpenImageIO" not in sys.modules
+"""
     subprocess.run([sys.executable, "-c", code], check=True)
