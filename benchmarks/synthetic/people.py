@@ -5,6 +5,9 @@ skin pushed outwards by some millimetres and painted; hair is a cap of the same 
 -y ahead, z up, metres. Angles are degrees about these axes.
 """
 
+# Packages of requirements/bench.txt may be absent; each use says what to do then.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field

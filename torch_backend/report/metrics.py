@@ -5,6 +5,9 @@ was never seen at t*, what moves) is judged by its own pixels; a window or a rec
 the region's border. A metric whose package is absent is None, and `missing_metrics` says so: never a made-up figure.
 """
 
+# Packages of requirements/bench.txt may be absent; each use says what to do then.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import importlib.util

@@ -4,6 +4,9 @@ Pictures stand in the page once each, as JPEG data URIs in one script; the slide
 by keyboard; colours follow the reader's light or dark setting.
 """
 
+# Packages of requirements/bench.txt may be absent; each use says what to do then.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import base64

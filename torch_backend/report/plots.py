@@ -1,5 +1,8 @@
 """Pictures of a report: quality against cost with Pareto fronts, strips of frames, one pose at two instants."""
 
+# Packages of requirements/bench.txt may be absent; each use says what to do then.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence

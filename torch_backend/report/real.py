@@ -4,6 +4,9 @@ whatever t* is. Here is told where nothing moves: where optical flow stays on it
 A surface that moves exactly along its epipolar lines looks like one at another depth, and is not told from it.
 """
 
+# Packages of requirements/bench.txt may be absent; each use says what to do then.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import importlib.util
