@@ -52,8 +52,12 @@ class SupervisionConfig:
     """`support`: (Gaussian, time) pairs drawn each time."""
     support_seconds: float = 4.0
     """`support`: confidence in an anchor decays as exp(-|dt| / this)."""
+    anchor: str = "unsupported"
+    """`support`, who is anchored where. unsupported: whoever did not contribute there; hidden: of those only whom
+    nobody could have seen, out of the frame or behind something. The latter fitted held-out frames of the bundled clip
+    0.3 dB worse (docs/benchmarks.md); which one freezes better, scenes with truth have to say."""
     look_every: int = 4
-    """`support` looks every so many iterations who could not be seen in the frame; only those are anchored there."""
+    """`support` with anchor `hidden` looks every so many iterations who could not be seen in the frame."""
 
 
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
@@ -84,7 +88,9 @@ def draw_anchored(
     """
     if not len(rows):
         return None
-    picked, bins, valid = _draw(model.support[rows], model.hidden[rows], config.support_samples, generator)
+    support = model.support[rows]
+    lacking = ~support & model.hidden[rows] if config.anchor == "hidden" else ~support
+    picked, bins, valid = _draw(support, lacking, config.support_samples, generator)
     rows = rows[picked]
     if rows.device.type == "cpu":
         rows, bins = rows[valid], bins[valid]
@@ -137,8 +143,8 @@ _FAR = 4
 """So many pairs anywhere are drawn for each one near support; near ones fill what is then left of the count."""
 
 
-def _draw(support: Tensor, hidden: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """(row, bin, valid) of drawn pairs; up to `count` are valid: hidden [M, B], without support, in a row with it.
+def _draw(support: Tensor, lacking: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """(row, bin, valid) of drawn pairs; up to `count` are valid: lacking [M, B], in a row with support [M, B].
 
     The first lie anywhere, the last `count` at a log-uniform distance from support.
 
@@ -160,7 +166,7 @@ def _draw(support: Tensor, hidden: Tensor, count: int, generator: torch.Generato
     valid = (chosen >= 0) & (chosen < bins)
     chosen = chosen.clamp(0, bins - 1)
     at = (picked, chosen)
-    valid &= support.any(1)[picked] & hidden[at] & ~support[at]
+    valid &= support.any(1)[picked] & lacking[at]
     return picked, chosen, valid & (valid.cumsum(0) <= count)
 
 

@@ -315,7 +315,8 @@ class Trainer:
 
     def _is_to_look(self) -> bool:
         s = self.config.supervision
-        return s.preset == "support" and self.model.field is not None and self.iteration % s.look_every == 0
+        needed = s.preset == "support" and s.anchor == "hidden" and self.model.field is not None
+        return needed and self.iteration % s.look_every == 0
 
     def _pairs_to_anchor(self, rows: Tensor) -> Anchored | None:
         s = self.config.supervision

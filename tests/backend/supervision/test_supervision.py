@@ -139,10 +139,16 @@ def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
     """Its owner moved on: the frames say that it is not there, and nothing pulls it back to where it was seen."""
     m = model([[1, 1, 0, 0, 0, 0]] * 2)
     m.hidden[0] = False
-    pairs = draw_anchored(m, torch.arange(2), SupervisionConfig(), torch.Generator().manual_seed(1))
-    assert set(pairs.rows.tolist()) == {1}
+    config = SupervisionConfig(anchor="hidden")
+
+    def rows_drawn(config: SupervisionConfig) -> set[int]:
+        pairs = draw_anchored(m, torch.arange(2), config, torch.Generator().manual_seed(1))
+        return set() if pairs is None else set(pairs.rows.tolist())
+
+    assert rows_drawn(config) == {1}
+    assert rows_drawn(SupervisionConfig()) == {0, 1}  # the default holds whatever did not contribute
     m.hidden[:] = False
-    assert draw_anchored(m, torch.arange(2), SupervisionConfig(), torch.Generator().manual_seed(1)) is None
+    assert rows_drawn(config) == set()
 
 
 def test_hidden_is_out_of_the_frame_or_behind_what_is_seen():
