@@ -52,10 +52,9 @@ class SupervisionConfig:
     """`support`: (Gaussian, time) pairs drawn each time."""
     support_seconds: float = 4.0
     """`support`: confidence in an anchor decays as exp(-|dt| / this)."""
-    anchor: str = "unsupported"
-    """`support`, who is anchored where. unsupported: whoever did not contribute there; hidden: of those only whom
-    nobody could have seen, out of the frame or behind something. The latter fitted held-out frames of the bundled clip
-    0.3 dB worse (docs/benchmarks.md); which one freezes better, scenes with truth have to say."""
+    anchor: str = "hidden"
+    """`support`, who is anchored where, among those that did not contribute. hidden: whom nobody could have seen, out
+    of the frame or behind something; unsupported: all. Scenes with truth have to say which freezes better."""
     look_every: int = 4
     """`support` with anchor `hidden` looks every so many iterations who could not be seen in the frame."""
 

@@ -139,14 +139,14 @@ def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
     """Its owner moved on: the frames say that it is not there, and nothing pulls it back to where it was seen."""
     m = model([[1, 1, 0, 0, 0, 0]] * 2)
     m.hidden[0] = False
-    config = SupervisionConfig(anchor="hidden")
+    config = SupervisionConfig()
 
     def rows_drawn(config: SupervisionConfig) -> set[int]:
         pairs = draw_anchored(m, torch.arange(2), config, torch.Generator().manual_seed(1))
         return set() if pairs is None else set(pairs.rows.tolist())
 
     assert rows_drawn(config) == {1}
-    assert rows_drawn(SupervisionConfig()) == {0, 1}  # the default holds whatever did not contribute
+    assert rows_drawn(SupervisionConfig(anchor="unsupported")) == {0, 1}
     m.hidden[:] = False
     assert rows_drawn(config) == set()
 
