@@ -58,6 +58,10 @@ class SupervisionConfig:
     look_every: int = 4
     """`support` with anchor `hidden` looks every so many iterations who could not be seen in the frame."""
 
+    def __post_init__(self) -> None:
+        if self.anchor not in ("hidden", "unsupported"):
+            raise ValueError(f"anchor is {self.anchor!r}: it should be hidden or unsupported")
+
 
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
 """Weights of the attributes in `support`, so that typical deltas of each count alike; means in scene units."""
