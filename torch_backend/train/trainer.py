@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ from .config import TrainConfig, config_to_json
 from .exposure import Exposure
 from .losses import photometric, psnr
 from .model import DynamicModel, render
+from .repair import drop_offenders, repair, unstable
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
@@ -96,7 +98,9 @@ class Trainer:
         self.iteration = 0
         self.trained_seconds = 0.0
         self.bad_steps = 0
+        self.unusable: set[int] = set()
         self.order: list[int] = []
+        self._recent: deque[int] = deque(maxlen=2 * _LOOK_EVERY)
         self.optimizer = self._gaussian_optimizer()
         self.densifier = Densifier(config.densify, len(gaussians), self.device)
         self._bad = torch.zeros(2, dtype=torch.int32, device=self.device)
@@ -217,7 +221,9 @@ class Trainer:
     # ------------------------------------------------------------------ the gate
 
     def _gate_round(self) -> None:
+        self._look()  # one NaN would make every residual NaN
         frames = list(range(0, len(self.train_ids), max(1, len(self.train_ids) // 40)))
+        frames = [frame for frame in frames if frame not in self.unusable]
         residual, weight = residual_per_gaussian(frames, self._residual_of, len(self.model.gaussians))
         open_gate(self.model.gaussians, residual, weight, self.config.gate)
         if not bool(self.model.gaussians.open.any()):
@@ -246,6 +252,7 @@ class Trainer:
         return error, pull, out.weight_sum[0]
 
     def _create_field(self) -> None:
+        self._look()  # and every bound of the field
         model, c = self.model.gaussians, self.config
         means = model.params["means"].detach()[model.open].cpu()
         harmonics = model.params["shN"].shape[1]
@@ -299,7 +306,9 @@ class Trainer:
 
     def _next_frame(self) -> int:
         if not self.order:
-            self.order = torch.randperm(len(self.train_ids), generator=self.generator, device="cpu").tolist()
+            drawn = torch.randperm(len(self.train_ids), generator=self.generator, device="cpu").tolist()
+            self.order = [frame for frame in drawn if frame not in self.unusable]
+        self._recent.append(self.order[-1])
         return self.order.pop()
 
     def _regularisers(self, rows: Tensor) -> Tensor:
@@ -340,8 +349,9 @@ class Trainer:
     def _paper_step(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> None:
         """Adds the paper's terms for this frame and a random other one; their gradients join the step's."""
         other = int(torch.randint(len(self.train_ids), (1,), generator=self.generator, device="cpu"))
-        if self.times[other] == self.times[frame]:
+        if self.times[other] == self.times[frame] or other in self.unusable:
             return
+        self._recent.append(other)
         acted = self._acted(frame, rows, state, out)
         other_state = self.model.state_at(self.times[other])
         other_state["means"].retain_grad()
@@ -373,35 +383,49 @@ class Trainer:
         return PaperView(self.times[frame], {k: v[rows] for k, v in state.items()}, inside, acted)
 
     def _left_out(self, frame: int) -> None:
-        """Counts a step that was left out on the CPU; a run that keeps failing ends in words, its checkpoint in place.
-        """
+        """After a step that was left out on the CPU: repairs; a run that keeps failing ends in words."""
         self.bad_steps += 1
         if self.bad_steps >= _MAX_BAD_STEPS:
-            raise self._unstable()
-        if self.bad_steps == 1:
-            number = self.scene.frames[self.train_ids[frame]]
-            self.report.warning(
-                f"Step {self.iteration} on frame {number} was skipped: its loss or gradient is not finite."
-            )
+            raise unstable(self.iteration)
+        number = self.scene.frames[self.train_ids[frame]]
+        text = f"Step {self.iteration} on frame {number} was skipped: its loss or gradient is not finite."
+        self._recover(text if self.bad_steps == 1 else "", gradients=True)
 
     def _look(self) -> None:
-        """Reads a GPU's counts of steps left out: in all since the last look, and in a row."""
-        if self.device.type == "cpu":
-            return
-        count, in_a_row = self._bad.tolist()
+        """Repairs what is not finite; reads a GPU's counts of steps left out: since the last look, and in a row."""
+        count, in_a_row = (0, 0) if self.device.type == "cpu" else self._bad.tolist()
         self._bad[0] = 0
         if in_a_row >= _MAX_BAD_STEPS:
-            raise self._unstable()
-        if count:
-            text = f"{count} of the steps up to {self.iteration} were skipped: their loss or gradient is not finite."
-            self.report.warning(text)
+            raise unstable(self.iteration)
+        text = f"{count} of the steps up to {self.iteration} were skipped: their loss or gradient is not finite."
+        self._recover(text if count else "", gradients=in_a_row > 0)
 
-    def _unstable(self) -> JobError:
-        return JobError(
-            f"Training became unstable at step {self.iteration} (the loss or its gradient is not finite).",
-            "The last good checkpoint is kept; train again with a smaller width or another seed.",
-            ExitCode.TRAIN,
-        )
+    def _recover(self, skipped: str, gradients: bool) -> None:
+        """Finds what is not finite and drops or mends it; `skipped` says which steps were left out, if any.
+
+        gradients: the parameters hold those of a step that was left out.
+        """
+        done = repair(self.model, self.optimizer, self.densifier, self.iteration)
+        bad = [] if done or not (skipped or gradients) else self._bad_images()
+        if bad:
+            self.unusable.update(bad)
+            self.order = [frame for frame in self.order if frame not in self.unusable]
+            if len(self.unusable) == len(self.train_ids):
+                raise unstable(self.iteration)
+            names = ", ".join(str(self.scene.frames[self.train_ids[frame]]) for frame in bad)
+            done = f"left frame {names} out from now on (its image is not finite)"
+        elif gradients and not done:
+            done = drop_offenders(self.model, self.optimizer, self.densifier)
+        if done:
+            skipped = f"{skipped} Repaired" if skipped else f"Step {self.iteration}: repaired"
+            self.report.warning(f"{skipped}: {done}. Training goes on.")
+        elif skipped:
+            self.report.warning(skipped)
+
+    def _bad_images(self) -> list[int]:
+        """Of the frames trained on lately, those whose image is not finite."""
+        frames = sorted({*self._recent} - self.unusable)
+        return [frame for frame in frames if not bool(torch.isfinite(self._image(frame)).all())]
 
     # ------------------------------------------------------------------ optimiser
 
