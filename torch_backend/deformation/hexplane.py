@@ -3,7 +3,10 @@
 Corrected against the published code (design: method-hosts 1.1): time is mapped to the whole plane, the heads' last
 layers start at zero so that the field starts as the identity, learning rates do not follow the scene's extent
 (the scene is normalised), smoothness acts along both axes of a spatial plane, and sampling coordinates are detached:
-the field says how things move, the image says where they are. `published` brings back all but the last.
+the field says how things move, the image says where they are. `published` brings all of that back.
+
+What stays the trainer's for every host, and so is not the published code's: one image per step (2 to 4), the loss, the
+Gaussians' own rates and their growth, and one optimiser for both stages.
 """
 
 from __future__ import annotations
@@ -56,7 +59,7 @@ class HexPlaneConfig(HostConfig):
     """Share of the run at which the learning rates have ended."""
     published: bool = False
     """Times fed as they are to a sampler of [-1, 1], heads that start as noise, smoothness down the planes only (so
-    never along x), the box of the first points, and all harmonics move (on)."""
+    never along x), the box of the first points, all harmonics move, and means are pulled through the lookup (on)."""
 
 
 def _reference(iterations: int) -> HexPlaneConfig:
@@ -110,7 +113,8 @@ class HexPlane(Deformation):
 
     def features_at(self, means: Tensor, times: Tensor) -> Tensor:
         """Product of the six planes' samples, levels concatenated: [M, features * levels]."""
-        where = 2.0 * (means.detach() - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
+        means = means if self.config.published else means.detach()
+        where = 2.0 * (means - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
         when = (times if self.config.published else 2.0 * times - 1.0).expand(len(means))
         planes = self._by_level()
         if compiled.supports(planes) and where.dtype == torch.float32:
@@ -126,7 +130,7 @@ class HexPlane(Deformation):
         return torch.cat(parts, dim=1)
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
-        """Deltas of M Gaussians; means [M, 3] scene units (detached here), times [M] or [1] in [0, 1]."""
+        """Deltas of M Gaussians; means [M, 3] scene units (ours detaches them), times [M] or [1] in [0, 1]."""
         hidden = F.relu(self.trunk(self.features_at(means, times)))
         out = {name: head(F.relu(self.hidden[name](hidden))) for name, head in self.out.items()}
         return Deltas(

@@ -24,23 +24,24 @@ _POINTS = 64
 
 _SAMPLES = r"""
 // planes: [levels * 6] addresses of [H][W][C]; sizes: H, W of each; where: [M][4] in [-1, 1];
-// samples: [levels * 6][M][C].
+// samples: [levels * 6][M][C]; pulls: [M][4], the gradient in `where`.
 const long long C = @CHANNELS@, V = C / 16, POINTS = @POINTS@;
 const int AXES[6][2] = {{0, 1}, {0, 2}, {1, 2}, {0, 3}, {1, 3}, {2, 3}};
 const float* const* planes = (const float* const*)P.planes;
 float* const* grads = (float* const*)P.grads;
 const long long* sizes = (const long long*)P.sizes;
-struct Corners { long long at[4]; float weight[4]; };
+struct Corners { long long at[4]; float weight[4]; float fx, fy, dx, dy; };
 // Border padding, corners aligned; a NaN goes to the rim.
 auto corners = FN(long long plane, const float* where) -> Corners {
     long long H = sizes[2 * plane], W = sizes[2 * plane + 1];
     float x = 0.5f * (where[AXES[plane % 6][0]] + 1.f) * (W - 1);
     float y = 0.5f * (where[AXES[plane % 6][1]] + 1.f) * (H - 1);
+    float dx = x > 0.f && x < W - 1 ? 0.5f * (W - 1) : 0.f, dy = y > 0.f && y < H - 1 ? 0.5f * (H - 1) : 0.f;
     x = x > 0.f ? (x < W - 1 ? x : W - 1) : 0.f; y = y > 0.f ? (y < H - 1 ? y : H - 1) : 0.f;
     long long x0 = (long long)x, y0 = (long long)y, x1 = x0 + 1 < W ? x0 + 1 : x0, y1 = y0 + 1 < H ? y0 + 1 : y0;
     float fx = x - x0, fy = y - y0;
     return {{(y0 * W + x0) * C, (y0 * W + x1) * C, (y1 * W + x0) * C, (y1 * W + x1) * C},
-            {(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy}}; };
+            {(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy}, fx, fy, dx, dy}; };
 const long long M = P.count, L = P.levels;
 
 if (stage == 0) for (long long first; (first = take() * POINTS) < M;) {
@@ -74,6 +75,31 @@ if (stage == 1) for (long long plane; (plane = take()) < 6 * L;) {
                 float* to = grads[plane] + c.at[q] + 16 * v;
                 store(to, load(to) + c.weight[q] * pull);
             }
+        }
+    }
+}
+if (stage == 2) for (long long first; (first = take() * POINTS) < M;) {
+    long long last = first + POINTS < M ? first + POINTS : M;
+    for (long long m = first; m < last; m++) {
+        F along[4] = {(F)0.f, (F)0.f, (F)0.f, (F)0.f};
+        for (long long plane = 0; plane < 6 * L; plane++) {
+            long long level = plane / 6;
+            Corners c = corners(plane, P.where + 4 * m);
+            for (int v = 0; v < V; v++) {
+                F pull = load(P.features + (m * L + level) * C + 16 * v);
+                for (int k = 0; k < 6; k++) if (6 * level + k != plane)
+                    pull *= load(P.samples + ((6 * level + k) * M + m) * C + 16 * v);
+                const float* from = planes[plane] + 16 * v;
+                F a = load(from + c.at[0]), b = load(from + c.at[1]);
+                F d = load(from + c.at[2]), e = load(from + c.at[3]);
+                along[AXES[plane % 6][0]] += c.dx * pull * ((1 - c.fy) * (b - a) + c.fy * (e - d));
+                along[AXES[plane % 6][1]] += c.dy * pull * ((1 - c.fx) * (d - a) + c.fx * (e - b));
+            }
+        }
+        for (int axis = 0; axis < 4; axis++) {
+            float lanes[16], sum = 0.f; store(lanes, along[axis]);
+            for (int l = 0; l < 16; l++) sum += lanes[l];
+            P.pulls[4 * m + axis] = sum;
         }
     }
 }
@@ -124,7 +150,7 @@ for (long long unit; (unit = take()) < P.count;) {
 @functools.lru_cache(maxsize=4)
 def _sampler(channels: int) -> Snippet:
     fields = {
-        **dict.fromkeys(("planes", "grads", "sizes", "where", "samples", "features"), POINTER),
+        **dict.fromkeys(("planes", "grads", "sizes", "where", "samples", "features", "pulls"), POINTER),
         **dict.fromkeys(("count", "levels"), INTEGER),
     }
     source = _SAMPLES.replace("@CHANNELS@", str(channels)).replace("@POINTS@", str(_POINTS))
@@ -162,7 +188,7 @@ def _sizes(planes: Sequence[Tensor]) -> Tensor:
 
 
 class _Product(torch.autograd.Function):
-    """Features of points; gradients for the planes alone."""
+    """Features of points, with gradients for the planes and the points."""
 
     @staticmethod
     def forward(ctx, where: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
@@ -173,7 +199,7 @@ class _Product(torch.autograd.Function):
         pointers, sizes = _table(planes), _sizes(planes)
         _sampler(channels).run(
             threads, planes=pointers.data_ptr(), grads=0, sizes=sizes.data_ptr(), where=where.data_ptr(),
-            samples=0 if samples is None else samples.data_ptr(), features=features.data_ptr(), count=count,
+            samples=0 if samples is None else samples.data_ptr(), features=features.data_ptr(), pulls=0, count=count,
             levels=levels,
         )  # fmt: skip
         ctx.save_for_backward(where, samples, *planes)
@@ -186,24 +212,27 @@ class _Product(torch.autograd.Function):
         where, samples, *planes = ctx.saved_tensors
         out = [torch.empty_like(p) for p in planes]
         grad = grad.contiguous()
+        pulls = torch.empty_like(where) if ctx.needs_input_grad[0] else None
         pointers, grads, sizes = _table(planes), _table(out), _sizes(planes)
-        _sampler(planes[0].shape[1]).run(
-            ctx.threads, 1, planes=pointers.data_ptr(), grads=grads.data_ptr(), sizes=sizes.data_ptr(),
-            where=where.data_ptr(), samples=samples.data_ptr(), features=grad.data_ptr(), count=len(where),
-            levels=len(planes) // 6,
-        )  # fmt: skip
-        return None, None, *out
+        for stage in (1,) if pulls is None else (1, 2):
+            _sampler(planes[0].shape[1]).run(
+                ctx.threads, stage, planes=pointers.data_ptr(), grads=grads.data_ptr(), sizes=sizes.data_ptr(),
+                where=where.data_ptr(), samples=samples.data_ptr(), features=grad.data_ptr(),
+                pulls=0 if pulls is None else pulls.data_ptr(), count=len(where), levels=len(planes) // 6,
+            )  # fmt: skip
+        return pulls, None, *out
 
 
 def features(where: Tensor, planes: Sequence[Tensor], threads: int | None = None) -> Tensor:
-    """Product over a level's six planes of their bilinear samples, [M, levels * C], differentiable in the planes.
+    """Product over a level's six planes of their bilinear samples, [M, levels * C], differentiable in both arguments.
 
-    where [M, 4]: x, y, z and time in [-1, 1], the rim holds outside. planes: [1, C, rows, columns], six per level in
-    the order of the axes xy, xz, yz, xt, yt, zt (first along a row). ValueError unless `supports` takes the planes.
+    where [M, 4]: x, y, z and time in [-1, 1]; outside the rim holds, without gradient. planes: [1, C, rows, columns],
+    six per level in the order of the axes xy, xz, yz, xt, yt, zt (first along a row). ValueError unless `supports`
+    takes the planes.
     """
     if not supports(planes):
         raise ValueError("planes should be float32 on the CPU, channels last, with a multiple of 16 features")
-    return _Product.apply(where.detach().float().contiguous(), threads, *planes)  # type: ignore[no-any-return]
+    return _Product.apply(where.float().contiguous(), threads, *planes)  # type: ignore[no-any-return]
 
 
 class _Bend(torch.autograd.Function):

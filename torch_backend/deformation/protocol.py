@@ -130,7 +130,7 @@ class Rehearsal:
 
 
 class Deformation(nn.Module):
-    """A host of the method. `config` is its dataclass of numbers. Means are never moved through the field."""
+    """A host of the method. `config` is its dataclass of numbers. Ours never move means through the field."""
 
     config: Any
     rules: Mapping[str, Rule]

@@ -70,6 +70,17 @@ def test_means_get_no_gradient_through_the_lookup():
     assert torch.autograd.grad(sum(d.sum() for d in deltas.moved().values()), x, allow_unused=True)[0] is None
 
 
+def test_published_means_get_gradient_through_the_lookup():
+    module, _ = published()
+    x = points().requires_grad_()
+    module(x, torch.tensor([0.5])).means.square().sum().backward()
+    step = 1e-3 * torch.nn.functional.normalize(x.grad, dim=1)
+    with torch.no_grad():
+        low, high = (module(x + sign * step, torch.tensor([0.5])).means.square().sum() for sign in (-1.0, 1.0))
+    # Some of the steps cross into another cell of a plane.
+    assert float(high - low) == pytest.approx(2.0 * float((x.grad * step).sum()), rel=0.2)
+
+
 def test_smoothness_sees_every_axis():
     """4DGaussians' spatial term never smooths x; ours must notice a kink along any axis."""
     for plane_index in range(3):

@@ -6,8 +6,8 @@ import torch
 from torch_backend.deformation import HexPlane, HexPlaneConfig, planes
 
 
-def field(features=16, levels=(1, 2), dtype=torch.float32, seed=0):
-    config = HexPlaneConfig(features=features, resolution=9, levels=levels, time_nodes=7)
+def field(features=16, levels=(1, 2), dtype=torch.float32, seed=0, published=False):
+    config = HexPlaneConfig(features=features, resolution=9, levels=levels, time_nodes=7, published=published)
     made = HexPlane(config, torch.tensor([[-1.0, -2, -1], [1, 1, 3]]), torch.Generator().manual_seed(seed))
     g = torch.Generator().manual_seed(seed + 1)
     with torch.no_grad():
@@ -41,6 +41,25 @@ def test_samples_and_their_gradients_match_float64(features):
         assert float((p.grad - q.grad).norm()) <= 1e-5 * float(q.grad.norm())
 
 
+@pytest.mark.parametrize("features", [16, 48])
+def test_the_published_lookup_pulls_points_as_float64_does(features):
+    ours, exact = field(features, published=True), field(features, dtype=torch.float64, published=True)
+    means, times = points()
+    # On a node and on the rim the slope is one-sided, and rounding decides which side.
+    means, times = means[3:], times[3:]
+    x, y = means.clone().requires_grad_(), means.double().requires_grad_()
+    s, t = times.clone().requires_grad_(), times.double().requires_grad_()
+    pull = torch.randn(len(means), 2 * features, generator=torch.Generator().manual_seed(3))
+    ours.features_at(x, s).backward(pull)
+    exact.features_at(y, t).backward(pull.double())
+    assert float(y.grad.norm()) > 1.0
+    assert float((x.grad - y.grad).norm()) <= 1e-4 * float(y.grad.norm())
+    assert float((s.grad - t.grad).norm()) <= 1e-4 * float(t.grad.norm())
+    outside = ((means < ours.box[0]) | (means > ours.box[1])).all(1)
+    assert bool(outside.any())
+    assert not x.grad[outside].any()
+
+
 def test_penalty_and_its_gradient_match_float64():
     ours, exact = field(), field(dtype=torch.float64)
     got, want = ours.regularisation(), exact.regularisation()
@@ -63,10 +82,10 @@ def test_any_number_of_threads_gives_the_same_bits():
     where = torch.rand(501, 4, generator=torch.Generator().manual_seed(4)) * 2.4 - 1.2
     results = []
     for threads in (1, 2, 3, 8):
-        ours = field()._by_level()
-        value = planes.features(where, ours, threads)
+        ours, at = field()._by_level(), where.clone().requires_grad_()
+        value = planes.features(at, ours, threads)
         (value.square().sum() + planes.penalty(ours, [(1.0, 0.5, 0.2)] * 12, threads)).backward()
-        results.append(torch.cat([value.detach().flatten(), *(p.grad.flatten() for p in ours)]))
+        results.append(torch.cat([value.detach().flatten(), *(p.grad.flatten() for p in (at, *ours))]))
     assert all(torch.equal(results[0], other) for other in results[1:])
 
 
