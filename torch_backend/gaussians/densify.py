@@ -69,13 +69,13 @@ class Densifier:
 
     @torch.no_grad()
     def step(
-        self, model: Gaussians, optimizer: torch.optim.Optimizer, initial: int, progress: float
+        self, model: Gaussians, optimizer: torch.optim.Optimizer, initial: int, progress: float, grow: bool = True
     ) -> tuple[int, int]:
-        """One round: prune, then split up to the schedule. Returns (split, pruned)."""
+        """One round: prune, then, if it is to `grow`, split up to the schedule. Returns (split, pruned)."""
         keep = self._keep(model)
         score = self.gradient / self.seen.clamp_min(1.0)
         room = self.target(initial, progress) - int(keep.sum())
-        split = self._choose(score, keep, room if progress < self.config.stop else 0)
+        split = self._choose(score, keep, room if grow and progress < self.config.stop else 0)
         survivors = torch.nonzero(keep & ~split).flatten()
         parents = torch.nonzero(split).flatten()
         rows = torch.cat([survivors, parents, parents])

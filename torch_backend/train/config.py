@@ -12,6 +12,7 @@ from ..deformation import GateConfig, HexPlaneConfig, HostConfig, host, host_con
 from ..gaussians import DensifyConfig, InitConfig
 from ..supervision import DETECTORS, SupervisionConfig
 from .exposure import ExposureConfig
+from .needs import NeedsConfig
 
 
 @dataclass
@@ -78,6 +79,8 @@ class TrainConfig:
     """Anchoring."""
     exposure: ExposureConfig = dataclasses.field(default_factory=ExposureConfig)
     """Brightness and tint that drift along the clip."""
+    needs: NeedsConfig = dataclasses.field(default_factory=NeedsConfig)
+    """When `auto` has enough: SH degree, Gaussians, time nodes, steps."""
 
 
 def _preview() -> TrainConfig:
@@ -149,9 +152,9 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     """Inverse of `config_to_json`; ValueError names an unknown field."""
     nested = {
         "init": InitConfig, "densify": DensifyConfig, "gate": GateConfig,
-        "supervision": SupervisionConfig, "exposure": ExposureConfig,
+        "supervision": SupervisionConfig, "exposure": ExposureConfig, "needs": NeedsConfig,
     }  # fmt: skip
-    values = dict(data)
+    values = {"needs": {}, **data}  # earlier runs decided nothing; a finished one is only read
     if "hexplane" in values:  # written before there were other hosts
         values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))
     try:

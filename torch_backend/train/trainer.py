@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections import deque
@@ -45,6 +46,7 @@ from .config import TrainConfig, config_to_json
 from .exposure import Exposure
 from .losses import photometric, psnr
 from .model import DynamicModel, render
+from .needs import Needs
 from .repair import drop_offenders, repair, unstable
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
@@ -95,6 +97,8 @@ class Trainer:
         gaussians = gaussians.to(self.device)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
         self.initial = len(gaussians)
+        decides = config.method == "auto" and config.host_config == "default"
+        self.needs = Needs(config.needs, len(train) if decides else 0)
         self.iteration = 0
         self.trained_seconds = 0.0
         self.bad_steps = 0
@@ -113,13 +117,18 @@ class Trainer:
         """Share of the run that is done."""
         return self.iteration / self.config.iterations
 
+    @property
+    def end(self) -> int:
+        """Iterations after which the run is over: the configured ones, or fewer if it has what the scene needs."""
+        return self.needs.end(self.config.iterations)
+
     def run(self, checkpoint: Path, evaluate: Callable[[Trainer], None]) -> None:
         """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured."""
         every = max(1, round(self.config.evaluate_every * self.config.iterations))
         since = time.perf_counter() - self.trained_seconds
         started = self.iteration
         try:
-            while self.iteration < self.config.iterations:
+            while self.iteration < self.end:
                 self.report.check_cancelled()
                 self._milestones()
                 loss = self.step()
@@ -127,10 +136,10 @@ class Trainer:
                 self.trained_seconds = time.perf_counter() - since
                 if self.iteration % every == 0:
                     evaluate(self)
-                if self.iteration % _LOOK_EVERY == 0 or self.iteration == self.config.iterations:
+                if self.iteration % _LOOK_EVERY == 0 or self.iteration == self.end:
                     self._look()
                     text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {float(loss):.4f}"
-                    self.report.progress("training", self.iteration, self.config.iterations, text)
+                    self.report.progress("training", self.iteration, self.end, text)
                 if time.perf_counter() - self._saved_at > self.config.checkpoint_seconds:
                     self.save(checkpoint)
         except Cancelled:
@@ -205,10 +214,12 @@ class Trainer:
     def _milestones(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
         c = self.config
-        self.model.sh_degree = min(c.sh_degree, int(self.progress / c.sh_every)) if c.sh_every > 0 else c.sh_degree
+        degree = min(c.sh_degree, int(self.progress / c.sh_every)) if c.sh_every > 0 else c.sh_degree
+        self.model.sh_degree = self.needs.sh_degree(degree)
+        self.needs.decide(self)
         due = self.iteration > 0 and self.iteration % c.densify.every == 0
         if due and c.densify.start <= self.progress < 0.9:
-            self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress)
+            self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress, self.needs.growing)
         if c.method == "static":
             return
         if c.method == "auto":
@@ -223,7 +234,7 @@ class Trainer:
     def _gate_round(self) -> None:
         self._look()  # one NaN would make every residual NaN
         frames = list(range(0, len(self.train_ids), max(1, len(self.train_ids) // 40)))
-        frames = [frame for frame in frames if frame not in self.unusable]
+        frames = [frame for frame in frames if frame not in self.unusable | self.needs.held]
         residual, weight = residual_per_gaussian(frames, self._residual_of, len(self.model.gaussians))
         open_gate(self.model.gaussians, residual, weight, self.config.gate)
         if not bool(self.model.gaussians.open.any()):
@@ -257,13 +268,17 @@ class Trainer:
         means = model.params["means"].detach()[model.open].cpu()
         harmonics = model.params["shN"].shape[1]
         start = Start(means, field_box(means), self.scene.points, len(self.train_ids), harmonics, self.generator)
-        field = host(c.host).create(c.field, start).to(self.device)
+        settings = c.field
+        if getattr(settings, "time_nodes", None) == 0 and (nodes := self.needs.time_nodes(self)):
+            settings = dataclasses.replace(settings, time_nodes=nodes)
+        field = host(c.host).create(settings, start).to(self.device)
         # Behind the gate the Gaussians that open say where the motion is.
         if field.rehearsal > 0 and c.method != "auto":
             self._rehearse(field)
         for name, owned in field.owned.items():
             model.adopt(name, owned.shape, owned.value)
         self.model.field = field
+        self.needs.facts["opened"] = {"iteration": self.iteration, "seconds": self.trained_seconds}
         self._add_field_groups(field)
 
     def _add_field_groups(self, field: Deformation) -> None:
@@ -307,7 +322,8 @@ class Trainer:
     def _next_frame(self) -> int:
         if not self.order:
             drawn = torch.randperm(len(self.train_ids), generator=self.generator, device="cpu").tolist()
-            self.order = [frame for frame in drawn if frame not in self.unusable]
+            out = self.unusable | self.needs.held
+            self.order = [frame for frame in drawn if frame not in out]
         self._recent.append(self.order[-1])
         return self.order.pop()
 
@@ -349,7 +365,7 @@ class Trainer:
     def _paper_step(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> None:
         """Adds the paper's terms for this frame and a random other one; their gradients join the step's."""
         other = int(torch.randint(len(self.train_ids), (1,), generator=self.generator, device="cpu"))
-        if self.times[other] == self.times[frame] or other in self.unusable:
+        if self.times[other] == self.times[frame] or other in self.unusable | self.needs.held:
             return
         self._recent.append(other)
         acted = self._acted(frame, rows, state, out)
@@ -449,9 +465,10 @@ class Trainer:
 
     def _schedule(self) -> None:
         """Log-linear learning rates from start to end over the run or a host's part of it (3DGS get_expon_lr_func)."""
+        progress = self.needs.rate_progress(self.iteration, self.config.iterations)
         for group in self.optimizer.param_groups:
             since, until = group.get("since", 0.0), group.get("until", 1.0)
-            share = min(max((self.progress - since) / (until - since), 0.0), 1.0)
+            share = min(max((progress - since) / (until - since), 0.0), 1.0)
             group["lr"] = group["lr_start"] * (group["lr_end"] / group["lr_start"]) ** share
 
     # ------------------------------------------------------------------ held-out frames
@@ -500,6 +517,7 @@ class Trainer:
             "config": config_to_json(self.config),
             "iteration": self.iteration,
             "initial": self.initial,
+            "needs": self.needs.state(),
             "trained_seconds": self.trained_seconds,
             "sh_degree": self.model.sh_degree,
             "train_frames": [self.scene.frames[i] for i in self.train_ids],
@@ -528,6 +546,7 @@ class Trainer:
         self.generator.set_state(tensors["generator"])
         self.order = tensors["order"].tolist()
         self.iteration, self.initial = int(meta["iteration"]), int(meta["initial"])
+        self.needs.restore(meta["needs"])
         self.trained_seconds = float(meta["trained_seconds"])
 
 
