@@ -40,6 +40,8 @@ class Console:
             print(json.dumps(dataclasses.asdict(event)), file=self.stream, flush=True)
         elif event.type == "progress":
             self._progress(event)
+        elif event.type == "metric" and event.data["values"].get("modelled"):
+            self._line(modelled_table(event.data["values"]["modelled"]))
         elif event.type == "warning":
             self._line(f"  note: {event.data['message']} {event.data['hint']}".rstrip())
         elif event.type == "error":
@@ -127,6 +129,19 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
         file=console.stream,
         flush=True,
     )
+
+
+def modelled_table(rows: list[dict[str, Any]]) -> str:
+    """What a run modelled (rows of its summary), what it cost and bought, aligned; "-" where nothing was measured."""
+    head = ["modelled", "", "s", "ms/step", "kB", "gain dB"]
+    lines = [head]
+    for row in rows:
+        size = None if row["bytes"] is None else row["bytes"] / 1000.0
+        numbers = ((row["seconds"], ".1f"), (row["ms_per_step"], ".1f"), (size, ".0f"), (row["gain_db"], "+.2f"))
+        lines.append([row["what"], row["detail"], *("-" if v is None else format(v, f) for v, f in numbers)])
+    widths = [max(len(line[n]) for line in lines) for n in range(len(head))]
+    pad = (str.ljust, str.ljust, str.rjust, str.rjust, str.rjust, str.rjust)
+    return "\n".join("  ".join(p(cell, w) for p, cell, w in zip(pad, line, widths, strict=True)) for line in lines)
 
 
 def doctor(args: argparse.Namespace, console: Console) -> int:

@@ -404,16 +404,3 @@ def _moving(trainer: Trainer, steps: int, seconds: float) -> dict[str, Any]:
     if nodes:
         detail += f", {nodes} time nodes"
     return _row("moving Gaussians", f"{detail}; {steps} steps", seconds, steps, size, gain)
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows of `modelled` as text, aligned; "-" where nothing was measured."""
-    head = ["modelled", "", "s", "ms/step", "kB", "gain dB"]
-    lines = [head]
-    for row in rows:
-        size = None if row["bytes"] is None else row["bytes"] / 1000.0
-        numbers = ((row["seconds"], ".1f"), (row["ms_per_step"], ".1f"), (size, ".0f"), (row["gain_db"], "+.2f"))
-        lines.append([row["what"], row["detail"], *("-" if v is None else format(v, f) for v, f in numbers)])
-    widths = [max(len(line[n]) for line in lines) for n in range(len(head))]
-    pad = (str.ljust, str.ljust, str.rjust, str.rjust, str.rjust, str.rjust)
-    return "\n".join("  ".join(p(cell, w) for p, cell, w in zip(pad, line, widths, strict=True)) for line in lines)

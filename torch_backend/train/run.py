@@ -23,6 +23,7 @@ from .checkpoint import load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .device import choose_device
 from .model import DynamicModel
+from .needs import modelled
 from .trainer import Trainer, restore_model
 
 _TOO_MUCH_MOTION = 0.25
@@ -196,6 +197,7 @@ def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, ke
         "device": model.device.type,
         "sh_degree": model.sh_degree,
         "train_seconds": round(trainer.trained_seconds, 2),
+        "modelled": modelled(trainer),
     }
 
 
