@@ -13,6 +13,7 @@ from ..gaussians import DensifyConfig, InitConfig
 from ..supervision import DETECTORS, SupervisionConfig
 from .exposure import ExposureConfig
 from .needs import NeedsConfig
+from .poses import PosesConfig
 
 
 @dataclass
@@ -81,6 +82,8 @@ class TrainConfig:
     """Brightness and tint that drift along the clip."""
     needs: NeedsConfig = dataclasses.field(default_factory=NeedsConfig)
     """When `auto` has enough: SH degree, Gaussians, time nodes, steps."""
+    poses: PosesConfig = dataclasses.field(default_factory=PosesConfig)
+    """Small corrections of the solve's cameras."""
 
 
 def _preview() -> TrainConfig:
@@ -153,8 +156,9 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     nested = {
         "init": InitConfig, "densify": DensifyConfig, "gate": GateConfig,
         "supervision": SupervisionConfig, "exposure": ExposureConfig, "needs": NeedsConfig,
+        "poses": PosesConfig,
     }  # fmt: skip
-    values = {"needs": {}, **data}  # earlier runs decided nothing; a finished one is only read
+    values = {"needs": {}, "poses": {}, **data}  # earlier runs decided nothing; a finished one is only read
     if "hexplane" in values:  # written before there were other hosts
         values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))
     try:

@@ -50,7 +50,7 @@ class NeedsConfig:
     every: float = 0.025
     """Share of the run between two measurements, rounded to rounds of densification."""
     sh_gain: float = 0.03
-    """Least gain of a higher SH degree over the model cut to the degree below, half a raise after the raise."""
+    """Least gain of a higher SH degree over the model cut to the degree below, when the next raise is due."""
     growth_gain: float = 0.03
     """Least gain per 10 % more Gaussians, what optimisation gained meanwhile included, for growth to go on."""
     stop_gain: float = 0.05
@@ -185,7 +185,7 @@ class Needs:
         c, degree = trainer.config, trainer.model.sh_degree
         if degree == 0 or degree in self.degrees or self.sh_limit is not None or c.sh_every <= 0:
             return
-        if trainer.progress < (degree + 0.5) * c.sh_every:
+        if int(trainer.progress / c.sh_every) <= degree and trainer.progress < self.config.join:
             return
         whole, cut = self._psnr(trainer), self._psnr(trainer, sh_degree=degree - 1)
         if whole is None or cut is None:

@@ -47,6 +47,7 @@ from .exposure import Exposure
 from .losses import photometric, psnr
 from .model import DynamicModel, render
 from .needs import Needs
+from .poses import Poses, corrected
 from .repair import drop_offenders, repair, unstable
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
@@ -105,6 +106,8 @@ class Trainer:
         self.unusable: set[int] = set()
         self.order: list[int] = []
         self._recent: deque[int] = deque(maxlen=2 * _LOOK_EVERY)
+        self.poses = Poses(self.times, config.poses, self.device)
+        self._refined = False
         self.optimizer = self._gaussian_optimizer()
         self.densifier = Densifier(config.densify, len(gaussians), self.device)
         self._bad = torch.zeros(2, dtype=torch.int32, device=self.device)
@@ -169,6 +172,8 @@ class Trainer:
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
         loss = photometric(exposed, self._image(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
+        if self._refines_poses():
+            total = total + self.poses.regularisation()
         if pairs is not None and anchored is not None:
             total = total + self._support_loss(pairs, anchored)
         self.optimizer.zero_grad(set_to_none=True)
@@ -176,6 +181,8 @@ class Trainer:
         if paper and len(rows):
             self._paper_step(frame, rows, state, out)
         self.optimizer.step(guard=[total])
+        if self._refines_poses():
+            self.poses.settle(self.unusable | self.needs.held)
         applied = self.optimizer.applied
         if self.device.type == "cpu" and not bool(applied):
             self._left_out(frame)
@@ -214,9 +221,11 @@ class Trainer:
     def _milestones(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
         c = self.config
+        self.needs.decide(self)
         degree = min(c.sh_degree, int(self.progress / c.sh_every)) if c.sh_every > 0 else c.sh_degree
         self.model.sh_degree = self.needs.sh_degree(degree)
-        self.needs.decide(self)
+        if c.poses.on and not self._refined and self.progress >= c.poses.until:
+            self._freeze_poses()
         due = self.iteration > 0 and self.iteration % c.densify.every == 0
         if due and c.densify.start <= self.progress < 0.9:
             self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress, self.needs.growing)
@@ -228,6 +237,25 @@ class Trainer:
         elif self.model.field is None and self.progress >= c.field.start:
             self.model.gaussians.open[:] = True
             self._create_field()
+
+    # ------------------------------------------------------------------ the cameras
+
+    def _refines_poses(self) -> bool:
+        c = self.config.poses
+        return c.on and c.start <= self.progress < c.until
+
+    def _freeze_poses(self) -> None:
+        """From here on the corrected cameras are the cameras; a frame's that is not trained on too."""
+        self.viewmats = corrected(self.viewmats, self.poses.at(self.scene.times))
+        self._refined = True
+
+    def _viewmat(self, index: int, frame: int | None = None) -> Tensor:
+        """[4, 4] of the scene's frame `index`, `frame` among the trained ones, as it is corrected now."""
+        if not self._refines_poses():
+            return self.viewmats[index]
+        if frame is None:
+            return corrected(self.viewmats[index], self.poses.at(self.scene.times[index : index + 1])[0])
+        return corrected(self.viewmats[index], self.poses.values[frame])
 
     # ------------------------------------------------------------------ the gate
 
@@ -316,7 +344,7 @@ class Trainer:
         options.setdefault("with_depth", False)
         degree = options.pop("sh_degree", self.model.sh_degree)
         return render(
-            state, degree, self.viewmats[index], self.Ks[index], self.width, self.height, **options
+            state, degree, self._viewmat(index, frame), self.Ks[index], self.width, self.height, **options
         )  # fmt: skip
 
     def _next_frame(self) -> int:
@@ -461,6 +489,15 @@ class Trainer:
         groups.append(
             {"params": [e.values], "lr": c.exposure.lr, "lr_start": c.exposure.lr, "lr_end": 0.1 * c.exposure.lr}
         )
+        if c.poses.on:
+            groups.append(
+                {
+                    "params": [self.poses.values],
+                    "lr_start": c.poses.lr,
+                    "lr_end": 0.1 * c.poses.lr,
+                    "until": c.poses.until,
+                }
+            )
         return FusedAdam(groups, eps=1e-15)
 
     def _schedule(self) -> None:
@@ -478,7 +515,7 @@ class Trainer:
         """Frame `index` of the scene at its own time, [H, W, 3], not clamped."""
         state = self.model.state_at(float(self.scene.times[index]))
         out = render(
-            state, self.model.sh_degree, self.viewmats[index], self.Ks[index], self.width, self.height,
+            state, self.model.sh_degree, self._viewmat(index), self.Ks[index], self.width, self.height,
             background=self.background, with_depth=False, with_contributions=False,
         )  # fmt: skip
         return self.model.exposure.apply(out.colors[0], float(self.scene.times[index]))
@@ -497,6 +534,8 @@ class Trainer:
 
     def _named(self) -> dict[str, Tensor]:
         named: dict[str, Tensor] = {**self.model.gaussians.params, "exposure": self.model.exposure.values}
+        if self.config.poses.on:
+            named["poses"] = self.poses.values
         if self.model.field is not None:
             named.update({f"field.{n}": p for n, p in self.model.field.named_parameters()})
         return named
@@ -512,6 +551,8 @@ class Trainer:
         tensors["order"] = torch.tensor(self.order, dtype=torch.long, device="cpu")
         tensors["centres"] = self.centres
         tensors["exposure"] = self.model.exposure.values
+        if self.config.poses.on:
+            tensors["poses"] = self.poses.values
         meta = {
             **self.identity,
             "config": config_to_json(self.config),
@@ -539,6 +580,8 @@ class Trainer:
         self.optimizer = self._gaussian_optimizer()
         if self.model.field is not None:
             self._add_field_groups(self.model.field)
+        if self.config.poses.on:
+            self.poses.values.data.copy_(tensors["poses"])
         restore_optimizer(self._named(), self.optimizer, tensors)
         self.densifier = Densifier(self.config.densify, len(self.model.gaussians), self.device)
         for name in ("gradient", "seen"):
@@ -547,6 +590,8 @@ class Trainer:
         self.order = tensors["order"].tolist()
         self.iteration, self.initial = int(meta["iteration"]), int(meta["initial"])
         self.needs.restore(meta["needs"])
+        if self.config.poses.on and self.progress >= self.config.poses.until:
+            self._freeze_poses()
         self.trained_seconds = float(meta["trained_seconds"])
 
 
