@@ -5,6 +5,7 @@
     python3 splannequin.py freeze CLIP --t-star 40  freeze your own
     python3 splannequin.py doctor                   what this machine can do
     python3 splannequin.py test                     all tests
+    python3 splannequin.py bench --quick            the method against ground truth, with a report
     python3 splannequin.py setup                    make the environments and stop
 
 The backend lives in `.venv`; Blender as a Python module lives in `.venv-bpy-X.Y` (their numpy versions exclude each
@@ -173,6 +174,8 @@ class Environment:
     """Python source that imports what must work."""
     disk_gb: float
     """Free disk that setting it up may need, in GB."""
+    complete: bool = False
+    """The requirement files name every package that is needed, so nothing else is installed."""
 
     @property
     def python(self) -> str:
@@ -234,6 +237,12 @@ def bpy_environment(series: str, testing: bool = False) -> Environment:
     """The environment of the bpy wheel of a Blender series ("5.0"), with pytest on request."""
     files = (f"bpy-{series}.txt", "test-bpy.txt") if testing else (f"bpy-{series}.txt",)
     return Environment(f"Blender {series}", home() / f".venv-bpy-{series}", files, "import bpy, numpy", BPY_DISK_GB)
+
+
+def bench_environment() -> Environment:
+    """The backend's environment with the benchmark's packages in it; `backend_environment` is to be ready before."""
+    probe = "import anny, cv2, ffmpeg, flip_evaluator, imageio, matplotlib, PIL, tqdm"
+    return Environment("the benchmark's packages", home() / ".venv", ("bench.txt",), probe, 1.0, complete=True)
 
 
 def child_environ(**extra: str) -> dict[str, str]:
@@ -306,6 +315,7 @@ def _make(environment: Environment, python: str) -> None:
     environment.begun.touch()
     pip = [environment.python, "-m", "pip", "install", "--no-input", "--progress-bar", "off"]
     pip += ["--disable-pip-version-check", "--only-binary=:all:"]
+    pip += ["--no-deps"] if environment.complete else []
     index = os.environ.get("SPLANNEQUIN_TORCH_INDEX")
     if index and environment.requirements[0] == "backend.txt":
         pip += ["--extra-index-url", index]
@@ -538,7 +548,7 @@ def start_child(command: Sequence[str], environ: dict[str, str], **streams: Any)
             apart: dict[str, Any] = {"creationflags": group}
         else:
             apart = {"start_new_session": True}
-        return subprocess.Popen(command, env=environ, stdin=subprocess.DEVNULL, **{**apart, **streams})
+        return subprocess.Popen(command, env=environ, **{"stdin": subprocess.DEVNULL, **apart, **streams})
     except OSError as error:
         raise LauncherError(f"Cannot start {command[0]} ({error}): run `setup` again, or see `doctor`.") from error
 
@@ -559,9 +569,13 @@ def stop_child(child: subprocess.Popen[Any]) -> None:
         child.wait()
 
 
-def run_child(command: Sequence[str], cwd: Path | None = None, **environ: str) -> int:
-    """Runs a child with our output; returns its exit code. On Ctrl-C it is cancelled and KeyboardInterrupt goes on."""
-    child = start_child(command, child_environ(**environ), cwd=cwd)
+def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = False, **environ: str) -> int:
+    """Runs a child with our output; returns its exit code. On Ctrl-C it is cancelled and KeyboardInterrupt goes on.
+
+    `tied`: its standard input stays open as long as this process lives, however that ends; the child watches it.
+    """
+    streams = {"stdin": subprocess.PIPE} if tied else {}
+    child = start_child(command, child_environ(**environ), cwd=cwd, **streams)
     try:
         while True:
             # A wait without limit cannot be interrupted on Windows.
@@ -733,6 +747,37 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
     for leg in legs:
         leg.run(backend.python)
     return _close_tests(legs, output)
+
+
+def bench(arguments: Sequence[str], output: Path) -> int:
+    """The benchmark of the method: what it does not know here goes to benchmarks/bench.py."""
+    started = time.monotonic()
+    backend = backend_environment()
+    setting_up = set_up(backend, sys.executable)
+    setting_up += set_up(bench_environment(), backend.python)
+    renderer: list[str] = []
+    if not _own_scenes(arguments):
+        blender, took = get_blender()
+        if not blender.is_wheel:
+            raise LauncherError(
+                "The benchmark's scenes are rendered by a bpy wheel, and none fits: start again with Python 3.11 or "
+                "3.13, or name scenes of your own by --truth or --shot."
+            )
+        renderer, setting_up = ["--bpy", blender.command[0]], setting_up + took
+    command = [backend.python, "-P", "-m", "benchmarks.bench", "--results", str(output), "--tied", *renderer]
+    code = run_child([*command, *arguments], tied=True)
+    summary: dict[str, Any] = {"command": "bench", "exit_code": code}
+    summary.update(wall_seconds=round(time.monotonic() - started, 2), setup_seconds=round(setting_up, 2))
+    if code == 0:
+        summary["report"] = str(output / "report" / "report.md")
+    write_json(output / "summary.json", summary)
+    return code
+
+
+def _own_scenes(arguments: Sequence[str]) -> bool:
+    """True if a benchmark's arguments ask for no synthetic scene."""
+    named = {word.partition("=")[0] for word in arguments}
+    return bool(named & {"--truth", "--shot"}) and not named & {"--size", "--quick"}
 
 
 class Leg:
@@ -970,7 +1015,8 @@ def blender_findings() -> Iterator[Finding]:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The grammar. What `freeze` and `demo` do not know goes to the backend, what `test` does not, to pytest."""
+    """The grammar. What `freeze` and `demo` do not know goes to the backend, what `test` does not, to pytest, what
+    `bench` does not, to benchmarks/bench.py."""
     top = argparse.ArgumentParser(
         prog="splannequin.py", description="Freeze time in a handheld clip.", allow_abbrev=False
     )
@@ -979,6 +1025,7 @@ def parser() -> argparse.ArgumentParser:
         "demo": "freeze the bundled clip",
         "freeze": "freeze your own clip; other options go to the backend (--t-star N, --preset NAME, ...)",
         "test": "run all tests; other arguments go to pytest",
+        "bench": "the method against ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
         "doctor": "say what this machine can do",
         "setup": "make the environments and stop",
     }
@@ -990,7 +1037,8 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("--bpy", choices=sorted(BPY_WHEELS), help="the bpy wheel (default: one that fits)")
         if name == "setup":
             command.add_argument("--tests", action="store_true", help="with what `test` needs")
-        command.add_argument("--output", metavar="DIR", help="folder for summary.json and results (output/...)")
+        names = ("--output", "--results") if name == "bench" else ("--output",)
+        command.add_argument(*names, metavar="DIR", help="folder for summary.json and results (output/...)")
     return top
 
 
@@ -1001,8 +1049,9 @@ def _interrupt(number: int, frame: object) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if words[:1] == ["freeze"] and {"-h", "--help"} & set(words) and backend_environment().ready():
-        return run_child([backend_environment().python, "-P", "-m", "torch_backend", "freeze", "--help"])
+    module = {"freeze": ["torch_backend", "freeze"], "bench": ["benchmarks.bench"]}.get(words[0] if words else "")
+    if module and {"-h", "--help"} & set(words) and backend_environment().ready():
+        return run_child([backend_environment().python, "-P", "-m", *module, "--help"])
     args, rest = parser().parse_known_args(words)
     if rest and args.command in ("doctor", "setup"):
         parser().error(f"unrecognized arguments: {' '.join(rest)}")
@@ -1045,6 +1094,8 @@ def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
         return freeze(args.clip, output, rest)
     if args.command == "setup":
         return setup([args.bpy] if args.bpy else [], args.tests, output)
+    if args.command == "bench":
+        return bench(rest, output)
     if args.command == "test":
         return run_tests(rest, args.bpy, output)
     return doctor(output)

@@ -6,6 +6,7 @@
 
 Every run is a child process: it trains (or goes on from its checkpoint), freezes, scores, and writes
 RESULTS/<run-id>.json whole. A run that has its file is not run again, so an interrupted benchmark goes on where it was.
+With `--jobs N`, N children run at once on cores of their own; children end when this process does, however it ends.
 """
 
 from __future__ import annotations
@@ -14,10 +15,8 @@ import argparse
 import dataclasses
 import os
 import re
-import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,21 +25,25 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
 
-from benchmarks.sources import ROOT, Log, load_source, make_scenes
+from benchmarks.sources import Log, child_environ, end_with_parent, load_source, locked, make_scenes
 from benchmarks.synthetic.make import default_folder
 from benchmarks.synthetic.sizes import SIZES
 from torch_backend.contract import ExitCode, JobError, TrainParams, from_dict, read_json
 from torch_backend.job import new_job, run_job
+from torch_backend.native import default_threads
 from torch_backend.report.records import RECORD_VERSION, RunRecord, finished, machine_facts, save_record
 from torch_backend.report.truth import TruthScene
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.shot import content_key, write_json
 from torch_backend.train import PRESETS, TrainConfig, config_from_params
 from torch_backend.train.config import METHODS, SUPERVISIONS, config_to_json
+from torch_backend.train.device import choose_device
 
 HOSTS = {"hexplane": "4DGaussians", "mlp": "Deformable 3DGS", "control_points": "SC-GS"}
 """TrainConfig.method of each published host -> its name."""
 QUICK_GAUSSIANS = 5000
+QUERIES = {"none": "plain", "paper": "plain", "support": "nearest"}
+"""Supervision -> how its runs are frozen: as published, at t* itself; `support` asks where a Gaussian was seen."""
 HOLDOUT = 8
 """Every how many frames one is kept out of training."""
 
@@ -56,7 +59,8 @@ class Ablation:
     """Dotted field of TrainConfig -> value."""
     training: Mapping[str, Any] = field(default_factory=dict)
     """Field of TrainParams -> value."""
-    query: str = "nearest"
+    query: str = ""
+    """Empty: as `QUERIES` says."""
 
 
 ABLATIONS = (
@@ -67,10 +71,14 @@ ABLATIONS = (
     Ablation("detector: grad_signed", "hexplane", "paper", training={"detector": "grad_signed"}),
     Ablation("gate, no anchors", "auto", "none"),
     Ablation("gate, paper's anchors", "auto", "paper"),
-    Ablation("asked at t* itself", "auto", "support", query="plain"),
+    Ablation("frozen at t* itself", "auto", "support", query="plain"),
+    Ablation("frozen at t* itself", "hexplane", "support", query="plain"),
+    Ablation("frozen where seen nearest", "hexplane", "none", query="nearest"),
+    Ablation("frozen where seen nearest", "hexplane", "paper", query="nearest"),
     Ablation("no exposure", "auto", "support", {"exposure.on": False}),
 )
-"""The paper's and ours. The main table's detector is grad_norm; its hosts with `support` are those without a gate."""
+"""The paper's and ours. The main table's detector is grad_norm; its hosts with `support` are those without a gate.
+What only freezes otherwise is not trained again."""
 
 
 @dataclass
@@ -86,7 +94,8 @@ class RunSpec:
     preset: str
     variant: str = "default"
     seed: int = 0
-    query: str = "nearest"
+    query: str = ""
+    """How Gaussians are asked at t*: nearest or plain; empty: as `QUERIES` says."""
     overrides: dict[str, Any] = field(default_factory=dict)
     """Dotted field of TrainConfig -> value."""
     training: dict[str, Any] = field(default_factory=dict)
@@ -99,6 +108,9 @@ class RunSpec:
     """Which of every `HOLDOUT` frames is kept out: one that spares the instants."""
     device: str = "auto"
     """cpu, cuda or auto."""
+
+    def __post_init__(self) -> None:
+        self.query = self.query or QUERIES[self.supervision]
 
     def params(self, run: str) -> TrainParams:
         """The training job's parameters. ValueError if one of `training` does not exist."""
@@ -165,8 +177,8 @@ def plan(
     """(runs, sentences about what is missing): hosts x {none, paper, support}, auto and static, then ablations.
 
     Runs are ordered so that an interrupted benchmark has compared something on every scene: by setting, then scene.
-    `reference` adds the hosts with the published sizes, rates and schedules. `common` goes to every `RunSpec`:
-    iterations, width, max_gaussians, device.
+    `reference` adds the hosts with the published sizes, rates and schedules, without and with `paper`. `common` goes to
+    every `RunSpec`: iterations, width, max_gaussians, device.
     """
     offered = [host for host in HOSTS if host in METHODS]
     supervised = [s for s in ("none", "paper", "support") if s in SUPERVISIONS]
@@ -178,6 +190,7 @@ def plan(
             RunSpec("", "", host, supervision, "preview", "reference", training=published)
             for host in offered
             for supervision in supervised
+            if supervision != "support"
         ]
     said = [
         f"{name} is not in this report: the trainer has no host {host!r}."
@@ -230,76 +243,124 @@ def _phase(scene: TruthScene) -> int:
 # ------------------------------------------------------------------------------------------------- running
 
 
-def run_plan(runs: Iterable[RunSpec], results: Path) -> list[str]:
-    """Runs what has no record yet, one child at a time. Returns sentences about runs that failed.
+def run_plan(runs: Iterable[RunSpec], results: Path, jobs: int = 1) -> list[str]:
+    """Runs what has no record yet, `jobs` children at once. Returns sentences about runs that failed.
 
-    KeyboardInterrupt ends the child at its next checkpoint and is raised again; so does the end of this process.
+    Runs that share a training run come one after the other. KeyboardInterrupt ends the children at their next
+    checkpoint and is raised again.
     """
     failures = []
     todo = [spec for spec in runs if not finished(results, spec.run_id)]
-    for n, spec in enumerate(todo):
-        print(f"[{n + 1}/{len(todo)}] {spec.run_id}", flush=True)
-        code = _child(spec, results)
-        if code != ExitCode.OK or not finished(results, spec.run_id):
-            log = results / "logs" / f"{spec.run_id}.txt"
-            failures.append(f"{spec.run_id} failed (exit code {code}): see {log}.")
-            print(f"  {failures[-1]}", flush=True)
+    trained = {spec.run_id: (spec.source, spec.run_name) for spec in todo}
+    total, running = len(todo), dict[int, tuple[RunSpec, subprocess.Popen[bytes]]]()
+    try:
+        while todo or running:
+            for slot in set(range(jobs)) - set(running):
+                busy = {trained[spec.run_id] for spec, _ in running.values()}
+                spec = next((spec for spec in todo if trained[spec.run_id] not in busy), None)
+                if spec is not None:
+                    todo.remove(spec)
+                    print(f"[{total - len(todo)}/{total}] {spec.run_id}", flush=True)
+                    running[slot] = spec, _start(spec, results, slot, jobs)
+            time.sleep(0.05)
+            for slot, (spec, child) in list(running.items()):
+                if child.poll() is None:
+                    continue
+                del running[slot]
+                _close(child)
+                if child.returncode != ExitCode.OK or not finished(results, spec.run_id):
+                    log = results / "logs" / f"{spec.run_id}.txt"
+                    failures.append(f"{spec.run_id} failed (exit code {child.returncode}): see {log}.")
+                    print(f"  {failures[-1]}", flush=True)
+    except BaseException:
+        for _, child in running.values():
+            child.terminate()
+        for _, child in running.values():
+            child.wait()
+            _close(child)
+        raise
     return failures
 
 
-def _child(spec: RunSpec, results: Path) -> int:
-    """Runs one spec in a process of its own, its output to RESULTS/logs; returns the exit code."""
+def cores() -> list[int]:
+    """Numbers of the cores that this process may use."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+def default_jobs(device: str) -> int:
+    """Two runs at once where there are two cores for them: most of a step does not divide. A GPU does one at a time."""
+    return 1 if choose_device(device).type == "cuda" else min(2, len(cores()))
+
+
+def _start(spec: RunSpec, results: Path, slot: int, jobs: int) -> subprocess.Popen[bytes]:
+    """Starts one spec in a process of its own on its share of the cores, its output to RESULTS/logs."""
     request = results / "requests" / f"{spec.run_id}.json"
     write_json(request, dataclasses.asdict(spec))
     log = results / "logs" / f"{spec.run_id}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "benchmarks.bench", "--work", str(request), "--results", str(results)]
+    command = [sys.executable, "-P", "-m", "benchmarks.bench", "--work", str(request), "--results", str(results)]
+    mine = cores()
+    share = max(1, len(mine) // jobs)
+    threads = {f"{library}_NUM_THREADS": str(share) for library in ("OMP", "MKL", "OPENBLAS")}
     with open(log, "w", encoding="utf-8") as out:
-        child = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=subprocess.STDOUT)
         try:
-            return child.wait()
-        except BaseException:
-            child.send_signal(signal.SIGTERM)
-            child.wait()
-            raise
+            # A child is born on its parent's cores. Where none can be chosen, each run takes all: its record says so.
+            if hasattr(os, "sched_setaffinity") and jobs > 1:
+                os.sched_setaffinity(0, {mine[(slot * share + n) % len(mine)] for n in range(share)})
+            return subprocess.Popen(
+                [*command, "--jobs", str(jobs)],
+                env=child_environ(**threads),
+                stdin=subprocess.PIPE,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+            )
+        finally:
+            if hasattr(os, "sched_setaffinity"):
+                os.sched_setaffinity(0, mine)
 
 
-def work(request: Path, results: Path) -> int:
+def _close(child: subprocess.Popen[bytes]) -> None:
+    if child.stdin:
+        child.stdin.close()
+
+
+def work(request: Path, results: Path, jobs: int) -> int:
     """The child: trains, freezes, scores, writes the record. Returns an exit code."""
-    _die_with(os.getppid())
+    end_with_parent()
     spec: RunSpec = from_dict(RunSpec, read_json(request))
     truth = load_source(spec.source, results)
     run_name = spec.run_name
-    folder = truth.shot.run(run_name)
-    whole = not folder.exists()
     # The job's parameters name a preset; this process knows one more, with the plan's overrides in it.
     known = PRESETS[spec.preset]
     PRESETS[spec.preset] = lambda: _overridden(known(), spec)
     if config_from_params(spec.params(run_name)) != spec.config():
         raise ValueError(f"an override of {spec.run_id} is set by the job's parameters: give it there")
+    # A child of a benchmark that was killed a moment ago may still be at its last checkpoint.
+    with locked(truth.shot.root / "bench" / f"{run_name}.lock"):
+        code, device, trained = _train(spec, truth, run_name, jobs)
+    return code or _judge(spec, truth, run_name, results, trained, device)
+
+
+def _train(spec: RunSpec, truth: TruthScene, run_name: str, jobs: int) -> tuple[int, str, dict[str, Any]]:
+    """Trains what is not trained yet: (exit code, device, facts of the training that its summary does not have)."""
+    folder = truth.shot.run(run_name)
+    path = folder / "bench.json"
+    facts: dict[str, Any] = read_json(path) if path.is_file() else {}
+    whole, trained = not folder.exists(), (folder / "summary.json").is_file()
+    pace = {"threads": default_threads(), "jobs": jobs}
+    if not trained:
+        if not whole and pace.items() != {name: facts.get(name) for name in pace}.items():
+            pace = dict.fromkeys(pace)  # it was begun at another pace: nothing can be said of its seconds
+        facts = {"version": 1, **pace, "train_cpu_seconds": None}
+        write_json(path, facts)
     since = time.process_time()
     code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print)
-    cpu_seconds = round(time.process_time() - since, 2)
-    facts = folder / "bench.json"
     if code != ExitCode.OK:
-        return int(code)
-    if whole and not facts.is_file():
-        write_json(facts, {"version": 1, "train_cpu_seconds": cpu_seconds, "machine": machine_facts()})
-    return _judge(spec, truth, run_name, results, read_json(facts) if facts.is_file() else {}, summary["device"])
-
-
-def _die_with(parent: int) -> None:
-    """Ends this process at its next checkpoint when the benchmark that started it is gone, however it went.
-
-    Two children of two benchmarks must not train one run.
-    """
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=watch, name="watch", daemon=True).start()
+        return int(code), "", facts
+    if whole:
+        facts["train_cpu_seconds"] = round(time.process_time() - since, 2)
+        write_json(path, facts)
+    return int(ExitCode.OK), summary["device"], facts
 
 
 def _overridden(config: TrainConfig, spec: RunSpec) -> TrainConfig:
@@ -327,6 +388,8 @@ def _judge(
         seed=spec.seed,
         query=spec.query,
         train_cpu_seconds=trained.get("train_cpu_seconds"),
+        threads=trained.get("threads"),
+        jobs=trained.get("jobs"),
         machine=machine_facts(),
         command=f"python -m benchmarks.bench --work requests/{spec.run_id}.json",
         device=trained_on,
@@ -343,9 +406,13 @@ def _judge(
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns an exit code."""
     args = _parser().parse_args(argv)
+    if args.jobs < 0 or args.seeds < 1:
+        _parser().error("--jobs and --seeds count runs: they should be 1 or more")
     results = Path(args.results).absolute()
     if args.work:
-        return work(Path(args.work), results)
+        return work(Path(args.work), results, args.jobs)
+    if args.tied:
+        end_with_parent()
     from torch_backend.report.write import write_report
 
     results.mkdir(parents=True, exist_ok=True)
@@ -355,7 +422,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not sources or args.size or args.quick:
             cameras = ("exact", "solved") if args.cameras == "both" else (args.cameras,)
             size = args.size or ("quick" if args.quick else "medium")
-            sources += make_scenes(size, args.tuning, cameras, Path(args.scenes).absolute())
+            sources += make_scenes(size, args.tuning, cameras, Path(args.scenes).absolute(), args.bpy)
         runs, said = plan(
             sources,
             results,
@@ -366,17 +433,30 @@ def main(argv: Sequence[str] | None = None) -> int:
             **{"iterations": args.iterations, "width": args.width, "max_gaussians": args.max_gaussians, **quick},
             device=args.device,
         )
-        said += run_plan(runs, results)
+        said += run_plan(runs, results, args.jobs or default_jobs(args.device))
     except (RuntimeError, JobError, FileNotFoundError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return int(ExitCode.USAGE)
     except KeyboardInterrupt:
         print("Interrupted. The same command goes on from here.", flush=True)
         return int(ExitCode.CANCELLED)
-    command = "python -m benchmarks.bench " + subprocess.list2cmdline(sys.argv[1:] if argv is None else list(argv))
-    path = write_report(results, results / "report", [r.run_id for r in runs], said, command.strip())
+    path = write_report(results, results / "report", [r.run_id for r in runs], said, _command(args, argv))
     print(f"Report: {path}", flush=True)
     return int(ExitCode.OK)
+
+
+def _command(args: argparse.Namespace, argv: Sequence[str] | None) -> str:
+    """What was typed: in this process's own words, or, where the launcher started it, in the launcher's."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not args.tied:
+        return subprocess.list2cmdline(["python", "-m", "benchmarks.bench", *words])
+    for name in ("--tied", "--bpy", "--results"):
+        at = words.index(name) if name in words else len(words)
+        del words[at : at + 1 + (name != "--tied")]
+    usual = Path(args.results) == Path("output/bench").absolute()
+    return subprocess.list2cmdline(
+        ["python3", "splannequin.py", "bench", *([] if usual else ["--output", args.results]), *words]
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -391,12 +471,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--results", default="output/bench", metavar="DIR", help="records, pictures and report")
     parser.add_argument("--preset", action="append", choices=tuple(PRESETS), help="default: preview")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="training seeds 0 to N - 1")
-    parser.add_argument("--reference", action="store_true", help="hosts with the published settings as well")
+    parser.add_argument("--reference", action="store_true", help="hosts in the published settings too: none and paper")
     parser.add_argument("--ablations", action="store_true", help="the paper's and ours")
     parser.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
     parser.add_argument("--width", type=int, default=0, help="width of training images in pixels (0: the preset's)")
     parser.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
+    parser.add_argument(
+        "--jobs", type=int, default=0, metavar="N", help="runs at once, each on its share of the cores (default: 2)"
+    )
+    parser.add_argument("--bpy", metavar="PYTHON", help="Python with Blender's module, renders synthetic scenes")
+    parser.add_argument("--tied", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--work", help=argparse.SUPPRESS)
     return parser
 

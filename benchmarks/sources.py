@@ -1,10 +1,18 @@
-"""Scenes for the benchmark: folders of truth, real clips, and the synthetic scenes of benchmarks/synthetic."""
+"""Scenes for the benchmark: folders of truth, real clips, and the synthetic scenes of benchmarks/synthetic.
+
+`python -m benchmarks.sources` is `python -m benchmarks.synthetic` that ends when its parent does.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.synthetic.folder import SyntheticScene
+from benchmarks.synthetic.folder import Regions, SyntheticScene
 from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, solved_shot
 from benchmarks.synthetic.sizes import REPORT_SEEDS, SIZES, TUNING_SEEDS
@@ -78,6 +86,13 @@ class SyntheticTruth:
         seen, moving = (_nearest(mask, width, height) for mask in (regions.seen, regions.moving))
         return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving}
 
+    def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
+        """Moving or static in the clip's own frame, by truth; of the nearest pixel."""
+        moving = self._scene.frame_moving(frame)
+        of_frame = Regions(self._scene.frame_depth(frame), moving, np.ones_like(moving))
+        moving = _nearest(self._pixels.regions(of_frame).moving, width, height)
+        return {"moving": moving, "static": ~moving}
+
 
 def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
     """A mask at another size."""
@@ -85,18 +100,66 @@ def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
     return torch.nn.functional.interpolate(values, (height, width), mode="nearest-exact")[0, 0] > 0.5
 
 
-def make_scenes(size: str, tuning: bool, cameras: Sequence[str], folder: Path) -> list[str]:
+def make_scenes(size: str, tuning: bool, cameras: Sequence[str], folder: Path, bpy: str | None = None) -> list[str]:
     """Sources of the synthetic scenes of a size, rendered first where they are not there (a child process).
 
-    RuntimeError with the child's own last words if a scene cannot be made.
+    `bpy` is a Python with Blender's module, found beside the repository if it is not given. RuntimeError with the
+    child's own last words if a scene cannot be made.
     """
     seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: SIZES[size].scenes]
-    command = [sys.executable, "-m", "benchmarks.synthetic", "--size", size, "--out", str(folder)]
-    made = subprocess.run([*command, "--seeds", *map(str, seeds)], cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    if made.returncode:
-        last = made.stderr.strip().splitlines()[-1:] or ["no output"]
+    command = [sys.executable, "-P", "-m", "benchmarks.sources", "--size", size, "--out", str(folder)]
+    command += [*(["--bpy", bpy] if bpy else []), "--seeds", *map(str, seeds)]
+    with subprocess.Popen(
+        command, env=child_environ(), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
+        said = child.stderr.read() if child.stderr else ""
+    if child.returncode:
+        last = said.strip().splitlines()[-1:] or ["no output"]
         raise RuntimeError(f"the synthetic scenes could not be made: {last[0]}")
     return [f"{c}:{folder / size / scene_name(seed, 'plain')}" for c in cameras for seed in seeds]
+
+
+def child_environ(**extra: str) -> dict[str, str]:
+    """Environment of a child of the benchmark: this checkout on its path."""
+    return {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", **extra}
+
+
+def end_with_parent() -> None:
+    """Ends this process as SIGTERM does once its standard input closes: its parent, which holds it open, is gone."""
+
+    def watch() -> None:
+        with contextlib.suppress(OSError):
+            while os.read(0, 1):
+                pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Holds a lock file, after waiting for whoever has it. The system frees it when this process ends, however."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a+b") as lock:
+        while not _try_lock(lock.fileno()):
+            time.sleep(0.2)
+        yield
+
+
+def _try_lock(handle: int) -> bool:
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            os.lseek(handle, 0, os.SEEK_SET)
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 class Log:
@@ -121,3 +184,10 @@ class Log:
 
     def check_cancelled(self) -> None:
         """Ctrl-C and SIGTERM end scoring by their own exceptions."""
+
+
+if __name__ == "__main__":
+    from benchmarks.synthetic.__main__ import main as make
+
+    end_with_parent()
+    sys.exit(make(None))

@@ -12,13 +12,14 @@ import splannequin
 
 @pytest.fixture
 def write_wheel(tmp_path: Path):
-    """Writes a wheel of one module and returns its path."""
+    """Writes a wheel of one module, which may ask for another package, and returns its path."""
 
-    def write(name: str, version: str, source: str) -> Path:
+    def write(name: str, version: str, source: str, needs: str = "") -> Path:
         info = f"{name}-{version}.dist-info"
         files = {
             f"{name}.py": source,
-            f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n",
+            f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+            + (f"Requires-Dist: {needs}\n" if needs else ""),
             f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
         }
         rows = []

@@ -117,3 +117,22 @@ def test_blenders_own_lines_go_to_the_log_alone(tmp_path: Path, capfd: pytest.Ca
     assert out.splitlines() == ["  baking  4%"]
     assert err.splitlines() == ["Error: no. Do so."]
     assert (tmp_path / "blender.log").read_text().splitlines() == lines
+
+
+TIED = """
+import os, pathlib, sys
+folder = pathlib.Path(sys.argv[1])
+(folder / "started").touch()
+os.read(0, 1)
+(folder / "checkpoint").write_text("whole")
+"""
+
+
+def test_a_tied_child_learns_that_the_launcher_was_killed(tmp_path: Path):
+    tied = PARENT.replace("sys.argv[2]])", "sys.argv[2]], tied=True)")
+    parent = subprocess.Popen([sys.executable, "-c", tied, TIED, str(tmp_path)], cwd=ROOT, stdin=subprocess.PIPE)
+    wait_for(tmp_path / "started")
+    assert not (tmp_path / "checkpoint").exists()
+    parent.kill()
+    parent.wait()
+    wait_for(tmp_path / "checkpoint")

@@ -49,6 +49,18 @@ def test_figures_of_an_earlier_run_do_not_pass_for_this_one(tmp_path: Path):
     assert "heldout_psnr_db" not in summary(tmp_path)
 
 
+def test_a_benchmark_of_ones_own_scenes_needs_no_blender():
+    assert splannequin._own_scenes(["--truth", "folder"]) and splannequin._own_scenes(["--shot=x", "--seeds", "2"])
+    assert not splannequin._own_scenes(["--quick"]) and not splannequin._own_scenes(["--shot", "x", "--size=tiny"])
+
+
+def test_benchs_help_is_the_benchmarks_own():
+    if not splannequin.backend_environment().ready():
+        pytest.skip("the backend's environment is not set up by the launcher")
+    ran = launch("bench", "--help")
+    assert ran.returncode == 0 and "--reference" in ran.stdout and "--jobs" in ran.stdout
+
+
 def test_an_output_that_cannot_be_a_folder_is_one_sentence(tmp_path: Path):
     (tmp_path / "file").touch()
     ran = launch("doctor", "--output", tmp_path / "file" / "out")

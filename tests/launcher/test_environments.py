@@ -47,6 +47,19 @@ def test_a_superset_of_the_requirements_is_ready_for_the_subset(environment: Env
     assert more.ready() and environment.ready()
 
 
+def test_a_complete_list_is_installed_into_what_is_there_and_nothing_else(
+    environment: Environment, requirements: Path, write_wheel
+):
+    set_up(environment, sys.executable)
+    wheel = write_wheel("otherthing", "1.0", "", needs="there-is-no-such-package")
+    (requirements / "more.txt").write_text(f"{wheel}\n")
+    more = dataclasses.replace(environment, requirements=("more.txt",), probe="import smallthing, otherthing")
+    with pytest.raises(LauncherError, match="no-such-package"):
+        set_up(more, sys.executable)
+    set_up(dataclasses.replace(more, complete=True), sys.executable)
+    assert more.ready() and environment.ready()
+
+
 def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment):
     set_up(environment, sys.executable)
     packages = site_packages(environment)

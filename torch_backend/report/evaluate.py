@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,10 @@ from ..freeze.query import FrozenGaussians, freeze_at, render_frozen
 from ..scene import Scene, load_scene, read_image, split_frames
 from ..train import LoadedRun, load_run
 from ..train.checkpoint import load_checkpoint
+from ..train.model import render
 from .colorvideovdp import sequence_jod
-from .metrics import best_share_psnr, gradient_energy, missing_metrics, score
-from .records import PICTURES, FrameScore, Picture
+from .metrics import best_share_psnr, gradient_energy, missing_metrics, psnr_by_region, score
+from .records import PICTURES, FrameScore, HeldOut, Picture
 from .truth import TruthScene
 
 SHOWN = 6
@@ -87,7 +89,9 @@ def evaluate_run(
     tensors, _ = load_checkpoint(run.folder / "checkpoint.safetensors")
     return {
         **{name: summary[name] for name in ("iterations", "train_seconds", "gaussians", "moving_share")},
+        "step_ms": last_third_step_ms(run.folder / "metrics.jsonl", summary["iterations"]),
         "heldout_psnr_db": summary["heldout_psnr_db"],
+        "heldout": [_of_frame(truth, run, scene, frame) for frame in held_out],
         "width": run.width,
         "height": run.height,
         "model_bytes": sum(v.nbytes for k, v in tensors.items() if not k.startswith("adam.")),
@@ -110,6 +114,35 @@ def _freeze(run: LoadedRun, scene: Scene, t_star: int, query: str) -> _Frozen:
     at = dict(zip(scene.frames, scene.seconds, strict=True))
     span = max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
     return _Frozen(run, scene, freeze_at(run.model, scene.time_of_frame(t_star), span, query))
+
+
+@torch.no_grad()
+def _of_frame(truth: TruthScene, run: LoadedRun, scene: Scene, frame: int) -> HeldOut:
+    """A held-out frame of the clip as the run shows it at its own time, against the plate."""
+    index, time_of = scene.frames.index(frame), scene.time_of_frame(frame)
+    model, size = run.model, (run.width, run.height)
+    where = (scene.viewmats[index].to(model.device), scene.camera_at(*size)[index].to(model.device))
+    background = torch.full((3,), 0.5, device=model.device)
+    out = render(
+        model.state_at(time_of), model.sh_degree, *where, *size,
+        background=background, with_depth=False, with_contributions=False,
+    )  # fmt: skip
+    image = model.exposure.apply(out.colors[0], time_of).cpu()
+    plate = read_image(truth.shot.frames / frame_file(frame, ".png"), *size)
+    return HeldOut(frame, psnr_by_region(image, plate, truth.frame_regions(frame, *size)))
+
+
+def last_third_step_ms(path: Path, iterations: int) -> float | None:
+    """Mean wall milliseconds of a step over the last third of a run, from its metrics.jsonl; None if that has too few.
+
+    An interrupted run measures again what it repeats: the later line counts.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    seconds = {row["iteration"]: row["seconds"] for row in map(json.loads, lines)}
+    late = sorted(iteration for iteration in seconds if iteration >= iterations * 2 / 3)
+    if len(late) < 2 or seconds[late[-1]] <= seconds[late[0]]:
+        return None
+    return 1000.0 * (seconds[late[-1]] - seconds[late[0]]) / (late[-1] - late[0])
 
 
 def _score(truth: TruthScene, t_star: int, pose: int, held_out: bool, image: Tensor, target: Tensor) -> FrameScore:

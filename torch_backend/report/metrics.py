@@ -64,6 +64,13 @@ def score(image: Tensor, truth: Tensor, regions: Mapping[str, Tensor] | None = N
     return {name: _over(maps, mask) for name, mask in {WHOLE: whole, **(regions or {})}.items()}
 
 
+def psnr_by_region(image: Tensor, truth: Tensor, regions: Mapping[str, Tensor]) -> dict[str, float | None]:
+    """PSNR in dB of two pictures [H, W, 3] over the whole and over bool regions [H, W]; None for a nearly empty one."""
+    error = {"psnr_db": (image.float().clamp(0.0, 1.0) - truth.float().clamp(0.0, 1.0)).double().square().mean(2)}
+    masks = {WHOLE: torch.ones(image.shape[:2], dtype=torch.bool), **regions}
+    return {name: _over(error, mask)["psnr_db"] for name, mask in masks.items()}
+
+
 def error_maps(image: Tensor, truth: Tensor) -> dict[str, Tensor | None]:
     """Maps [H, W] of two pictures [H, W, 3] by metric (psnr_db: the squared error); None where it is not to be had."""
     image, truth = image.float().clamp(0.0, 1.0), truth.float().clamp(0.0, 1.0)

@@ -13,7 +13,7 @@ from ..contract import check_version, from_dict, read_json
 from ..shot import write_json
 from .metrics import WHOLE, Key
 
-RECORD_VERSION = 1
+RECORD_VERSION = 2
 """Rises when figures measured before must not stand beside new ones."""
 PICTURES = "pictures"
 """Folder of pictures beside the records."""
@@ -39,6 +39,16 @@ class FrameScore:
     def value(self, metric: str, region: str = WHOLE) -> float | None:
         """A figure, or None if it is not there."""
         return self.regions.get(region, {}).get(metric)
+
+
+@dataclass
+class HeldOut:
+    """A frame of the clip that was kept out of training, at its own time."""
+
+    frame: int
+    """Its number."""
+    psnr_db: dict[str, float | None]
+    """By region: `WHOLE`, and where known `moving` and `static`; None where the region is nearly empty."""
 
 
 @dataclass
@@ -83,9 +93,15 @@ class RunRecord:
     """Pixels of training and scoring."""
     height: int
     train_seconds: float
-    """Wall seconds of the training loop, evaluation excluded; other work on the machine lengthens them."""
+    """Wall seconds of the training loop; other work on the machine lengthens them."""
     train_cpu_seconds: float | None
     """Processor seconds of the training job; None if it was interrupted."""
+    threads: int | None
+    """Threads that trained; None if the run was interrupted and went on with another number of them."""
+    jobs: int | None
+    """Runs at once while it trained, this one among them; None likewise."""
+    step_ms: float | None
+    """Wall milliseconds of a training step over the last third of the run, with its measurements on held-out frames."""
     gaussians: int
     moving_share: float
     """Share of the Gaussians that the field moves."""
@@ -96,6 +112,8 @@ class RunRecord:
     heldout_psnr_db: float | None
     """On frames of the clip kept out of training, each at its own time."""
     rows: list[FrameScore]
+    heldout: list[HeldOut] = field(default_factory=list)
+    """Those frames one by one."""
     jod: dict[str, float | None] = field(default_factory=dict)
     """t* -> ColorVideoVDP of its poses as a sequence."""
     pictures: list[Picture] = field(default_factory=list)
@@ -120,10 +138,22 @@ class RunRecord:
         """What is compared: (host, supervision, preset, variant, cameras)."""
         return self.host, self.supervision, self.preset, self.variant, self.cameras
 
+    @property
+    def place(self) -> tuple[str, str, int]:
+        """Where settings meet: (scene, cameras, seed)."""
+        return self.scene, self.cameras, self.seed
+
+    def jod_values(self) -> dict[Key, float | None]:
+        """ColorVideoVDP by instant, ready for `metrics.paired`."""
+        return {(*self.place, int(t_star), -1): value for t_star, value in self.jod.items()}
+
     def values(self, metric: str, region: str = WHOLE) -> dict[Key, float | None]:
         """A metric by frame, ready for `metrics.paired`."""
-        at = (self.scene, self.cameras, self.seed)
-        return {(*at, row.t_star, row.pose): row.value(metric, region) for row in self.rows}
+        return {(*self.place, row.t_star, row.pose): row.value(metric, region) for row in self.rows}
+
+    def heldout_values(self, region: str = WHOLE) -> dict[Key, float | None]:
+        """PSNR in dB of the clip's held-out frames, ready for `metrics.paired`."""
+        return {(*self.place, row.frame, row.frame): row.psnr_db.get(region) for row in self.heldout}
 
     def per_frame(self, read: Callable[[FrameScore], float | None]) -> list[float | None]:
         """Any figure of every frame."""
@@ -143,6 +173,7 @@ def load_record(path: str | Path) -> RunRecord:
     check_version(data, str(path), RECORD_VERSION)
     try:
         data["rows"] = [from_dict(FrameScore, row) for row in data["rows"]]
+        data["heldout"] = [from_dict(HeldOut, row) for row in data["heldout"]]
         for name in ("pictures", "two_instants"):
             data[name] = [from_dict(Picture, row) for row in data[name]]
         return from_dict(RunRecord, data)
@@ -157,9 +188,10 @@ def finished(folder: str | Path, run_id: str) -> bool:
 
 
 def load_records(folder: str | Path, run_ids: Iterable[str] | None = None) -> list[RunRecord]:
-    """The records of a folder (those of `run_ids`, if given), by name."""
+    """The records of a folder (those of `run_ids`, if given), by name. The launcher's summary.json is none."""
     wanted = None if run_ids is None else set(run_ids)
-    paths = sorted(p for p in Path(folder).glob("*.json") if wanted is None or p.stem in wanted)
+    paths = sorted(p for p in Path(folder).glob("*.json") if p.name != "summary.json")
+    paths = [p for p in paths if wanted is None or p.stem in wanted]
     return [load_record(path) for path in paths]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .metrics import METRICS, WHOLE, Paired, Summary, paired, summarise
+from .metrics import METRICS, WHOLE, Key, Paired, Summary, paired, summarise
 from .records import FrameScore, RunRecord
 from .truth import REGIONS, RIGID
 
@@ -29,6 +29,12 @@ REGION_NAMES = {
     "static": "static",
     RIGID: "what never moves",
 }
+QUERIES = {"plain": "at t*", "nearest": "nearest seen"}
+"""How Gaussians are asked -> in a table."""
+QUERY_NOTE = (
+    "Hosts without anchors and with the paper's are frozen at t* itself, as published; `support` asks every Gaussian "
+    "at the time nearest to t* at which it was seen."
+)
 _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
 NONE = "–"
 
@@ -76,10 +82,33 @@ class Setting:
         values = [v for run in self.runs for v in run.jod.values() if v is not None]
         return float(np.mean(values)) if values else None
 
+    def of_heldout(self, region: str) -> float | None:
+        """Mean PSNR in dB over a region of the clip's held-out frames of all runs; None if none has it."""
+        values = [v for run in self.runs for v in run.heldout_values(region).values() if v is not None]
+        return float(np.mean(values)) if values else None
+
     def against(self, other: Setting, metric: str, region: str = WHOLE) -> Paired | None:
-        """Frame by frame against another setting."""
-        mine, theirs = ({k: v for run in s.runs for k, v in run.values(metric, region).items()} for s in (self, other))
-        return paired(mine, theirs, METRICS[metric])
+        """Frame by frame against another setting; `jod` instant by instant."""
+        if metric == "jod":
+            return self._against(other, RunRecord.jod_values)
+        return self._against(other, lambda run: run.values(metric, region), METRICS[metric])
+
+    def against_heldout(self, other: Setting, region: str) -> Paired | None:
+        """PSNR on the clip's held-out frames, frame by frame against another setting."""
+        return self._against(other, lambda run: run.heldout_values(region))
+
+    def _against(
+        self, other: Setting, read: Callable[[RunRecord], dict[Key, float | None]], more_is_better: bool = True
+    ) -> Paired | None:
+        mine, theirs = ({k: v for run in s.runs for k, v in read(run).items()} for s in (self, other))
+        return paired(mine, theirs, more_is_better)
+
+    def ratio(self, other: Setting, read: Callable[[RunRecord], float | None]) -> float | None:
+        """Geometric mean over scenes and seeds of a cost here over the same there; None if no run of both has it."""
+        there = {run.place: read(run) for run in other.runs}
+        pairs = [(read(run), there.get(run.place)) for run in self.runs]
+        logs = [float(np.log(a / b)) for a, b in pairs if a and b]
+        return float(np.exp(np.mean(logs))) if logs else None
 
 
 def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
@@ -127,7 +156,8 @@ def all_tables(records: Sequence[RunRecord]) -> list[Table]:
         tables += [
             _quality(main, WHOLE, "Frozen frames against the rendered truth, whole frame"),
             _regions(main),
-            _comparisons(main, (WHOLE, *REGIONS), "Without and with, frame by frame"),
+            _who_wins(main),
+            _every_metric(main, (WHOLE, "never_seen"), "Every metric, frame by frame"),
         ]
     ablations = [s for s in synthetic if s.variant not in ("default", "reference")]
     if ablations:
@@ -136,14 +166,14 @@ def all_tables(records: Sequence[RunRecord]) -> list[Table]:
         tables += [
             _quality(real, RIGID, "Real clips, where nothing moves: frozen frames against held-out plates"),
             _real_extra(real),
-            _comparisons(real, (RIGID,), "Real clips: without and with, frame by frame"),
+            _every_metric(real, (RIGID,), "Real clips: every metric, frame by frame"),
         ]
     tables += [_costs(s) for s in (main, real) if s]
     return tables
 
 
 def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
-    header = ["method", "runs", "frames", "PSNR mean", "bottom 75 %", "50 %", "25 %", "worst frame"]
+    header = ["method", "frozen", "runs", "frames", "PSNR mean", "bottom 75 %", "50 %", "25 %", "worst frame"]
     header += ["SSIM", "ST-LPIPS", "FLIP", "JOD"]
     rows, means = [], []
     for s in settings:
@@ -154,6 +184,7 @@ def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
         rows.append(
             [
                 s.label,
+                ", ".join(sorted({QUERIES[r.query] for r in s.runs})),
                 str(len(s.runs)),
                 str(psnr.count if psnr else 0),
                 *(number(v, "psnr_db") for v in shares),
@@ -163,7 +194,7 @@ def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
         )
     note = (
         "PSNR in dB; bottom shares are means of the worst frames, as in the paper's tables. SSIM and JOD "
-        "(ColorVideoVDP, 10 is no difference): more is better; ST-LPIPS and FLIP: less is better."
+        f"(ColorVideoVDP, 10 is no difference): more is better; ST-LPIPS and FLIP: less is better. {QUERY_NOTE}"
     )
     return Table(title, header, rows, note, _best(means))
 
@@ -179,17 +210,28 @@ def _regions(settings: Sequence[Setting]) -> Table:
 
 
 def _costs(settings: Sequence[Setting]) -> Table:
-    header = ["method", "held-out PSNR, dB", "training, s", "processor, s", "steps", "frozen frames / s", "model, MB"]
-    header += ["Gaussians", "moving, %"]
+    header = [
+        "method",
+        "held-out PSNR, dB",
+        "moving",
+        "static",
+        "training, s",
+        "processor, s",
+        "threads × runs at once",
+    ]
+    header += ["steps", "step, ms", "frozen frames / s", "model, MB", "Gaussians", "moving, %"]
     rows = []
     for s in settings:
         rows.append(
             [
                 s.label,
                 number(s.of_runs(lambda r: r.heldout_psnr_db), "psnr_db"),
+                *(number(s.of_heldout(region), "psnr_db") for region in ("moving", "static")),
                 plain(s.of_runs(lambda r: r.train_seconds), 1),
                 plain(s.of_runs(lambda r: r.train_cpu_seconds), 1),
+                ", ".join(sorted({pace(r) for r in s.runs})),
                 plain(s.of_runs(lambda r: r.iterations), 0),
+                plain(s.of_runs(lambda r: r.step_ms), 1),
                 plain(s.of_runs(lambda r: r.frozen_fps), 1),
                 plain(s.of_runs(lambda r: r.model_bytes / 1e6), 2),
                 plain(s.of_runs(lambda r: r.gaussians), 0),
@@ -198,7 +240,11 @@ def _costs(settings: Sequence[Setting]) -> Table:
         )
     loads = [r.machine.get("load_1min") for s in settings for r in s.runs]
     there = [load for load in loads if load is not None]
-    note = "Means over runs. Held-out: frames of the clip kept out of training, each at its own time."
+    note = (
+        "Means over runs. Held-out: frames of the clip kept out of training, each at its own time: whole, on what "
+        "moves, on what does not. Seconds, milliseconds and frames per second are wall time with that many threads per "
+        "run and that many runs at once; a step's are those of the last third of the run, with the measurements in it."
+    )
     if there:
         note += f" Load of the machine after the runs: {min(there):.1f} to {max(there):.1f}; wall times include it."
     kind = "real clips" if settings[0].runs[0].kind == "real" else "synthetic scenes"
@@ -207,40 +253,101 @@ def _costs(settings: Sequence[Setting]) -> Table:
 
 def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
     """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static."""
-    by_place: dict[tuple[str, str], list[Setting]] = {}
-    for s in settings:
-        by_place.setdefault((s.cameras, s.preset), []).append(s)
     pairs = []
-    for group in by_place.values():
+    for group in _places(settings):
         at = {(s.variant, s.host, s.supervision): s for s in group}
         for variant, host in dict.fromkeys((s.variant, s.host) for s in group):
-            for a, b in (("paper", "none"), ("support", "none"), ("support", "paper")):
+            for a, b in (("paper", "none"), ("support", "paper"), ("support", "none")):
                 if (variant, host, a) in at and (variant, host, b) in at:
                     pairs.append((at[variant, host, a], at[variant, host, b]))
         ours = at.get(("default", "auto", "support"))
         if ours:
-            pairs += [(ours, s) for s in group if s.supervision == "none" and s.host != "auto"]
+            bare = [s for s in group if s.host != "auto" and s.supervision == "none"]
+            published = [s for s in group if s.variant == "reference" and s not in bare]
+            gateless = [s for s in group if (s.variant, s.host, s.supervision) == (*GATELESS, "support")]
+            pairs += [(ours, s) for s in (*bare, *published, *gateless)]
     return pairs
 
 
-def _comparisons(settings: Sequence[Setting], regions: Sequence[str], title: str) -> Table:
-    header = ["a against b", "region", "PSNR a - b, dB", "standard error", "independent units", "frames", "verdict"]
+GATELESS = ("default", "hexplane")
+"""(variant, host) of what `auto` is without its gate: all Gaussians move."""
+
+
+def _places(settings: Sequence[Setting]) -> list[list[Setting]]:
+    """Settings that can be told apart: those of the same cameras and preset."""
+    by_place: dict[tuple[str, str], list[Setting]] = {}
+    for s in settings:
+        by_place.setdefault((s.cameras, s.preset), []).append(s)
+    return list(by_place.values())
+
+
+def _who_wins(settings: Sequence[Setting]) -> Table:
+    """The claims one by one: mean paired difference, its standard error, and what it cost."""
+    header = ["a against b", "where", "PSNR a - b, dB", "standard error", "n", "frames", "verdict", "cost a / b"]
     rows: list[list[str]] = []
-    marks = {}
+    marks: dict[int, str] = {}
+
+    def add(a: Setting, b: Setting, where: str, result: Paired | None, cost: str = "") -> None:
+        if result is None:
+            return
+        if result.verdict != "undecided":
+            marks[len(rows)] = result.verdict
+        rows.append([f"{a.label} against {b.label}", where, *_paired_cells(result), cost])
+
     for a, b in comparisons(settings):
-        for region in regions:
-            result = a.against(b, "psnr_db", region)
-            if result is None:
-                continue
-            if result.verdict != "undecided":
-                marks[len(rows)] = result.verdict
-            rows.append([f"{a.label} against {b.label}", REGION_NAMES[region], *_paired_cells(result)])
+        seconds = _times("training", a.ratio(b, lambda r: r.train_seconds))
+        if a.host == b.host:
+            for region in (WHOLE, "never_seen"):
+                add(a, b, REGION_NAMES[region], a.against(b, "psnr_db", region), seconds)
+        elif b.host == "static":
+            frames = _times("frozen frame", a.ratio(b, lambda r: 1.0 / r.frozen_fps))
+            for region in ("static", "seen"):
+                add(a, b, REGION_NAMES[region], a.against(b, "psnr_db", region), frames)
+            add(a, b, "moving, held-out frames of the clip", a.against_heldout(b, "moving"), seconds)
+        elif (b.variant, b.host, b.supervision) == (*GATELESS, "support"):
+            step = _times("step", a.ratio(b, lambda r: r.step_ms))
+            add(a, b, f"{REGION_NAMES[WHOLE]} (gate on, off)", a.against(b, "psnr_db"), step)
+        elif b.variant == "reference":
+            add(a, b, REGION_NAMES[WHOLE], a.against(b, "psnr_db"), seconds)
     note = (
         "A win or a loss: the mean difference over frames exceeds twice its standard error. Frames of one run fail "
-        "together, so the error is taken over runs (scene and seed) where there are at least four, else over freezes "
-        "(and t*), else over frames, which is too small an error. Fewer than four units decide nothing."
+        "together, so the error is taken over runs, that is pairs of (scene, training seed), where there are at least "
+        "four, else over freezes (and t*), else over frames, which is too small an error. Fewer than four units decide "
+        "nothing. Costs are geometric means over runs of the same scene and seed; a step's are those of the last third "
+        f"of a run. {QUERY_NOTE}"
     )
-    return Table(title, header, rows, note, marks)
+    return Table("Who wins", header, rows, note, marks)
+
+
+def _times(what: str, ratio: float | None) -> str:
+    return NONE if ratio is None else f"{what} {ratio:.2f}"
+
+
+def _every_metric(settings: Sequence[Setting], regions: Sequence[str], title: str) -> Table:
+    header = ["a against b", "region", *METRIC_NAMES.values(), "n"]
+    rows = []
+    for a, b in comparisons(settings):
+        for region in regions:
+            whole = region in (WHOLE, RIGID)
+            found = {m: a.against(b, m, region) for m in METRIC_NAMES if m != "jod" or whole}
+            psnr = found["psnr_db"]
+            if psnr is not None:
+                cells = [_difference(found.get(m), m) for m in METRIC_NAMES]
+                label = f"{a.label} against {b.label}"
+                rows.append([label, REGION_NAMES[region], *cells, f"{psnr.units} {psnr.unit}"])
+    note = (
+        "a - b, mean and standard error, with the verdict where there is one (for ST-LPIPS and FLIP less is better); "
+        "ColorVideoVDP (JOD) is of whole frames, each instant one sequence."
+    )
+    return Table(title, header, rows, note)
+
+
+def _difference(result: Paired | None, metric: str) -> str:
+    if result is None:
+        return NONE
+    digits = _DIGITS[metric]
+    error = "" if result.se is None else f" ± {result.se:.{digits}f}"
+    return f"{result.mean:+.{digits}f}{error}" + (f" {result.verdict}" if result.verdict != "undecided" else "")
 
 
 def _paired_cells(result: Paired) -> list[str]:
@@ -290,6 +397,11 @@ def number(value: float | None, metric: str) -> str:
 def plain(value: float | None, digits: int) -> str:
     """A number, or a dash for one that was not measured."""
     return NONE if value is None else f"{value:.{digits}f}"
+
+
+def pace(run: RunRecord) -> str:
+    """Threads and runs at once while it trained: "1 × 2"."""
+    return NONE if run.threads is None or run.jobs is None else f"{run.threads} × {run.jobs}"
 
 
 def _best(values: Sequence[float | None]) -> dict[int, str]:

@@ -66,6 +66,10 @@ class TruthScene(Protocol):
         """name -> bool [height, width]."""
         ...
 
+    def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
+        """`moving` and `static`, bool [height, width], of the clip's own frame; {} if that is not known."""
+        ...
+
 
 class TruthFolder:
     """A folder of truth, see the module."""
@@ -100,6 +104,10 @@ class TruthFolder:
         """The regions by truth; a pixel belongs to one if more than half of it does."""
         named = {name: self.folder / "regions" / f"{t_star:06d}_{pose:06d}_{name}.png" for name in self._regions}
         return {name: read_image(path, width, height).mean(2) > 0.5 for name, path in named.items()}
+
+    def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
+        """Nothing: the folder holds none."""
+        return {}
 
 
 class RealScene:
@@ -138,10 +146,17 @@ class RealScene:
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
         """The rigid pixels of the plate; one counts if nearly all of it is."""
-        if pose not in self._masks:
-            self._masks = self._load_masks(sorted({*self._asked, pose}))
-        mask = self._masks[pose].float()[None, None]
-        return {RIGID: F.interpolate(mask, (height, width), mode="area")[0, 0] > 0.95}
+        return {RIGID: self._rigid_share(pose, width, height) > 0.95}
+
+    def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
+        """Static: nearly all of the pixel stays on its epipolar lines; moving: nearly nothing of it does."""
+        share = self._rigid_share(frame, width, height)
+        return {"moving": share < 0.05, "static": share > 0.95}
+
+    def _rigid_share(self, frame: int, width: int, height: int) -> Tensor:
+        if frame not in self._masks:
+            self._masks = self._load_masks(sorted({*self._asked, frame}))
+        return F.interpolate(self._masks[frame].float()[None, None], (height, width), mode="area")[0, 0]
 
     def _load_masks(self, frames: list[int]) -> dict[int, Tensor]:
         """The masks of `frames`, from the cache or from optical flow."""

@@ -15,7 +15,7 @@ from . import plots
 from .metrics import WHOLE
 from .page import page
 from .records import RunRecord, load_records, machine_facts
-from .tables import Setting, Table, all_tables, markdown, settings_of
+from .tables import NONE, Setting, Table, all_tables, markdown, pace, settings_of
 from .truth import RIGID
 
 TITLE = "Frozen time: speed against error"
@@ -61,6 +61,8 @@ def _facts(records: Sequence[RunRecord], command: str) -> list[str]:
     scenes = sorted({f"{r.scene} ({r.kind}, {r.cameras} cameras)" for r in records})
     lines = [f"Runs: {len(records)}; scenes: {', '.join(scenes)}"]
     lines += [f"Machine: {'; '.join(machines)}"] if machines else []
+    paces = sorted({pace(r) for r in records} - {NONE})
+    lines += [f"Threads per run × runs at once: {', '.join(paces)}; all times are of that"] if paces else []
     lines += [f"Runs finished {dates[0]} to {dates[-1]} UTC"] if dates else []
     lines = [html.escape(line) for line in lines]
     return [*lines, f"Command: <code>{html.escape(command)}</code>"] if command else lines

@@ -10,7 +10,8 @@ import time
 import pytest
 import torch
 
-from benchmarks.bench import ABLATIONS, HOLDOUT, ROOT, RunSpec, override, plan, run_plan
+from benchmarks.bench import ABLATIONS, HOLDOUT, RunSpec, override, plan, run_plan
+from benchmarks.sources import ROOT
 from torch_backend.report.records import finished, load_record, load_records
 from torch_backend.report.truth import RealScene, TruthFolder
 from torch_backend.report.write import write_report
@@ -36,7 +37,7 @@ def done(tmp_path_factory, scene):
     results = tmp_path_factory.mktemp("results")
     runs, said = plan([f"truth:{scene[0]}"], results, **SIZE)
     runs = only(runs, ("auto", "support"), ("static", "none"))
-    assert run_plan(runs, results) == []
+    assert run_plan(runs, results, 2) == []
     return results, runs, said
 
 
@@ -51,7 +52,11 @@ def test_the_plan_is_every_host_with_and_without_and_says_what_is_missing(scene,
         assert sum(repr(host) in sentence for sentence in said) == 1
     variants = {r.variant for r in runs} - {"default"}
     assert {"no hidden loss", "no defective loss", "no confidence weighting", "no exposure"} <= variants
-    assert len(variants) + sum("ablation" in sentence for sentence in said) == len(ABLATIONS)
+    assert len(variants) + sum("ablation" in s for s in said) == len({a.name for a in ABLATIONS})
+    main = {r.run_name for r in runs if r.variant == "default"}
+    asked = [r for r in runs if r.variant.startswith("frozen")]
+    assert {r.supervision for r in asked} == {"none", "paper", "support"}
+    assert {r.run_name for r in asked} <= main  # trained once, asked twice
     assert not only(plan([f"truth:{scene[0]}"], tmp_path)[0], ("auto", "none"))
 
 
@@ -66,6 +71,7 @@ def test_instants_are_trained_on(scene, tmp_path):
 def test_a_run_is_named_after_scene_and_settings():
     spec = RunSpec("truth:/a/tiny", "abc", "auto", "support", "preview")
     assert spec.run_id == dataclasses.replace(spec).run_id
+    assert spec.query == "nearest" and RunSpec("", "", "mlp", "paper", "preview").query == "plain"
     changed = [{"scene_key": "abd"}, {"seed": 1}, {"query": "plain"}, {"overrides": {"exposure.on": False}}]
     assert len({spec.run_id, *(dataclasses.replace(spec, **c).run_id for c in changed)}) == 5
     assert dataclasses.replace(spec, query="plain").run_name == spec.run_name  # trained once, asked twice
@@ -91,11 +97,61 @@ def test_a_record_holds_every_frame_and_its_regions(done, scene):
         unseen = {key[3:]: value for key, value in record.values("psnr_db", "never_seen").items()}
         assert unseen[103, 103] is None and unseen[103, 114] > 5  # t*'s own pose sees nothing new
         assert record.host == spec.host and record.iterations == 60 and record.heldout_psnr_db is not None
+        assert record.jobs == 2 and record.threads == max(1, len(cores()) // 2) and 0 < record.step_ms < 60_000
+        # Measured on the plate as 8-bit PNG here, by the trainer on the same in half precision.
+        psnr = [row.psnr_db["whole"] for row in record.heldout]
+        assert psnr and sum(psnr) / len(psnr) == pytest.approx(record.heldout_psnr_db, abs=0.02)
         assert record.frozen_fps > 0 and 1e4 < record.model_bytes < 1e7 and record.train_cpu_seconds > 0
         assert all((results / p.ours).is_file() and (results / p.truth).is_file() for p in record.pictures)
         assert [p.psnr_db for p in record.pictures] == sorted(p.psnr_db for p in record.pictures)
         one, other = record.two_instants
         assert one.pose == other.pose and {one.t_star, other.t_star} == set(truth.t_stars) == {*map(int, record.plates)}
+
+
+def test_a_run_that_is_only_asked_otherwise_is_not_trained_again(done):
+    results, runs, _ = done
+    spec = only(runs, ("auto", "support"))[0]
+    others = [dataclasses.replace(spec, query="plain", variant=name) for name in ("frozen at t* itself",)]
+    trained = TruthFolder(spec.source.partition(":")[2]).shot.run(spec.run_name) / "checkpoint.safetensors"
+    before = trained.stat().st_mtime_ns
+    assert run_plan(others, results, 2) == [] and trained.stat().st_mtime_ns == before
+    nearest, plain = (load_record(results / f"{s.run_id}.json") for s in (spec, *others))
+    assert (nearest.query, plain.query) == ("nearest", "plain")
+    assert (plain.train_seconds, plain.threads) == (nearest.train_seconds, nearest.threads)
+
+
+def test_runs_that_share_a_training_come_one_after_the_other(scene, tmp_path):
+    runs, _ = plan([f"truth:{scene[0]}"], tmp_path, **{**SIZE, "iterations": 50})
+    spec = only(runs, ("hexplane", "none"))[0]
+    runs = [spec, dataclasses.replace(spec, query="nearest", variant="frozen where seen nearest")]
+    assert run_plan(runs, tmp_path, 2) == []
+    logs = [(tmp_path / "logs" / f"{r.run_id}.txt").read_text() for r in runs]
+    assert "already trained" not in logs[0] and "already trained" in logs[1]
+
+
+def test_published_settings_are_what_is_trained(scene, tmp_path):
+    runs, _ = plan([f"truth:{scene[0]}"], tmp_path, reference=True, **SIZE)
+    published = [r for r in runs if r.variant == "reference"]
+    assert {(r.host, r.supervision) for r in published} == {(h, s) for h in hosts() for s in ("none", "paper")}
+    for spec in published:
+        config = spec.config()
+        assert config.field == host_config(spec.host, "reference", 60) != host_config(spec.host, "default", 60)
+    spec = next(r for r in published if (r.host, r.supervision) == ("mlp", "none"))
+    assert run_plan([spec], tmp_path) == []
+    trained = read_json(TruthFolder(scene[0]).shot.run(spec.run_name) / "config.json")["config"]
+    assert config_from_json(trained) == spec.config()
+
+
+def test_the_last_third_of_a_run_has_a_pace_of_its_own(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    # Ten measurements of 100 steps of 20 ms, from the 7th on 50 ms; one was repeated after an interruption.
+    rows = [(100 * n, 2.0 * min(n, 6) + 5.0 * max(0, n - 6)) for n in range(1, 11)]
+    rows.insert(8, (800, 99.0))
+    path.write_text("".join(json.dumps({"iteration": i, "seconds": s}) + "\n" for i, s in sorted(rows, reverse=False)))
+    assert last_third_step_ms(tmp_path / "absent.jsonl", 1000) is None
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:8], *lines[9:], lines[7]]) + "\n")
+    assert last_third_step_ms(path, 1000) == pytest.approx(50.0)
 
 
 def test_a_finished_plan_runs_nothing(done, capsys):

@@ -14,7 +14,16 @@ import torch
 
 from torch_backend.footage.images import write_png
 from torch_backend.report.metrics import score
-from torch_backend.report.records import FrameScore, Picture, RunRecord, load_record, machine_facts, save_record
+from torch_backend.report.records import (
+    FrameScore,
+    HeldOut,
+    Picture,
+    RunRecord,
+    load_record,
+    load_records,
+    machine_facts,
+    save_record,
+)
 from torch_backend.report.tables import all_tables, comparisons, settings_of
 from torch_backend.report.write import write_report
 
@@ -54,9 +63,13 @@ def example(results: Path, frame: torch.Tensor, scene: str, seed: int, host: str
     pictures.sort(key=lambda p: p.psnr_db)
     record = RunRecord(
         f"{scene}-{host}-{supervision}-s{seed}", scene, "synthetic", "exact", host, supervision, "preview", "default",
-        seed, "nearest", 3000, width, height, 40.0 * (2 - strength) * (0.4 if host == "static" else 1), 70.0, 4800,
+        seed, "nearest" if supervision == "support" else "plain", 3000, width, height,
+        40.0 * (2 - strength) * (0.4 if host == "static" else 1), 70.0,
+        1, 2, 5.0 if host == "auto" else 12.5, 4800,
         0.04 if host == "auto" else float(host != "static"), 1_900_000 if host == "static" else 2_600_000,
-        240.0 - 100 * (host == "hexplane"), 28.0, rows, {"8": 8.9, "24": None}, pictures,
+        240.0 - 100 * (host == "hexplane"), 28.0, rows,
+        [HeldOut(f, {"whole": 28.0, "moving": 25.0 - 3 * strength, "static": None}) for f in (3, 11)],
+        {"8": 8.9, "24": None}, pictures,
         [p for p in pictures if p.pose == 40], plates, {}, machine_facts(), "bench", "2026-11-21 12:00",
     )  # fmt: skip
     save_record(results, record)
@@ -91,7 +104,7 @@ def test_a_record_comes_back_as_it_went(results):
 
 
 def test_a_damaged_record_is_named(tmp_path):
-    (tmp_path / "x.json").write_text('{"version": 1, "rows": []}')
+    (tmp_path / "x.json").write_text('{"version": 2, "rows": []}')
     with pytest.raises(ValueError, match="x.json"):
         load_record(tmp_path / "x.json")
     (tmp_path / "y.json").write_text('{"version": 99}')
@@ -106,27 +119,41 @@ def test_means_are_those_of_the_frames(results, report):
     values = []
     for path in results.glob("*hexplane-paper*.json"):
         values += [r["regions"]["whole"]["psnr_db"] for r in json.loads(path.read_text())["rows"]]
-    assert len(values) == 24 and row[1:3] == ["4", "24"]
-    assert float(row[3]) == pytest.approx(np.mean(values), abs=0.006)
-    assert float(row[6]) == pytest.approx(np.mean(sorted(values)[:6]), abs=0.006)
-    assert float(row[7]) == pytest.approx(min(values), abs=0.006)
+    assert len(values) == 24 and row[1:4] == ["at t*", "4", "24"]
+    assert float(row[4]) == pytest.approx(np.mean(values), abs=0.006)
+    assert float(row[7]) == pytest.approx(np.mean(sorted(values)[:6]), abs=0.006)
+    assert float(row[8]) == pytest.approx(min(values), abs=0.006)
     assert quality["marks"] == {str([r[0] for r in quality["rows"]].index("auto (ours)")): "best"}
 
 
 def test_what_is_compared_with_what(results):
-    from torch_backend.report.records import load_records
-
     names = [(a.label, b.label) for a, b in comparisons(settings_of(load_records(results), "synthetic"))]
     assert ("4DGaussians + paper", "4DGaussians") in names and ("4DGaussians + support", "4DGaussians + paper") in names
-    assert ("auto (ours)", "static 3DGS") in names and len(names) == 5
+    assert ("auto (ours)", "static 3DGS") in names and ("auto (ours)", "4DGaussians + support") in names
+    assert len(names) == 6
 
 
-def test_anchors_win_where_nothing_was_seen(results):
-    from torch_backend.report.records import load_records
-
-    table = next(t for t in all_tables(load_records(results)) if t.title.startswith("Without and with"))
-    row = next(r for r in table.rows if r[:2] == ["4DGaussians + support against 4DGaussians", "never seen at t*"])
+def test_who_wins_where_and_at_what_cost(results):
+    table = next(t for t in all_tables(load_records(results)) if t.title == "Who wins")
+    rows = {(row[0], row[1]): row for row in table.rows}
+    row = rows["4DGaussians + support against 4DGaussians", "never seen at t*"]
     assert float(row[2]) > 0 and row[4] == "4 runs" and row[6] == "win"
+    row = rows["auto (ours) against 4DGaussians + support", "whole frame (gate on, off)"]
+    assert row[-1] == "step 0.40"
+    row = rows["auto (ours) against static 3DGS", "moving, held-out frames of the clip"]
+    assert float(row[2]) == pytest.approx(3 * (0.8 - 0.3)) and row[5] == "8" and row[6] == "win"
+    # Seconds are 40 (2 - strength), times 0.4 for static.
+    assert row[-1] == f"training {(2 - 0.3) / (1.2 * 0.4):.2f}"
+
+
+def test_every_metric_says_which_way_is_better(results):
+    table = next(t for t in all_tables(load_records(results)) if t.title.startswith("Every metric"))
+    row = next(r for r in table.rows if r[:2] == ["4DGaussians + support against 4DGaussians", "whole frame"])
+    cells = dict(zip(table.header, row, strict=True))
+    assert cells["PSNR, dB"].startswith("+") and cells["PSNR, dB"].endswith(" win")
+    assert cells["JOD"] == "+0.00 ± 0.00"
+    if cells["FLIP"] != "–":
+        assert cells["FLIP"].startswith("-") and cells["FLIP"].endswith(" win")
 
 
 def test_one_metric_missing_leaves_a_dash_and_a_sentence(results, tmp_path):
