@@ -5,6 +5,12 @@ hyper-coordinates, each turning it about itself. Corrected against the published
 Gaussians that move, so that no separate stage has to find them and the host works behind the gate; scales change in
 the log and one rotation serves both the frame of a node and the Gaussians in it; nodes are added where more Gaussians
 open. Positions of nodes and of Gaussians are detached throughout, as published.
+
+`reference` is the published host but for this: nodes are not densified and pruned once more at 10,000 steps of stage
+two (the screen gradients that decide it stay with the trainer, and its threshold is for the Gaussians' published
+rates; farthest paths have just spread the nodes), its optional losses that need optical flow or masks are left out,
+the surrogates multiply on a schedule instead of by a threshold, and positions of nodes stay after stage one. Losses,
+the Gaussians' own rates and their growth are the trainer's, as with every host.
 """
 
 from __future__ import annotations
@@ -16,6 +22,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from ..gaussians.model import SH_C0
 from .geometry import farthest_points, near_identity, nearest, rigid_rotations, rotation_matrices
@@ -41,6 +48,8 @@ _WINDOW = 0.05
 """ARAP: the two times lie within this."""
 _SURROGATES = 16
 """Pre-stage: at most so many surrogate points per node."""
+_PRUNED = 0.005
+"""Pre-stage: surrogates less opaque than this go."""
 _INSTANTS = 16
 """Times at which a trajectory is sampled."""
 
@@ -172,33 +181,36 @@ class ControlPoints(Deformation):
         if hyper is None:
             hyper = x.new_full((len(x), self.config.hyper), self.owned["hyper"].value)
         index, share = self._skin(x, hyper)
-        motion, at = self._motions(index, times)
-        frame = rotation_matrices(near_identity(motion.frame))
-        place = self.places[index]
-        moved = (frame[at] @ (x[:, None] - place)[..., None])[..., 0] + place + motion.shift[at]
-        share = share[..., None]
-        return Deltas(
-            means=(share * moved).sum(1) - x,
-            quats=(share * motion.quats[at]).sum(1),
-            log_scales=(share * motion.log_scales[at]).sum(1),
-        )
+        places, motion, at = self._motions(index, times)
+        # Of the turn only what it changes is blended: a node that stands still moves nothing, however far off.
+        turned = rotation_matrices(near_identity(motion.frame)) - torch.eye(3, device=x.device)
+        offset = motion.shift - (turned @ places[..., None])[..., 0]
+        rows = torch.cat([turned.flatten(1), offset, motion.quats, motion.log_scales], dim=1)
+        blend = F.embedding_bag(at, rows, per_sample_weights=share, mode="sum")
+        turned, offset, quats, log_scales = blend.split((9, 3, 4, 3), dim=1)
+        means = (turned.unflatten(1, (3, 3)) * x[:, None, :]).sum(2) + offset
+        return Deltas(means=means, quats=quats, log_scales=log_scales)
 
     def _skin(self, x: Tensor, hyper: Tensor) -> tuple[Tensor, Tensor]:
         """(nodes followed [M, K], their shares [M, K]) of Gaussians at x [M, 3] with hyper [M, H]."""
-        joint, nodes = torch.cat([x, hyper], dim=1), torch.cat([self.places, self.hyper], dim=1)
-        index = nearest(joint, nodes, min(_FOLLOWED, len(nodes)))
-        squared = (joint[:, None] - nodes[index]).square().sum(2)
-        reach = torch.exp(-0.5 * squared * torch.exp(-2.0 * self.log_radii[index]))
-        share = reach * torch.sigmoid(self.weights[index]) + 1e-7
+        with torch.no_grad():
+            joint, nodes = torch.cat([x, hyper], dim=1), torch.cat([self.places, self.hyper], dim=1)
+            index = nearest(joint, nodes, min(_FOLLOWED, len(nodes)))
+            away = (x[:, None] - self.places[index]).square().sum(2)
+        reach, weight = -0.5 * torch.exp(-2.0 * self.log_radii), torch.sigmoid(self.weights)
+        each = F.embedding(index, torch.cat([self.hyper, reach[:, None], weight[:, None]], dim=1))
+        squared = away + (hyper[:, None] - each[..., :-2]).square().sum(2)
+        share = torch.exp(squared * each[..., -2]) * each[..., -1] + 1e-7
         return index, share / share.sum(1, keepdim=True)
 
-    def _motions(self, index: Tensor, times: Tensor) -> tuple[_Motion, Tensor]:
-        """Motions that index [M, K] needs at times [M] or [1], each (node, time) once, and where each stands [M, K]."""
+    def _motions(self, index: Tensor, times: Tensor) -> tuple[Tensor, _Motion, Tensor]:
+        """What index [M, K] needs at times [M] or [1], each (node, time) once: (places [R, 3], motions, rows [M, K])."""
         if times.shape[0] == 1:
-            return self.node_motion(self.places, times), index
+            return self.places, self.node_motion(self.places, times), index
         instants, which = times.unique(return_inverse=True)
         pairs, at = (index * len(instants) + which[:, None]).unique(return_inverse=True)
-        return self.node_motion(self.places[pairs // len(instants)], instants[pairs % len(instants)]), at
+        places = self.places[pairs // len(instants)]
+        return places, self.node_motion(places, instants[pairs % len(instants)]), at
 
     def node_motion(self, places: Tensor, times: Tensor) -> _Motion:
         """The network at places [R, 3] (detached) and times [R] or [1]."""
@@ -278,17 +290,7 @@ class ControlPoints(Deformation):
             ("log_radii", radii),
             ("weights", self.weights.new_zeros(len(fresh))),
         ):
-            old = getattr(self, name)
-            new = nn.Parameter(torch.cat([old.detach(), rows]))
-            setattr(self, name, new)
-            state = optimizer.state.pop(old, None)
-            if state is not None:
-                optimizer.state[new] = {
-                    key: torch.cat([value, torch.zeros_like(rows)]) if value.shape == old.shape else value
-                    for key, value in state.items()
-                }
-            for group in optimizer.param_groups:
-                group["params"] = [new if p is old else p for p in group["params"]]
+            setattr(self, name, _with_rows(getattr(self, name), None, rows, optimizer))
 
     def _paths(self, places: Tensor) -> Tensor:
         """[R, 3 * 16]: trajectories of places [R, 3] as features, in which distance is root mean square distance."""
@@ -299,8 +301,8 @@ class ControlPoints(Deformation):
     def rehearse(self, stage: Rehearsal) -> None:
         """SC-GS' stage one: surrogate balls of one size move point-wise; farthest paths become the nodes.
 
-        A fifth of the steps with motion off, nodes drawn at three quarters, the rest with the nodes alone. Departure:
-        surrogates do not multiply; as many as the published limit on real data are there from the start.
+        A fifth of the steps with motion off, nodes drawn at three quarters, the rest with the nodes alone. Until they
+        are drawn the surrogates multiply, up to 16 per node (`_Surrogates`).
         """
         _Surrogates(self, stage).run()
 
@@ -317,6 +319,24 @@ class ControlPoints(Deformation):
         """Inverse of `state`, whatever the number of nodes."""
         self.place(tensors["field.places"])
         super().load_state(tensors)
+
+
+def _with_rows(old: nn.Parameter, kept: Tensor | None, fresh: Tensor, optimizer: torch.optim.Optimizer) -> nn.Parameter:
+    """The rows `kept` [K] of a parameter (None: all), then `fresh` ones, which the optimiser has no memory of."""
+
+    def rows(values: Tensor) -> Tensor:
+        return values if kept is None else values[kept]
+
+    new = nn.Parameter(torch.cat([rows(old.detach()), fresh]))
+    state = optimizer.state.pop(old, None)
+    if state is not None:
+        optimizer.state[new] = {
+            key: torch.cat([rows(value), torch.zeros_like(fresh)]) if value.shape == old.shape else value
+            for key, value in state.items()
+        }
+    for group in optimizer.param_groups:
+        group["params"] = [new if p is old else p for p in group["params"]]
+    return new
 
 
 # ---------------------------------------------------------------------- penalties
@@ -371,7 +391,12 @@ def _radii(places: Tensor, published: bool) -> Tensor:
 
 
 class _Surrogates:
-    """Balls of one common size, SH degree 0, that find the motion before any Gaussian has to follow it."""
+    """Balls of one common size, SH degree 0, that find the motion before any Gaussian has to follow it.
+
+    They multiply every hundredth of the stage (at least 10 steps apart, so that a round has frames to judge by) from a
+    twentieth on, as published; but on a schedule that ends at 16 per node when nodes are drawn, where the image pulls
+    hardest, since the published threshold is on a screen gradient that this stage is not told.
+    """
 
     def __init__(self, field: ControlPoints, stage: Rehearsal) -> None:
         self.field, self.stage = field, stage
@@ -390,22 +415,30 @@ class _Surrogates:
             "sh0": nn.Parameter(((colors - 0.5) / SH_C0)[:, None, :].clone()),
         }
         self.optimizer = self._optimiser()
+        self.pull, self.limit = torch.zeros_like(points[:, 0]), limit
 
     def run(self) -> None:
         """All steps; the field's nodes are placed at the end."""
         stage, field = self.stage, self.field
         warm, sampling = round(0.2 * stage.steps), round(0.75 * stage.steps)
+        first, every = round(0.05 * stage.steps), max(10, round(0.01 * stage.steps))
         for step in range(stage.steps):
+            if first < step < sampling and step % every == 0:
+                self._multiply(1 + (sampling - 1 - step) // every)
             if step == sampling:
                 self._draw_nodes()
             frame = int(torch.randint(len(stage.times), (1,), generator=stage.generator, device="cpu"))
-            loss = stage.loss(self._state(frame, moving=step >= warm), frame)
+            state = self._state(frame, moving=step >= warm)
+            state["means"].retain_grad()
+            loss = stage.loss(state, frame)
             if step >= warm:
                 loss = loss + self._penalties()
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             if bool(torch.isfinite(loss)):
                 self.optimizer.step()
+                if state["means"].grad is not None:
+                    self.pull += state["means"].grad.norm(dim=1)
         field.place(self.params["means"].detach())
 
     def _state(self, frame: int, moving: bool) -> dict[str, Tensor]:
@@ -442,9 +475,23 @@ class _Surrogates:
         )
 
     @torch.no_grad()
+    def _multiply(self, rounds: int) -> None:
+        """Gives those that are pulled hardest a second one within their size, drops those that nobody sees."""
+        shown = torch.sigmoid(self.params["opacity_logits"]) >= _PRUNED
+        kept = torch.nonzero(shown).flatten() if bool(shown.any()) else torch.arange(len(shown), device=shown.device)
+        more = min(len(kept), max(0, self.limit - len(kept)) // rounds)
+        parents = kept[self.pull[kept].topk(more).indices]
+        spread = torch.randn(more, 3, generator=self.stage.generator, device="cpu").to(parents.device)
+        fresh = {name: value.detach()[parents] for name, value in self.params.items()}
+        fresh["means"] = fresh["means"] + self.scale.exp() * spread
+        self.params = {n: _with_rows(p, kept, fresh[n], self.optimizer) for n, p in self.params.items()}
+        self.pull = torch.zeros_like(self.params["means"][:, 0])
+
+    @torch.no_grad()
     def _draw_nodes(self) -> None:
         rows = farthest_points(self.field._paths(self.params["means"].detach()), self.field.config.nodes)
         self.params = {name: nn.Parameter(value.detach()[rows]) for name, value in self.params.items()}
+        self.pull = torch.zeros_like(self.params["means"][:, 0])
         self.optimizer = self._optimiser()
 
     def _optimiser(self) -> torch.optim.Adam:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+
+from ..native import INTEGER, POINTER, Snippet
 
 _SERIES = 0.25
 """Below this squared angle sin and cos quotients are series: their closed forms cancel in float32."""
@@ -93,12 +97,67 @@ def farthest_points(features: Tensor, count: int, chosen: Tensor | None = None) 
     return torch.tensor(picked, dtype=torch.long, device=features.device)
 
 
+_MOST = 16
+"""Most neighbours that the compiled search keeps."""
+
+_NEAREST = r"""
+// queries: [count][D]; points: [D][padded], the padding far away; index: [count][K].
+const long long D = P.dims, K = P.neighbours, Q = P.count, N = P.padded;
+for (long long first; (first = take() * 256) < Q;) {
+    long long last = first + 256 < Q ? first + 256 : Q;
+    for (long long m = first; m < last; m++) {
+        const float* query = P.queries + m * D;
+        long long* index = (long long*)P.index + m * K;
+        float best[@MOST@];
+        for (long long k = 0; k < K; k++) { best[k] = __builtin_inff(); index[k] = k; }
+        for (long long n = 0; n < N; n += 16) {
+            F squared = (F)0.f;
+            for (long long d = 0; d < D; d++) { F gap = load(P.points + d * N + n) - query[d]; squared += gap * gap; }
+            if (!(__builtin_reduce_min(squared) < best[K - 1])) continue;
+            float lanes[16]; store(lanes, squared);
+            for (int l = 0; l < 16; l++) if (lanes[l] < best[K - 1]) {
+                long long k = K - 1;
+                for (; k > 0 && best[k - 1] > lanes[l]; k--) { best[k] = best[k - 1]; index[k] = index[k - 1]; }
+                best[k] = lanes[l]; index[k] = n + l;
+            }
+        }
+    }
+}
+"""
+
+
+@functools.cache
+def _search() -> Snippet:
+    fields = {
+        **dict.fromkeys(("queries", "points", "index"), POINTER),
+        **dict.fromkeys(("count", "padded", "dims", "neighbours"), INTEGER),
+    }
+    return Snippet("nearest", fields, _NEAREST.replace("@MOST@", str(_MOST)))
+
+
+def warm_up() -> None:
+    """Compile, or load from the cache, from the main thread."""
+    _search().warm_up()
+
+
+@torch.no_grad()
 def nearest(queries: Tensor, points: Tensor, count: int) -> Tensor:
-    """Indices int64 [Q, count] of the points [P, D] nearest to queries [Q, D], nearest first; no gradient."""
+    """Indices int64 [Q, count] of the points [P, D] nearest to queries [Q, D], nearest first; no gradient.
+
+    On the CPU compiled; a query that is no number gets the first points.
+    """
+    if queries.device.type == "cpu" and queries.dtype == torch.float32 and count <= min(_MOST, len(points)):
+        padded = F.pad(points.float().t(), (0, -len(points) % 16), value=1e18).contiguous()
+        queries, index = queries.contiguous(), torch.empty(len(queries), count, dtype=torch.long, device="cpu")
+        _search().run(
+            1 if len(queries) < 2048 else None, queries=queries.data_ptr(), points=padded.data_ptr(),
+            index=index.data_ptr(), count=len(queries), padded=padded.shape[1], dims=len(padded), neighbours=count,
+        )  # fmt: skip
+        return index
     # Products of coordinates are twice as fast as differences, and exact enough near the origin.
-    centre = points.detach().mean(0)
-    targets = points.detach() - centre
-    chunks = (queries.detach() - centre).split(4096)
+    centre = points.mean(0)
+    targets = points - centre
+    chunks = (queries - centre).split(4096)
     found = [torch.cdist(chunk, targets).topk(count, dim=1, largest=False).indices for chunk in chunks]
     return torch.cat(found) if found else torch.zeros(0, count, dtype=torch.long, device=points.device)
 

@@ -12,7 +12,7 @@ from torch_backend.deformation.control_points import (
     arap_energy,
     elastic_energy,
 )
-from torch_backend.deformation.geometry import rotation_matrices
+from torch_backend.deformation.geometry import near_identity, rotation_matrices
 from torch_backend.deformation.registry import host_config
 
 BOX = torch.tensor([[-2.0] * 3, [2.0] * 3])
@@ -73,6 +73,31 @@ def test_hyper_coordinates_say_whom_to_follow():
     for row, pair in ((0, {0, 1}), (1, {2, 3})):
         kept = {int(k): float(s) for k, s in zip(index[row], share[row].tolist(), strict=True)}
         assert sum(s for k, s in kept.items() if k in pair) > 0.999
+
+
+@pytest.mark.parametrize("configuration", ["default", "reference"])
+def test_blending_is_linear_blend_skinning_of_the_nodes(configuration):
+    """Against the sum over nodes as SC-GS writes it, at float64."""
+    g = torch.Generator().manual_seed(3)
+    config = host_config("control_points", configuration, 1000)
+    module = ControlPoints(config, torch.randn(40, 3, generator=g), BOX, 10, g)
+    with torch.no_grad():
+        for head in module.heads.values():
+            head.weight.normal_(std=0.1, generator=g)
+        module.weights.normal_(generator=g)
+    x, hyper, times = torch.randn(30, 3, generator=g), torch.randn(30, config.hyper, generator=g), torch.rand(30, generator=g)
+    got = module(x, times, {"hyper": hyper})
+    index, share = module._skin(x, hyper)
+    moved, turned = torch.zeros(30, 3, dtype=torch.float64), torch.zeros(30, 4, dtype=torch.float64)
+    for m in range(30):
+        for k, s in zip(index[m].tolist(), share[m].double(), strict=True):
+            place = module.places[k : k + 1]
+            motion = module.node_motion(place, times[m : m + 1])
+            rotation = rotation_matrices(near_identity(motion.frame.double()))[0]
+            moved[m] += s * (rotation @ (x[m] - place[0]).double() + place[0] + motion.shift[0])
+            turned[m] += s * motion.quats[0].double()
+    torch.testing.assert_close((x + got.means).double(), moved, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(got.quats.double(), turned, rtol=1e-5, atol=1e-5)
 
 
 def test_hyper_coordinates_learn_and_places_do_not():

@@ -116,3 +116,21 @@ def test_collapsed_flat_and_bad_edges():
     assert usable.tolist() == [False, True, False, True]
     assert bool(torch.isfinite(rotation).all())
     assert torch.linalg.det(rotation).tolist() == pytest.approx([1, 1, 1, 1], abs=1e-5)
+
+
+@pytest.mark.parametrize(("dims", "points", "count"), [(3, 1, 1), (5, 37, 3), (11, 512, 3), (3, 200, 11), (3, 16, 16)])
+def test_the_compiled_search_finds_what_sorting_finds(dims, points, count):
+    g = torch.Generator().manual_seed(dims)
+    places, queries = torch.randn(points, dims, generator=g), torch.randn(700, dims, generator=g) + 30.0
+    places[: points // 2] += 30.0
+    got = nearest(queries, places, count)
+    want = torch.cdist(queries.double(), places.double()).sort(dim=1).values[:, :count]
+    there = (queries[:, None].double() - places[got].double()).norm(dim=2)
+    torch.testing.assert_close(there, want, rtol=1e-6, atol=1e-6)
+    assert all(len(set(row)) == count for row in got.tolist())
+
+
+def test_a_query_that_is_no_number_stays_inside_the_points():
+    got = nearest(torch.full((2, 3), float("nan")), torch.rand(20, 3), 3)
+    assert got.tolist() == [[0, 1, 2]] * 2
+    assert nearest(torch.zeros(0, 3), torch.rand(20, 3), 3).shape == (0, 3)
