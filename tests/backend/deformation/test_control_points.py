@@ -85,7 +85,11 @@ def test_blending_is_linear_blend_skinning_of_the_nodes(configuration):
         for head in module.heads.values():
             head.weight.normal_(std=0.1, generator=g)
         module.weights.normal_(generator=g)
-    x, hyper, times = torch.randn(30, 3, generator=g), torch.randn(30, config.hyper, generator=g), torch.rand(30, generator=g)
+    x, hyper, times = (
+        torch.randn(30, 3, generator=g),
+        torch.randn(30, config.hyper, generator=g),
+        torch.rand(30, generator=g),
+    )
     got = module(x, times, {"hyper": hyper})
     index, share = module._skin(x, hyper)
     moved, turned = torch.zeros(30, 3, dtype=torch.float64), torch.zeros(30, 4, dtype=torch.float64)
