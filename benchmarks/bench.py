@@ -328,6 +328,8 @@ def work(request: Path, results: Path, jobs: int) -> int:
     """The child: trains, freezes, scores, writes the record. Returns an exit code."""
     end_with_parent()
     spec: RunSpec = from_dict(RunSpec, read_json(request))
+    if spec.run_id != request.stem:
+        raise ValueError("the program was changed while the benchmark ran: start it again")
     truth = load_source(spec.source, results)
     run_name = spec.run_name
     # The job's parameters name a preset; this process knows one more, with the plan's overrides in it.
