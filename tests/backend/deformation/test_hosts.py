@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torch_backend.deformation import registry
-from torch_backend.deformation.protocol import Rehearsal, Start, apply_deltas
+from torch_backend.deformation.protocol import Deltas, Rehearsal, Start, add_to_scale, apply_deltas, turn
 from torch_backend.gaussians import PARAM_NAMES, Gaussians
 
 HOSTS = tuple(registry.hosts())
@@ -79,6 +79,22 @@ def test_a_time_for_all_is_the_same_time_for_each(name, configuration):
         assert a.shape[0] == 30
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(a[:10], c[:10], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("rules", [{}, {"quats": turn, "log_scales": add_to_scale}])
+def test_deltas_meet_all_rows_as_they_meet_some(rules):
+    """All rows in order are not indexed; the same rows in another order, and each half alone, give the same."""
+    model, g = cloud(20), torch.Generator().manual_seed(6)
+    deltas = Deltas(*(0.1 * torch.randn(20, n, generator=g) for n in (3, 4, 3)))
+    rows, mixed = torch.arange(20), torch.randperm(20, generator=g)
+    want = apply_deltas(model, rows, deltas, rules)
+    shuffled = apply_deltas(model, mixed, Deltas(*(d if d is None else d[mixed] for d in deltas)), rules)
+    halves = [apply_deltas(model, part, Deltas(*(d if d is None else d[part] for d in deltas)), rules)
+              for part in rows.split(10)]  # fmt: skip
+    for name in PARAM_NAMES:
+        torch.testing.assert_close(shuffled[name], want[name])
+        torch.testing.assert_close(torch.cat([halves[0][name][:10], halves[1][name][10:]]), want[name])
+        assert torch.equal(halves[0][name][10:], model.params[name][10:])
 
 
 def rigid(means, t):
