@@ -44,6 +44,7 @@ table { border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabu
 th, td { padding: .3rem .65rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th { color: var(--quiet); font-weight: 600; vertical-align: bottom; white-space: normal; min-width: 4rem; }
 th:first-child, td:first-child, .word { text-align: left; }
+td:first-child { white-space: normal; min-width: 11rem; max-width: 22rem; }
 tr.best td { font-weight: 700; } tr.win td:last-child { color: var(--win); font-weight: 600; }
 tr.loss td:last-child { color: var(--loss); font-weight: 600; }
 figure { margin: 1rem 0; } figure img { max-width: 100%; height: auto; border-radius: 4px; }

@@ -32,8 +32,8 @@ REGION_NAMES = {
 QUERIES = {"plain": "at t*", "nearest": "nearest seen"}
 """How Gaussians are asked -> in a table."""
 QUERY_NOTE = (
-    "Hosts without anchors and with the paper's are frozen at t* itself, as published; `support` asks every Gaussian "
-    "at the time nearest to t* at which it was seen."
+    "Hosts without anchors and with the paper's are frozen at t* itself, as published; with support every Gaussian is "
+    "asked at the time nearest to t* at which it was seen."
 )
 _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
 NONE = "–"
@@ -136,12 +136,12 @@ def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
 
 
 def _label(host: str, supervision: str, variant: str) -> str:
-    name = HOST_NAMES.get(host, host)
+    name = HOST_NAMES.get(host, host) + (" (reference)" if variant == "reference" else "")
     if supervision != "none" and not (host == "auto" and supervision == "support"):
         name += f" + {supervision}"
     elif supervision == "none" and host == "auto":
         name += ", no anchors"
-    return name if variant == "default" else f"{name}: {variant}"
+    return name if variant in ("default", "reference") else f"{name}: {variant}"
 
 
 # ------------------------------------------------------------------------------------------------- tables
@@ -154,9 +154,9 @@ def all_tables(records: Sequence[RunRecord]) -> list[Table]:
     tables = []
     if main:
         tables += [
+            _who_wins(main),
             _quality(main, WHOLE, "Frozen frames against the rendered truth, whole frame"),
             _regions(main),
-            _who_wins(main),
             _every_metric(main, (WHOLE, "never_seen"), "Every metric, frame by frame"),
         ]
     ablations = [s for s in synthetic if s.variant not in ("default", "reference")]
@@ -283,7 +283,7 @@ def _places(settings: Sequence[Setting]) -> list[list[Setting]]:
 
 def _who_wins(settings: Sequence[Setting]) -> Table:
     """The claims one by one: mean paired difference, its standard error, and what it cost."""
-    header = ["a against b", "where", "PSNR a - b, dB", "standard error", "n", "frames", "verdict", "cost a / b"]
+    header = ["a against b", "where", "cost a / b", "PSNR a - b, dB", "standard error", "n", "frames", "verdict"]
     rows: list[list[str]] = []
     marks: dict[int, str] = {}
 
@@ -292,7 +292,7 @@ def _who_wins(settings: Sequence[Setting]) -> Table:
             return
         if result.verdict != "undecided":
             marks[len(rows)] = result.verdict
-        rows.append([f"{a.label} against {b.label}", where, *_paired_cells(result), cost])
+        rows.append([f"{a.label} against {b.label}", where, cost, *_paired_cells(result)])
 
     for a, b in comparisons(settings):
         seconds = _times("training", a.ratio(b, lambda r: r.train_seconds))

@@ -135,15 +135,16 @@ def test_what_is_compared_with_what(results):
 
 def test_who_wins_where_and_at_what_cost(results):
     table = next(t for t in all_tables(load_records(results)) if t.title == "Who wins")
-    rows = {(row[0], row[1]): row for row in table.rows}
+    rows = {(row[0], row[1]): dict(zip(table.header, row, strict=True)) for row in table.rows}
     row = rows["4DGaussians + support against 4DGaussians", "never seen at t*"]
-    assert float(row[2]) > 0 and row[4] == "4 runs" and row[6] == "win"
+    assert float(row["PSNR a - b, dB"]) > 0 and row["n"] == "4 runs" and row["verdict"] == "win"
     row = rows["auto (ours) against 4DGaussians + support", "whole frame (gate on, off)"]
-    assert row[-1] == "step 0.40"
+    assert row["cost a / b"] == "step 0.40"
     row = rows["auto (ours) against static 3DGS", "moving, held-out frames of the clip"]
-    assert float(row[2]) == pytest.approx(3 * (0.8 - 0.3)) and row[5] == "8" and row[6] == "win"
+    assert float(row["PSNR a - b, dB"]) == pytest.approx(3 * (0.8 - 0.3))
+    assert row["frames"] == "8" and row["verdict"] == "win"
     # Seconds are 40 (2 - strength), times 0.4 for static.
-    assert row[-1] == f"training {(2 - 0.3) / (1.2 * 0.4):.2f}"
+    assert row["cost a / b"] == f"training {(2 - 0.3) / (1.2 * 0.4):.2f}"
 
 
 def test_every_metric_says_which_way_is_better(results):
