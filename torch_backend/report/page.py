@@ -13,6 +13,7 @@ import base64
 import html
 import io
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -164,7 +165,9 @@ def _table(table: Table) -> str:
 
 
 def _word(cell: str) -> str:
-    return ' class="word"' if cell[:1].isalpha() and cell not in ("win", "loss", "undecided") else ""
+    """Attribute of a cell that is text, not a figure with its unit: "4DGaussians" is, "3 frames" is not."""
+    text = re.match(r"\d*[^\W\d]", cell) and cell not in ("win", "loss", "undecided")
+    return ' class="word"' if text else ""
 
 
 def _plot(name: str, light: Path, dark: Path) -> str:

@@ -63,7 +63,10 @@ def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str, t
     axes.set_xscale("log")
     _limits(axes, [p[1] for p in points])
     named = [p for p in points if p[0].host == "auto" or p[0].variant != "default"]
-    _labels(axes, [(p[1], p[2], p[0].label, _COLOURS.get(p[0].host, ink)) for p in named])
+    # Colour and marker say which host; the names of six published ones would cover one another.
+    texts = [p[0].variant if p[0].variant == "reference" else p[0].label for p in named]
+    points_of = [(p[1], p[2], text, _COLOURS.get(p[0].host, ink)) for p, text in zip(named, texts, strict=True)]
+    _labels(axes, points_of)
     _legend(figure, [p[0] for p in points], ink)
     axes.set_xlabel(axis + " (logarithmic, less is better)")
     axes.set_ylabel("PSNR of frozen frames, dB")

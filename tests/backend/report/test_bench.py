@@ -15,7 +15,7 @@ from benchmarks.sources import ROOT
 from torch_backend.contract import read_json
 from torch_backend.deformation import host_config, hosts
 from torch_backend.report.evaluate import last_third_step_ms
-from torch_backend.report.records import finished, load_record, load_records
+from torch_backend.report.records import finished, load_record
 from torch_backend.report.truth import RealScene, TruthFolder
 from torch_backend.report.write import write_report
 from torch_backend.scene import load_scene, split_frames
@@ -162,39 +162,38 @@ def test_a_finished_plan_runs_nothing(done, capsys):
     assert {p: p.stat().st_mtime_ns for p in results.glob("*.json")} == before
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="the parent's end is seen by its pid, which Windows keeps")
+@pytest.mark.skipif(sys.platform == "win32", reason="sends POSIX signals")
 def test_killed_twice_it_ends_as_if_it_had_not_been(done, tmp_path, write_truth):
     results, runs, _ = done
     folder = tmp_path / "tiny"
     write_truth(folder)
     again = tmp_path / "results"
-    spec = dataclasses.replace(only(runs, ("auto", "support"))[0], source=f"truth:{folder}")
-    assert spec.run_id in {r.run_id for r in runs}
-    log = again / "logs" / f"{spec.run_id}.txt"
+    specs = [dataclasses.replace(spec, source=f"truth:{folder}") for spec in runs]
+    assert {s.run_id for s in specs} == {r.run_id for r in runs}
+    log = again / "logs" / f"{specs[0].run_id}.txt"
     code = (
         "import json, sys; from pathlib import Path; from benchmarks.bench import *\n"
-        "run_plan([RunSpec(**json.loads(sys.argv[1]))], Path(sys.argv[2]))"
+        "run_plan([RunSpec(**spec) for spec in json.loads(sys.argv[1])], Path(sys.argv[2]), 2)"
     )
     for stage in ("loading frames", "stage='training'"):
-        command = [sys.executable, "-c", code, json.dumps(dataclasses.asdict(spec)), str(again)]
+        command = [sys.executable, "-c", code, json.dumps([dataclasses.asdict(s) for s in specs]), str(again)]
         bench = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
         deadline = time.monotonic() + 120
         while time.monotonic() < deadline and not (log.is_file() and stage in log.read_text().replace('"', "'")):
-            if finished(again, spec.run_id):
+            if finished(again, specs[0].run_id):
                 break
             time.sleep(0.01)
         bench.send_signal(signal.SIGKILL)
         bench.wait()
         log.unlink(missing_ok=True)
-    deadline = time.monotonic() + 60  # its child notices, and ends
-    while time.monotonic() < deadline and working(spec.run_id):
-        time.sleep(0.2)
-    assert not working(spec.run_id)
-    assert run_plan([spec], again) == []
-    one, other = (load_record(folder / f"{spec.run_id}.json") for folder in (results, again))
-    for a, b in zip(one.rows, other.rows, strict=True):
-        assert b.value("psnr_db") == pytest.approx(a.value("psnr_db"), abs=0.01)
-        assert b.regions.keys() == a.regions.keys()
+    # What the killed ones started may still be at its last checkpoint: nothing waits for that here.
+    assert run_plan(specs, again, 2) == []
+    for spec in specs:
+        assert not working(spec.run_id)
+        one, other = (load_record(place / f"{spec.run_id}.json") for place in (results, again))
+        for a, b in zip(one.rows, other.rows, strict=True):
+            assert b.value("psnr_db") == pytest.approx(a.value("psnr_db"), abs=0.01)
+            assert b.regions.keys() == a.regions.keys()
 
 
 def working(run_id: str) -> bool:
@@ -218,7 +217,7 @@ def test_the_report_is_written_from_what_the_runs_left(done, tmp_path):
     assert "auto (ours)" in text and "static 3DGS" in text and "never seen at t*" in text
     assert all(sentence in text for sentence in said)
     figures = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert {r["run_id"] for r in figures["runs"]} == {r.run_id for r in load_records(results)}
+    assert {r["run_id"] for r in figures["runs"]} == {r.run_id for r in runs}
 
 
 def test_a_real_clip_is_judged_where_nothing_moves_far_from_the_instant(scene, tmp_path):
