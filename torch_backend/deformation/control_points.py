@@ -66,13 +66,14 @@ class ControlPointsConfig(HostConfig):
     """Layers of the nodes' network (8)."""
     width: int = 128
     """Width of them (256)."""
-    position_frequencies: int = 3
-    """Octaves of the position's encoding (10)."""
+    position_frequencies: int = 6
+    """Octaves of the position's encoding (10). Synthetic scene `quick` 0, all move, 1500 steps, one seed: 23.9 dB on
+    moving pixels of held-out frames, 23.6 with 3; static 22.0."""
     time_frequencies: int = 4
     """Octaves of the time's encoding (10)."""
     published: bool = False
     """Raw coordinates, scale deltas after activation, rotation added, a rotation of its own for a node's frame (on)."""
-    lr: float = 2e-4
+    lr: float = 5e-4
     """Start learning rate of the network (8e-4)."""
     lr_end: float = 2e-5
     """End learning rate of the network (1.6e-6)."""
@@ -204,7 +205,7 @@ class ControlPoints(Deformation):
         return index, share / share.sum(1, keepdim=True)
 
     def _motions(self, index: Tensor, times: Tensor) -> tuple[Tensor, _Motion, Tensor]:
-        """What index [M, K] needs at times [M] or [1], each (node, time) once: (places [R, 3], motions, rows [M, K])."""
+        """What index [M, K] needs at times [M] or [1], each once: (places [R, 3], motions, rows [M, K])."""
         if times.shape[0] == 1:
             return self.places, self.node_motion(self.places, times), index
         instants, which = times.unique(return_inverse=True)
