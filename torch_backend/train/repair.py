@@ -2,16 +2,19 @@
 
 A step that is not finite changes nothing (`FusedAdam`), and the rasteriser culls what is not finite; so one bad number
 does no harm at once. But it stays: a NaN in an opacity leaves out every further step, and one in a position is never
-seen again in any loss (docs/numerics.md). Nothing good is known that could be put in its place, so
+seen again in any loss (docs/numerics.md). So
 
 - a Gaussian with a parameter that is not finite is dropped: its neighbours and the next round of growth fill the hole;
 - a quaternion without length, whose Gaussian is culled and gets no gradient, becomes the identity;
 - a number of a host's own per Gaussian becomes what a new Gaussian starts with;
-- a number of the field or of the exposure becomes the median of its tensor: 0 among weights, the neutral 1 in planes
-  of time, a usual radius among radii;
+- a number of the field becomes what it was when the field was last seen in order; where that is not known, the median
+  of its tensor: 0 among weights, the neutral 1 in planes of time, a usual radius among radii;
+- a number of the exposure or the poses becomes 0, which is no correction;
+- a field that throws the Gaussians out of the scene goes back to what it was as a whole, at half the learning rates:
+  whoever is out of the picture gets no gradient to come back by;
 - Adam's moments start at 0 wherever a number was mended, and wherever they are not finite themselves.
 
-What would leave less than half of the Gaussians, or of the field's numbers, is no repair: the run ends in words.
+What would leave less than half of the Gaussians is no repair: the run ends in words.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import torch
 from torch import Tensor
 
 from ..contract import ExitCode, JobError
+from ..deformation import Deformation
 from ..gaussians import PARAM_NAMES, Densifier
 from ..raster.constants import QUAT_MIN
 from .model import DynamicModel
@@ -29,6 +33,8 @@ from .model import DynamicModel
 _FEW = 0.01
 """Share of the Gaussians up to which a gradient that is not finite is their own fault, and not the frame's or field's.
 """
+_THROWN = 0.1
+"""Share of the moving Gaussians that a field in order may shift by more than the scene's extent."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
@@ -41,27 +47,77 @@ def unstable(step: int) -> JobError:
     )
 
 
+class FieldMemory:
+    """A field's parameters as they were when it was last seen in order, on its device.
+
+    Only good for as long as the field has the same nodes and box: `keep` it anew when they change.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[str, Tensor] = {}
+
+    @torch.no_grad()
+    def keep(self, field: Deformation | None) -> None:
+        """Copies the parameters of a field that is in order."""
+        named = {} if field is None else dict(field.named_parameters())
+        if {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in self._kept.items()}:
+            self._kept = {name: torch.empty_like(p) for name, p in named.items()}
+        for name, p in named.items():
+            self._kept[name].copy_(p)
+
+    def of(self, name: str, p: Tensor) -> Tensor | None:
+        """What parameter `name` was; None if not known."""
+        kept = self._kept.get(name)
+        return kept if kept is not None and kept.shape == p.shape else None
+
+    @torch.no_grad()
+    def put_back(self, field: Deformation, shift: Tensor, extent: float, optimizer: torch.optim.Optimizer) -> str:
+        """Puts the field back if its last `shift` of means [M, 3] threw a tenth farther than the scene's `extent`.
+
+        Halves the learning rates of what the field owns. Returns what was done, in words.
+        """
+        named = dict(field.named_parameters())
+        before = {name: kept for name, p in named.items() if (kept := self.of(name, p)) is not None}
+        thrown = ~(shift.abs().amax(1) <= extent)
+        if not len(thrown) or before.keys() != named.keys() or not bool(thrown.float().mean() > _THROWN):
+            return ""
+        for name, p in named.items():
+            p.copy_(before[name])
+            optimizer.state.pop(p, None)
+        owned = {id(p) for p in named.values()}
+        for group in optimizer.param_groups:
+            if any(id(p) in owned for p in group["params"]):
+                group["lr_start"], group["lr_end"] = 0.5 * group["lr_start"], 0.5 * group["lr_end"]
+        count = _counted(int(thrown.sum()), "Gaussian")
+        return f"put the field back to what it was, at half the learning rates ({count} thrown out of the scene)"
+
+
 @torch.no_grad()
-def repair(model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, step: int) -> str:
+def repair(
+    model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, memory: FieldMemory, step: int
+) -> str:
     """Drops or mends what is not finite in the model and in Adam's moments.
 
     Returns what was done, in words; nothing if all was sound (asked on the device, one answer read back). JobError if
-    too little is left.
+    too few Gaussians are left.
     """
     if _sound(model, optimizer):
         return ""
     said = _repair_gaussians(model, optimizer, densifier, step)
-    rest = {} if model.field is None else dict(model.field.named_parameters())
-    bad = {name: ~torch.isfinite(p) for name, p in rest.items()}
-    if 2 * sum(int(mask.sum()) for mask in bad.values()) > sum(p.numel() for p in rest.values()):
-        raise unstable(step)
-    rest["exposure"] = model.exposure.values
-    bad["exposure"] = ~torch.isfinite(model.exposure.values)
-    for name, mask in bad.items():
-        if bool(mask.any()):
-            sound = rest[name][~mask]
-            _mend(rest[name], mask, float(sound.median()) if len(sound) else 0.0, optimizer)
-            said.append(f"mended {_counted(int(mask.sum()), 'number')} of {name}")
+    named = {} if model.field is None else dict(model.field.named_parameters())
+    for name, p in named.items():
+        bad, before = ~torch.isfinite(p), memory.of(name, p)
+        if bool(bad.any()):
+            sound = p[~bad]
+            said.append(f"mended {_counted(int(bad.sum()), 'number')} of {name}")
+            _mend(p, bad, before if before is not None else sound.median() if len(sound) else 0.0, optimizer)
+    known = {id(p) for p in (*model.gaussians.params.values(), *named.values())}
+    for group in optimizer.param_groups:
+        for p in (p for p in group["params"] if id(p) not in known and not bool(torch.isfinite(p).all())):
+            bad = ~torch.isfinite(p)
+            name = "exposure" if p is model.exposure.values else "the poses"
+            said.append(f"mended {_counted(int(bad.sum()), 'number')} of {name}")
+            _mend(p, bad, 0.0, optimizer)
     count = sum(_clear_moments(optimizer, p) for group in optimizer.param_groups for p in group["params"])
     if count:
         said.append(f"cleared {_counted(count, 'moment')} of Adam")

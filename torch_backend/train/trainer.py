@@ -48,7 +48,7 @@ from .losses import photometric, psnr
 from .model import DynamicModel, render
 from .needs import Needs
 from .poses import Poses, corrected
-from .repair import drop_offenders, repair, unstable
+from .repair import FieldMemory, drop_offenders, repair, unstable
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
@@ -106,6 +106,9 @@ class Trainer:
         self.unusable: set[int] = set()
         self.order: list[int] = []
         self._recent: deque[int] = deque(maxlen=2 * _LOOK_EVERY)
+        self._memory, self._shift = FieldMemory(), torch.zeros(0, 3, device=self.device)
+        low, high = field_box(scene.points)
+        self._extent = float((high - low).norm())
         self.poses = Poses(self.times, config.poses, self.device)
         self._refined = False
         self.optimizer = self._gaussian_optimizer()
@@ -159,6 +162,7 @@ class Trainer:
         rows = self.model.open_rows()
         pairs = self._pairs_to_anchor(rows)
         deltas, anchored = self._deltas(rows, frame, pairs)
+        self._shift = self._shift[:0] if deltas is None else deltas.means.detach()
         if deltas is not None and self.progress < self.config.field.detached:
             deltas = deltas.detached()
         state = self.model.moved(rows, deltas)
@@ -272,6 +276,7 @@ class Trainer:
         else:
             is_open = self.model.gaussians.open
             self.model.field.cover(self.model.gaussians.params["means"].detach()[is_open], self.optimizer)
+            self._memory.keep(self.model.field)  # the one before had another box, or fewer nodes
 
     def _residual_of(self, frame: int) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
         self.report.check_cancelled()
@@ -306,6 +311,7 @@ class Trainer:
         for name, owned in field.owned.items():
             model.adopt(name, owned.shape, owned.value)
         self.model.field = field
+        self._memory.keep(field)
         self.needs.facts["opened"] = {"iteration": self.iteration, "seconds": self.trained_seconds}
         self._add_field_groups(field)
 
@@ -449,7 +455,9 @@ class Trainer:
 
         gradients: the parameters hold those of a step that was left out.
         """
-        done = repair(self.model, self.optimizer, self.densifier, self.iteration)
+        done = repair(self.model, self.optimizer, self.densifier, self._memory, self.iteration)
+        if self.model.field is not None and not done:
+            done = self._memory.put_back(self.model.field, self._shift, self._extent, self.optimizer)
         bad = [] if done or not (skipped or gradients) else self._bad_images()
         if bad:
             self.unusable.update(bad)
@@ -461,10 +469,11 @@ class Trainer:
         elif gradients and not done:
             done = drop_offenders(self.model, self.optimizer, self.densifier)
         if done:
-            skipped = f"{skipped} Repaired" if skipped else f"Step {self.iteration}: repaired"
-            self.report.warning(f"{skipped}: {done}. Training goes on.")
+            self.report.warning(f"{skipped or f'Step {self.iteration}.'} Repaired: {done}. Training goes on.")
         elif skipped:
             self.report.warning(skipped)
+        elif not gradients:
+            self._memory.keep(self.model.field)
 
     def _bad_images(self) -> list[int]:
         """Of the frames trained on lately, those whose image is not finite."""

@@ -1,0 +1,278 @@
+"""What is not finite, or thrown out of all proportion, is dropped or mended and named; the run goes on."""
+
+import math
+
+import pytest
+import torch
+
+from benchmarks.stability import METHODS, configuration, table, train_once
+from torch_backend.contract import JobError
+from torch_backend.scene import load_images, load_scene
+from torch_backend.train.repair import repair
+from torch_backend.train.trainer import Trainer
+
+HOSTS = METHODS[:-1]
+NAN = math.nan
+
+
+@pytest.fixture
+def begin(world, quiet):
+    """(method, steps) -> a trainer on the tiny world after that many steps; the field joins after 20 of 60."""
+
+    def make(method="hexplane", steps=25, **changes) -> Trainer:
+        scene = load_scene(world.shot)
+        config = configuration(method, 0, iterations=60, **changes)
+        if config.host == "hexplane":
+            config.field.resolution = 16  # a step takes a third of the time
+        trainer = Trainer(scene, load_images(scene, scene.solved, 64, 48), scene.solved, config, quiet())
+        go_on(trainer, steps)
+        assert not warnings(trainer)
+        return trainer
+
+    return make
+
+
+def go_on(trainer: Trainer, steps: int) -> list[float]:
+    """The loop of `Trainer.run`, without its checkpoints; returns the losses of the steps that were applied."""
+    losses = []
+    for _ in range(steps):
+        trainer._milestones()
+        loss = float(trainer.step())
+        losses += [loss] if bool(trainer.optimizer.applied) else []
+        trainer.iteration += 1
+        if trainer.iteration % 10 == 0:
+            trainer._look()
+    return losses
+
+
+def warnings(trainer: Trainer) -> list[str]:
+    return [event[1] for event in trainer.report.events if event[0] == "warning"]
+
+
+def finite(trainer: Trainer) -> bool:
+    params = [p for group in trainer.optimizer.param_groups for p in group["params"]]
+    moments = [m for p in params for m in trainer.optimizer.state[p].values()]
+    return all(bool(torch.isfinite(t).all()) for t in [*params, *moments])
+
+
+def aligned(trainer: Trainer) -> bool:
+    g, d = trainer.model.gaussians, trainer.densifier
+    sizes = {len(t) for t in (*g.params.values(), g.open, g.support, g.hidden, d.gradient, d.seen)}
+    held = {id(p) for group in trainer.optimizer.param_groups for p in group["params"]}
+    return len(sizes) == 1 and all(id(p) in held for p in g.params.values())
+
+
+def gaussian(name, value, row=7):
+    def poison(trainer):
+        trainer.model.gaussians.params[name].data[row] = value
+
+    return poison
+
+
+def without_length(trainer):
+    """Nor momentum that would turn it."""
+    p = trainer.model.gaussians.params["quats"]
+    p.data[7] = trainer.optimizer.state[p]["exp_avg"][7] = 0.0
+
+
+def of_the_field(trainer):
+    dict(trainer.model.field.named_parameters())["trunk.weight"].data[3, 2] = NAN
+
+
+def of_the_exposure(trainer):
+    trainer.model.exposure.values.data[4, 0, 1] = math.inf
+
+
+def of_a_moment(trainer):
+    """Seen before the next step, which would make a NaN of it and cost the Gaussian."""
+    p = trainer.model.gaussians.params["means"]
+    trainer.optimizer.state[p]["exp_avg_sq"][7, 0] = math.inf
+    trainer._look()
+
+
+@pytest.mark.parametrize(
+    ("poison", "words"),
+    [
+        (gaussian("means", torch.tensor([NAN, 0.0, 1.0])), "dropped 1 Gaussian (means not finite)"),
+        (gaussian("log_scales", torch.tensor([math.inf, -3.0, -3.0])), "dropped 1 Gaussian (log_scales not finite)"),
+        (gaussian("opacity_logits", NAN), "dropped 1 Gaussian (opacity_logits not finite)"),
+        (gaussian("sh0", NAN), "dropped 1 Gaussian (sh0 not finite)"),
+        (gaussian("shN", NAN, row=slice(7, 9)), "dropped 2 Gaussians (shN not finite)"),
+        (without_length, "mended 1 Gaussian (quats without length)"),
+        (of_the_field, "mended 1 number of trunk.weight"),
+        (of_the_exposure, "mended 1 number of exposure"),
+        (of_a_moment, "cleared 1 moment of Adam"),
+    ],
+)
+def test_one_bad_number_is_named_and_the_run_goes_on(begin, poison, words):
+    trainer = begin("hexplane" if poison is of_the_field else "static")
+    before = float(torch.tensor(go_on(trainer, 5)).mean())
+    count = len(trainer.model.gaussians)
+    poison(trainer)
+    after = go_on(trainer, 9)  # densification, which drops some of these by itself, is due at 40
+    trainer._look()
+    said = warnings(trainer)
+    assert len(said) == 1
+    assert words in said[0]
+    assert "Step 3" in said[0]
+    assert len(after) >= 8
+    assert sum(after) / len(after) < 1.3 * before
+    assert len(trainer.model.gaussians) == count - {"d": int(words.split()[1]), "m": 0, "c": 0}[words[0]]
+    assert finite(trainer)
+    go_on(trainer, 15)
+    assert len(warnings(trainer)) == 1
+    assert aligned(trainer)
+
+
+def test_what_was_in_order_stays_as_it_was_row_by_row(begin):
+    trainer = begin("control_points", 30)
+    model, densifier = trainer.model, trainer.densifier
+    bad = [3, 10, 11]
+    gaussian("means", NAN, 3)(trainer)
+    gaussian("sh0", math.inf, slice(10, 12))(trainer)
+    gaussian("hyper", NAN, 5)(trainer)
+    gaussian("quats", 1e-8, 6)(trainer)
+    keep = [n for n in range(len(model.gaussians)) if n not in bad]
+    params = {name: p.detach()[keep].clone() for name, p in model.gaussians.params.items()}
+    moments = {name: trainer.optimizer.state[p]["exp_avg"][keep].clone() for name, p in model.gaussians.params.items()}
+    memory = [t[keep].clone() for t in (model.gaussians.open, model.gaussians.support, densifier.gradient)]
+    said = repair(model, trainer.optimizer, densifier, trainer._memory, 30)
+    assert "dropped 3 Gaussians (means, sh0 not finite)" in said
+    assert "mended 1 Gaussian (hyper not finite)" in said
+    params["hyper"][4] = model.field.owned["hyper"].value
+    params["quats"][5] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    moments["hyper"][4] = moments["quats"][5] = 0.0
+    for name, p in model.gaussians.params.items():
+        assert torch.equal(p, params[name]), name
+        assert torch.equal(trainer.optimizer.state[p]["exp_avg"], moments[name]), name
+    for kept, now in zip(memory, (model.gaussians.open, model.gaussians.support, densifier.gradient), strict=True):
+        assert torch.equal(kept, now)
+    assert repair(model, trainer.optimizer, densifier, trainer._memory, 30) == ""
+
+
+def test_a_gradient_of_its_own_costs_a_gaussian_and_no_more(begin):
+    trainer = begin("static")
+    count = len(trainer.model.gaussians)
+    trainer.model.gaussians.params["means"].register_hook(lambda g: g.index_fill(0, torch.tensor([4]), NAN))
+    assert len(go_on(trainer, 10)) == 9
+    (said,) = warnings(trainer)
+    assert "was skipped" in said
+    assert "dropped 1 Gaussian (gradient of means not finite)" in said
+    assert len(trainer.model.gaussians) == count - 1
+    assert finite(trainer)
+    assert aligned(trainer)
+
+
+@pytest.mark.parametrize("supervision", ["support", "paper"])
+def test_a_frame_with_bad_pixels_is_left_out_from_then_on(begin, supervision):
+    trainer = begin(steps=0, supervision=supervision)
+    trainer.images[5, 10:12, 20] = NAN
+    count = len(trainer.model.gaussians)
+    go_on(trainer, 19)
+    (said,) = warnings(trainer)
+    assert f"left frame {trainer.scene.frames[trainer.train_ids[5]]} out" in said
+    assert len(go_on(trainer, 40)) == 40  # among them, with `paper`, those that look at a second frame
+    assert len(warnings(trainer)) == 1
+    assert finite(trainer)
+    assert len(trainer.model.gaussians) >= 0.9 * count
+
+
+def test_a_bad_frame_does_not_keep_the_gate_shut(begin):
+    trainer = begin("auto", steps=0)
+    trainer.images[5] = NAN
+    go_on(trainer, 19)
+    residuals = [trainer._residual_of(frame)[0] for frame in range(len(trainer.train_ids)) if frame != 5]
+    assert all(bool(torch.isfinite(error).all()) for error in residuals)
+    trainer.config.gate.floor = trainer.config.gate.threshold = 0.0  # everything above the median is motion
+    trainer._gate_round()
+    assert bool(trainer.model.gaussians.open.any())
+
+
+@pytest.mark.parametrize("host", HOSTS)
+def test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back(begin, host):
+    """One step at a thousand times the field's rates: what is out of the picture has no gradient to come back by."""
+    trainer = begin(host, 30)
+    before = {name: p.detach().clone() for name, p in trainer.model.field.named_parameters()}
+    loss = float(torch.tensor(go_on(trainer, 9)).mean())
+    normal = trainer._schedule
+    fields = {id(p) for p in trainer.model.field.parameters()}
+    rates = [group["lr_start"] for group in trainer.optimizer.param_groups]
+
+    def hasty():
+        normal()
+        for group in trainer.optimizer.param_groups:
+            if any(id(p) in fields for p in group["params"]):
+                group["lr"] *= 1e3
+
+    trainer._schedule = hasty
+    trainer.step()
+    trainer._schedule = normal
+    assert float(trainer.step()) > 1.3 * loss
+    trainer._look()
+    (said,) = warnings(trainer)
+    assert "put the field back" in said
+    for name, p in trainer.model.field.named_parameters():
+        assert torch.equal(p, before[name])
+    halved = [now["lr_start"] / was for now, was in zip(trainer.optimizer.param_groups, rates, strict=True)]
+    assert sorted(set(halved)) == [0.5, 1.0]
+    after = go_on(trainer, 20)
+    assert len(after) == 20
+    assert sum(after[-10:]) / 10 < 1.2 * loss
+    assert len(warnings(trainer)) == 1
+    assert finite(trainer)
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh0", "shN"])
+def test_a_hasty_step_of_one_attribute_is_trained_away(begin, name):
+    trainer = begin("static", 20)
+    loss = float(torch.tensor(go_on(trainer, 10)).mean())
+    normal = trainer._schedule
+
+    def hasty():
+        normal()
+        next(group for group in trainer.optimizer.param_groups if group.get("name") == name)["lr"] *= 1e3
+
+    trainer._schedule = hasty
+    trainer.step()
+    trainer._schedule = normal
+    after = go_on(trainer, 25)
+    assert len(after) == 25
+    assert sum(after[-5:]) / 5 < 2.0 * loss
+    assert finite(trainer)
+
+
+def test_control_points_on_one_spot_stay_finite(begin):
+    trainer = begin("control_points", 25)
+    field = trainer.model.field
+    field.places[:] = field.places[0].clone()
+    field.log_radii.data[:] = -20.0
+    assert len(go_on(trainer, 20)) == 20
+    assert finite(trainer)
+    assert not warnings(trainer)
+
+
+def test_too_much_to_repair_ends_in_words(begin):
+    trainer = begin("static", 5)
+    trainer.model.gaussians.params["means"].data[::2] = NAN
+    trainer.model.gaussians.params["means"].data[1] = NAN
+    with pytest.raises(JobError, match="unstable at step 5"):
+        trainer._look()
+
+
+def test_whole_runs_of_every_host_stay_finite_and_alike(world):
+    scene = load_scene(world.shot)
+    outcomes = []
+    for method in METHODS:
+        for seed in range(2):
+            config = configuration(method, seed, iterations=60)
+            if config.host == "hexplane":
+                config.field.resolution = 16
+            outcomes.append(train_once(scene, config))
+    for outcome in outcomes:
+        assert outcome.psnr_db is not None
+        assert (outcome.finite, outcome.left_out, outcome.warnings) == (True, 0, [])
+    for method in METHODS:
+        values = [outcome.psnr_db for outcome in outcomes if outcome.method == method]
+        assert min(values) > 18.0
+        assert max(values) - min(values) < 3.0
+    assert all(row.split("|")[7].strip() == "0" for row in table(outcomes)[2:])
