@@ -4,7 +4,8 @@ A few trained frames are kept back as probes, and every decision reads the PSNR 
 on (`TrainConfig.holdout`) decide nothing. Late in the run the probes are trained on like all others. Decisions depend
 on nothing but the run's numbers, and their state is in the checkpoint: a resumed run decides the same.
 
-- SH degree: a raise is kept if the model beats itself cut to the degree below.
+- SH degree: a raise is kept if the model beats itself cut to the degree below. When that is asked, harmonics have
+  learnt for a while only; what they gained is scaled by how far their learning rate still lets them go (`lasting`).
 - Growth: PSNR rises by optimisation alone too, and a run cannot be had twice. So growth ends on a bound: when all that
   the probes gained while the Gaussians grew, optimisation included, falls below a threshold per 10 % more of them,
   what growth gained is below it as well. It errs on the side of growing.
@@ -49,8 +50,9 @@ class NeedsConfig:
     """Share of the run at which the probe frames are trained on too; until then they decide."""
     every: float = 0.025
     """Share of the run between two measurements, rounded to rounds of densification."""
-    sh_gain: float = 0.03
-    """Least gain of a higher SH degree over the model cut to the degree below, when the next raise is due."""
+    sh_gain: float = 0.015
+    """Least gain of a higher SH degree by the end of the run, over the model cut to the degree below: measured when
+    the next raise is due, and scaled."""
     growth_gain: float = 0.03
     """Least gain per 10 % more Gaussians, what optimisation gained meanwhile included, for growth to go on."""
     stop_gain: float = 0.05
@@ -87,6 +89,14 @@ def newest_gain(measured: list[tuple[int, int, float]], since: int) -> float | N
     before = [value for iteration, _, value in measured if iteration <= since]
     after = [value for iteration, _, value in measured if iteration > since]
     return max(after) - max(before) if before and after else None
+
+
+def lasting(since: float, now: float) -> float:
+    """How far harmonics that learn since a share of the run will go by its end, over how far they came until `now`.
+
+    Adam moves a parameter by about a rate per step, and the rate falls tenfold over the run.
+    """
+    return (0.1**since - 0.1) / max(1e-6, 0.1**since - 0.1**now)
 
 
 class Needs:
@@ -191,7 +201,8 @@ class Needs:
         if whole is None or cut is None:
             return
         self.degrees[degree] = whole - cut
-        if whole - cut <= self.config.sh_gain:
+        lasts = lasting(degree * c.sh_every, trainer.progress)
+        if (whole - cut) * lasts <= self.config.sh_gain:
             self.sh_limit = trainer.model.sh_degree = degree - 1
             limit_harmonics(trainer.model.gaussians, trainer.optimizer, degree - 1)
 
