@@ -206,6 +206,18 @@ class Needs:
             self.sh_limit = trainer.model.sh_degree = degree - 1
             limit_harmonics(trainer.model.gaussians, trainer.optimizer, degree - 1)
 
+    def judge_cameras(self, trainer: Trainer, refined: Tensor) -> None:
+        """What refined cameras [F, 4, 4] are worth, as they are about to replace those of the trainer."""
+        if self.joined or "poses_gain_db" in self.facts:
+            return
+        before, without = trainer.viewmats, self._psnr(trainer)
+        try:
+            trainer.viewmats = refined
+            value = self._psnr(trainer)
+        finally:
+            trainer.viewmats = before
+        self.facts["poses_gain_db"] = None if value is None or without is None else value - without
+
     def _join(self, trainer: Trainer) -> None:
         """The last look at frames that were not trained on: what exposure and motion are worth; then they join."""
         whole = self._psnr(trainer)
@@ -371,6 +383,11 @@ def modelled(trainer: Trainer) -> list[dict[str, Any]]:
         values = model.exposure.values
         detail = f"{len(values)} times"
         rows.append(_row("exposure", detail, size=4 * values.numel(), gain=facts.get("exposure_gain_db")))
+    if c.poses.on:
+        values = trainer.poses.values
+        turn = float(values.detach()[:, :3].norm(dim=1).mean()) * float(trainer.Ks[0, 0, 0])
+        detail = f"{len(values)} cameras, turned by {turn:.2f} px on average"
+        rows.append(_row("poses", detail, size=4 * values.numel(), gain=facts.get("poses_gain_db")))
     if model.field is not None:
         rows.append(_moving(trainer, trainer.iteration - steps, trainer.trained_seconds - seconds))
         if c.supervision.preset != "none":

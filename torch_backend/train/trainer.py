@@ -250,8 +250,9 @@ class Trainer:
 
     def _freeze_poses(self) -> None:
         """From here on the corrected cameras are the cameras; a frame's that is not trained on too."""
-        self.viewmats = corrected(self.viewmats, self.poses.at(self.scene.times))
-        self._refined = True
+        refined = corrected(self.viewmats, self.poses.at(self.scene.times))
+        self.needs.judge_cameras(self, refined)
+        self.viewmats, self._refined = refined, True
 
     def _viewmat(self, index: int, frame: int | None = None) -> Tensor:
         """[4, 4] of the scene's frame `index`, `frame` among the trained ones, as it is corrected now."""
