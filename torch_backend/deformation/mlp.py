@@ -4,6 +4,9 @@ It moves means, rotations and scales; opacity and colour stay. Corrected against
 times are scaled to [-1, 1] before they are encoded, scales change in the log and rotations by a quaternion product, so
 that no delta leaves the domain; heads start near zero, so that the field starts as the identity to about 1e-5; the
 6-DoF variant is finite at angle 0. The net is smaller and its encoding has fewer octaves.
+
+`reference` is the published host; what stays the trainer's for every host are the loss, the Gaussians' own rates and
+their growth, for which the published code keeps a second screen-gradient buffer and a threshold of its own.
 """
 
 from __future__ import annotations
