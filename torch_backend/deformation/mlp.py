@@ -55,8 +55,8 @@ class MlpConfig(HostConfig):
     """Raw coordinates, deltas after activation, rotations added (on)."""
     six_dof: bool = False
     """Means move by a rigid motion about the origin of the encoded box instead of a shift (off)."""
-    lr: float = 5e-4
-    """Start learning rate (8e-4)."""
+    lr: float = 1e-3
+    """Start learning rate (8e-4). Synthetic scene as above: half of it left the moving pixels at 23.0 dB."""
     lr_end: float = 2e-5
     """End learning rate (1.6e-6)."""
     until: float = 1.0
