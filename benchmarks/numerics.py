@@ -563,8 +563,61 @@ ROWS: list[tuple[str, list[str], str]] = [
      "the rasteriser's part: a world of any scale renders the same"),
 ]
 """Rows of the list of known failures that concern rendering: (row, tests, remark)."""
-ELSEWHERE = ("Floaters, exposure drift, rolling shutter, moving shadows, time planes and their bounds, timestamps, the "
-             "SVD of ARAP and 6-DoF rotations near 0 concern the method, not the rasteriser, and are tested with it.")
+_S, _D, _T = "train/test_stability.py::", "deformation/", "train/"
+TRAINING: list[tuple[str, list[str], str]] = [
+    ("NaN loss, everything dies in 1 to 2 steps",
+     [_S + "test_one_bad_number_is_named_and_the_run_goes_on",
+      _S + "test_a_gradient_of_its_own_costs_a_gaussian_and_no_more",
+      _S + "test_too_much_to_repair_ends_in_words", _T + "test_adam.py::test_a_step_that_is_not_finite_changes_nothing",
+      _T + "test_train.py::test_a_run_that_keeps_failing_ends_in_words"],
+     "the step is left out, the offender dropped or mended and named; no restart"),
+    ("NaN hidden by culling",
+     [_S + "test_one_bad_number_is_named_and_the_run_goes_on", _S + "test_what_was_in_order_stays_as_it_was_row_by_row",
+      "gaussians/test_model.py::test_budget_is_never_exceeded_and_nan_is_pruned"],
+     "parameters and moments are looked over every 10 steps, whatever the loss says"),
+    ("NaN spreads in squares",
+     [_S + "test_a_frame_with_bad_pixels_is_left_out_from_then_on",
+      _S + "test_a_bad_frame_does_not_keep_the_gate_shut"], "from an image"),
+    ("Zero scale, log-scale explosion",
+     [_T + "test_adam.py::test_range_is_kept", _S + "test_a_gaussian_too_large_for_its_place_is_dropped"], ""),
+    ("Opacity reset kills Gaussians", [], "opacities are never reset"),
+    ("More than 2^24 samples", [], "nothing is drawn by `torch.multinomial`"),
+    ("Wrong poses or scene scale",
+     ["test_scene.py::test_normalisation_keeps_every_pixel_and_leads_back",
+      "test_scene.py::test_a_camera_that_stands_still_is_refused", "solve/test_solving.py::test_points_are_filtered",
+      "solve/test_solving.py::test_models_that_nothing_could_be_trained_on_are_refused"], ""),
+    ("Divergence without NaN",
+     [_S + "test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back",
+      _S + "test_a_hasty_step_of_one_attribute_is_trained_away",
+      _S + "test_whole_runs_of_every_host_stay_finite_and_alike"], "docs/benchmarks.md, \"Stability\""),
+    ("Floaters in front of the camera", [], "no remedy of its own and no test; held-out views are shown"),
+    ("Exposure drift", [_T + "test_exposure.py::test_finds_a_drift"], "fitted from the first step, before the gate"),
+    ("Rolling shutter", [], "neither detected nor tested; there is a synthetic scene to measure it on"),
+    ("Moving shadows, light", [], "no test; there is a synthetic scene to measure them on"),
+    ("Time-plane half range", [_D + "test_hexplane.py::test_ends_of_time_hit_the_end_nodes"], ""),
+    ("HexPlane out of bounds",
+     [_D + "test_hexplane.py::test_outside_is_counted",
+      _D + "test_hexplane.py::test_refit_keeps_the_field_and_resolves_more",
+      _D + "test_planes.py::test_a_gaussian_at_nan_stays_inside_the_planes"], ""),
+    ("Single or duplicate timestamps",
+     [_D + "test_planes.py::test_planes_of_two_nodes_do_not_bend",
+      "supervision/test_supervision.py::test_paper_needs_a_well_supervised_reference_and_two_times"],
+     "with one pose the camera stands still: refused (`test_scene.py`)"),
+    ("ARAP SVD",
+     [_D + "test_geometry.py::test_collapsed_flat_and_bad_edges",
+      _D + "test_control_points.py::test_penalties_are_finite_at_collapsed_nodes",
+      _S + "test_control_points_on_one_spot_stay_finite"], ""),
+    ("6-DoF rotation of angle 0",
+     [_D + "test_geometry.py::test_screw_has_gradients_at_angle_zero",
+      _D + "test_mlp.py::test_six_dof_is_still_at_the_start_and_has_gradients_there"], ""),
+]
+"""Rows that concern training: (row, tests in tests/backend, remark)."""
+
+
+def _known(rows: list[tuple[str, list[str], str]]) -> list[str]:
+    """The table of known failures."""
+    lines = ["| known failure | tests | remark |", "|---|---|---|"]
+    return lines + [f"| {row} | {'<br>'.join(f'`{t}`' for t in tests)} | {remark} |" for row, tests, remark in rows]
 
 
 def test_names() -> set[str]:
@@ -689,11 +742,8 @@ def report(bodies: list[str], names: list[str], asked: int) -> str:
         "",
         "## Known failures, and the tests that stand for them", "",
         "`tests/backend/raster/remedies.py` takes the remedies out, one at a time, and checks that these tests fail.",
-        "",
-        "| known failure | tests | remark |", "|---|---|---|"]
-    for row, tests, remark in ROWS:
-        text.append(f"| {row} | {'<br>'.join(f'`{t}`' for t in tests)} | {remark} |")
-    text += ["", ELSEWHERE, "", "## Hard cases, body by body", ""]
+        "", *_known(ROWS), "", "## The same, of training", "", "Tests in `tests/backend`.", "", *_known(TRAINING), "",
+        "## Hard cases, body by body", ""]
     for body in bodies:
         rows = [(name, compare(size(name, body), body)) for name in names]
         text += [f"### {_TITLES[body]}", "", *_table(rows), ""]

@@ -172,8 +172,8 @@ def main() -> None:
         shot = Shot.open(args.shot)
     scene, kept = load_scene(shot), read_json(args.results)["runs"] if args.results.is_file() else {}
     outcomes = []
-    for method in args.methods:
-        for seed in range(args.seeds):
+    for seed in range(args.seeds):
+        for method in args.methods:
             config = configuration(method, seed)
             key = content_key(config_to_json(config), solve_key(shot))
             if key not in kept:

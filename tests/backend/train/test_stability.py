@@ -1,10 +1,13 @@
 """What is not finite, or thrown out of all proportion, is dropped or mended and named; the run goes on."""
 
+import ast
 import math
+import pathlib
 
 import pytest
 import torch
 
+from benchmarks.numerics import TRAINING
 from benchmarks.stability import METHODS, configuration, table, train_once
 from torch_backend.contract import JobError
 from torch_backend.scene import load_images, load_scene
@@ -249,6 +252,26 @@ def test_control_points_on_one_spot_stay_finite(begin):
     assert len(go_on(trainer, 20)) == 20
     assert finite(trainer)
     assert not warnings(trainer)
+
+
+def test_a_gaussian_too_large_for_its_place_is_dropped(begin):
+    trainer = begin("static", 5)
+    g, d = trainer.model.gaussians, trainer.densifier
+    at = g.params["means"].detach()[7].clone()
+    g.params["log_scales"].data[7, 1] = math.log(1.1 * d.config.max_scale * max(1.0, float(at.norm())))
+    d.step(g, trainer.optimizer, len(g), 0.8)
+    assert not bool((g.params["means"] == at).all(1).any())
+    assert aligned(trainer)
+
+
+def test_the_table_of_known_failures_names_tests_that_there_are():
+    folder = pathlib.Path(__file__).parents[1]
+    for row, tests, remark in TRAINING:
+        assert tests or remark, row
+        for test in tests:
+            path, _, name = test.partition("::")
+            tree = ast.parse((folder / path).read_text(encoding="utf-8"))
+            assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, test
 
 
 def test_too_much_to_repair_ends_in_words(begin):
