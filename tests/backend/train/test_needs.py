@@ -1,0 +1,251 @@
+"""Only what a scene needs: what decides, on which frames, and that a resumed run decides the same."""
+
+import copy
+import io
+import json
+import math
+import sys
+
+import pytest
+import torch
+
+from torch_backend.cli import Console
+from torch_backend.contract import Event, TrainParams
+from torch_backend.freeze.query import freeze_at, render_frozen
+from torch_backend.scene import load_images, load_scene
+from torch_backend.train import config_from_params
+from torch_backend.train.checkpoint import load_checkpoint
+from torch_backend.train.needs import (
+    correlation_frames,
+    growth_gain,
+    lasting,
+    limit_harmonics,
+    modelled,
+    newest_gain,
+    probe_frames,
+)
+from torch_backend.train.trainer import Trainer, restore_model
+
+
+@pytest.fixture(scope="module")
+def long_world(tmp_path_factory, quiet):
+    """The tiny shot, long enough to have probe frames: (scene, images)."""
+    module = sys.modules[quiet.__module__]
+    patch = pytest.MonkeyPatch()
+    patch.setattr(module, "FRAMES", 30)
+    world = module.build_world(tmp_path_factory.mktemp("long"))
+    patch.undo()
+    scene = load_scene(world.shot)
+    return scene, load_images(scene, scene.solved, 64, 48)
+
+
+def trainer_of(long_world, quiet, iterations=100, method="auto", **changes):
+    scene, images = long_world
+    config = config_from_params(TrainParams(iterations=iterations, max_gaussians=1200, method=method))
+    config.densify.every = 10
+    for path, value in changes.items():
+        part = config
+        *parents, name = path.split("__")
+        for parent in parents:
+            part = getattr(part, parent)
+        setattr(part, name, value)
+    return Trainer(scene, images.clone(), scene.solved, config, quiet())
+
+
+def finish(trainer, folder):
+    trainer.run(folder / "checkpoint.safetensors", lambda _: None)
+    return trainer
+
+
+def test_probes_are_spread_and_never_an_end():
+    assert probe_frames(23, 12) == []
+    assert probe_frames(200, 0) == []
+    for frames in (24, 31, 48, 240, 2000):
+        probes = probe_frames(frames, 12)
+        assert 3 <= len(probes) <= 12
+        assert len(set(probes)) == len(probes)
+        assert min(probes) > 0
+        assert max(probes) < frames - 1
+        gaps = torch.tensor(probes).diff()
+        assert int(gaps.max() - gaps.min()) <= 1
+
+
+def test_growth_is_judged_per_tenth_and_only_when_there_was_some():
+    counts = [1000, 1100, 1210, 1331, 1464]
+    measured = [(100 * n, count, 20.0 + 0.2 * n) for n, count in enumerate(counts)]
+    assert growth_gain(measured) == pytest.approx(0.2, rel=0.01)
+    flat = [*measured, (500, 1600, 20.8), (600, 1760, 20.79), (700, 1936, 20.8), (800, 2130, 20.8)]
+    assert growth_gain(flat) < 0.03  # what was gained before does not count any more
+    assert growth_gain([(n, 1000 + n, 20.0 + n) for n in range(20)]) is None
+    assert growth_gain(measured[:2]) is None
+
+
+def test_newest_gain_is_over_the_best_before():
+    measured = [(0, 1, 20.0), (10, 1, 21.0), (20, 1, 20.5), (30, 1, 21.2), (40, 1, 21.1)]
+    assert newest_gain(measured, 20) == pytest.approx(0.2)
+    assert newest_gain(measured, 40) is None
+    assert newest_gain(measured, -1) is None
+
+
+def test_correlation_follows_the_period_and_knows_noise():
+    frames, g = torch.arange(60.0), torch.Generator().manual_seed(0)
+    phase = 2 * math.pi * torch.rand(40, generator=g)
+    noise = 0.2 * torch.randn(60, 40, generator=g)
+    for period in (12.0, 24.0):
+        swing = torch.sin(2 * math.pi * frames[:, None] / period + phase)
+        assert correlation_frames(swing + noise, torch.ones(60, 40)) == pytest.approx(period / 6, rel=0.3)
+    assert correlation_frames(noise, torch.ones(60, 40)) is None
+    hidden = torch.ones(60, 40)
+    hidden[20:40] = 0
+    swing = torch.sin(2 * math.pi * frames[:, None] / 24 + phase)
+    swing[20:40] = 100.0  # nobody saw this
+    assert correlation_frames(swing, hidden) == pytest.approx(4.0, rel=0.3)
+
+
+def test_dropped_harmonics_change_nothing_below(long_world, quiet):
+    trainer = trainer_of(long_world, quiet)
+    trainer.model.sh_degree = 2
+    for _ in range(3):
+        trainer.step()
+    trainer.model.sh_degree = 1
+    before = trainer.render_frame(4)
+    moments = trainer.optimizer.state[trainer.model.gaussians.params["shN"]]["exp_avg"][:, :3].clone()
+    limit_harmonics(trainer.model.gaussians, trainer.optimizer, 1)
+    shN = trainer.model.gaussians.params["shN"]
+    assert shN.shape[1:] == (3, 3)
+    assert torch.equal(trainer.render_frame(4), before)
+    assert torch.equal(trainer.optimizer.state[shN]["exp_avg"], moments)
+    kept = shN.detach().clone()
+    trainer.step()
+    assert not torch.equal(trainer.model.gaussians.params["shN"], kept)
+
+
+def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
+    never = {"needs__sh_gain": -1e9, "needs__growth_gain": -1e9}
+    runs = [trainer_of(long_world, quiet, **never) for _ in range(2)]
+    probes = runs[0].needs.probes
+    assert len(probes) == 3
+    runs[1].images[probes] = 1.0  # as good as no picture at all
+    for trainer in runs:
+        while trainer.iteration < 60:
+            trainer._milestones()
+            trainer.step()
+            trainer.iteration += 1
+    assert bool(runs[0].model.gaussians.open.any())
+    for name, value in runs[0].model.gaussians.params.items():
+        assert torch.equal(value, runs[1].model.gaussians.params[name]), name
+    assert not runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
+    for trainer in runs:
+        while trainer.iteration < 99:
+            trainer._milestones()
+            trainer.step()
+            trainer.iteration += 1
+    assert runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
+    assert not torch.equal(runs[0].model.gaussians.params["sh0"], runs[1].model.gaussians.params["sh0"])
+
+
+def test_what_harmonics_gained_is_scaled_by_what_they_may_still_learn():
+    steps = 0.1 ** (torch.arange(1000, dtype=torch.float64) / 1000)
+    for since, now in ((0.15, 0.3), (0.3, 0.45), (0.45, 0.6)):
+        first, last = round(1000 * since), round(1000 * now)
+        assert lasting(since, now) == pytest.approx(float(steps[first:].sum() / steps[first:last].sum()), rel=0.01)
+
+
+def test_a_degree_that_gains_too_little_is_dropped_for_good(long_world, quiet, tmp_path):
+    """What is left out is gone from the checkpoint too, and what stays can be frozen."""
+    trainer = finish(trainer_of(long_world, quiet, needs__sh_gain=1e9), tmp_path)
+    assert trainer.model.sh_degree == 0
+    assert trainer.needs.degrees.keys() == {1}
+    rows = {row["what"]: row for row in modelled(trainer)}
+    assert rows["SH degree 1"]["detail"] == "dropped"
+    assert rows["SH degree 1"]["gain_db"] == pytest.approx(trainer.needs.degrees[1], abs=1e-3)
+    model = restore_model(*load_checkpoint(tmp_path / "checkpoint.safetensors"), trainer.config)
+    assert model.gaussians.params["shN"].shape[1] == 0
+    scene = long_world[0]
+    image = render_frozen(freeze_at(model, 0.5, 2.0), scene.viewmats[9], scene.camera_at(64, 48)[9], 64, 48)
+    assert float(image.alpha.mean()) > 0.9
+    kept = finish(trainer_of(long_world, quiet, needs__sh_gain=-1e9), tmp_path)
+    assert kept.model.sh_degree == 2
+
+
+def test_growth_ends_when_it_gains_too_little(long_world, quiet, tmp_path):
+    changes = {"init__seeds": 0, "densify__budget": 1200, "iterations": 200}
+    free = finish(trainer_of(long_world, quiet, needs__growth_gain=-1e9, **changes), tmp_path)
+    assert free.needs.growth_ended is None
+    assert len(free.model.gaussians) > 1000
+    bound = finish(trainer_of(long_world, quiet, needs__growth_gain=1e9, **changes), tmp_path)
+    assert 0 < bound.needs.growth_ended < 0.6 * 200
+    at_end = dict((i, n) for i, n, _ in bound.needs.measured)[bound.needs.growth_ended]
+    assert len(bound.model.gaussians) <= at_end < 1000
+
+
+def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
+    trainer = finish(trainer_of(long_world, quiet, needs__stop_gain=1e9), tmp_path)
+    assert trainer.needs.stopped == 70  # the first measurement after the gate's last round
+    assert trainer.iteration == 80
+    group = trainer.optimizer.param_groups[0]
+    trainer._schedule()
+    assert group["lr"] == pytest.approx(group["lr_end"])
+    assert trainer.report.events[-1][2:4] == (80, 80)
+    end = modelled(trainer)[-1]
+    assert end["detail"] == "stopped at step 80 of 100: nothing more was gained"
+    again = trainer_of(long_world, quiet, needs__stop_gain=1e9)
+    again.restore(tmp_path / "checkpoint.safetensors")
+    assert again.end == 80
+    on = finish(trainer_of(long_world, quiet, needs__stop_gain=-1e9), tmp_path)
+    assert on.needs.stopped is None
+    assert on.iteration == 100
+
+
+def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
+    changes = {"init__seeds": 0, "needs__growth_gain": 0.5, "needs__stop_gain": 0.5}
+    whole = finish(trainer_of(long_world, quiet, **changes), tmp_path)
+    for stop in (45, 72):
+        broken = trainer_of(long_world, quiet, **changes)
+        while broken.iteration < stop:
+            broken._milestones()
+            broken.step()
+            broken.iteration += 1
+        broken.save(tmp_path / "broken.safetensors")
+        resumed = trainer_of(long_world, quiet, **changes)
+        resumed.restore(tmp_path / "broken.safetensors")
+        finish(resumed, tmp_path)
+        expected, got = (copy.deepcopy(json.loads(json.dumps(t.needs.state()))) for t in (whole, resumed))
+        for state in (expected, got):
+            (state["facts"].get("opened") or {}).pop("seconds", None)
+        assert got == expected
+        assert resumed.iteration == whole.iteration
+        for name, value in whole.model.gaussians.params.items():
+            torch.testing.assert_close(resumed.model.gaussians.params[name], value, rtol=1e-4, atol=1e-5, msg=name)
+
+
+def test_published_hosts_are_left_alone(long_world, quiet):
+    scene, images = long_world
+    for params in (TrainParams(method="hexplane"), TrainParams(method="static"), TrainParams(host_config="reference")):
+        trainer = Trainer(scene, images, scene.solved, config_from_params(params), quiet())
+        assert trainer.needs.probes == []
+        assert trainer.needs.held == set()
+    assert trainer_of(long_world, quiet).needs.held == set(probe_frames(len(scene.solved), 12))
+
+
+def test_time_nodes_follow_the_motion(long_world, quiet, tmp_path):
+    """One sway over the clip of 30 frames: half of the frames' number of nodes would be 15."""
+    trainer = finish(trainer_of(long_world, quiet, iterations=300, needs__sh_gain=1e9), tmp_path)
+    assert trainer.model.field is not None
+    nodes = trainer.needs.facts["time_nodes"]
+    assert 4 <= nodes <= 12
+    assert trainer.model.field.config.time_nodes == nodes
+
+
+def test_the_console_shows_the_table(trained):
+    _, summary = trained
+    rows = {row["what"]: row for row in summary["modelled"]}
+    moving = rows["moving Gaussians"]
+    assert moving["seconds"] + rows["static world"]["seconds"] == pytest.approx(summary["train_seconds"], abs=0.1)
+    assert moving["gain_db"] is None  # 14 frames have no probes: nothing was measured
+    stream = io.StringIO()
+    Console(stream)(Event("metric", 0, 0.0, {"stage": "train", "values": summary}))
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 1 + len(summary["modelled"])
+    assert "moving Gaussians" in stream.getvalue()
+    assert lines[1].split()[-1] == "-"

@@ -1,0 +1,103 @@
+"""Corrections of cameras: rigid, without a part that all share, found where a camera is wrong, kept from what moves."""
+
+import numpy as np
+import pytest
+import torch
+
+from torch_backend.contract import TrainParams
+from torch_backend.scene import load_images, load_scene
+from torch_backend.train import config_from_params
+from torch_backend.train.poses import Poses, PosesConfig, corrected
+from torch_backend.train.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+
+def random_viewmats(count, generator):
+    rotation = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator)).Q
+    rotation = rotation * torch.linalg.det(rotation)[:, None, None]
+    viewmats = torch.eye(4).repeat(count, 1, 1)
+    viewmats[:, :3, :3] = rotation
+    viewmats[:, :3, 3] = torch.randn(count, 3, generator=generator)
+    return viewmats
+
+
+def test_a_correction_is_rigid_and_moves_the_world():
+    g = torch.Generator().manual_seed(0)
+    viewmats = random_viewmats(5, g)
+    assert torch.equal(corrected(viewmats, torch.zeros(5, 6)), viewmats)
+    moved = corrected(viewmats, 0.3 * torch.randn(5, 6, generator=g))
+    assert torch.allclose(moved[:, :3, :3] @ moved[:, :3, :3].mT, torch.eye(3).expand(5, 3, 3), atol=1e-5)
+    assert torch.equal(moved[:, 3], viewmats[:, 3])
+    shift = corrected(torch.eye(4), torch.tensor([0.0, 0, 0, 1, 2, 3]))
+    assert torch.allclose(shift[:3, 3], torch.tensor([1.0, 2, 3]))
+    turn = corrected(torch.eye(4), torch.tensor([0.0, 0, torch.pi / 2, 0, 0, 0]))
+    assert torch.allclose(turn[:3, :3] @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6)
+
+
+def test_gradients_are_those_of_finite_differences():
+    g = torch.Generator().manual_seed(1)
+    viewmats = random_viewmats(2, g).double()
+    values = (0.1 * torch.randn(2, 6, generator=g)).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: corrected(viewmats, x), (values,))
+
+
+def test_the_gauge_holds_and_held_frames_follow_their_neighbours():
+    poses = Poses([0.0, 0.2, 0.4, 0.8, 1.0], PosesConfig(), CPU)
+    with torch.no_grad():
+        poses.values[:] = torch.tensor([3.0, 100.0, 1.0, 2.0, 4.0])[:, None]
+    poses.settle({1})
+    assert poses.values[[0, 2, 3, 4], 0].tolist() == pytest.approx([0.5, -1.5, -0.5, 1.5])  # their mean, 2.5, is out
+    assert float(poses.values.detach()[1, 0]) == pytest.approx(-0.5)
+    between = poses.at(np.array([0.0, 0.6, 1.0, 2.0]))
+    assert between[:, 3].tolist() == pytest.approx([0.5, -1.0, 1.5, 1.5])
+
+
+def wrong_cameras(world, quiet, on):
+    """The tiny shot with cameras that are off by about half a pixel, trained while it is static: (trainer, truth)."""
+    scene = load_scene(world.shot)
+    truth = scene.viewmats.clone()
+    wrong = 0.008 * torch.randn(len(truth), 6, generator=torch.Generator().manual_seed(3))
+    wrong[:, 2:] *= 0.1
+    scene.viewmats = corrected(truth, wrong - wrong.mean(0))
+    config = config_from_params(TrainParams(iterations=900, max_gaussians=1200, method="static"))
+    config.poses.on = on
+    trainer = Trainer(scene, load_images(scene, scene.solved, 64, 48), scene.solved, config, quiet())
+    while trainer.iteration < 320:
+        trainer._milestones()
+        trainer.step()
+        trainer.iteration += 1
+    return trainer, truth
+
+
+def shifts(trainer, viewmats):
+    """[F, P, 2] px: how far the scene's points lie in these cameras from where the solve's see them, less what all
+    frames share."""
+    seen = []
+    for cameras in (viewmats, trainer.scene.viewmats):
+        pixel = (trainer.scene.points @ cameras[:, :3, :3].mT + cameras[:, None, :3, 3]) @ trainer.Ks.mT
+        seen.append(pixel[..., :2] / pixel[..., 2:])
+    off = seen[0] - seen[1]
+    return off - off.mean(0)
+
+
+def test_wrong_cameras_are_found_and_frozen(world, quiet, tmp_path):
+    plain, truth = wrong_cameras(world, quiet, on=False)
+    trainer, _ = wrong_cameras(world, quiet, on=True)
+    assert trainer._refined
+    assert float(trainer.poses.values.detach().mean(0).abs().max()) < 1e-6
+    wanted, found = shifts(trainer, truth), shifts(trainer, trainer.viewmats)
+    assert float(wanted.norm(dim=-1).mean()) > 0.3
+    assert float((wanted * found).sum() / (wanted.norm() * found.norm())) > 0.35
+    frames = [trainer.train_ids[n] for n in (3, 8, 12)]
+    images = plain.images[[3, 8, 12]]
+    assert trainer.heldout_psnr(frames, images) > plain.heldout_psnr(frames, images) + 0.2
+    kept, cameras = trainer.poses.values.detach().clone(), trainer.viewmats.clone()
+    trainer.step()
+    assert torch.equal(trainer.poses.values, kept)
+    trainer.save(tmp_path / "checkpoint.safetensors")
+    scene = load_scene(world.shot)
+    scene.viewmats = plain.viewmats
+    again = Trainer(scene, trainer.images, scene.solved, trainer.config, quiet())
+    again.restore(tmp_path / "checkpoint.safetensors")
+    assert torch.equal(again.viewmats, cameras)
