@@ -15,7 +15,7 @@ from ..footage.images import read_png
 from ..shot import atomic_path
 from .metrics import pareto_front
 from .records import Picture, RunRecord
-from .tables import HOST_NAMES, Setting
+from .tables import HOST_NAMES, Setting, pace
 
 COSTS = {
     "seconds": ("training, seconds", lambda run: run.train_seconds),
@@ -68,7 +68,9 @@ def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str, t
     points_of = [(p[1], p[2], text, _COLOURS.get(p[0].host, ink)) for p, text in zip(named, texts, strict=True)]
     _labels(axes, points_of)
     _legend(figure, [p[0] for p in points], ink)
-    axes.set_xlabel(axis + " (logarithmic, less is better)")
+    paces = ", ".join(sorted({pace(run) for s, _, _ in points for run in s.runs}))
+    measured = "" if cost == "megabytes" else f"; threads × runs at once: {paces}"
+    axes.set_xlabel(f"{axis} (logarithmic, less is better{measured})")
     axes.set_ylabel("PSNR of frozen frames, dB")
     axes.set_title("Filled and joined: no other is better in both", fontsize=9, color=ink, loc="left")
     axes.grid(color=grid, lw=0.6, which="both")
