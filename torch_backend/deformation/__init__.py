@@ -1,6 +1,6 @@
 """How Gaussians move: one protocol, a host per file, and the gate that says which Gaussians move at all."""
 
-from .gate import GateConfig, open_gate, residual_per_gaussian
+from .gate import GateConfig, change_of, painted, stays_open
 from .hexplane import HexPlane, HexPlaneConfig
 from .protocol import Deformation, Deltas, HostConfig, Rehearsal, Start, apply_deltas, field_box, split_deltas
 from .registry import CONFIGURATIONS, host, host_config, hosts
@@ -16,11 +16,12 @@ __all__ = [
     "Rehearsal",
     "Start",
     "apply_deltas",
+    "change_of",
     "field_box",
     "host",
     "host_config",
     "hosts",
-    "open_gate",
-    "residual_per_gaussian",
+    "painted",
     "split_deltas",
+    "stays_open",
 ]

@@ -2,7 +2,8 @@
 
 Corrected against the published code (design: method-hosts 1.1): time is mapped to the whole plane, the heads' last
 layers start at zero so that the field starts as the identity, learning rates do not follow the scene's extent
-(the scene is normalised), smoothness acts along both axes of a spatial plane, and sampling coordinates are detached:
+(the scene is normalised), smoothness acts along both axes of a spatial plane, the network bends by SiLU (with ReLU the
+whole trunk often dies in the first steps, and the field stands still for good), and sampling coordinates are detached:
 the field says how things move, the image says where they are. `published` brings all of that back.
 
 What stays the trainer's for every host, and so is not the published code's: one image per step (2 to 4), the loss, the
@@ -35,7 +36,7 @@ class HexPlaneConfig(HostConfig):
 
     features: int = 16
     """Channels per plane (dynerf: 16)."""
-    resolution: int = 64
+    resolution: int = 32
     """Nodes per spatial axis of the coarsest level (64)."""
     levels: tuple[int, ...] = (1, 2)
     """Multipliers of the spatial resolution (dynerf: 1, 2)."""
@@ -49,14 +50,22 @@ class HexPlaneConfig(HostConfig):
     """Start learning rate of trunk and heads (1.6e-4 times the scene's extent)."""
     lr_end: float = 0.1
     """Learning rates end at this share of their start (0.1)."""
-    smooth_space: float = 2e-4
+    smooth_space: float = 2e-3
     """Weight of the squared second difference along both axes of the spatial planes (2e-4)."""
-    smooth_time: float = 1e-3
+    smooth_time: float = 2e-2
     """Weight of the squared second difference along time on the time planes (1e-3)."""
-    time_l1: float = 1e-4
-    """Weight of mean |1 - plane| on the time planes (1e-4)."""
+    time_l1: float = 0.0
+    """Weight of mean |1 - plane| on the time planes (1e-4). With heads that start at zero it wins the first steps, the
+    planes fall to 1 for good, and nothing ever moves."""
+    space_range: tuple[float, float] = (0.5, 1.5)
+    """Spatial planes start between these (0.1 and 0.5: products of three of them, 0.03, make the network deaf at first).
+    """
+    time_spread: float = 0.1
+    """Time planes start at 1 and up to this much above or below (0)."""
     until: float = 1.0
     """Share of the run at which the learning rates have ended."""
+    silu: bool = True
+    """The network bends by SiLU (off: by ReLU)."""
     published: bool = False
     """Times fed as they are to a sampler of [-1, 1], heads that start as noise, smoothness down the planes only (so
     never along x), the box of the first points, all harmonics move, and means are pulled through the lookup (on)."""
@@ -71,6 +80,13 @@ def _reference(iterations: int) -> HexPlaneConfig:
         width=128,
         lr_grid=1.6e-3 * scale,
         lr_heads=1.6e-4 * scale,
+        resolution=64,
+        smooth_space=2e-4,
+        smooth_time=1e-3,
+        time_l1=1e-4,
+        space_range=(0.1, 0.5),
+        time_spread=0.0,
+        silu=False,
         until=23_000 / whole,
         published=True,
     )
@@ -95,10 +111,13 @@ class HexPlane(Deformation):
             nodes = config.resolution * level
             for _ in _SPATIAL:
                 plane = torch.empty(1, config.features, nodes, nodes, device="cpu")
-                plane.uniform_(0.1, 0.5, generator=generator)
+                plane.uniform_(*config.space_range, generator=generator)
                 self.spatial.append(_plane(plane))
             for _ in range(3):
                 still = torch.ones(1, config.features, config.time_nodes, nodes, device="cpu")
+                if config.time_spread > 0:
+                    low, high = 1.0 - config.time_spread, 1.0 + config.time_spread
+                    still.uniform_(low, high, generator=generator)
                 self.temporal.append(_plane(still))
         self.trunk = _linear(config.features * len(config.levels), config.width, generator)
         widths = {**_WIDTHS, "shN": 3 * harmonics} if config.published and harmonics else _WIDTHS
@@ -131,8 +150,9 @@ class HexPlane(Deformation):
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] scene units (ours detaches them), times [M] or [1] in [0, 1]."""
-        hidden = F.relu(self.trunk(self.features_at(means, times)))
-        out = {name: head(F.relu(self.hidden[name](hidden))) for name, head in self.out.items()}
+        bent = F.silu if self.config.silu else F.relu
+        hidden = bent(self.trunk(self.features_at(means, times)))
+        out = {name: head(bent(self.hidden[name](hidden))) for name, head in self.out.items()}
         return Deltas(
             means=out["means"],
             quats=out["quats"],

@@ -28,7 +28,7 @@ class DensifyConfig:
     """Most Gaussians the run may have."""
     start: float = 0.06
     """Share of the run at which growth begins."""
-    stop: float = 0.65
+    stop: float = 0.5
     """Share of the run at which growth ends; pruning goes on."""
     every: int = 100
     """Iterations between two rounds."""

@@ -7,6 +7,7 @@ from .anchors import (
     SupervisionConfig,
     draw_anchored,
     paper_loss,
+    stillness,
     support_loss,
     well_supervised,
 )
@@ -25,6 +26,7 @@ __all__ = [
     "nearest_bin",
     "nearest_supported",
     "paper_loss",
+    "stillness",
     "support_confidence",
     "support_loss",
     "well_supervised",

@@ -58,6 +58,11 @@ class SupervisionConfig:
     look_every: int = 4
     """`support` with anchor `hidden` looks every so many iterations who could not be seen in the frame."""
 
+    still_weight: float = 0.7
+    """`support`: weight of `stillness`, which every motion has to be worth."""
+    still_knee: float = 2e-3
+    """`support`: shifts in scene units below this cost their square, others themselves."""
+
     def __post_init__(self) -> None:
         if self.anchor not in ("hidden", "unsupported"):
             raise ValueError(f"anchor is {self.anchor!r}: it should be hidden or unsupported")
@@ -65,6 +70,8 @@ class SupervisionConfig:
 
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
 """Weights of the attributes in `support`, so that typical deltas of each count alike; means in scene units."""
+_STILL_WEIGHTS = {"means": 5.0, "quats": 0.5, "log_scales": 0.5, "opacity_logits": 1.0, "sh0": 1.0, "shN": 0.5}
+"""Weights of the attributes in `stillness`: more on what lets a Gaussian be another thing at another time."""
 _KNEE = 0.02
 """Below this the support loss is quadratic, above it linear (Charbonnier)."""
 
@@ -140,6 +147,23 @@ def support_loss(
         gap = value.reshape(len(rows), -1) - torch.lerp(first, second, share[:, None])
         total = total + _ATTRIBUTE_WEIGHTS[name] * (torch.sqrt(gap.square() + _KNEE**2) - _KNEE).sum(1)
     return config.support_weight * (pairs.weights * confidence * total).sum() / pairs.weights.sum().clamp_min(1.0)
+
+
+def stillness(here: Deltas, count: int, config: SupervisionConfig) -> Tensor:
+    """What the deltas `here` [M] of one frame cost in a model of `count` Gaussians: an L1 norm, rounded off at 0.
+
+    At its own time a Gaussian is seen from one side only, so whatever a field does to it there to please that one
+    frame goes unpunished, and shows as soon as the instant is seen from elsewhere. What moves must therefore be worth
+    more to the image than this; the sum is over all Gaussians of the model, so that the price of one does not depend
+    on how many others may move.
+    """
+    total = here.means.new_zeros(())
+    for name, value in here.moved().items():
+        weight = _STILL_WEIGHTS[name]
+        knee = config.still_knee * _STILL_WEIGHTS["means"] / weight
+        size = torch.sqrt(value.reshape(len(value), -1).square().sum(1) + knee**2) - knee
+        total = total + weight * size.sum()
+    return config.still_weight * total / max(1, count)
 
 
 _FAR = 4

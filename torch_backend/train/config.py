@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,11 @@ from .poses import PosesConfig
 
 @dataclass
 class TrainConfig:
-    """One run. Learning rates are per scene unit of camera extent 1; shares are of the run's length."""
+    """One run. Learning rates are per scene unit of camera extent 1; shares are of the run's length.
+
+    The Gaussians' rates are those of 3000 steps; `config_from_params` scales them to the run's length by the root of
+    the ratio, which meets the published ones at their 30,000.
+    """
 
     preset: str = "preview"
     """Preset these numbers come from."""
@@ -44,19 +49,19 @@ class TrainConfig:
     """Highest SH degree."""
     sh_every: float = 0.15
     """The SH degree rises by one every this share of the run."""
-    lr_means: float = 6e-4
+    lr_means: float = 1e-3
     """Start learning rate of means (3DGS 1.6e-4 over 30,000 steps; shorter runs need longer ones)."""
     lr_means_end: float = 6e-6
     """End learning rate of means."""
-    lr_scales: float = 8e-3
+    lr_scales: float = 2.2e-2
     """Learning rate of log-scales (3DGS: 5e-3)."""
-    lr_quats: float = 2e-3
+    lr_quats: float = 5.6e-3
     """Learning rate of quaternions (3DGS: 1e-3)."""
-    lr_opacities: float = 4e-2
+    lr_opacities: float = 6e-2
     """Learning rate of opacity logits (3DGS: 5e-2)."""
-    lr_sh0: float = 5e-3
+    lr_sh0: float = 8e-3
     """Learning rate of the constant colour (3DGS: 2.5e-3)."""
-    lr_sh_rest: float = 2.5e-4
+    lr_sh_rest: float = 4e-4
     """Learning rate of the other harmonics (3DGS: 2.5e-3 / 20)."""
     opacity_weight: float = 2e-3
     """Weight of the mean opacity: keeps what no image needs from staying (3DGS-MCMC: 1e-2)."""
@@ -134,6 +139,7 @@ def config_from_params(params: TrainParams) -> TrainConfig:
     config.method, config.seed = params.method, params.seed
     config.iterations = params.iterations or config.iterations
     config.width = params.width or config.width
+    _rates_for(config)
     config.densify.budget = params.max_gaussians or config.densify.budget
     config.supervision.preset, config.supervision.detector = params.supervision, params.detector
     config.host = params.method if params.method in hosts() else params.host
@@ -144,6 +150,18 @@ def config_from_params(params: TrainParams) -> TrainConfig:
     if config.iterations < 10:
         raise ValueError(f"iterations is {config.iterations}: a run needs at least 10")
     return config
+
+
+_RATES_FOR = 3000
+"""Steps of the run that the rates in TrainConfig are for."""
+
+
+def _rates_for(config: TrainConfig) -> None:
+    """Scales the Gaussians' rates, and how often they multiply, to the length of the run."""
+    scale = min(max(math.sqrt(_RATES_FOR / max(1, config.iterations)), 0.3), 1.5)
+    for name in ("lr_means", "lr_scales", "lr_quats", "lr_sh0", "lr_sh_rest"):
+        setattr(config, name, getattr(config, name) * scale)
+    config.densify.every = min(100, max(50, round(config.iterations / 30)))
 
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:
@@ -161,6 +179,10 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     values = {"needs": {}, "poses": {}, **data}  # earlier runs decided nothing; a finished one is only read
     if "hexplane" in values:  # written before there were other hosts
         values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))
+    if "rounds" in values.get("gate", {}):  # written before the gate opened on trial, and HexPlane bent by SiLU
+        values["gate"] = {k: v for k, v in values["gate"].items() if k not in ("rounds", "threshold", "floor")}
+        if values.get("host") == "hexplane":
+            values["field"] = {**values["field"], "silu": False}
     try:
         nested["field"] = host(values["host"]).settings
         for name, cls in nested.items():

@@ -56,7 +56,7 @@ class NeedsConfig:
     growth_gain: float = 0.03
     """Least gain per 10 % more Gaussians, what optimisation gained meanwhile included, for growth to go on."""
     stop_gain: float = 0.05
-    """Least gain over `stop_window`, after the gate's last round, for the run to go on."""
+    """Least gain over `stop_window`, after the gate has hardened, for the run to go on."""
     stop_window: float = 0.15
     """Share of the run over which that gain is looked for."""
     anneal: float = 0.1
@@ -185,7 +185,7 @@ class Needs:
             if gain is not None and gain < self.config.growth_gain:
                 self.growth_ended = trainer.iteration
         c = trainer.config
-        over = trainer.progress > max(*c.gate.rounds, c.densify.stop if self.growing else 0.0)
+        over = trainer.progress > max(c.gate.harden, c.densify.stop if self.growing else 0.0)
         gain = newest_gain(self.measured, trainer.iteration - round(self.config.stop_window * c.iterations))
         early = trainer.iteration + self._anneal(c.iterations) < c.iterations
         if over and early and gain is not None and gain < self.config.stop_gain:
@@ -265,7 +265,8 @@ class Needs:
         if not self.probes or most == 4:
             return 0
         residual, weight = signed_residual(trainer, torch.nonzero(trainer.model.gaussians.open).flatten())
-        same = correlation_frames(residual, weight)
+        likely = likely_movers(residual, weight)
+        same = correlation_frames(residual[:, likely], weight[:, likely])
         self.facts["correlation_frames"] = same
         nodes = most if same is None else min(max(round((frames - 1) / same) + 1, 4), most)
         self.facts["time_nodes"] = nodes
@@ -321,6 +322,18 @@ def signed_residual(trainer: Trainer, rows: Tensor) -> tuple[Tensor, Tensor]:
         weight[n] = out.weight_sum[0][rows]
         residual[n] = pulled[rows, 0] / weight[n].clamp_min(1e-6)
     return residual, weight
+
+
+def likely_movers(residual: Tensor, weight: Tensor) -> Tensor:
+    """Indices of the tenth of M Gaussians whose residual [I, M] is most alike two frames apart (least 64 of them).
+
+    Noise is not alike, and what a static model merely fits badly is the same in all frames.
+    """
+    seen = (weight > 0.5).float()
+    value = (residual - (residual * seen).sum(0) / seen.sum(0).clamp_min(1.0)) * seen
+    pairs = (seen[2:] * seen[:-2]).sum(0)
+    alike = torch.where(pairs >= 4, (value[2:] * value[:-2]).sum(0) / pairs.clamp_min(1.0), -torch.inf)
+    return alike.topk(min(len(alike), max(64, len(alike) // 10))).indices
 
 
 def correlation_frames(residual: Tensor, weight: Tensor) -> float | None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,11 +20,12 @@ from ..deformation import (
     Deltas,
     Rehearsal,
     Start,
+    change_of,
     field_box,
     host,
-    open_gate,
-    residual_per_gaussian,
+    painted,
     split_deltas,
+    stays_open,
 )
 from ..gaussians import Densifier, Gaussians, initialise
 from ..raster import RasterOutput
@@ -37,6 +39,7 @@ from ..supervision import (
     mark_hidden,
     mark_seen,
     paper_loss,
+    stillness,
     support_loss,
     well_supervised,
 )
@@ -52,6 +55,8 @@ from .repair import FieldMemory, drop_offenders, repair, unstable
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
+_MOMENTS = 16
+"""Times and cameras at which it is asked whether a Gaussian moves."""
 _LOOK_EVERY = 10
 """Steps between two looks at what a GPU counted, and between two reports of progress."""
 
@@ -176,6 +181,8 @@ class Trainer:
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
         loss = photometric(exposed, self._image(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
+        if deltas is not None and self.config.supervision.preset == "support":
+            total = total + stillness(deltas, len(self.model.gaussians), self.config.supervision)
         if self._refines_poses():
             total = total + self.poses.regularisation()
         if pairs is not None and anchored is not None:
@@ -216,8 +223,10 @@ class Trainer:
         if pairs is None:
             return self.model.deltas(rows, when), None
         times = torch.cat([when.expand(len(rows)), self.centres[pairs.bins]])
-        deltas = self.model.deltas(torch.cat([rows, pairs.rows]), times)
-        return split_deltas(deltas, len(rows)) if deltas is not None else (None, None)
+        means = self.model.gaussians.params["means"]
+        # Anchors teach the field; a host that moves means through it would have them pull the Gaussians along.
+        where = torch.cat([means[rows], means.detach()[pairs.rows]])
+        return split_deltas(field(where, times, self.model.gaussians.own(torch.cat([rows, pairs.rows]))), len(rows))
 
     def _image(self, frame: int) -> Tensor:
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
@@ -236,8 +245,10 @@ class Trainer:
         if c.method == "static":
             return
         if c.method == "auto":
-            if any(self.iteration == round(share * c.iterations) for share in c.gate.rounds):
-                self._gate_round()
+            if self.iteration == round(c.gate.start * c.iterations):
+                self._open_gate()
+            elif self.iteration == round(c.gate.harden * c.iterations):
+                self._harden_gate()
         elif self.model.field is None and self.progress >= c.field.start:
             self.model.gaussians.open[:] = True
             self._create_field()
@@ -264,37 +275,42 @@ class Trainer:
 
     # ------------------------------------------------------------------ the gate
 
-    def _gate_round(self) -> None:
-        self._look()  # one NaN would make every residual NaN
-        frames = list(range(0, len(self.train_ids), max(1, len(self.train_ids) // 40)))
-        frames = [frame for frame in frames if frame not in self.unusable | self.needs.held]
-        residual, weight = residual_per_gaussian(frames, self._residual_of, len(self.model.gaussians))
-        open_gate(self.model.gaussians, residual, weight, self.config.gate)
-        if not bool(self.model.gaussians.open.any()):
-            return
-        if self.model.field is None:
+    def _open_gate(self) -> None:
+        """Opens all that is painted, on trial."""
+        model = self.model.gaussians
+        model.open |= painted(model)
+        if bool(model.open.any()):
             self._create_field()
-        else:
-            is_open = self.model.gaussians.open
-            self.model.field.cover(self.model.gaussians.params["means"].detach()[is_open], self.optimizer)
-            self._memory.keep(self.model.field)  # the one before had another box, or fewer nodes
 
-    def _residual_of(self, frame: int) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
-        self.report.check_cancelled()
-        with torch.no_grad():
-            state = {k: v.detach() for k, v in self.model.state_at(self.times[frame]).items()}
-        probe = torch.zeros(len(self.model.gaussians), 1, device=self.device, requires_grad=True)
-        background = torch.cat([self.background, self.background.new_zeros(1)])
-        out = self._render(state, frame, colors=probe, background=background, with_contributions=True)
-        exposed = self.model.exposure.apply(out.colors[0, ..., :3], self.times[frame]).detach()
-        error = (exposed - self._image(frame)).abs().mean(-1)
+    @torch.no_grad()
+    def _harden_gate(self) -> None:
+        """Closes for good what did not move; its mean change stays."""
+        self._look()  # one NaN would spoil the neighbours' verdicts
+        rows, model = self.model.open_rows(), self.model.gaussians
+        if self.model.field is None or not len(rows):
+            return
+        picked = np.unique(np.linspace(0, len(self.centres) - 1, min(_MOMENTS, len(self.centres))).round().astype(int))
+        moments = [self.model.deltas(rows, self.centres[n : n + 1]) for n in picked]
+        asked = [moment for moment in moments if moment is not None]
+        change, mean = change_of(model, rows, asked, self._pixels(rows), self.config.gate)
+        stays = stays_open(model, rows, change, self.config.gate)
+        closed, moved = rows[~stays], self.model.moved(rows, mean)
+        for name, param in model.params.items():
+            if name in moved:
+                param.data[closed] = moved[name][closed]
+        model.open[closed] = False
+        self._shift = self._shift[:0]
 
-        def pull(values: Tensor) -> Tensor:
-            # The gradient of sum(value * image channel) for a Gaussian's colour is its sum of alpha * T * value.
-            (grad,) = torch.autograd.grad(out.colors[0, ..., 3], probe, values)
-            return grad[:, 0]
-
-        return error, pull, out.weight_sum[0]
+    def _pixels(self, rows: Tensor) -> Tensor:
+        """[M] pixels of the training images per scene unit, where each of `rows` is nearest to a camera that saw it."""
+        means = self.model.gaussians.params["means"].detach()[rows]
+        nearest = torch.full((len(rows),), torch.inf, device=self.device)
+        for frame in range(0, len(self.train_ids), max(1, len(self.train_ids) // _MOMENTS)):
+            view = self.viewmats[self.train_ids[frame]]
+            depth = means @ view[2, :3] + view[2, 3]
+            seen = self.model.gaussians.support[rows, self._bins[frame]] & (depth > 1e-3)
+            nearest = torch.where(seen, torch.minimum(nearest, depth), nearest)
+        return torch.where(nearest.isfinite(), self.Ks[self.train_ids[0], 0, 0] / nearest, 0.0)
 
     def _create_field(self) -> None:
         self._look()  # and every bound of the field
