@@ -32,7 +32,7 @@ class GateConfig:
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""
     harden: float = 0.6
     """Share of the run at which what did not move is closed for good."""
-    pixels: float = 0.3
+    pixels: float = 0.2
     """A Gaussian stays open if it moves by this many pixels of the training images, seen from the nearest camera..."""
     color: float = 0.02
     """...or changes its colour by this (display-referred, 0 to 1)..."""

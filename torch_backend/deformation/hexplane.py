@@ -58,8 +58,7 @@ class HexPlaneConfig(HostConfig):
     """Weight of mean |1 - plane| on the time planes (1e-4). With heads that start at zero it wins the first steps, the
     planes fall to 1 for good, and nothing ever moves."""
     space_range: tuple[float, float] = (0.5, 1.5)
-    """Spatial planes start between these (0.1 and 0.5: products of three of them, 0.03, make the network deaf at first).
-    """
+    """Spatial planes start between these (0.1 and 0.5, and the network hardly hears the products of three)."""
     time_spread: float = 0.1
     """Time planes start at 1 and up to this much above or below (0)."""
     until: float = 1.0

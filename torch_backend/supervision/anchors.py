@@ -60,6 +60,9 @@ class SupervisionConfig:
 
     still_weight: float = 0.7
     """`support`: weight of `stillness`, which every motion has to be worth."""
+    still_ramp: float = 0.2
+    """`support`: share of the run, from `start` on, over which that weight grows from nothing: a field that has to pay
+    before it has found anything finds nothing."""
     still_knee: float = 2e-3
     """`support`: shifts in scene units below this cost their square, others themselves."""
 
@@ -149,13 +152,13 @@ def support_loss(
     return config.support_weight * (pairs.weights * confidence * total).sum() / pairs.weights.sum().clamp_min(1.0)
 
 
-def stillness(here: Deltas, count: int, config: SupervisionConfig) -> Tensor:
+def stillness(here: Deltas, count: int, progress: float, config: SupervisionConfig) -> Tensor:
     """What the deltas `here` [M] of one frame cost in a model of `count` Gaussians: an L1 norm, rounded off at 0.
 
     At its own time a Gaussian is seen from one side only, so whatever a field does to it there to please that one
     frame goes unpunished, and shows as soon as the instant is seen from elsewhere. What moves must therefore be worth
     more to the image than this; the sum is over all Gaussians of the model, so that the price of one does not depend
-    on how many others may move.
+    on how many others may move. `progress`: share of the run that is done.
     """
     total = here.means.new_zeros(())
     for name, value in here.moved().items():
@@ -163,7 +166,8 @@ def stillness(here: Deltas, count: int, config: SupervisionConfig) -> Tensor:
         knee = config.still_knee * _STILL_WEIGHTS["means"] / weight
         size = torch.sqrt(value.reshape(len(value), -1).square().sum(1) + knee**2) - knee
         total = total + weight * size.sum()
-    return config.still_weight * total / max(1, count)
+    grown = min(max((progress - config.start) / max(config.still_ramp, 1e-6), 0.0), 1.0)
+    return config.still_weight * grown * total / max(1, count)
 
 
 _FAR = 4

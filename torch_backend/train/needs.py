@@ -32,7 +32,7 @@ from .model import render
 if TYPE_CHECKING:
     from .trainer import Trainer
 
-_LEAST_FRAMES, _LEAST_PROBES, _MOST_PROBES = 24, 3, 12
+_LEAST_FRAMES, _LEAST_PROBES, _MOST_PROBES = 48, 3, 12
 _GROWN = 1.2
 """Growth is judged over measurements between which the Gaussians grew by this factor, at least `_POINTS` of them."""
 _POINTS = 4
@@ -45,7 +45,7 @@ class NeedsConfig:
     """What is enough. Gains are dB of mean PSNR on the probe frames, shares are of the run's length."""
 
     probes: int = 12
-    """Every how many trained frames one is a probe, 3 to 12 in all, none of under 24 frames; 0: none, all is spent."""
+    """Every how many trained frames one is a probe, 3 to 12 in all, none of under 48 frames; 0: none, all is spent."""
     join: float = 0.6
     """Share of the run at which the probe frames are trained on too; until then they decide."""
     every: float = 0.025

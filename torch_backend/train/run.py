@@ -93,7 +93,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
 
 
 def place_images(images: Tensor, device: torch.device) -> Tensor:
-    """Images [I, H, W, 3] on the device, or in pinned host memory if they would take over half of what is free there."""
+    """Images [I, H, W, 3] on the device, or in pinned host memory if they would fill half of what is free there."""
     if device.type == "cpu":
         return images
     free, _ = torch.cuda.mem_get_info(device)

@@ -182,7 +182,7 @@ class Trainer:
         loss = photometric(exposed, self._image(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
         if deltas is not None and self.config.supervision.preset == "support":
-            total = total + stillness(deltas, len(self.model.gaussians), self.config.supervision)
+            total = total + stillness(deltas, len(self.model.gaussians), self.progress, self.config.supervision)
         if self._refines_poses():
             total = total + self.poses.regularisation()
         if pairs is not None and anchored is not None:
