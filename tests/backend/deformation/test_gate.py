@@ -1,10 +1,13 @@
-"""The gate opens what has a residual, in pieces, within its share."""
+"""The gate closes what did not move, keeps what moves in pieces, and leaves the mean change behind."""
+
+import math
 
 import torch
 
-from torch_backend.deformation import GateConfig, apply_deltas, open_gate, residual_per_gaussian
+from torch_backend.deformation import GateConfig, apply_deltas, change_of, painted, stays_open
 from torch_backend.deformation.protocol import Deltas
 from torch_backend.gaussians import PARAM_NAMES, Gaussians
+from torch_backend.gaussians.model import SH_C0
 
 
 def model(count=400):
@@ -15,50 +18,71 @@ def model(count=400):
     return Gaussians(params, 4)
 
 
-def test_opens_the_piece_that_moves_and_little_else():
-    m = model()
+def moments(count, shift=None, opacity=None, color=None):
+    """Deltas at the two ends of a swing about 0."""
+    for sign in (1.0, -1.0):
+        yield Deltas(
+            torch.zeros(count, 3) if shift is None else sign * shift,
+            torch.zeros(count, 4),
+            None,
+            torch.zeros(count) if opacity is None else sign * opacity,
+            torch.zeros(count, 1, 3) if color is None else sign * color,
+        )
+
+
+def test_change_is_measured_in_pixels_colour_and_opacity():
+    m, config = model(10), GateConfig()
+    shift, opacity, color = torch.zeros(10, 3), torch.zeros(10), torch.zeros(10, 1, 3)
+    shift[2, 1] = 0.01
+    opacity[5] = 1.0
+    color[7, 0, 0] = 0.5
+    pixels = torch.full((10,), 100.0)
+    change, _ = change_of(m, torch.arange(10), moments(10, shift, opacity, color), pixels, config)
+    expected = torch.zeros(10)
+    expected[2] = 0.01 * 100.0 / config.pixels
+    expected[5] = (1.0 / (1.0 + math.exp(-1.0)) - 0.5) / config.opacity
+    expected[7] = 0.5 * SH_C0 / config.color
+    torch.testing.assert_close(change, expected)
+
+
+def test_what_is_only_displaced_does_not_move():
+    m = model(10)
+    there = [Deltas(torch.full((10, 3), 0.2), torch.zeros(10, 4)) for _ in range(3)]
+    change, mean = change_of(m, torch.arange(10), there, torch.full((10,), 100.0), GateConfig())
+    assert float(change.max()) < 1e-3
+    torch.testing.assert_close(mean.means, torch.full((10, 3), 0.2))
+    assert mean.sh0 is None
+
+
+def test_the_piece_that_moves_stays_open_and_little_else():
+    m, rows = model(), torch.arange(400)
     moves = m.params["means"].detach()[:, 0] > 0.85
-    residual = 0.02 + 0.004 * torch.rand(400, generator=torch.Generator().manual_seed(1)) + 0.2 * moves
-    opened = open_gate(m, residual, torch.full((400,), 10.0), GateConfig())
-    assert opened == int(m.open.sum())
-    assert m.open[moves].float().mean() > 0.9
-    assert m.open[m.params["means"].detach()[:, 0] < 0.7].float().mean() < 0.03
+    change = 0.3 * torch.rand(400, generator=torch.Generator().manual_seed(1)) + 3.0 * moves
+    stays = stays_open(m, rows, change, GateConfig())
+    assert stays[moves].float().mean() > 0.9
+    assert stays[m.params["means"].detach()[:, 0] < 0.7].float().mean() < 0.03
 
 
-def test_lone_noise_does_not_open():
+def test_a_lone_mover_is_noise():
     m = model()
-    residual = torch.full((400,), 0.02) + 0.002 * torch.rand(400, generator=torch.Generator().manual_seed(2))
-    residual[17] = 0.03
-    open_gate(m, residual, torch.full((400,), 10.0), GateConfig(threshold=6.0))
-    assert not m.open[17]
+    change = torch.full((400,), 0.2)
+    change[17] = 50.0
+    assert not stays_open(m, torch.arange(400), change, GateConfig()).any()
 
 
-def test_share_is_a_limit_and_the_largest_go_first():
+def test_share_is_a_limit_and_what_moves_most_stays():
     m = model()
-    residual = torch.linspace(0, 1, 400) ** 8
-    open_gate(m, residual, torch.full((400,), 10.0), GateConfig(max_share=0.05, neighbours=0, threshold=0.5))
-    assert int(m.open.sum()) == 20
-    assert m.open[-20:].all()
+    # Neighbours in space are alike: each stands for itself.
+    change = 1.5 + m.params["means"].detach()[:, 0]
+    stays = stays_open(m, torch.arange(400), change, GateConfig(max_share=0.05))
+    assert int(stays.sum()) == 20
+    assert float(m.params["means"].detach()[stays, 0].min()) > 0.8
 
 
-def test_unpainted_gaussians_stay_closed():
-    m = model()
-    open_gate(m, torch.ones(400), torch.zeros(400), GateConfig())
-    assert not m.open.any()
-
-
-def test_residual_is_the_mean_error_of_what_is_painted():
-    """Two Gaussians, two pixels: a weight matrix stands for alpha * T."""
-    weights = torch.tensor([[1.0, 0.0], [0.5, 0.5]])
-
-    def render(frame):
-        error = torch.tensor([0.1, 0.3 * (frame + 1)])
-        return error, lambda values: weights @ values, weights.sum(1)
-
-    residual, weight = residual_per_gaussian([0, 1, 2], render, 2)
-    # The worst third of three frames is the worst frame.
-    torch.testing.assert_close(residual, torch.tensor([0.1, 0.5 * (0.1 + 0.9)]))
-    torch.testing.assert_close(weight, torch.tensor([3.0, 3.0]))
+def test_only_what_was_painted_is_opened():
+    m = model(6)
+    m.support[2, 1] = True
+    assert torch.nonzero(painted(m)).flatten().tolist() == [2]
 
 
 def test_closed_gaussians_do_not_move():

@@ -19,6 +19,7 @@ from torch_backend.supervision import (
     nearest_bin,
     nearest_supported,
     paper_loss,
+    stillness,
     support_confidence,
     support_loss,
     well_supervised,
@@ -133,6 +134,38 @@ def test_support_loss_needs_open_gaussians_that_were_seen():
     assert anchor(m, Ramp(), 3) is None
     m = model([[1, 1, 1]])
     assert anchor(m, Ramp(), 3) is None
+
+
+def shifts(*lengths):
+    means = torch.zeros(len(lengths), 3)
+    means[:, 0] = torch.tensor(lengths)
+    return Deltas(means.requires_grad_(True), torch.zeros(len(lengths), 4))
+
+
+def test_stillness_costs_nothing_at_rest_and_a_rate_per_unit_beyond_the_knee():
+    config = SupervisionConfig()
+    assert float(stillness(shifts(0.0, 0.0), 2, 1.0, config).detach()) == 0.0
+    one, two = (float(stillness(shifts(length, 0.0), 2, 1.0, config).detach()) for length in (1.0, 2.0))
+    assert two - one == pytest.approx(config.still_weight * 5.0 / 2, rel=1e-3)
+
+
+def test_the_price_of_one_gaussian_does_not_depend_on_how_many_are_open():
+    config = SupervisionConfig()
+    many, few = shifts(0.1, 0.0, 0.0, 0.0), shifts(0.1)
+    assert float(stillness(many, 4, 1.0, config).detach()) == pytest.approx(
+        float(stillness(few, 4, 1.0, config).detach())
+    )
+    for deltas in (many, few):
+        stillness(deltas, 4, 1.0, config).backward()
+    torch.testing.assert_close(many.means.grad[0], few.means.grad[0])
+
+
+def test_a_field_may_look_for_motion_before_it_has_to_pay():
+    config = SupervisionConfig()
+    prices = [float(stillness(shifts(0.5), 1, config.start + share, config).detach()) for share in (0.0, 0.1, 0.2, 0.6)]
+    assert prices[0] == 0.0
+    assert prices[1] == pytest.approx(0.5 * prices[2])
+    assert prices[2] == prices[3]
 
 
 def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
