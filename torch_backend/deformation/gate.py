@@ -32,6 +32,8 @@ class GateConfig:
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""
     harden: float = 0.6
     """Share of the run at which what did not move is closed for good."""
+    give_up: float = 0.75
+    """Share of the run until which that is put off while nothing moves yet: some fields take their time."""
     pixels: float = 0.2
     """A Gaussian stays open if it moves by this many pixels of the training images, seen from the nearest camera..."""
     color: float = 0.02

@@ -44,7 +44,7 @@ class HexPlaneConfig(HostConfig):
     """Nodes on the time axis (150); 0: about half the trained frames."""
     width: int = 64
     """Width of the trunk and the heads (64)."""
-    lr_grid: float = 1e-2
+    lr_grid: float = 3e-2
     """Start learning rate of the planes (1.6e-3 times the scene's extent)."""
     lr_heads: float = 1e-3
     """Start learning rate of trunk and heads (1.6e-4 times the scene's extent)."""
@@ -52,7 +52,7 @@ class HexPlaneConfig(HostConfig):
     """Learning rates end at this share of their start (0.1)."""
     smooth_space: float = 2e-3
     """Weight of the squared second difference along both axes of the spatial planes (2e-4)."""
-    smooth_time: float = 2e-2
+    smooth_time: float = 2e-3
     """Weight of the squared second difference along time on the time planes (1e-3)."""
     time_l1: float = 0.0
     """Weight of mean |1 - plane| on the time planes (1e-4). With heads that start at zero it wins the first steps, the

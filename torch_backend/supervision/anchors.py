@@ -58,8 +58,10 @@ class SupervisionConfig:
     look_every: int = 4
     """`support` with anchor `hidden` looks every so many iterations who could not be seen in the frame."""
 
-    still_weight: float = 0.7
-    """`support`: weight of `stillness`, which every motion has to be worth."""
+    still_weight: float = 22.0
+    """`support`: weight of `stillness`, which every motion has to be worth, in photometric losses."""
+    still_scale: float = 0.15
+    """`support`: from here on a change costs less and less; 0.15 is a shift of 0.03 scene units."""
     still_ramp: float = 0.2
     """`support`: share of the run, from `start` on, over which that weight grows from nothing: a field that has to pay
     before it has found anything finds nothing."""
@@ -152,22 +154,28 @@ def support_loss(
     return config.support_weight * (pairs.weights * confidence * total).sum() / pairs.weights.sum().clamp_min(1.0)
 
 
-def stillness(here: Deltas, count: int, progress: float, config: SupervisionConfig) -> Tensor:
-    """What the deltas `here` [M] of one frame cost in a model of `count` Gaussians: an L1 norm, rounded off at 0.
+def stillness(here: Deltas, count: int, error: Tensor, progress: float, config: SupervisionConfig) -> Tensor:
+    """What the deltas `here` [M] of one frame cost in a model of `count` Gaussians.
 
     At its own time a Gaussian is seen from one side only, so whatever a field does to it there to please that one
     frame goes unpunished, and shows as soon as the instant is seen from elsewhere. What moves must therefore be worth
-    more to the image than this; the sum is over all Gaussians of the model, so that the price of one does not depend
-    on how many others may move. `progress`: share of the run that is done.
+    more to the image than this. Per Gaussian the price is the logarithm of an L1 norm: to begin to move costs most, to
+    go on little, since who moves much is no more suspect than who moves. The sum is over all Gaussians of the model, so
+    that the price of one does not depend on how many others may move.
+
+    Args:
+        error: the frame's photometric loss, 0-dim, which is the currency: an image that is harder to fit gains more
+            from any motion, a false one too.
+        progress: share of the run that is done.
     """
-    total = here.means.new_zeros(())
+    total = here.means.new_zeros(len(here.means))
     for name, value in here.moved().items():
         weight = _STILL_WEIGHTS[name]
         knee = config.still_knee * _STILL_WEIGHTS["means"] / weight
-        size = torch.sqrt(value.reshape(len(value), -1).square().sum(1) + knee**2) - knee
-        total = total + weight * size.sum()
+        total = total + weight * (torch.sqrt(value.reshape(len(value), -1).square().sum(1) + knee**2) - knee)
+    price = config.still_scale * torch.log1p(total / config.still_scale)
     grown = min(max((progress - config.start) / max(config.still_ramp, 1e-6), 0.0), 1.0)
-    return config.still_weight * grown * total / max(1, count)
+    return config.still_weight * grown * error.detach() * price.sum() / max(1, count)
 
 
 _FAR = 4

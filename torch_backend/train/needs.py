@@ -32,7 +32,7 @@ from .model import render
 if TYPE_CHECKING:
     from .trainer import Trainer
 
-_LEAST_FRAMES, _LEAST_PROBES, _MOST_PROBES = 48, 3, 12
+_LEAST_PROBES, _MOST_PROBES = 3, 12
 _GROWN = 1.2
 """Growth is judged over measurements between which the Gaussians grew by this factor, at least `_POINTS` of them."""
 _POINTS = 4
@@ -45,7 +45,9 @@ class NeedsConfig:
     """What is enough. Gains are dB of mean PSNR on the probe frames, shares are of the run's length."""
 
     probes: int = 12
-    """Every how many trained frames one is a probe, 3 to 12 in all, none of under 48 frames; 0: none, all is spent."""
+    """Every how many trained frames one is a probe, 3 to 12 in all; 0: none, all is spent."""
+    least: int = 48
+    """A clip of fewer trained frames keeps none back: it can spare none (3 of 42 cost 0.1 dB)."""
     join: float = 0.6
     """Share of the run at which the probe frames are trained on too; until then they decide."""
     every: float = 0.025
@@ -63,9 +65,9 @@ class NeedsConfig:
     """Share of the run over which a run that has enough brings its learning rates to their end."""
 
 
-def probe_frames(frames: int, every: int) -> list[int]:
+def probe_frames(frames: int, every: int, least: int = 24) -> list[int]:
     """Positions among `frames` trained frames of those kept back, evenly spread, never an end; [] for short clips."""
-    if every <= 0 or frames < _LEAST_FRAMES:
+    if every <= 0 or frames < least:
         return []
     count = min(max(frames // every, _LEAST_PROBES), _MOST_PROBES)
     return [int((n + 0.5) * frames / count) for n in range(count)]
@@ -104,7 +106,7 @@ class Needs:
 
     def __init__(self, config: NeedsConfig, frames: int) -> None:
         self.config = config
-        self.probes = probe_frames(frames, config.probes)
+        self.probes = probe_frames(frames, config.probes, config.least)
         self.joined = not self.probes
         self.measured: list[tuple[int, int, float]] = []
         self.degrees: dict[int, float] = {}
@@ -185,7 +187,8 @@ class Needs:
             if gain is not None and gain < self.config.growth_gain:
                 self.growth_ended = trainer.iteration
         c = trainer.config
-        over = trainer.progress > max(c.gate.harden, c.densify.stop if self.growing else 0.0)
+        hardened = self.facts.get("hardened", c.gate.give_up * c.iterations) / c.iterations
+        over = trainer.progress > max(hardened, c.densify.stop if self.growing else 0.0)
         gain = newest_gain(self.measured, trainer.iteration - round(self.config.stop_window * c.iterations))
         early = trainer.iteration + self._anneal(c.iterations) < c.iterations
         if over and early and gain is not None and gain < self.config.stop_gain:

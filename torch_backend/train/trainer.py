@@ -182,7 +182,7 @@ class Trainer:
         loss = photometric(exposed, self._image(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
         if deltas is not None and self.config.supervision.preset == "support":
-            total = total + stillness(deltas, len(self.model.gaussians), self.progress, self.config.supervision)
+            total = total + stillness(deltas, len(self.model.gaussians), loss, self.progress, self.config.supervision)
         if self._refines_poses():
             total = total + self.poses.regularisation()
         if pairs is not None and anchored is not None:
@@ -247,7 +247,7 @@ class Trainer:
         if c.method == "auto":
             if self.iteration == round(c.gate.start * c.iterations):
                 self._open_gate()
-            elif self.iteration == round(c.gate.harden * c.iterations):
+            elif self._on_trial():
                 self._harden_gate()
         elif self.model.field is None and self.progress >= c.field.start:
             self.model.gaussians.open[:] = True
@@ -282,9 +282,19 @@ class Trainer:
         if bool(model.open.any()):
             self._create_field()
 
+    def _on_trial(self) -> bool:
+        """Is the trial judged now? At `harden`, and as long as nothing has begun to move, again until `give_up`."""
+        c = self.config
+        if self.model.field is None or "hardened" in self.needs.facts:
+            return False
+        first, last, every = (round(share * c.iterations) for share in (c.gate.harden, c.gate.give_up, 0.05))
+        return first <= self.iteration <= last and (
+            (self.iteration - first) % max(1, every) == 0 or self.iteration == last
+        )
+
     @torch.no_grad()
     def _harden_gate(self) -> None:
-        """Closes for good what did not move; its mean change stays."""
+        """Closes for good what did not move; its mean change stays. While nothing moves at all, the trial goes on."""
         self._look()  # one NaN would spoil the neighbours' verdicts
         rows, model = self.model.open_rows(), self.model.gaussians
         if self.model.field is None or not len(rows):
@@ -294,6 +304,9 @@ class Trainer:
         asked = [moment for moment in moments if moment is not None]
         change, mean = change_of(model, rows, asked, self._pixels(rows), self.config.gate)
         stays = stays_open(model, rows, change, self.config.gate)
+        if not bool(stays.any()) and self.progress < self.config.gate.give_up:
+            return
+        self.needs.facts["hardened"] = self.iteration
         closed, moved = rows[~stays], self.model.moved(rows, mean)
         for name, param in model.params.items():
             if name in moved:

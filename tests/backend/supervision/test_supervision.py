@@ -142,27 +142,39 @@ def shifts(*lengths):
     return Deltas(means.requires_grad_(True), torch.zeros(len(lengths), 4))
 
 
-def test_stillness_costs_nothing_at_rest_and_a_rate_per_unit_beyond_the_knee():
-    config = SupervisionConfig()
-    assert float(stillness(shifts(0.0, 0.0), 2, 1.0, config).detach()) == 0.0
-    one, two = (float(stillness(shifts(length, 0.0), 2, 1.0, config).detach()) for length in (1.0, 2.0))
-    assert two - one == pytest.approx(config.still_weight * 5.0 / 2, rel=1e-3)
+ERROR = torch.tensor(0.05)
+
+
+def price(deltas, count=1, progress=1.0, error=ERROR):
+    return float(stillness(deltas, count, error, progress, SupervisionConfig()).detach())
+
+
+def test_stillness_costs_nothing_at_rest_and_less_and_less_beyond():
+    assert price(shifts(0.0, 0.0)) == 0.0
+    near, far = price(shifts(0.01)) - price(shifts(0.005)), price(shifts(1.005)) - price(shifts(1.0))
+    assert 0.0 < far < 0.1 * near
+
+
+def test_stillness_is_paid_in_photometric_loss_and_does_not_change_it():
+    error = torch.tensor(0.05, requires_grad=True)
+    deltas = shifts(0.1)
+    stillness(deltas, 1, error, 1.0, SupervisionConfig()).backward()
+    assert error.grad is None
+    assert float(deltas.means.grad[0, 0]) > 0.0
+    assert price(shifts(0.1), error=0.5 * ERROR) == pytest.approx(0.5 * price(shifts(0.1)))
 
 
 def test_the_price_of_one_gaussian_does_not_depend_on_how_many_are_open():
-    config = SupervisionConfig()
     many, few = shifts(0.1, 0.0, 0.0, 0.0), shifts(0.1)
-    assert float(stillness(many, 4, 1.0, config).detach()) == pytest.approx(
-        float(stillness(few, 4, 1.0, config).detach())
-    )
+    assert price(many, 4) == pytest.approx(price(few, 4))
     for deltas in (many, few):
-        stillness(deltas, 4, 1.0, config).backward()
+        stillness(deltas, 4, ERROR, 1.0, SupervisionConfig()).backward()
     torch.testing.assert_close(many.means.grad[0], few.means.grad[0])
 
 
 def test_a_field_may_look_for_motion_before_it_has_to_pay():
-    config = SupervisionConfig()
-    prices = [float(stillness(shifts(0.5), 1, config.start + share, config).detach()) for share in (0.0, 0.1, 0.2, 0.6)]
+    start = SupervisionConfig().start
+    prices = [price(shifts(0.5), progress=start + share) for share in (0.0, 0.1, 0.2, 0.6)]
     assert prices[0] == 0.0
     assert prices[1] == pytest.approx(0.5 * prices[2])
     assert prices[2] == prices[3]

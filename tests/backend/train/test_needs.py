@@ -43,6 +43,7 @@ def trainer_of(long_world, quiet, iterations=100, method="auto", **changes):
     scene, images = long_world
     config = config_from_params(TrainParams(iterations=iterations, max_gaussians=1200, method=method))
     config.densify.every = 10
+    config.needs.least = 24
     for path, value in changes.items():
         part = config
         *parents, name = path.split("__")
@@ -181,17 +182,17 @@ def test_growth_ends_when_it_gains_too_little(long_world, quiet, tmp_path):
 
 def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     trainer = finish(trainer_of(long_world, quiet, needs__stop_gain=1e9), tmp_path)
-    assert trainer.needs.stopped == 70  # the first measurement after the gate's last round
-    assert trainer.iteration == 80
+    assert trainer.needs.stopped == 80  # the first measurement after the gate has given up waiting for motion
+    assert trainer.iteration == 90
     group = trainer.optimizer.param_groups[0]
     trainer._schedule()
     assert group["lr"] == pytest.approx(group["lr_end"])
-    assert trainer.report.events[-1][2:4] == (80, 80)
+    assert trainer.report.events[-1][2:4] == (90, 90)
     end = modelled(trainer)[-1]
-    assert end["detail"] == "stopped at step 80 of 100: nothing more was gained"
+    assert end["detail"] == "stopped at step 90 of 100: nothing more was gained"
     again = trainer_of(long_world, quiet, needs__stop_gain=1e9)
     again.restore(tmp_path / "checkpoint.safetensors")
-    assert again.end == 80
+    assert again.end == 90
     on = finish(trainer_of(long_world, quiet, needs__stop_gain=-1e9), tmp_path)
     assert on.needs.stopped is None
     assert on.iteration == 100

@@ -184,16 +184,18 @@ def test_a_bad_frame_does_not_keep_the_gate_shut(begin):
     trainer = begin("auto", steps=0)
     trainer.images[5] = NAN
     go_on(trainer, 19)
-    residuals = [trainer._residual_of(frame)[0] for frame in range(len(trainer.train_ids)) if frame != 5]
-    assert all(bool(torch.isfinite(error).all()) for error in residuals)
-    trainer.config.gate.floor = trainer.config.gate.threshold = 0.0  # everything above the median is motion
-    trainer._gate_round()
+    trainer._open_gate()
+    go_on(trainer, 5)
+    assert 5 in trainer.unusable
+    trainer.config.gate.pixels = 1e-6  # any change at all is motion
+    trainer._harden_gate()
     assert bool(trainer.model.gaussians.open.any())
+    assert finite(trainer)
 
 
 @pytest.mark.parametrize("host", HOSTS)
 def test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back(begin, host):
-    """One step at a thousand times the field's rates: what is out of the picture has no gradient to come back by."""
+    """One step at ten thousand times the field's rates: what is out of the picture has no gradient to come back by."""
     trainer = begin(host, 30)
     before = {name: p.detach().clone() for name, p in trainer.model.field.named_parameters()}
     loss = float(torch.tensor(go_on(trainer, 9)).mean())
@@ -205,7 +207,7 @@ def test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back(begin, host)
         normal()
         for group in trainer.optimizer.param_groups:
             if any(id(p) in fields for p in group["params"]):
-                group["lr"] *= 1e3
+                group["lr"] *= 1e4
 
     trainer._schedule = hasty
     trainer.step()
@@ -233,7 +235,7 @@ def test_a_hasty_step_of_one_attribute_is_trained_away(begin, name):
 
     def hasty():
         normal()
-        next(group for group in trainer.optimizer.param_groups if group.get("name") == name)["lr"] *= 1e3
+        next(group for group in trainer.optimizer.param_groups if group.get("name") == name)["lr"] *= 1e2
 
     trainer._schedule = hasty
     trainer.step()
