@@ -33,7 +33,7 @@ def test_samples_and_their_gradients_match_float64(features):
     assert not planes.supports(exact._by_level())
     means, times = points()
     got, want = ours.features_at(means, times), exact.features_at(means.double(), times.double())
-    torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-5)  # products of planes round 1
     pull = torch.randn(got.shape, generator=torch.Generator().manual_seed(3))
     got.backward(pull)
     want.backward(pull.double())
