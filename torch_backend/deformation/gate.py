@@ -75,7 +75,7 @@ def change_of(
         if at.sh0 is not None and mean.sh0 is not None:
             change = torch.maximum(change, SH_C0 * (at.sh0 - mean.sh0).abs().amax((1, 2)) / config.color)
         if at.opacity_logits is not None and mean.opacity_logits is not None:
-            here, usual = (torch.sigmoid(opacity + d.opacity_logits) for d in (at, mean))
+            here, usual = torch.sigmoid(opacity + at.opacity_logits), torch.sigmoid(opacity + mean.opacity_logits)
             change = torch.maximum(change, (here - usual).abs() / config.opacity)
     return change, mean
 
