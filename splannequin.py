@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import ctypes
+import functools
 import hashlib
 import json
 import os
@@ -146,7 +147,7 @@ if __name__ == "__main__" and sys.version_info[:2] < NEEDED_PYTHON:
     sys.exit(hand_over_to_newer_python())
 
 from torch_backend.contract import ExitCode, read_json  # noqa: E402  (needs 3.11)
-from torch_backend.shot import is_disk_full, write_json  # noqa: E402
+from torch_backend.shot import is_disk_full, locked, write_json  # noqa: E402
 
 
 class LauncherError(Exception):
@@ -252,36 +253,6 @@ def child_environ(**extra: str) -> dict[str, str]:
     return environ
 
 
-@contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Holds the lock file `path`, so that two launchers do not set up one environment at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a+b") as lock:
-        told = False
-        while not _try_lock(lock.fileno()):
-            if not told:
-                say("another set-up is at work in this folder; waiting for it")
-                told = True
-            time.sleep(0.5)
-        yield  # closing the file frees the lock, also when this process dies
-
-
-def _try_lock(handle: int) -> bool:
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            os.lseek(handle, 0, os.SEEK_SET)
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
-
-
 def set_up(environment: Environment, python: str) -> float:
     """Makes `environment` with `python` unless it is ready; returns the seconds it took.
 
@@ -292,7 +263,8 @@ def set_up(environment: Environment, python: str) -> float:
     if environment.ready():
         return 0.0
     try:
-        with locked(environment.folder.parent / ".splannequin-setup.lock"):
+        wait = functools.partial(say, "another set-up is at work in this folder; waiting for it")
+        with locked(environment.folder.parent / ".splannequin-setup.lock", wait):
             if not environment.ready():
                 _make(environment, python)
     except OSError as error:

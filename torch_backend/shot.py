@@ -14,8 +14,9 @@ import json
 import os
 import re
 import shutil
+import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,39 @@ def _replace(source: Path, target: Path) -> None:
             if os.name != "nt" or attempt == 39:
                 raise
             time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
+    """Holds a lock file, after waiting for whoever has it; `waiting` is called once if it has to.
+
+    The system frees it when this process ends, however that comes about.
+    """
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a+b") as lock:
+        told = False
+        while not _try_lock(lock.fileno()):
+            if not told and waiting is not None:
+                waiting()
+                told = True
+            time.sleep(0.2)
+        yield
+
+
+def _try_lock(handle: int) -> bool:
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            os.lseek(handle, 0, os.SEEK_SET)
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:

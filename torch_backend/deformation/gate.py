@@ -5,8 +5,8 @@ price on motion (`supervision.stillness`), and when the Gaussians have stopped m
 closed for good, their mean change kept. Closed Gaussians never touch the field: no cost, no drift, nothing to anchor.
 
 The error of the static model was tried as the judge, and is a poor one: where a surface is hard to fit it is as large
-as where something moves (area under the curve against the truth 0.60 to 0.97, docs/benchmarks.md), while motion that
-is worth its price to several frames in a row is rarely anything else.
+as where something moves (figures in docs/architecture.md), while motion that is worth its price to several frames in a
+row is rarely anything else.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def change_of(
 
     Args:
         rows: [M] who.
-        moments: their deltas [M] at times spread over the clip; gone through twice.
+        moments: their deltas [M] at times spread over the clip.
         pixels: [M] pixels per scene unit where each is seen from nearest.
 
     Returns:

@@ -27,7 +27,7 @@ from .needs import modelled
 from .trainer import Trainer, restore_model
 
 _TOO_MUCH_MOTION = 0.25
-"""Share of open Gaussians above which the artist is told (holding still opens 0.03 to 0.10: docs/benchmarks.md)."""
+"""Share of open Gaussians above which the artist is told (holding still left 0.03 to 0.21 open: docs/benchmarks.md)."""
 
 
 @dataclass
