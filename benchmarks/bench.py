@@ -67,6 +67,8 @@ ABLATIONS = (
     Ablation("no hidden loss", "hexplane", "paper", {"supervision.weight_hidden": 0.0}),
     Ablation("no defective loss", "hexplane", "paper", {"supervision.weight_defective": 0.0}),
     Ablation("no confidence weighting", "hexplane", "paper", {"supervision.tau": 0.0}),
+    Ablation("canonical parameters pulled too", "hexplane", "paper", {"supervision.pulls": "all"}),
+    Ablation("canonical parameters pulled too", "mlp", "paper", {"supervision.pulls": "all"}),
     Ablation("detector: weight", "hexplane", "paper", training={"detector": "weight"}),
     Ablation("detector: grad_signed", "hexplane", "paper", training={"detector": "grad_signed"}),
     Ablation("gate, no anchors", "auto", "none"),

@@ -30,7 +30,7 @@ class GateConfig:
 
     start: float = 1.0 / 3.0
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""
-    harden: float = 0.6
+    harden: float = 0.45
     """Share of the run at which what did not move is closed for good."""
     give_up: float = 0.75
     """Share of the run until which that is put off while nothing moves yet: some fields take their time."""

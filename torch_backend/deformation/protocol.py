@@ -213,10 +213,17 @@ def rate_scale(published: int, iterations: int) -> float:
 
 
 def apply_deltas(
-    model: Gaussians, rows: Tensor, deltas: Deltas | None, rules: Mapping[str, Rule] | None = None
+    model: Gaussians,
+    rows: Tensor,
+    deltas: Deltas | None,
+    rules: Mapping[str, Rule] | None = None,
+    canonical: bool = True,
 ) -> dict[str, Tensor]:
-    """The model's parameters with `deltas` met at `rows` [M] by a host's `rules`; without deltas the canonical ones."""
-    state: dict[str, Tensor] = {name: model.params[name] for name in PARAM_NAMES}
+    """The model's parameters with `deltas` met at `rows` [M] by a host's `rules`; without deltas the canonical ones.
+
+    canonical: whether gradients reach the canonical parameters; if not, they reach the deltas alone.
+    """
+    state: dict[str, Tensor] = {n: model.params[n] if canonical else model.params[n].detach() for n in PARAM_NAMES}
     if deltas is None or len(rows) == 0:
         return state
     # Indexing costs ten times the sum; where all move there is nothing to index. A GPU would have to be asked.

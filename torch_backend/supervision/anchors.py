@@ -44,7 +44,11 @@ class SupervisionConfig:
     detector: str = "grad_norm"
     """`paper`, which Gaussians an image acts on. grad_norm: by the norm of the screen gradient, as the paper says;
     grad_signed: by its signed sum over x and y, as the published code does; weight: by what they contribute."""
-    support_every: int = 2
+    pulls: str = "field"
+    """`paper`, what its terms pull. field: the field alone. all: the canonical parameters too, as the published code
+    does (method-hosts 2.11): it detaches the reference state and not what both states share, so canonical parameters
+    follow a difference that does not depend on them. Published configurations (`host_config`) set all."""
+    support_every: int = 4
     """`support` acts every so many iterations."""
     support_weight: float = 0.2
     """`support`: weight of the whole term (docs/benchmarks.md)."""
@@ -71,6 +75,8 @@ class SupervisionConfig:
     def __post_init__(self) -> None:
         if self.anchor not in ("hidden", "unsupported"):
             raise ValueError(f"anchor is {self.anchor!r}: it should be hidden or unsupported")
+        if self.pulls not in ("all", "field"):
+            raise ValueError(f"pulls is {self.pulls!r}: it should be all or field")
 
 
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}

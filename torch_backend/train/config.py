@@ -144,6 +144,8 @@ def config_from_params(params: TrainParams) -> TrainConfig:
     config.supervision.preset, config.supervision.detector = params.supervision, params.detector
     config.host = params.method if params.method in hosts() else params.host
     config.host_config = params.host_config
+    if params.host_config == "reference":
+        config.supervision.pulls = "all"
     config.field = host_config(config.host, config.host_config, config.iterations)
     if params.holdout >= 0:
         config.holdout = params.holdout

@@ -56,10 +56,13 @@ class DynamicModel:
         """All parameters where `deltas` have met those of rows [M], with gradients."""
         return apply_deltas(self.gaussians, rows, deltas, None if self.field is None else self.field.rules)
 
-    def state_at(self, time: float) -> dict[str, Tensor]:
-        """All parameters at a normalised time, with gradients."""
-        rows = self.open_rows()
-        return self.moved(rows, self.deltas(rows, torch.tensor([time], device=self.device)))
+    def state_at(self, time: float, canonical: bool = True) -> dict[str, Tensor]:
+        """All parameters at a normalised time, with gradients: of the field, and of the `canonical` ones or not."""
+        rows, when = self.open_rows(), torch.tensor([time], device=self.device)
+        if canonical or self.field is None or not len(rows):
+            return self.moved(rows, self.deltas(rows, when))
+        deltas = self.field(self.gaussians.params["means"].detach()[rows], when, self.gaussians.own(rows))
+        return apply_deltas(self.gaussians, rows, deltas, self.field.rules, canonical=False)
 
 
 def render(

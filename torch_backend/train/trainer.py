@@ -438,9 +438,13 @@ class Trainer:
         other_out = self._render(other_state, other)
         exposed = self.model.exposure.apply(other_out.colors[0], self.times[other])
         photometric(exposed, self._image(other), self.config.dssim).backward(retain_graph=True)
+        other_acted = self._acted(other, rows, other_state, other_out)
+        every = self.config.supervision.pulls == "all"
+        if not every:
+            other_state = self.model.state_at(self.times[other], canonical=False)
         views = [
-            self._paper_view(self.model.state_at(self.times[frame]), frame, rows, acted),
-            self._paper_view(other_state, other, rows, self._acted(other, rows, other_state, other_out)),
+            self._paper_view(self.model.state_at(self.times[frame], canonical=every), frame, rows, acted),
+            self._paper_view(other_state, other, rows, other_acted),
         ]
         loss = paper_loss(views[0], views[1], self.progress, self.config.supervision)
         if loss is not None and bool(torch.isfinite(loss)):

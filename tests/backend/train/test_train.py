@@ -89,6 +89,27 @@ def test_every_method_and_preset_of_supervision_runs(world, quiet, method, super
         assert all(bool(torch.isfinite(v).all()) for v in again.state_at(0.4).values())
 
 
+@pytest.mark.parametrize("host", ["hexplane", "control_points"])
+def test_a_state_can_be_asked_for_without_pulling_what_is_canonical(world, quiet, host):
+    train_shot(world.shot, short(world, f"pull-{host}", method=host), quiet())
+    model = load_run(world.shot, f"pull-{host}").model
+    with torch.no_grad():
+        for p in model.field.parameters():
+            p += 0.01 * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
+    params = [model.gaussians.params[name].requires_grad_() for name in sorted(PARAM_NAMES)]
+    reached = {}
+    for canonical in (True, False):
+        state = model.state_at(0.4, canonical=canonical)
+        total = sum(value.sum() for value in state.values())
+        pulls = torch.autograd.grad(total, [*params, *model.field.parameters()], allow_unused=True)
+        reached[canonical] = state, [pull is not None and bool((pull != 0).any()) for pull in pulls]
+    for name in PARAM_NAMES:
+        torch.testing.assert_close(reached[True][0][name], reached[False][0][name], rtol=0, atol=0)
+    assert all(reached[True][1][: len(params)])
+    assert not any(reached[False][1][: len(params)])
+    assert sum(reached[False][1]) >= 4
+
+
 @pytest.mark.parametrize("host", ["mlp", "control_points"])
 def test_any_host_works_behind_the_gate_and_resumes(world, quiet, host, monkeypatch):
     """More Gaussians, split and pruned while the field is there: a host's own parameters grow with them."""
