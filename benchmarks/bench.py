@@ -69,6 +69,12 @@ ABLATIONS = (
     Ablation("no confidence weighting", "hexplane", "paper", {"supervision.tau": 0.0}),
     Ablation("canonical parameters pulled too", "hexplane", "paper", {"supervision.pulls": "all"}),
     Ablation("canonical parameters pulled too", "mlp", "paper", {"supervision.pulls": "all"}),
+    Ablation(
+        "a tenth of the weights",
+        "control_points",
+        "paper",
+        {"supervision.weight_hidden": 1.0, "supervision.weight_defective": 1.0},
+    ),
     Ablation("detector: weight", "hexplane", "paper", training={"detector": "weight"}),
     Ablation("detector: grad_signed", "hexplane", "paper", training={"detector": "grad_signed"}),
     Ablation("gate, no anchors", "auto", "none"),

@@ -58,6 +58,8 @@ _INSTANTS = 16
 class ControlPointsConfig(HostConfig):
     """Sizes, learning rates and weights; SC-GS' numbers in brackets (arguments/__init__.py, utils/time_utils.py)."""
 
+    still: float = 0.1
+    """As in `HostConfig`. Smooth by itself, the host bends few walls, and a full price keeps it from moving people."""
     nodes: int = 192
     """Most nodes at the start (512); fewer where there are few Gaussians to move."""
     hyper: int = 2

@@ -39,6 +39,8 @@ PUBLISHED_ITERATIONS = 40_000
 class MlpConfig(HostConfig):
     """Sizes and learning rates; Deformable 3DGS' numbers in brackets (utils/time_utils.py, arguments/__init__.py)."""
 
+    still: float = 0.1
+    """As in `HostConfig`. Smooth by itself, the host bends few walls, and a full price keeps it from moving people."""
     depth: int = 4
     """Layers of the trunk; the input joins again after the middle one (8)."""
     width: int = 64

@@ -91,6 +91,8 @@ class HostConfig:
     """Share of the run at which the field joins where all Gaussians move (behind the gate, the gate says when)."""
     detached: float = 0.0
     """Until this share the images move the Gaussians through the deformation, but not the field."""
+    still: float = 1.0
+    """Share of `support`'s price on motion (`supervision.stillness`) that the host's deltas pay."""
 
 
 @dataclass

@@ -182,7 +182,8 @@ class Trainer:
         loss = photometric(exposed, self._image(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
         if deltas is not None and self.config.supervision.preset == "support":
-            total = total + stillness(deltas, len(self.model.gaussians), loss, self.progress, self.config.supervision)
+            price = stillness(deltas, len(self.model.gaussians), loss, self.progress, self.config.supervision)
+            total = total + self.config.field.still * price
         if self._refines_poses():
             total = total + self.poses.regularisation()
         if pairs is not None and anchored is not None:
