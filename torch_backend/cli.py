@@ -233,6 +233,11 @@ def parser() -> argparse.ArgumentParser:
     job = commands.add_parser("run-job", help="run the job in a folder (what Blender starts)")
     job.add_argument("folder")
 
+    live = commands.add_parser("live", help="draw frozen views as they are asked for on standard input (for Blender)")
+    live.add_argument("shot", help="shot folder")
+    live.add_argument("--run", default="main", help="name of the run")
+    _add_device_flag(live)
+
     whole = commands.add_parser("freeze", help="clip to frozen frames: import, solve, train, freeze")
     whole.add_argument("clip", help="video file, image sequence or pattern (shot.####.exr)")
     whole.add_argument("--output", default="output", metavar="DIR", help="folder for the shot and summary.json")
@@ -345,6 +350,10 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
         return run_job(args.folder)[0]
     if args.command == "freeze":
         return freeze_clip(args, console)
+    if args.command == "live":
+        from .live import run_live
+
+        return run_live(args.shot, args.run, args.device)
     if args.command == "import":
         params = contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height)
         run_station(Shot.create(args.shot), "import", params, console)

@@ -114,9 +114,37 @@ def render_frozen(
     return FrozenImage(color.clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1]).cpu()
 
 
-@torch.no_grad()
+@dataclass
+class Instant:
+    """A trained frame as a place for time to stand still."""
+
+    index: int
+    """Index into the trained frames."""
+    score: float
+    """Higher is better; comparable within one ranking."""
+    seen: float
+    """Share of what moves that this frame saw, 0 to 1; 1 where nothing moves."""
+    sharpness: float
+    """Share of the trained frames whose plates are not sharper, 0 to 1."""
+
+
 def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> int:
-    """Index of the frame to freeze: among trained frames, the one that saw most of what moves and whose plate is sharp.
+    """Index of the frame to freeze: the best of `rank_instants`, which has the arguments."""
+    return max(rank_instants(model, times, sharpness), key=lambda instant: instant.score).index
+
+
+def best_instants(instants: list[Instant], count: int = 5, apart: float = 0.08) -> list[Instant]:
+    """Up to `count` of a ranking, best first, at least `apart` of the trained frames from each other."""
+    chosen: list[Instant] = []
+    for instant in sorted(instants, key=lambda i: -i.score):
+        if all(abs(instant.index - other.index) >= apart * len(instants) for other in chosen):
+            chosen.append(instant)
+    return chosen[:count]
+
+
+@torch.no_grad()
+def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> list[Instant]:
+    """Every trained frame as an instant to freeze: one that saw most of what moves and whose plate is sharp is good.
 
     Gaussians count by how far they travel, so that people weigh more than a flickering lamp.
 
@@ -127,7 +155,7 @@ def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray
     rows = model.open_rows()
     rank = np.argsort(np.argsort(sharpness)) / max(1, len(sharpness) - 1)
     if not len(rows) or model.field is None:
-        return int(np.argmax(rank))
+        return [Instant(n, float(r), 1.0, float(r)) for n, r in enumerate(rank)]
     instants = torch.linspace(0, 1, 12, device=model.device)
     moves = [model.deltas(rows, instants[n : n + 1]) for n in range(len(instants))]
     places = torch.stack([move.means for move in moves if move is not None])
@@ -135,5 +163,7 @@ def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray
     support = model.gaussians.support[rows].float()
     seen = (travel[:, None] * support).sum(0) / travel.sum().clamp_min(1e-9)
     bins = [int((model.centres - float(t)).abs().argmin()) for t in times]
-    score = seen.cpu().numpy()[bins]
-    return int(np.argmax(score / max(float(score.max()), 1e-6) + 0.5 * rank))
+    share = seen.cpu().numpy()[bins]
+    scores = share / max(float(share.max()), 1e-6) + 0.5 * rank
+    told = zip(scores.tolist(), share.tolist(), rank.tolist(), strict=True)
+    return [Instant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(told)]

@@ -175,7 +175,7 @@ def _render_all(
             continue
         if frozen is None or output.t_star != at:
             frozen, at = (
-                freeze_at(run.model, scene.time_of_frame(output.t_star), _span(scene, run), query),
+                freeze_at(run.model, scene.time_of_frame(output.t_star), span_of(scene, run), query),
                 output.t_star,
             )
         exposed_at = scene.time_of_frame(output.exposed_like)
@@ -184,7 +184,7 @@ def _render_all(
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
 
 
-def _span(scene: Scene, run: LoadedRun) -> float:
+def span_of(scene: Scene, run: LoadedRun) -> float:
     """Seconds between the first and the last trained frame."""
     at = {frame: second for frame, second in zip(scene.frames, scene.seconds, strict=True)}
     return max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
@@ -233,7 +233,7 @@ def _finish(
     if note:
         report.warning(note)
     report.progress("finishing the take", 2, 3, "PLY")
-    frozen = freeze_at(run.model, scene.time_of_frame(t_star), _span(scene, run), params.query)
+    frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), params.query)
     _write_ply(folder / "frozen.ply", frozen, scene)
     facts = {
         "version": 1,

@@ -1,0 +1,157 @@
+"""A live session as Blender holds one: a child process, views in, frames out."""
+
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torch_backend.contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, read_message, write_message
+from torch_backend.footage.color import linear_to_srgb
+from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.live import _Waiting
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def session(trained):
+    """The child after its `ready`, and that message."""
+    world, _ = trained
+    child = start(world.shot.root)
+    header, body = read_message(child.stdout)
+    assert body == b""
+    yield child, header
+    child.stdin.close()
+    assert child.wait(20) == 0
+    child.stdout.close()
+
+
+def start(shot, run="main"):
+    command = [sys.executable, "-m", "torch_backend", "live", str(shot), "--run", run, "--device", "cpu"]
+    return subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+
+def view_of(world, frame, t_star, width=64, height=48, **more):
+    path = CameraPath.load(world.shot.solve / "cameras.json")
+    camera = next(f for f in path.frames if f.frame == frame)
+    x, y = width / path.width, height / path.height
+    k = [camera.K[0] * x, camera.K[1] * y, camera.K[2] * x, camera.K[3] * y]
+    facts = {"view": 1, "seq": 7, "viewmat": camera.viewmat, "K": k, "width": width, "height": height}
+    return {"kind": "view", **facts, "t_star": t_star, **more}
+
+
+def picture(answer):
+    header, body = answer
+    assert header["kind"] == "frame", header
+    w, h = header["width"], header["height"]
+    values = np.frombuffer(body, np.float32)
+    return values[: 4 * w * h].reshape(h, w, 4), values[4 * w * h :].reshape(h, w)
+
+
+def ask(child, header):
+    write_message(child.stdin, header)
+    return read_message(child.stdout)
+
+
+def test_ready_tells_what_there_is_to_freeze(session, trained):
+    _, summary = trained
+    header = session[1]
+    assert header["kind"] == "ready"
+    assert (header["first"], header["last"]) == (101, 116)
+    assert header["gaussians"] == summary["gaussians"]
+    assert 0 < header["moving"] < header["gaussians"]
+    frames = [s["frame"] for s in header["suggestions"]]
+    assert len(frames) >= 2
+    assert len(frames) == len(set(frames))
+    assert set(frames) <= set(header["trained"])
+    assert all(0 <= s["seen"] <= 1 and 0 <= s["sharpness"] <= 1 for s in header["suggestions"])
+
+
+def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
+    world, _ = trained
+    freeze_shot(world.shot, FreezeParams(take="live", t_star=112, first=105, last=105), quiet())
+    want = read_frozen_exr(world.shot.take("live") / "000105.exr")
+    rgba, depth = picture(ask(session[0], view_of(world, 105, 112.2, exposed_like=105.0)))
+    seen = want.rgba[..., 3] > 0.99
+    assert seen.mean() > 0.9
+    assert np.abs(rgba[..., :3] - linear_to_srgb(want.rgba[..., :3]))[seen].max() < 4e-3
+    assert np.abs(depth[seen] / want.depth[seen] - 1).max() < 1e-3
+    assert bool((depth[rgba[..., 3] == 0] == np.float32(NO_DEPTH)).all())
+    for show in ("support", "motion"):
+        matte, _ = picture(ask(session[0], view_of(world, 105, 112, show=show)))
+        assert np.abs(matte[..., 0] - getattr(want, show) * want.rgba[..., 3]).max() < 4e-3
+
+
+def test_two_instants_differ_where_the_patch_moved(session, trained):
+    world, _ = trained
+    early, late = (picture(ask(session[0], view_of(world, 108, t)))[0] for t in (105, 112))
+    truth = (world.image(7, 4 / 15) - world.image(7, 11 / 15)).abs().mean(-1).numpy()
+    assert np.abs(early - late)[truth > 0.1].mean() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"show": "beauty"}, "color, support, motion"),
+        ({"width": 0}, "pixels"),
+        ({"t_star": 1e400}, None),
+        ({"more": 1}, "no field"),
+    ],
+)
+def test_a_request_that_makes_no_sense_is_answered_in_words_and_the_session_goes_on(session, trained, change, words):
+    world, _ = trained
+    asked = {**view_of(world, 105, 105), **change}
+    if words is None:
+        with pytest.raises(ValueError, match="JSON"):
+            write_message(session[0].stdin, asked)
+    else:
+        header, _ = ask(session[0], asked)
+        assert (header["kind"], header["seq"]) == ("error", 7)
+        assert words in header["message"]
+    picture(ask(session[0], view_of(world, 105, 105)))
+
+
+def test_a_shot_without_the_run_ends_in_a_sentence(trained):
+    world, _ = trained
+    child = start(world.shot.root, "other")
+    header, _ = read_message(child.stdout)
+    assert header["kind"] == "error"
+    assert "'other'" in header["message"]
+    assert child.wait(20) == ExitCode.FREEZE
+    for pipe in (child.stdin, child.stdout):
+        pipe.close()
+
+
+def test_newer_requests_replace_those_that_wait(trained):
+    world, _ = trained
+    stream = io.BytesIO()
+    for seq, view in ((1, 1), (2, 2), (3, 1)):
+        write_message(stream, {**view_of(world, 105, 105), "seq": seq, "view": view})
+    stream.seek(0)
+    waiting = _Waiting()
+    waiting.read(stream)
+    waiting._ended = False
+    assert [waiting.next().seq, waiting.next().seq] == [3, 2]
+
+
+def test_messages_survive_a_pipe_that_gives_little_at_a_time():
+    class Slow(io.BytesIO):
+        def read(self, count=-1):
+            return super().read(min(count, 3))
+
+    stream = Slow()
+    write_message(stream, {"kind": "x"}, b"abcdefgh")
+    whole = stream.getvalue()
+    stream.seek(0)
+    assert read_message(stream) == ({"kind": "x"}, b"abcdefgh")
+    assert read_message(stream) is None
+    assert read_message(io.BytesIO(whole[:-1])) is None
+    with pytest.raises(ValueError, match="no message"):
+        read_message(io.BytesIO(b"Traceback (most recent call last):"))
+    with pytest.raises(ValueError, match="JSON object"):
+        read_message(io.BytesIO(whole.replace(json.dumps({"kind": "x"}).encode(), b'["kind", "x"]')[:]))
