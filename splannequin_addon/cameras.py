@@ -19,7 +19,7 @@ from ..torch_backend import contract
 from . import compat, compositor, shots
 
 _TAG = "splannequin"
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenCV camera axes to Blender's, and back."""
 SENSOR_MM = 36.0
 """Width given to the camera's sensor. Only its ratio to the focal length matters."""
@@ -34,7 +34,7 @@ def camera_to_world(viewmat: np.ndarray) -> np.ndarray:
     Returns:
         Camera-to-world with Blender's camera axes, [4, 4] float64, in the same world.
     """
-    return np.linalg.inv(np.asarray(viewmat, dtype=np.float64)) @ _FLIP
+    return np.linalg.inv(np.asarray(viewmat, dtype=np.float64)) @ FLIP
 
 
 def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -> tuple[float, float, float]:

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, jobs, steps, supervisor
+from . import backend, bake, jobs, steps, supervisor, viewport
 
 
 class _StepOperator:
@@ -219,6 +219,68 @@ class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class SPLANNEQUIN_OT_live(bpy.types.Operator):
+    """Draw the frozen instant over the 3D view while you scrub t* and move the view; press again to stop"""
+
+    bl_idname = "splannequin.live"
+    bl_label = "Scrub in View"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off without a trained run, and where there is no view."""
+        if bpy.app.background:
+            cls.poll_message_set("There is no 3D view")
+            return False
+        folder = steps.shot_folder(context.scene)
+        state = supervisor.watch_of(folder).state if folder else None
+        if state is None or context.scene.splannequin.run_name not in state.runs:
+            cls.poll_message_set("Train first")
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Starts or stops the session."""
+        if viewport.session() is not None:
+            viewport.end()
+            return {"FINISHED"}
+        try:
+            viewport.begin(context.scene)
+        except contract.JobError as error:
+            self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
+    """Set t* to the previous or next suggested instant: one that saw most of what moves, and whose plate is sharp"""
+
+    bl_idname = "splannequin.suggested_instant"
+    bl_label = "Suggested Instant"
+    bl_options = {"REGISTER", "UNDO"}
+
+    step: bpy.props.IntProperty(name="Step", description="1: the next one, -1: the one before", default=1)
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """On while scrubbing: the backend ranks the instants."""
+        if not viewport.suggestions():
+            cls.poll_message_set("Suggestions come with Scrub in View")
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Takes the nearest suggestion on that side; at the end, the first on the other."""
+        props = context.scene.splannequin
+        frames = sorted(s["frame"] for s in viewport.suggestions())
+        now = viewport.instant(context.scene)
+        beyond = [f for f in frames if now is None or (f - now) * self.step > 0]
+        ordered = beyond or frames
+        props.t_star = ordered[0] if self.step > 0 else ordered[-1]
+        props.choose_t_star = True
+        return {"FINISHED"}
+
+
 def _edit(operator: Any, context: Any, step: str, change: Any) -> set[str]:
     """Runs a change of the scene; says what was done or why not."""
     folder = steps.shot_folder(context.scene)
@@ -247,4 +309,6 @@ CLASSES = (
     SPLANNEQUIN_OT_insert_freeze,
     SPLANNEQUIN_OT_remove_shot,
     SPLANNEQUIN_OT_t_star_here,
+    SPLANNEQUIN_OT_live,
+    SPLANNEQUIN_OT_suggested_instant,
 )

@@ -11,7 +11,7 @@ from typing import Any
 
 import bpy
 
-from . import cameras, compat, compositor, scene_setup, shots, steps, supervisor
+from . import cameras, compat, compositor, scene_setup, shots, steps, supervisor, viewport
 
 CATEGORY = "Splannequin"
 
@@ -312,6 +312,24 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         value.enabled = props.choose_t_star
         value.prop(props, "t_star", text="")
         row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
+        self._live(context, layout)
+
+    def _live(self, context: Any, layout: Any) -> None:
+        """Scrubbing: on or off, what is shown, suggestions and why."""
+        session = viewport.session()
+        row = layout.row(align=True)
+        icon = "PAUSE" if session is not None else "HIDE_OFF"
+        text = "Stop Scrubbing" if session is not None else "Scrub in View"
+        row.operator("splannequin.live", text=text, icon=icon, depress=session is not None)
+        if session is None:
+            told = viewport.failure()
+            if told is not None:
+                wrap(layout, context, f"{told[0]} {told[1]}".strip(), "ERROR")
+            return
+        row.operator("splannequin.suggested_instant", text="", icon="TRIA_LEFT").step = -1
+        row.operator("splannequin.suggested_instant", text="", icon="TRIA_RIGHT").step = 1
+        layout.row().prop(context.scene.splannequin, "live_show", expand=True)
+        wrap(layout, context, viewport.reason(context.scene), "INFO")
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The take's name."""

@@ -56,6 +56,17 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
     t_star: IntProperty(
         name="t*", description="Frame number of the clip at which time stands still", default=1, options=set()
     )
+    live_show: EnumProperty(
+        name="Show",
+        description="What is drawn over the view while scrubbing",
+        items=[
+            ("color", "Picture", "The frozen people and place"),
+            ("guesses", "Guesses", "The picture, tinted where no frame near t* saw what is shown"),
+            ("support", "Support", "White where frames near t* saw what is shown, black where it is a guess"),
+            ("motion", "Motion", "White where something moves in the clip"),
+        ],
+        options=set(),
+    )
     take_name: StringProperty(
         name="Take", description="Name of the frozen frames; a new name keeps the old", default="freeze", options=set()
     )

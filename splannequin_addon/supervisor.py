@@ -16,7 +16,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, jobs, shots, steps
+from . import backend, jobs, shots, steps, viewport
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
@@ -184,6 +184,7 @@ def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
 @persistent
 def _on_load(*_: Any) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
+    viewport.end()
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     for watch in _watches.values():
@@ -230,6 +231,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Undoes `register`. Running jobs go on."""
+    viewport.end()
     if bpy.app.timers.is_registered(tick):
         bpy.app.timers.unregister(tick)
     bpy.app.handlers.render_cancel.remove(_on_render_end)

@@ -344,7 +344,7 @@ class LiveView:
     exposed_like: float | None = None
     """Frame number whose exposure the camera has; None: t*'s."""
     show: str = "color"
-    """color; or support or motion: that matte in the place of the colour."""
+    """color; guesses: colour, tinted where nobody saw it near t*; support or motion: that matte as a grey picture."""
 
     def __post_init__(self) -> None:
         if len(self.viewmat) != 16 or len(self.K) != 4:
@@ -359,7 +359,7 @@ class LiveView:
 
 LIVE_LIMIT = 8192
 """Most pixels of a live view along a side."""
-LIVE_SHOWS = ("color", "support", "motion")
+LIVE_SHOWS = ("color", "guesses", "support", "motion")
 """What a live view can show."""
 _MESSAGE = struct.Struct("<4sIQ")
 """Before every message: a mark, bytes of the header, bytes of the body."""

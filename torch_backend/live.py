@@ -33,6 +33,8 @@ from .train import choose_device, load_run
 
 _INSTANTS_KEPT = 8
 """Frozen scenes that are kept: going back and forth between keys costs no evaluation of the field."""
+_TINT, _TINTED = (1.0, 0.15, 0.55), 0.75
+"""Display-referred colour of what is a guess, and how much of it covers what nobody saw at all."""
 
 
 class LiveSession:
@@ -87,7 +89,13 @@ class LiveSession:
             self.scene.time_of_frame(like),
         )
         alpha = image.alpha[..., None]
-        shown = image.color if view.show == "color" else getattr(image, view.show)[..., None].expand(-1, -1, 3) * alpha
+        if view.show == "color":
+            shown = image.color
+        elif view.show == "guesses":
+            guess = _TINTED * (1.0 - image.support)[..., None]
+            shown = image.color * (1.0 - guess) + guess * alpha * torch.tensor(_TINT, device="cpu")
+        else:
+            shown = getattr(image, view.show)[..., None].expand(-1, -1, 3) * alpha
         depth = torch.where(image.depth < NO_DEPTH, image.depth / self.scene.scale, NO_DEPTH)
         body = torch.cat([shown.clamp(0.0, 1.0), alpha], dim=2).contiguous().numpy().tobytes() + depth.numpy().tobytes()
         header = {

@@ -82,6 +82,10 @@ def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
     assert np.abs(rgba[..., :3] - linear_to_srgb(want.rgba[..., :3]))[seen].max() < 4e-3
     assert np.abs(depth[seen] / want.depth[seen] - 1).max() < 1e-3
     assert bool((depth[rgba[..., 3] == 0] == np.float32(NO_DEPTH)).all())
+    tinted, _ = picture(ask(session[0], view_of(world, 105, 112, show="guesses", exposed_like=105.0)))
+    changed = np.abs(tinted - rgba)[..., :3].max(-1)
+    assert changed[seen & (want.support > 0.999)].max() < 4e-3
+    assert changed[seen & (want.support < 0.5)].min() > 0.02
     for show in ("support", "motion"):
         matte, _ = picture(ask(session[0], view_of(world, 105, 112, show=show)))
         assert np.abs(matte[..., 0] - getattr(want, show) * want.rgba[..., 3]).max() < 4e-3
@@ -97,7 +101,7 @@ def test_two_instants_differ_where_the_patch_moved(session, trained):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"show": "beauty"}, "color, support, motion"),
+        ({"show": "beauty"}, "color, guesses, support, motion"),
         ({"width": 0}, "pixels"),
         ({"t_star": 1e400}, None),
         ({"more": 1}, "no field"),

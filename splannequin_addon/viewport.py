@@ -1,0 +1,288 @@
+"""Scrubbing: the frozen instant drawn over the 3D view by the warm backend, in front of and behind what is there.
+
+A view asks for what it shows, at a size that is drawn at once; left alone, it asks again, sharper. What has arrived is
+drawn until something newer has. Nothing of bpy is kept between two draws but the handler.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from gpu_extras.batch import batch_for_shader
+from mathutils import Matrix
+
+from ..torch_backend import contract
+from . import backend, cameras, live, steps
+
+TICK_SECONDS = 1 / 60
+QUICK_PIXELS = 320 * 180
+"""Most pixels of a view while it changes."""
+SHARP_PIXELS = 960 * 540
+"""Most pixels once it rests."""
+_REST_SECONDS = 0.35
+
+_session: live.Session | None = None
+_handler: Any = None
+_shader: Any = None
+_told: tuple[str, str] | None = None
+"""Why the last session ended, (sentence, hint)."""
+_shown: dict[int, tuple[int, Any, Any]] = {}
+"""View -> (seq of the frame, texture of its colour, of its depth)."""
+_moved: dict[int, float] = {}
+"""View -> when it last showed something else, monotonic seconds."""
+
+
+def session() -> live.Session | None:
+    """The live session, if there is one that draws."""
+    return _session if _session is not None and _session.open else None
+
+
+def failure() -> tuple[str, str] | None:
+    """Why the last session ended, (sentence, hint); None if it was ended on purpose."""
+    return _told
+
+
+def begin(scene: Any) -> None:
+    """Starts drawing the scene's run. JobError if there is no run, no backend, or no window."""
+    global _session, _handler, _told
+    if bpy.app.background:
+        raise contract.JobError("There is no view to draw in.", "Use Freeze.", contract.ExitCode.USAGE)
+    shot, run = steps.shot_folder(scene), scene.splannequin.run_name
+    if shot is None or not (shot / "runs" / run / "checkpoint.safetensors").is_file():
+        raise contract.JobError(f"There is no trained run {run!r}.", "Train first.", contract.ExitCode.USAGE)
+    end()
+    _told = None
+    _session = live.open_session(shot, run, backend.python(), backend.package_root())
+    _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+    bpy.app.timers.register(_tick, first_interval=TICK_SECONDS, persistent=True)
+
+
+def end() -> None:
+    """Stops drawing; the backend's process ends and frees what it held."""
+    global _session, _handler
+    if _session is not None:
+        _session.close()
+        _session = None
+    if _handler is not None:
+        bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
+        _handler = None
+    _shown.clear()
+    _moved.clear()
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+    redraw()
+
+
+def instant(scene: Any) -> float | None:
+    """The frame at which time stands still in the view: the artist's t*, else the best suggestion; None before any."""
+    props = scene.splannequin
+    if props.choose_t_star:
+        return float(props.t_star)
+    suggested = _session.facts.get("suggestions") if _session is not None else None
+    return float(suggested[0]["frame"]) if suggested else None
+
+
+def suggestions() -> list[dict[str, Any]]:
+    """Instants worth freezing, best first: frame, seen and sharpness in 0..1; empty before the backend has said."""
+    return list(_session.facts.get("suggestions", [])) if _session is not None else []
+
+
+def reason(scene: Any) -> str:
+    """One sentence about the instant in the view: why it is a good one, or where better ones are."""
+    if _session is None or not _session.facts:
+        return "The backend is loading the run."
+    at = instant(scene)
+    shown = {frame.t_star for frame in _session.frames.values()}
+    for rank, one in enumerate(suggestions()):
+        if one["frame"] == at:
+            share, sharp = round(100 * one["seen"]), round(100 * one["sharpness"])
+            return f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, as sharp as {sharp} %."
+    frames = ", ".join(str(one["frame"]) for one in suggestions())
+    snapped = f"Shown: frame {shown.pop()}. " if len(shown) == 1 and at not in shown else ""
+    return f"{snapped}Suggested: {frames}."
+
+
+def redraw() -> None:
+    """Draws every 3D view again."""
+    manager = bpy.context.window_manager
+    for window in manager.windows if manager else ():
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+_last: tuple[int, tuple[Any, ...]] = (-1, ())
+
+
+def _tick() -> float | None:
+    """Draws again when a frame has arrived, when t* changed, or when a view rests; ends with the session."""
+    global _told, _last
+    if _session is None:
+        return None
+    if _session.failure is not None:
+        _told = _session.failure
+        end()
+        return None
+    scenes = [s for s in bpy.data.scenes if steps.shot_folder(s) == _session.shot]
+    if not any(s.splannequin.run_name == _session.run for s in scenes):
+        end()  # another file, another shot or another run
+        return None
+    state = (
+        _session.drawn,
+        (bool(_session.facts), *((instant(s), s.splannequin.live_show, s.frame_current) for s in scenes)),
+    )
+    now = time.monotonic()
+    resting = [v for v, moved in _moved.items() if 0 < now - moved - _REST_SECONDS < 2 * TICK_SECONDS]
+    if state != _last or resting:
+        _last = state
+        redraw()
+    return TICK_SECONDS
+
+
+def view_of(scene: Any, shot: Path, region: Any, view: Any, t_star: float, pixels: int) -> contract.LiveView | None:
+    """What a region of a 3D view shows, as the backend is asked for it; None for an orthographic view.
+
+    Args:
+        scene: the scene whose shot is drawn.
+        shot: its shot folder.
+        region: the region, for its size.
+        view: its `RegionView3D`.
+        t_star: frame number at which time stands still.
+        pixels: most pixels to ask for.
+    """
+    window = np.array(view.window_matrix)
+    if abs(window[3, 3]) > 1e-6:
+        return None
+    shrink = min(1.0, (pixels / max(1, region.width * region.height)) ** 0.5)
+    width, height = max(1, round(region.width * shrink)), max(1, round(region.height * shrink))
+    root = cameras.find(scene, shot, "EMPTY")
+    placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
+    scale = cameras.depth_scale(scene, shot)
+    to_view = cameras.FLIP @ np.array(view.view_matrix, dtype=np.float64) @ placed
+    to_view[:3] /= scale
+    K = [
+        0.5 * width * window[0, 0],
+        0.5 * height * window[1, 1],
+        0.5 * width * (1.0 - window[0, 2]),
+        0.5 * height * (1.0 + window[1, 2]),
+    ]
+    show = scene.splannequin.live_show
+    through_clip = view.view_perspective == "CAMERA" and scene.camera == cameras.find(scene, shot, "CAMERA")
+    like = float(scene.frame_current) if through_clip else None
+    return contract.LiveView(0, 0, to_view.ravel().tolist(), K, width, height, t_star, like, show)
+
+
+def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
+    """True if both show the same, at whatever size."""
+    if (one.t_star, one.show, one.exposed_like) != (other.t_star, other.show, other.exposed_like):
+        return False
+    ks = [np.array(v.K) / (v.width, v.height, v.width, v.height) for v in (one, other)]
+    return bool(np.allclose(ks[0], ks[1], atol=2e-3) and np.allclose(one.viewmat, other.viewmat, atol=1e-6))
+
+
+def _draw() -> None:
+    """One region's part: ask for what it shows, draw what has arrived."""
+    context = bpy.context
+    scene, region, view = context.scene, context.region, context.region_data
+    if _session is None or view is None or steps.shot_folder(scene) != _session.shot:
+        return
+    t_star = instant(scene)
+    if t_star is None:
+        return
+    key = region.as_pointer() & 0x7FFFFFFF
+    wanted = view_of(scene, _session.shot, region, view, t_star, QUICK_PIXELS)
+    if wanted is None:
+        return
+    wanted.view = key
+    _ask(key, wanted, view_of(scene, _session.shot, region, view, t_star, SHARP_PIXELS))
+    frame = _session.frames.get(key)
+    if frame is not None:
+        _paint(key, frame, view, cameras.depth_scale(scene, _session.shot))
+
+
+def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView | None) -> None:
+    """Asks for the quick view if it shows something new, for the sharp one once it has rested."""
+    if _session is None:
+        return
+    asked, now = _session.wanted(key), time.monotonic()
+    if asked is None or not _same(asked, quick):
+        _moved[key] = now
+        _session.ask(quick)
+    elif sharp is not None and asked.width < sharp.width and now - _moved[key] > _REST_SECONDS:
+        if _session.busy(key):
+            return
+        sharp.view = key
+        _session.ask(sharp)
+
+
+def _paint(key: int, frame: live.Frame, view: Any, scale: float) -> None:
+    """Draws a frame over the region, each pixel at its own depth."""
+    shader = _shader_of()
+    seq, colour, depth = _shown.get(key, (-1, None, None))
+    if seq != frame.asked.seq:
+        h, w = frame.depth.shape
+        colour = gpu.types.GPUTexture((w, h), format="RGBA16F", data=_buffer(frame.rgba))
+        depth = gpu.types.GPUTexture((w, h), format="R32F", data=_buffer(frame.depth * np.float32(scale)))
+        _shown[key] = (frame.asked.seq, colour, depth)
+    window = view.window_matrix
+    batch = batch_for_shader(shader, "TRI_STRIP", {"pos": ((-1, -1), (1, -1), (-1, 1), (1, 1))})
+    gpu.state.blend_set("ALPHA_PREMULT")
+    gpu.state.depth_test_set("LESS_EQUAL")
+    gpu.state.depth_mask_set(True)
+    try:
+        shader.bind()
+        shader.uniform_sampler("colour", colour)
+        shader.uniform_sampler("range", depth)
+        shader.uniform_float("project", (window[2][2], window[2][3], window[3][2], window[3][3]))
+        batch.draw(shader)
+    finally:
+        gpu.state.depth_mask_set(False)
+        gpu.state.depth_test_set("NONE")
+        gpu.state.blend_set("NONE")
+
+
+def _buffer(values: np.ndarray) -> Any:
+    values = np.ascontiguousarray(values, dtype=np.float32)
+    return gpu.types.Buffer("FLOAT", values.size, values.ravel())
+
+
+def _shader_of() -> Any:
+    """The shader, made at the first draw: there is no GPU context before."""
+    global _shader
+    if _shader is None:
+        between = gpu.types.GPUStageInterfaceInfo("splannequin_frozen")
+        between.smooth("VEC2", "at")
+        info = gpu.types.GPUShaderCreateInfo()
+        info.vertex_in(0, "VEC2", "pos")
+        info.vertex_out(between)
+        info.push_constant("VEC4", "project")
+        info.sampler(0, "FLOAT_2D", "colour")
+        info.sampler(1, "FLOAT_2D", "range")
+        info.fragment_out(0, "VEC4", "painted")
+        if hasattr(info, "depth_write"):  # 4.4 on; OpenGL, which was the rule before, needs no word about it
+            info.depth_write("ANY")
+        info.vertex_source("void main() { at = vec2(pos.x, -pos.y) * 0.5 + 0.5; gl_Position = vec4(pos, 0.0, 1.0); }")
+        info.fragment_source(
+            """
+            void main()
+            {
+              vec4 c = texture(colour, at);
+              if (c.a < 0.01) { discard; }
+              ivec2 size = textureSize(range, 0);
+              float z = -texelFetch(range, clamp(ivec2(at * vec2(size)), ivec2(0), size - 1), 0).r;
+              float clip = (project.x * z + project.y) / (project.z * z + project.w);
+              gl_FragDepth = clamp(clip * 0.5 + 0.5, 0.0, 0.999999);
+              /* Pictures are display-referred, the view's overlay takes linear light and encodes it. */
+              vec3 shown = c.rgb / c.a;
+              vec3 light = mix(shown / 12.92, pow((shown + 0.055) / 1.055, vec3(2.4)), step(vec3(0.04045), shown));
+              painted = vec4(light * c.a, c.a);
+            }
+            """
+        )
+        _shader = gpu.shader.create_from_info(info)
+    return _shader

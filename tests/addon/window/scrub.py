@@ -1,0 +1,216 @@
+"""Scrubs t* in a real Blender window over a trained shot: how many frozen views a second, how long the main thread waits.
+
+    python tests/addon/window/scrub.py --blender BLENDER --shot SHOT.splannequin [--output docs/images]
+
+BLENDER has the extension installed, as for press_steps.py, and SPLANNEQUIN_PYTHON (or a checkout's .venv) names the
+backend. Prints the figures as JSON; pictures: the camera's view, a free view with a cube among the people, the guesses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import press_steps as press
+
+PLAN = "SPLANNEQUIN_SCRUB_PLAN"
+SWEEP_SECONDS = 10.0
+
+
+def main() -> int:
+    """The host's side: a display, Blender on it, photographs when asked for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--blender", required=True)
+    parser.add_argument("--shot", required=True, help="shot folder with a trained run `main`")
+    parser.add_argument("--output", default="docs/images")
+    parser.add_argument("--display", default=":98")
+    parser.add_argument("--limit", type=float, default=300.0)
+    args = parser.parse_args()
+    output = Path(args.output).absolute()
+    output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="splannequin-scrub-") as work:
+        environ = {**os.environ, "DISPLAY": args.display}
+        environ[PLAN] = json.dumps({"shot": str(Path(args.shot).absolute()), "work": work})
+        size = press.WINDOW
+        screen = subprocess.Popen(["Xvfb", args.display, "-screen", "0", f"{size[0]}x{size[1]}x24"])
+        try:
+            time.sleep(2.0)
+            command = [args.blender, "--gpu-backend", "opengl", "--enable-event-simulate"]
+            command += ["--window-geometry", "0", "0", str(size[0]), str(size[1]), "--python", __file__]
+            blender = subprocess.Popen(command, env=environ)
+            press._serve(blender, Path(work), output, environ, args.limit)
+        finally:
+            screen.terminate()
+            screen.wait()
+        told = Path(work) / "told.json"
+        if not told.is_file():
+            print("Error: Blender ended without telling how it went.", file=sys.stderr)
+            return 1
+        results = json.loads(told.read_text())
+        print(json.dumps(results, indent=1))
+        return 1 if "error" in results else 0
+
+
+# ------------------------------------------------------------------------------------------------- inside Blender
+
+
+def inside() -> None:
+    """Starts the script as a timer that walks through `_play`."""
+    import bpy
+
+    plan = json.loads(os.environ[PLAN])
+    told: dict[str, Any] = {"blender": bpy.app.version_string}
+    play = _play(plan, told)
+
+    def turn() -> float | None:
+        try:
+            return next(play)
+        except StopIteration:
+            pass
+        except Exception as error:  # whatever it was: told, and Blender must not stand open until the limit
+            traceback.print_exc()
+            told["error"] = f"{type(error).__name__}: {error}"
+        (Path(plan["work"]) / "told.json").write_text(json.dumps(told))
+        bpy.ops.wm.quit_blender()
+        return None
+
+    bpy.app.timers.register(turn, first_interval=2.0, persistent=True)
+
+
+def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+    import bpy
+
+    work = Path(plan["work"])
+    yield from press._arrange()
+    scene = bpy.context.scene
+    scene.splannequin.shot_path = plan["shot"]
+    viewport = _module("viewport")
+    stalls = _time(viewport, told)
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+        bpy.ops.splannequin.load_camera()
+    yield 1.0
+    yield from press._click("splannequin.live")
+    since = time.monotonic()
+    while viewport.session() is None or not viewport.session().facts:
+        if viewport.failure():
+            raise RuntimeError(" ".join(viewport.failure()))
+        if time.monotonic() - since > 30:
+            yield from press._shoot(work, "8-scrub-failed")
+            raise RuntimeError("the backend never was ready")
+        yield 0.1
+    told["ready_seconds"] = round(time.monotonic() - since, 2)
+    session = viewport.session()
+    told["facts"] = {k: session.facts[k] for k in ("gaussians", "moving", "suggestions", "width", "height")}
+    scene.splannequin.choose_t_star = True
+    trained = session.facts["trained"]
+    scene.splannequin.t_star = trained[len(trained) // 2]
+    yield 3.0
+    yield from press._shoot(work, "8-scrub-camera")
+    told["sharp_width"] = max(frame.rgba.shape[1] for frame in session.frames.values())
+    told["covered"] = round(min(float(frame.rgba[..., 3].mean()) for frame in session.frames.values()), 3)
+    stalls.clear()
+    for name, change in _sweeps(scene, trained):
+        began, drawn, n = time.monotonic(), session.drawn, 0
+        while time.monotonic() - began < SWEEP_SECONDS:
+            change(n)
+            n += 1
+            yield 0.001
+        spent = time.monotonic() - began
+        told[name] = {"frozen_views_per_second": round((session.drawn - drawn) / spent, 1), "asked": n}
+    told["main_thread_ms"] = {name: round(1000 * max(times), 1) for name, times in stalls.items()}
+    told["main_thread_mean_ms"] = {name: round(1000 * sum(t) / len(t), 2) for name, t in stalls.items()}
+    told["sweep_size"] = min((f.rgba.shape[1], f.rgba.shape[0]) for f in session.frames.values())
+    yield from _free_view(scene, work)
+    scene.splannequin.live_show = "guesses"
+    yield 2.0
+    yield from press._shoot(work, "8-scrub-guesses")
+    pid = session._process.pid
+    yield from press._click("splannequin.live")
+    since = time.monotonic()
+    while session._process.poll() is None and time.monotonic() - since < 10:
+        yield 0.05
+    told["ended"] = {"pid": pid, "exit_code": session._process.poll()}
+
+
+def _sweeps(scene: Any, trained: list[int]) -> list[tuple[str, Callable[[int], None]]]:
+    """Changes of t* over the whole clip; then a pose of the camera per turn, with t* held."""
+
+    def instants(n: int) -> None:
+        scene.splannequin.t_star = trained[(3 * n) % len(trained)]
+
+    def poses(n: int) -> None:
+        scene.frame_set(scene.frame_start + n % (scene.frame_end - scene.frame_start + 1))
+
+    return [("sweep_t_star", instants), ("sweep_camera", poses)]
+
+
+def _free_view(scene: Any, work: Path) -> Iterator[float]:
+    """A view of its own, with a cube that stands in the middle of what is seen."""
+    import bpy
+    from mathutils import Vector
+
+    window = bpy.context.window_manager.windows[0]
+    area = press._view(window)
+    region = next(r for r in area.regions if r.type == "WINDOW")
+    cloud = next(o for o in scene.objects if o.type == "MESH" and o.get("splannequin"))
+    places = sorted((cloud.matrix_world @ v.co for v in cloud.data.vertices), key=lambda p: p.y)
+    middle = sum(places[len(places) // 4 : len(places) // 2], Vector()) / max(1, len(places) // 2 - len(places) // 4)
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.mesh.primitive_cube_add(size=0.25 * (scene.camera.matrix_world.translation - middle).length)
+        bpy.context.object.location = middle
+        area.spaces.active.region_3d.view_perspective = "PERSP"
+        turn = area.spaces.active.region_3d
+        turn.view_location = middle
+        turn.view_rotation = scene.camera.matrix_world.to_quaternion()
+        turn.view_distance = 0.9 * (scene.camera.matrix_world.translation - middle).length
+    yield 2.5
+    yield from press._shoot(work, "8-scrub-free")
+
+
+def _module(name: str) -> Any:
+    found = [m for n, m in sys.modules.items() if n.endswith(f".splannequin.splannequin_addon.{name}")]
+    if not found:
+        raise RuntimeError("the extension is not enabled in this Blender")
+    return found[0]
+
+
+def _time(viewport: Any, told: dict[str, Any]) -> dict[str, list[float]]:
+    """Has everything of ours that runs on Blender's main thread timed: seconds by name, filled as it goes."""
+    import bpy
+
+    stalls: dict[str, list[float]] = {}
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any) -> Any:
+            began = time.perf_counter()
+            try:
+                return function(*args)
+            finally:
+                stalls.setdefault(name, []).append(time.perf_counter() - began)
+
+        return call
+
+    viewport._draw, viewport._tick = timed("draw", viewport._draw), timed("live tick", viewport._tick)
+    supervisor = _module("supervisor")
+    bpy.app.timers.unregister(supervisor.tick)
+    supervisor.tick = timed("tick", supervisor.tick)
+    bpy.app.timers.register(supervisor.tick, persistent=True)
+    return stalls
+
+
+if __name__ == "__main__":
+    if PLAN in os.environ and "bpy" in sys.modules:
+        inside()
+    else:
+        sys.exit(main())
