@@ -26,15 +26,27 @@ SENSOR_MM = 36.0
 
 
 def camera_to_world(viewmat: np.ndarray) -> np.ndarray:
-    """Blender's camera matrix from an OpenCV one.
+    """Blender's camera matrices from rigid OpenCV ones.
 
     Args:
-        viewmat: world-to-camera, OpenCV axes, [4, 4] float64.
+        viewmat: world-to-camera, OpenCV axes, [..., 4, 4] float64.
 
     Returns:
-        Camera-to-world with Blender's camera axes, [4, 4] float64, in the same world.
+        Camera-to-world with Blender's camera axes, [..., 4, 4] float64, in the same world.
     """
-    return np.linalg.inv(np.asarray(viewmat, dtype=np.float64)) @ FLIP
+    viewmat = np.asarray(viewmat, dtype=np.float64)
+    turned = np.swapaxes(viewmat[..., :3, :3], -1, -2)
+    result = np.zeros_like(viewmat)
+    # No LAPACK: on a busy machine its threads keep Blender's main thread waiting for milliseconds, once per frame.
+    result[..., :3, :3] = turned
+    result[..., :3, 3] = -(turned * viewmat[..., None, :3, 3]).sum(-1)
+    result[..., 3, 3] = 1.0
+    return result * np.diagonal(FLIP)
+
+
+def poses(path: contract.CameraPath) -> np.ndarray:
+    """`camera_to_world` of every frame of a path, [F, 4, 4]."""
+    return camera_to_world(np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4))
 
 
 def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -> tuple[float, float, float]:
@@ -69,7 +81,7 @@ def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarra
     Returns:
         [4, 4] float64, rotation and translation, no scale.
     """
-    matrices = np.stack([camera_to_world(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
+    matrices = poses(path)
     up = matrices[:, :3, 1].mean(axis=0)
     forward = -matrices[:, :3, 2].mean(axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
@@ -180,22 +192,21 @@ def _animate(camera: Any, path: contract.CameraPath) -> None:
         max(column) - min(column) > 1e-6 * max(abs(max(column)), 1.0) for column in zip(*lenses)
     )
     before: Quaternion | None = None
-    for frame, lens in zip(path.frames, lenses):
-        location, rotation, _ = Matrix(camera_to_world(np.reshape(frame.viewmat, (4, 4))).tolist()).decompose()
+    places, turns = [], []
+    for matrix in poses(path).tolist():
+        location, rotation, _ = Matrix(matrix).decompose()
         if before is not None and before.dot(rotation) < 0:  # q and -q turn alike, but keys would go the long way
             rotation.negate()
         before = rotation
-        camera.location, camera.rotation_quaternion = location, rotation
-        camera.keyframe_insert("location", frame=frame.frame)
-        camera.keyframe_insert("rotation_quaternion", frame=frame.frame)
-        data.lens, data.shift_x, data.shift_y = lens
-        if varies:
-            for channel in ("lens", "shift_x", "shift_y"):
-                data.keyframe_insert(channel, frame=frame.frame)
-    for block in (camera, data):
-        for curve in compat.fcurves(block):
-            for key in curve.keyframe_points:
-                key.interpolation = "LINEAR"
+        places.append(tuple(location))
+        turns.append(tuple(rotation))
+    frames = [frame.frame for frame in path.frames]
+    camera.location, camera.rotation_quaternion = places[-1], turns[-1]
+    data.lens, data.shift_x, data.shift_y = lenses[-1]
+    compat.set_keys(camera, frames, {"location": np.array(places), "rotation_quaternion": np.array(turns)})
+    if varies:
+        columns = np.array(lenses).T
+        compat.set_keys(data, frames, {n: columns[i][:, None] for i, n in enumerate(("lens", "shift_x", "shift_y"))})
 
 
 def _show_plate(data: Any, shot: Path, name: str) -> None:
@@ -241,7 +252,7 @@ def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> Any:
 
 def _extent(path: contract.CameraPath) -> float:
     """Length of the diagonal of the box around the camera's path, solve units; at least 0.1."""
-    centres = np.stack([camera_to_world(np.reshape(f.viewmat, (4, 4)))[:3, 3] for f in path.frames])
+    centres = poses(path)[:, :3, 3]
     return max(float(np.linalg.norm(centres.max(axis=0) - centres.min(axis=0))), 0.1)
 
 

@@ -6,10 +6,11 @@ The compositor tree moved from `scene.node_tree` (4.x, output: Composite node) t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import bpy
+import numpy as np
 
 HAS_COMPOSITING_GROUP = bpy.app.version >= (5, 0, 0)
 """True where the compositor is a node group of the scene (5.0 on)."""
@@ -168,3 +169,34 @@ def fcurves(datablock: Any) -> Iterator[Any]:
                     yield from bag.fcurves
     elif hasattr(data.action, "fcurves"):
         yield from data.action.fcurves
+
+
+def set_keys(datablock: Any, frames: Sequence[int], channels: Mapping[str, np.ndarray]) -> None:
+    """Keys channels of a data-block that has no action yet, straight between keys, all at once.
+
+    Args:
+        datablock: what is animated.
+        frames: [F] ascending frame numbers.
+        channels: data path -> values [F, C], a column per array index.
+    """
+    action = bpy.data.actions.new(f"{datablock.name}Action")
+    animation = datablock.animation_data_create()
+    if hasattr(action, "slots"):
+        slot = action.slots.new(datablock.id_type, datablock.name)
+        strip = action.layers.new("Layer").strips.new(type="KEYFRAME")
+        curves = strip.channelbag(slot, ensure=True).fcurves
+        animation.action, animation.action_slot = action, slot
+    else:
+        curves = action.fcurves
+        animation.action = action
+    straight = next(
+        i.value for i in bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items if i.identifier == "LINEAR"
+    )
+    for name, values in channels.items():
+        for index in range(values.shape[1]):
+            curve = curves.new(name, index=index)
+            keys = curve.keyframe_points
+            keys.add(len(frames))
+            keys.foreach_set("co", np.stack([np.asarray(frames, float), values[:, index]], axis=1).ravel())
+            keys.foreach_set("interpolation", np.full(len(frames), straight, dtype=np.int32))
+            curve.update()

@@ -58,6 +58,7 @@ def begin(scene: Any) -> None:
     end()
     _told = None
     _session = live.open_session(shot, run, backend.python(), backend.package_root())
+    _show_points(scene, shot, False)
     _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
     bpy.app.timers.register(_tick, first_interval=TICK_SECONDS, persistent=True)
 
@@ -67,6 +68,8 @@ def end() -> None:
     global _session, _handler
     if _session is not None:
         _session.close()
+        for scene in steps.scenes_of(_session.shot):
+            _show_points(scene, _session.shot, True)
         _session = None
     if _handler is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
@@ -76,6 +79,14 @@ def end() -> None:
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
     redraw()
+
+
+def _show_points(scene: Any, shot: Path, shown: bool) -> None:
+    """Opens or closes the eye of our point cloud: its dots would cover the picture."""
+    cloud = cameras.find(scene, shot, "MESH")
+    for layer in scene.view_layers if cloud is not None else ():
+        if cloud.name in layer.objects:
+            cloud.hide_set(not shown, view_layer=layer)
 
 
 def instant(scene: Any) -> float | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import json
 import math
 import struct
@@ -441,7 +442,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 def from_dict(cls: type, data: Mapping[str, Any]) -> Any:
     """A dataclass from plain JSON. ValueError names an unknown or missing field, or a value of the wrong type."""
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     unknown = set(data) - set(hints)
     if unknown:
         raise ValueError(f"{cls.__name__} has no field {sorted(unknown)[0]!r}: it has {', '.join(hints)}")
@@ -450,6 +451,12 @@ def from_dict(cls: type, data: Mapping[str, Any]) -> Any:
         return cls(**values)
     except TypeError as error:
         raise ValueError(f"{cls.__name__}: {error}") from error
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    """Asked for once per class: a camera path makes hundreds of frames on Blender's main thread."""
+    return typing.get_type_hints(cls)
 
 
 def _checked(owner: str, name: str, hint: Any, value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Scrubs t* in a real Blender window over a trained shot: how many frozen views a second, how long the main thread waits.
+"""Scrubs t* in a real Blender window over a trained shot: frozen views a second, and how long the main thread waits.
 
     python tests/addon/window/scrub.py --blender BLENDER --shot SHOT.splannequin [--output docs/images]
 
