@@ -155,37 +155,35 @@ def _tick() -> float | None:
     return TICK_SECONDS
 
 
-def view_of(scene: Any, shot: Path, region: Any, view: Any, t_star: float, pixels: int) -> contract.LiveView | None:
-    """What a region of a 3D view shows, as the backend is asked for it; None for an orthographic view.
+def view_of(
+    scene: Any, shot: Path, size: tuple[int, int], matrices: tuple[Any, Any], t_star: float, pixels: int
+) -> contract.LiveView | None:
+    """What a view of the scene shows, as the backend is asked for it; None for an orthographic view.
 
     Args:
         scene: the scene whose shot is drawn.
         shot: its shot folder.
-        region: the region, for its size.
-        view: its `RegionView3D`.
+        size: width and height of the region in pixels.
+        matrices: world to view, and the projection; Blender's axes.
         t_star: frame number at which time stands still.
         pixels: most pixels to ask for.
     """
-    window = np.array(view.window_matrix)
+    window = np.array(matrices[1])
     if abs(window[3, 3]) > 1e-6:
         return None
-    shrink = min(1.0, (pixels / max(1, region.width * region.height)) ** 0.5)
-    width, height = max(1, round(region.width * shrink)), max(1, round(region.height * shrink))
+    shrink = min(1.0, (pixels / max(1, size[0] * size[1])) ** 0.5)
+    width, height = max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
     root = cameras.find(scene, shot, "EMPTY")
     placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
-    scale = cameras.depth_scale(scene, shot)
-    to_view = cameras.FLIP @ np.array(view.view_matrix, dtype=np.float64) @ placed
-    to_view[:3] /= scale
+    to_view = cameras.FLIP @ np.array(matrices[0], dtype=np.float64) @ placed
+    to_view[:3] /= cameras.depth_scale(scene, shot)
     K = [
         0.5 * width * window[0, 0],
         0.5 * height * window[1, 1],
         0.5 * width * (1.0 - window[0, 2]),
         0.5 * height * (1.0 + window[1, 2]),
     ]
-    show = scene.splannequin.live_show
-    through_clip = view.view_perspective == "CAMERA" and scene.camera == cameras.find(scene, shot, "CAMERA")
-    like = float(scene.frame_current) if through_clip else None
-    return contract.LiveView(0, 0, to_view.ravel().tolist(), K, width, height, t_star, like, show)
+    return contract.LiveView(0, 0, to_view.ravel().tolist(), K, width, height, t_star, show=scene.splannequin.live_show)
 
 
 def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
@@ -206,17 +204,21 @@ def _draw() -> None:
     if t_star is None:
         return
     key = region.as_pointer() & 0x7FFFFFFF
-    wanted = view_of(scene, _session.shot, region, view, t_star, QUICK_PIXELS)
-    if wanted is None:
+    size, matrices = (region.width, region.height), (view.view_matrix, view.window_matrix)
+    quick, sharp = (view_of(scene, _session.shot, size, matrices, t_star, p) for p in (QUICK_PIXELS, SHARP_PIXELS))
+    if quick is None or sharp is None:
         return
-    wanted.view = key
-    _ask(key, wanted, view_of(scene, _session.shot, region, view, t_star, SHARP_PIXELS))
+    # Through the clip's camera the picture stands before the plate, and is exposed like it.
+    if view.view_perspective == "CAMERA" and scene.camera == cameras.find(scene, _session.shot, "CAMERA"):
+        quick.exposed_like = sharp.exposed_like = float(scene.frame_current)
+    quick.view = sharp.view = key
+    _ask(key, quick, sharp)
     frame = _session.frames.get(key)
     if frame is not None:
         _paint(key, frame, view, cameras.depth_scale(scene, _session.shot))
 
 
-def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView | None) -> None:
+def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:
     """Asks for the quick view if it shows something new, for the sharp one once it has rested."""
     if _session is None:
         return
@@ -224,10 +226,7 @@ def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView | None) ->
     if asked is None or not _same(asked, quick):
         _moved[key] = now
         _session.ask(quick)
-    elif sharp is not None and asked.width < sharp.width and now - _moved[key] > _REST_SECONDS:
-        if _session.busy(key):
-            return
-        sharp.view = key
+    elif asked.width < sharp.width and now - _moved[key] > _REST_SECONDS and not _session.busy(key):
         _session.ask(sharp)
 
 
