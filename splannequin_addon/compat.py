@@ -116,10 +116,29 @@ def new_mix_node(tree: Any) -> tuple[Any, Any, Any, Any, Any]:
     return node, node.inputs[0], node.inputs[1], node.inputs[2], node.outputs[0]
 
 
-def new_multiply_node(tree: Any) -> Any:
-    """A Math node that multiplies inputs[0] by inputs[1]."""
+def new_math_node(tree: Any, operation: str = "MULTIPLY") -> Any:
+    """A Math node on inputs[0] and inputs[1]: MULTIPLY, LESS_THAN and so on."""
     node = tree.nodes.new("ShaderNodeMath" if HAS_COMPOSITING_GROUP else "CompositorNodeMath")
-    node.operation = "MULTIPLY"
+    node.operation = operation
+    return node
+
+
+def new_over_node(tree: Any) -> tuple[Any, Any, Any]:
+    """An Alpha Over node of premultiplied pictures: (node, background socket, foreground socket)."""
+    node = tree.nodes.new("CompositorNodeAlphaOver")
+    pictures = [s for s in node.inputs if s.type == "RGBA"]
+    return node, pictures[0], pictures[1]
+
+
+def new_stretch_node(tree: Any) -> Any:
+    """A Scale node that stretches inputs[0] to the render size."""
+    node = tree.nodes.new("CompositorNodeScale")
+    if HAS_COMPOSITING_GROUP:
+        node.inputs["Type"].default_value = "Render Size"
+        node.inputs["Frame Type"].default_value = "Stretch"
+    else:
+        node.space = "RENDER_SIZE"
+        node.frame_method = "STRETCH"
     return node
 
 

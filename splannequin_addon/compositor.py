@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ..torch_backend import contract
 from . import compat
@@ -21,6 +22,7 @@ from . import compat
 GROUP_NAME = "Splannequin Freeze"
 _TAG = "splannequin"
 _BEFORE = "splannequin_before"
+_CG = "cg"
 _GAP = 200.0
 
 
@@ -68,11 +70,43 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
         node = _insert_node(tree, before)
         changes.append(f'The node group "{GROUP_NAME}" was inserted before the output.')
     else:
+        _set_defaults(node, _give_sockets(node.node_tree))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
     _fill_group(scene, node.node_tree, take)
     if plate is not None and json.loads(node.node_tree[_BEFORE])["made_tree"]:
         _show_plate(scene, tree, node, plate, take)
     return changes
+
+
+def may_combine_cg(scene: Any) -> Any:
+    """Our node, if the scene's render can be led into it. JobError if it is not there, or its CG is taken."""
+    tree = compat.compositor_tree(scene)
+    node = group_node(tree) if tree else None
+    if node is None:
+        raise contract.JobError("The freeze is not in this compositor.", "Bake first.", contract.ExitCode.BAKE)
+    if node.inputs["CG"].is_linked:
+        raise contract.JobError(
+            f'Something is led into "CG" of {GROUP_NAME} already.',
+            "Unlink it to have it done here.",
+            contract.ExitCode.BAKE,
+        )
+    return node
+
+
+def combine_cg(scene: Any) -> list[str]:
+    """Leads the scene's own render into the group, where it stands among the frozen by depth; says what was changed.
+
+    The view layer must have its depth pass. JobError as `may_combine_cg`.
+    """
+    node, tree = may_combine_cg(scene), compat.compositor_tree(scene)
+    layers = tree.nodes.new("CompositorNodeRLayers")
+    layers[_TAG] = _CG
+    layers.scene = scene
+    layers.name = layers.label = "CG among the frozen"
+    layers.location = (node.location.x - 2 * _GAP, node.location.y - 300.0)
+    tree.links.new(layers.outputs["Image"], node.inputs["CG"])
+    tree.links.new(layers.outputs["Depth"], node.inputs["CG Depth"])
+    return ["The scene's own render was led into the freeze: objects stand among the frozen people by depth."]
 
 
 def group_node(tree: Any) -> Any | None:
@@ -171,7 +205,7 @@ def blend_path(path: Path) -> str:
 def relative_images() -> None:
     """Makes the paths of our images relative to the .blend, once it has a place."""
     for image in bpy.data.images:
-        if image.get(_TAG):
+        if image.get(_TAG) and image.filepath:
             image.filepath = blend_path(Path(bpy.path.abspath(image.filepath)))
 
 
@@ -182,24 +216,65 @@ def _is_ours(group: Any) -> bool:
     return group is not None and bool(group.get(_TAG))
 
 
+_FACTORS = (
+    ("Mix", 1.0, "0: your stream, 1: the frozen frame"),
+    ("Wipe", 1.0, "The frozen frame shows left of here: 0 is the left edge, 1 the right"),
+    ("Only Supported", 0.0, "1: your stream shows through where the frozen frame is a guess"),
+    ("Only Moving", 0.0, "1: your stream shows through where nothing moves in the footage"),
+)
+_OUT = (
+    ("Image", "NodeSocketColor", "Frozen frame, scene-linear"),
+    ("Depth", "NodeSocketFloat", "Distance along the camera's axis in scene units; 1e10 where there is nothing"),
+    ("Support", "NodeSocketFloat", "1 where the footage saw this at the frozen instant, 0 where it is a guess"),
+    ("Motion", "NodeSocketFloat", "1 where things move in the footage, 0 where they never do"),
+)
+
+
+def _give_sockets(group: Any) -> set[str]:
+    """Gives a group the sockets that it lacks, those of an older version stay; returns the names of new inputs."""
+    face = group.interface
+    there = {(i.in_out, i.name) for i in face.items_tree if i.item_type == "SOCKET"}
+    given: set[str] = set()
+
+    def new(name: str, side: str, kind: str, text: str) -> Any:
+        if (side, name) in there:
+            return None
+        if side == "INPUT":
+            given.add(name)
+        return face.new_socket(name, in_out=side, socket_type=kind, description=text)
+
+    new("Image", "INPUT", "NodeSocketColor", "Your stream, up to here")
+    for name, value, text in _FACTORS:
+        socket = new(name, "INPUT", "NodeSocketFloat", text)
+        if socket is not None:
+            socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
+    cg = new("CG", "INPUT", "NodeSocketColor", "Rendered objects on a transparent film, to stand among the frozen")
+    if cg is not None:
+        cg.default_value = (0.0, 0.0, 0.0, 0.0)
+    far = new("CG Depth", "INPUT", "NodeSocketFloat", "Depth pass of the rendered objects")
+    if far is not None:
+        far.default_value = contract.NO_DEPTH
+    for name, kind, text in _OUT:
+        new(name, "OUTPUT", kind, text)
+    return given
+
+
+def _set_defaults(node: Any, names: set[str]) -> None:
+    """Gives the named inputs of our node their values: a node does not always take its group's."""
+    for name, value, _ in _FACTORS:
+        if name in names:
+            node.inputs[name].default_value = value
+    if "CG" in names:
+        node.inputs["CG"].default_value = (0.0, 0.0, 0.0, 0.0)
+    if "CG Depth" in names:
+        node.inputs["CG Depth"].default_value = contract.NO_DEPTH
+
+
 def _insert_node(tree: Any, before: dict[str, bool]) -> Any:
     group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
     group[_TAG] = True
     group[_BEFORE] = json.dumps(before)
-    face = group.interface
-    face.new_socket("Image", in_out="INPUT", socket_type="NodeSocketColor", description="Your stream, up to here")
-    mix = face.new_socket(
-        "Mix", in_out="INPUT", socket_type="NodeSocketFloat", description="0: your stream, 1: the frozen frame"
-    )
-    mix.default_value, mix.min_value, mix.max_value, mix.subtype = 1.0, 0.0, 1.0, "FACTOR"
-    outputs = (
-        ("Image", "NodeSocketColor", "Frozen frame, scene-linear"),
-        ("Depth", "NodeSocketFloat", "Distance along the camera's axis in scene units; 1e10 where there is nothing"),
-        ("Support", "NodeSocketFloat", "1 where the footage saw this at the frozen instant, 0 where it is a guess"),
-        ("Motion", "NodeSocketFloat", "1 where things move in the footage, 0 where they never do"),
-    )
-    for name, kind, text in outputs:
-        face.new_socket(name, in_out="OUTPUT", socket_type=kind, description=text)
+    _give_sockets(group)
     target = compat.output_socket(tree) or compat.new_output_node(tree)
     source = target.links[0].from_socket if target.is_linked else None
     node = tree.nodes.new("CompositorNodeGroup")
@@ -208,7 +283,7 @@ def _insert_node(tree: Any, before: dict[str, bool]) -> Any:
     node.width = 180.0
     end = target.node
     node.location = (end.location.x - node.width - 30.0, end.location.y - 160.0)
-    node.inputs["Mix"].default_value = 1.0
+    _set_defaults(node, {s.name for s in node.inputs})
     if source is not None:
         tree.links.new(source, node.inputs["Image"])
     tree.links.new(node.outputs["Image"], target)
@@ -217,7 +292,7 @@ def _insert_node(tree: Any, before: dict[str, bool]) -> Any:
 
 def _fill_group(scene: Any, group: Any, take: Take) -> None:
     """(Re)builds the inside of the group; its sockets, and so the links around it, stay."""
-    old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image}
+    old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image} - {_RAMP}
     group.nodes.clear()
     enter = group.nodes.new("NodeGroupInput")
     leave = group.nodes.new("NodeGroupOutput")
@@ -226,16 +301,17 @@ def _fill_group(scene: Any, group: Any, take: Take) -> None:
     frozen.name = frozen.label = "Frozen"
     show_sequence(frozen, image, take.first, take.last)
     mix, factor, first, second, mixed = compat.new_mix_node(group)
-    depth = compat.new_multiply_node(group)
+    depth = compat.new_math_node(group)
     depth.name = depth.label = "Depth in scene units"
     depth.inputs[1].default_value = take.depth_scale
     enter.location, frozen.location = (-2 * _GAP, 150.0), (-3 * _GAP, -100.0)
     mix.location, depth.location, leave.location = (_GAP, 150.0), (_GAP, -100.0), (2 * _GAP, 0.0)
 
     fitted = _fitted(scene, group, take, frozen)
-    group.links.new(enter.outputs["Mix"], factor)
+    share = _share(group, enter, fitted)
+    group.links.new(share, factor)
     group.links.new(enter.outputs["Image"], first)
-    group.links.new(fitted["Combined"], second)
+    group.links.new(_among(group, enter, fitted["Combined"], depth.outputs[0]), second)
     group.links.new(mixed, leave.inputs["Image"])
     group.links.new(fitted["Depth"], depth.inputs[0])
     group.links.new(depth.outputs[0], leave.inputs["Depth"])
@@ -245,6 +321,90 @@ def _fill_group(scene: Any, group: Any, take: Take) -> None:
         stale = bpy.data.images.get(name)
         if stale is not None and stale.users == 0:
             bpy.data.images.remove(stale)
+
+
+def _among(group: Any, enter: Any, frozen: Any, depth: Any) -> Any:
+    """Socket of the frozen picture with CG in front of it or behind, whichever is nearer, pixel by pixel."""
+    front, under, over = compat.new_over_node(group)
+    group.links.new(frozen, under)
+    group.links.new(enter.outputs["CG"], over)
+    back, below, above = compat.new_over_node(group)
+    group.links.new(enter.outputs["CG"], below)
+    group.links.new(frozen, above)
+    nearer = compat.new_math_node(group, "LESS_THAN")
+    nearer.label = "CG is nearer"
+    group.links.new(enter.outputs["CG Depth"], nearer.inputs[0])
+    group.links.new(depth, nearer.inputs[1])
+    choose, factor, first, second, chosen = compat.new_mix_node(group)
+    choose.label = "CG among the frozen"
+    group.links.new(nearer.outputs[0], factor)
+    group.links.new(back.outputs[0], first)
+    group.links.new(front.outputs[0], second)
+    for row, node in enumerate((nearer, front, back)):
+        node.location = (-_GAP, -350.0 - 170.0 * row)
+    choose.location = (0.0, -350.0)
+    return chosen
+
+
+def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+    """Socket of how much of the frozen frame shows: Mix, left of Wipe, and where the mattes let it."""
+    ramp = group.nodes.new("CompositorNodeImage")
+    ramp.image = _ramp()
+    ramp.label = "From left to right"
+    wide = compat.new_stretch_node(group)
+    group.links.new(ramp.outputs["Image"], wide.inputs[0])
+    # A scaled picture fades out over its last pixels: those of the ramp lie outside of the frame.
+    larger = group.nodes.new("CompositorNodeScale")
+    larger.inputs["X"].default_value = larger.inputs["Y"].default_value = _BEYOND
+    group.links.new(wide.outputs[0], larger.inputs[0])
+    left = compat.new_math_node(group, "LESS_THAN")
+    left.label = "Left of the wipe"
+    group.links.new(larger.outputs[0], left.inputs[0])
+    group.links.new(enter.outputs["Wipe"], left.inputs[1])
+    total = _product(group, enter.outputs["Mix"], left.outputs[0])
+    for row, (name, layer) in enumerate((("Only Supported", "Support"), ("Only Moving", "Motion"))):
+        # 1 - amount * (1 - matte)
+        lacking = compat.new_math_node(group, "SUBTRACT")
+        lacking.inputs[0].default_value = 1.0
+        group.links.new(layers[layer], lacking.inputs[1])
+        taken = _product(group, enter.outputs[name], lacking.outputs[0])
+        kept = compat.new_math_node(group, "SUBTRACT")
+        kept.inputs[0].default_value = 1.0
+        group.links.new(taken, kept.inputs[1])
+        total = _product(group, total, kept.outputs[0])
+        lacking.location, kept.location = (-2 * _GAP, 500.0 + 170.0 * row), (-_GAP, 500.0 + 170.0 * row)
+    ramp.location, wide.location, left.location = (-3 * _GAP, 330.0), (-2 * _GAP, 330.0), (-_GAP, 330.0)
+    return total
+
+
+def _product(group: Any, one: Any, other: Any) -> Any:
+    node = compat.new_math_node(group)
+    node.location = (0.0, 330.0)
+    group.links.new(one, node.inputs[0])
+    group.links.new(other, node.inputs[1])
+    return node.outputs[0]
+
+
+_RAMP = "Splannequin Ramp"
+_STEPS, _ROWS = 1024, 32
+_BEYOND = 1.1
+"""How much larger than the frame the ramp is shown."""
+
+
+def _ramp() -> Any:
+    """A picture that rises from 0 at the frame's left to 1 at its right: nodes before 5.0 know no coordinates."""
+    image = next((i for i in bpy.data.images if i.get(_TAG) and i.name.startswith(_RAMP)), None)
+    if image is not None:
+        return image
+    image = bpy.data.images.new(_RAMP, _STEPS, _ROWS, alpha=False, float_buffer=True, is_data=True)
+    image[_TAG] = True
+    across = 0.5 + _BEYOND * ((np.arange(_STEPS, dtype=np.float32) + 0.5) / _STEPS - 0.5)
+    row = np.repeat(across[:, None], 4, axis=1)
+    row[:, 3] = 1.0
+    image.pixels.foreach_set(np.tile(row, (_ROWS, 1)).ravel())
+    image.update()
+    image.pack()
+    return image
 
 
 def show_sequence(user: Any, image: Any, first: int, last: int) -> None:
@@ -284,7 +444,7 @@ def render_size(scene: Any) -> tuple[int, int]:
 
 def _show_plate(scene: Any, tree: Any, node: Any, plate: Path, take: Take) -> None:
     """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
-    for old in [n for n in tree.nodes if n.get(_TAG)]:
+    for old in [n for n in tree.nodes if n.get(_TAG) and n.get(_TAG) != _CG]:
         tree.nodes.remove(old)
     image_node = tree.nodes.new("CompositorNodeImage")
     image_node[_TAG] = True

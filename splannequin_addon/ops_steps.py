@@ -185,6 +185,19 @@ class SPLANNEQUIN_OT_insert_freeze(bpy.types.Operator):
         return _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take))
 
 
+class SPLANNEQUIN_OT_combine_cg(bpy.types.Operator):
+    """Lead the scene's own render into the freeze, so that your objects stand in front of and behind the frozen people
+    by depth. Sets the film transparent and the depth pass on"""
+
+    bl_idname = "splannequin.combine_cg"
+    bl_label = "Combine with Scene's Objects"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Adds one Render Layers node and two links."""
+        return _edit(self, context, "bake", steps.combine_cg)
+
+
 class SPLANNEQUIN_OT_remove_shot(bpy.types.Operator):
     """Take camera, points and the compositor group of this shot out of the file, and give the scene its own settings
     back. The shot folder on disk stays"""
@@ -307,6 +320,7 @@ CLASSES = (
     SPLANNEQUIN_OT_render,
     SPLANNEQUIN_OT_load_camera,
     SPLANNEQUIN_OT_insert_freeze,
+    SPLANNEQUIN_OT_combine_cg,
     SPLANNEQUIN_OT_remove_shot,
     SPLANNEQUIN_OT_t_star_here,
     SPLANNEQUIN_OT_live,

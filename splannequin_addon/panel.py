@@ -348,6 +348,7 @@ class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
         """Colours, and the parts of the step one by one."""
         layout.prop(context.scene.splannequin, "keep_colours")
         layout.operator("splannequin.insert_freeze", text="Insert in Compositor Only")
+        layout.operator("splannequin.combine_cg")
         layout.operator("splannequin.remove_shot")
 
 

@@ -96,6 +96,20 @@ def keep_plate_colours(scene: Any) -> list[str]:
     return changes
 
 
+def render_cg(scene: Any) -> list[str]:
+    """Has the scene rendered on a transparent film with a depth pass; returns what was changed, in words."""
+    changes = []
+    if not scene.render.film_transparent:
+        _remember(scene, "render", ("film_transparent",))
+        scene.render.film_transparent = True
+        changes.append("Film set to transparent.")
+    if not scene.view_layers[0].use_pass_z:
+        _remember(scene, "layer", ("use_pass_z",))
+        scene.view_layers[0].use_pass_z = True
+        changes.append("The depth pass was switched on.")
+    return changes
+
+
 def keeps_plate_colours(scene: Any) -> bool:
     """True if pictures leave the scene with the colours they came in with."""
     return all(getattr(scene.view_settings, name) == value for name, value in _VIEW.items())
@@ -114,7 +128,9 @@ def restore(scene: Any) -> bool:
 
 
 def _owner(scene: Any, name: str) -> Any:
-    return {"scene": scene, "render": scene.render, "view": scene.view_settings}[name]
+    return {
+        "scene": scene, "render": scene.render, "view": scene.view_settings, "layer": scene.view_layers[0],
+    }[name]  # fmt: skip
 
 
 def _remember(scene: Any, owner: str, names: tuple[str, ...]) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, jobs, scene_setup, shots
+from . import backend, bake, cameras, compositor, jobs, scene_setup, shots
 
 
 @dataclass(frozen=True)
@@ -194,6 +194,13 @@ def insert_freeze(scene: Any, shot: Path, take: str) -> list[str]:
     """Puts a take into the scene's compositor, and keeps the plate's colours if the artist consents."""
     changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
     return bake.insert(scene, shot, take) + changes
+
+
+def combine_cg(scene: Any, shot: Path) -> list[str]:
+    """Has the scene's own objects stand among the frozen. JobError if the freeze is not in the compositor."""
+    compositor.may_combine_cg(scene)
+    changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
+    return compositor.combine_cg(scene) + changes
 
 
 def remove_all(scene: Any, shot: Path) -> list[str]:

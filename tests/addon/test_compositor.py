@@ -5,6 +5,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from mathutils import Vector
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def artists_tree(addon, scene):
     colour = tree.nodes.new("CompositorNodeRGB")
     colour.outputs[0].default_value = (0.25, 0.5, 0.75, 1.0)
     blur = tree.nodes.new("CompositorNodeBlur")
-    multiply = compat.new_multiply_node(tree)
+    multiply = compat.new_math_node(tree)
     multiply.inputs[1].default_value = 0.125
     tree.links.new(colour.outputs[0], blur.inputs["Image"])
     tree.links.new(blur.outputs["Image"], compat.output_socket(tree))
@@ -136,7 +137,9 @@ def test_removal_leaves_a_group_that_another_scene_shows(addon, scene, artists_t
 def test_group_offers_what_a_compositor_needs(addon, scene, take):
     addon("compositor").insert(scene, take)
     node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
-    assert [s.name for s in node.inputs] == ["Image", "Mix"]
+    assert [s.name for s in node.inputs] == [
+        "Image", "Mix", "Wipe", "Only Supported", "Only Moving", "CG", "CG Depth",
+    ]  # fmt: skip
     assert [s.name for s in node.outputs] == ["Image", "Depth", "Support", "Motion"]
     assert node.inputs["Mix"].default_value == 1.0
 
@@ -219,3 +222,101 @@ def test_frames_of_another_size_are_fitted(addon, scene, take, shot, tmp_path, l
         for columns in (slice(0, 16), slice(16, 32)):
             small = expected[rows.start // 2 : rows.stop // 2, columns.start // 2 : columns.stop // 2]
             assert found[rows, columns].mean() == pytest.approx(small.mean(), abs=0.06)
+
+
+def over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
+    return front + (1.0 - front[..., 3:]) * back
+
+
+@pytest.mark.parametrize("alpha", [1.0, 0.5])
+def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, layers, pictures, alpha):
+    """A wall of CG at depth 12 among frames whose depth grows downwards: pixel by pixel the nearer is in front."""
+    compositor, compat = addon("compositor"), addon("compat")
+    compositor.insert(scene, compositor.take_of(take.folder, depth_scale=2.0))
+    node = compositor.group_node(compat.compositor_tree(scene))
+    wall = np.array([0.5, 0.25, 0.0, 1.0], np.float32) * alpha
+    node.inputs["CG"].default_value, node.inputs["CG Depth"].default_value = tuple(wall), 24.0
+    render(addon, scene, tmp_path / "out")
+    for frame in (5, 7):
+        data = layers(frame)
+        cg = np.broadcast_to(wall, data["rgba"].shape)
+        nearer = (2.0 * data["depth"] > 24.0)[..., None]
+        assert 0.1 < nearer.mean() < 0.9
+        expected = np.where(nearer, over(cg, data["rgba"]), over(data["rgba"], cg))
+        found = pictures.read(tmp_path / "out" / f"{frame:06d}.png")
+        assert np.abs(found - pictures.srgb(expected[..., :3])).max() * 255 < 1.1
+
+
+def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_path, layers, pictures):
+    compositor, compat = addon("compositor"), addon("compat")
+    scene.render.resolution_x, scene.render.resolution_y = 16, 12
+    compositor.insert(scene, take, shot / "frames" / "000005.png")
+    node = compositor.group_node(compat.compositor_tree(scene))
+    frozen, support = layers(6)["rgba"], layers(6)["support"]
+    plate = pictures.read(shot / "frames" / "000006.png")
+    linear = np.where(plate <= 0.04045, plate / 12.92, ((plate + 0.055) / 1.055) ** 2.4)
+    for name, value, share in (
+        ("Wipe", 0.5, (np.arange(16) < 8)[None, :, None].astype(np.float32)),
+        ("Wipe", 0.0, np.zeros((1, 1, 1), np.float32)),
+        ("Only Supported", 1.0, support[..., None]),
+        ("Only Supported", 0.5, 0.5 + 0.5 * support[..., None]),
+        ("Only Moving", 1.0, layers(6)["motion"][..., None]),
+    ):
+        before = node.inputs[name].default_value
+        node.inputs[name].default_value = value
+        render(addon, scene, tmp_path / name)
+        node.inputs[name].default_value = before
+        expected = linear + share * (frozen[..., :3] - linear)
+        found = pictures.read(tmp_path / name / "000006.png")
+        difference = np.abs(found - pictures.srgb(expected)) * 255
+        assert difference.max() < 1.1, f"{name} {value}: columns {np.nonzero((difference > 1.1).any((0, 2)))[0]}"
+
+
+def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, scene, take, shot, tmp_path, pictures):
+    """The scene's own render, through its own depth pass, from the solved camera."""
+    steps, compat = addon("steps"), addon("compat")
+    scene.splannequin.shot_path = str(shot)
+    scene.splannequin.set_up_scene = True
+    steps.load_camera(scene, shot)
+    steps.insert_freeze(scene, shot, "freeze")
+    settings = scene.render.film_transparent, scene.view_layers[0].use_pass_z
+    tree = compat.compositor_tree(scene)
+    nodes = len(tree.nodes)
+    said = steps.combine_cg(scene, shot)
+    assert "by depth" in said[0] and len(tree.nodes) == nodes + 1
+    with pytest.raises(Exception, match="already"):
+        steps.combine_cg(scene, shot)
+    scene.frame_set(6)
+    for other in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
+        bpy.data.objects.remove(other)
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.device = 1, False, "CPU"
+    bpy.ops.mesh.primitive_plane_add(size=200.0)
+    wall = bpy.context.object
+    glow = bpy.data.materials.new("glow")
+    glow.use_nodes = True
+    glow.node_tree.nodes.clear()
+    shine = glow.node_tree.nodes.new("ShaderNodeEmission")
+    shine.inputs["Color"].default_value = (0.0, 1.0, 0.0, 1.0)
+    end = glow.node_tree.nodes.new("ShaderNodeOutputMaterial")
+    glow.node_tree.links.new(shine.outputs[0], end.inputs["Surface"])
+    wall.data.materials.append(glow)
+    camera = scene.camera.matrix_world
+    wall.rotation_mode = "QUATERNION"
+    wall.rotation_quaternion = camera.to_quaternion()
+    wall.location = camera @ Vector((0.0, 0.0, -12.0))  # facing the camera, 12 in front of it
+    scene.frame_start = scene.frame_end = 6
+    addon("bake").render(scene, tmp_path / "out")
+    found = pictures.read(tmp_path / "out" / "000006.png")
+    depth = make_depth(6)
+    green = (found[..., 1] > 0.99) & (found[..., 0] < 0.01)
+    sure = np.abs(depth - 12.0) > 0.05
+    assert (green == (depth > 12.0))[sure & (np.arange(16) > 0)[None, :]].all()
+    assert 10 < green.sum() < 150
+    steps.remove_all(scene, shot)
+    assert (scene.render.film_transparent, scene.view_layers[0].use_pass_z) == settings
+
+
+def make_depth(frame: int) -> np.ndarray:
+    y, x = np.mgrid[0:12, 0:16]
+    return frame + x / 16.0 + y
