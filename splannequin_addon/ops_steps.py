@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, jobs, steps, supervisor, viewport
+from . import backend, bake, cameras, jobs, steps, supervisor, viewport
 
 
 class _StepOperator:
@@ -28,7 +28,7 @@ class _StepOperator:
         """Runs the step."""
         scene = context.scene
         try:
-            job = steps.begin(scene, self.step)
+            job = steps.begin(scene, self.step, self.params(scene))
             supervisor.follow(self.step, job)
             if not bpy.app.background:
                 return {"FINISHED"}
@@ -47,6 +47,10 @@ class _StepOperator:
         for note in notes:
             self.report({"INFO"}, note)  # type: ignore[attr-defined]
         return {"FINISHED"}
+
+    def params(self, scene: Any) -> Any:
+        """What the job is asked for; None: what the scene's settings say."""
+        return None
 
     def after(self, scene: Any, job: Any) -> list[str]:
         """What follows the job when blocking; returns what changed, in words."""
@@ -81,12 +85,33 @@ class SPLANNEQUIN_OT_train(_StepOperator, bpy.types.Operator):
 
 
 class SPLANNEQUIN_OT_freeze(_StepOperator, bpy.types.Operator):
-    """Render every frame of the clip with time standing still at t*"""
+    """Render time standing still at t*: from every pose of the clip, or from an animated camera of your own"""
 
     bl_idname = "splannequin.freeze"
     bl_label = "Freeze"
     bl_options = {"REGISTER"}
     step = "freeze"
+
+    def execute(self, context: Any) -> set[str]:
+        """Runs the step. In a window a camera of the artist's is read a few frames per turn of the timer."""
+        scene = context.scene
+        name, folder = steps.own_camera(scene), steps.shot_folder(scene)
+        if not name or folder is None or bpy.app.background:
+            return super().execute(context)
+        supervisor.sample(scene, folder, cameras.sample_path(scene, name, folder, scene.splannequin.freeze_width))
+        return {"FINISHED"}
+
+    def params(self, scene: Any) -> Any:
+        """Reads the artist's camera, if one is chosen, all at once."""
+        name, folder = steps.own_camera(scene), steps.shot_folder(scene)
+        if not name or folder is None:
+            return None
+        turns = cameras.sample_path(scene, name, folder, scene.splannequin.freeze_width)
+        while True:
+            try:
+                next(turns)
+            except StopIteration as end:
+                return steps.freeze_from(scene, end.value)
 
 
 class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):

@@ -185,6 +185,12 @@ class _StepPanel:
             layout.progress(factor=done / max(total, 1), type="BAR", text=f"Rendering, frame {done} of {total}")
             wrap(layout, context, "Press Esc in the render window to stop.", "INFO")
             return
+        if watch.sampling is not None:
+            done, total = watch.sampling.done, watch.sampling.total
+            layout.progress(
+                factor=done / max(total, 1), type="BAR", text=f"Reading the camera, frame {done} of {total}"
+            )
+            return
         job = watch.jobs[self.step]
         status = job.status
         row = layout.split(factor=0.7, align=True)
@@ -332,8 +338,18 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         wrap(layout, context, viewport.reason(context.scene), "INFO")
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
-        """The take's name."""
+        """The take's name, its size, and where it is seen from."""
         layout.prop(context.scene.splannequin, "take_name")
+        layout.prop(context.scene.splannequin, "freeze_width")
+        layout.prop(context.scene.splannequin, "path_camera")
+        camera = context.scene.splannequin.path_camera
+        if camera is not None and camera.data.dof.use_dof:
+            wrap(
+                layout,
+                context,
+                "Frozen frames are sharp throughout: the camera's depth of field is not in them.",
+                "INFO",
+            )
 
 
 class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):

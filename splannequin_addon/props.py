@@ -54,7 +54,27 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
         options=set(),
     )
     t_star: IntProperty(
-        name="t*", description="Frame number of the clip at which time stands still", default=1, options=set()
+        name="t*",
+        description="Frame number of the clip at which time stands still. Keyed, it is followed frame by frame: "
+        "freeze, hold and release",
+        default=1,
+        options={"ANIMATABLE"},
+    )
+    path_camera: PointerProperty(
+        name="Camera",
+        description="Animated camera to see the frozen instant from; empty: the clip's own move",
+        type=bpy.types.Object,
+        poll=lambda _, item: item.type == "CAMERA",
+        options=set(),
+    )
+    freeze_width: IntProperty(
+        name="Width",
+        description="Width in pixels of the frozen frames; 0: as trained, or as the scene renders from a camera "
+        "of your own",
+        default=0,
+        min=0,
+        max=16384,
+        options=set(),
     )
     live_show: EnumProperty(
         name="Show",

@@ -15,7 +15,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, compositor, jobs, scene_setup, shots
+from . import backend, bake, cameras, compat, compositor, jobs, scene_setup, shots
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,48 @@ def params_of(scene: Any, step: str) -> Any:
     if step == "train":
         return contract.TrainParams(run=props.run_name, preset=props.preset)
     t_star = props.t_star if props.choose_t_star else None
-    params = contract.FreezeParams(run=props.run_name, take=props.take_name, t_star=t_star, only_missing=True)
+    params = contract.FreezeParams(
+        run=props.run_name,
+        take=props.take_name,
+        t_star=t_star,
+        t_star_per_frame=keyed_instants(scene),
+        width=props.freeze_width,
+        only_missing=True,
+    )
     folder = shot_folder(scene)
     if step == "bake" and folder is not None:
         params = take_params(folder, props.take_name, t_star) or params
+    return params
+
+
+def keyed_instants(scene: Any) -> dict[str, float]:
+    """Frame -> t* of a keyed t*, for every frame of the clip and of the scene's range; empty if it is not keyed."""
+    curve = next((c for c in compat.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
+    if curve is None or not scene.splannequin.choose_t_star:
+        return {}
+    folder = shot_folder(scene)
+    first, last = shots.read(folder).frame_range if folder else (scene.frame_start, scene.frame_end)
+    low, high = min(first, scene.frame_start), max(last, scene.frame_end)
+    return {str(n): min(max(float(curve.evaluate(n)), first), last) for n in range(low, high + 1)}
+
+
+def own_camera(scene: Any) -> str:
+    """Name of the artist's camera to freeze from; empty for the clip's own move."""
+    camera, folder = scene.splannequin.path_camera, shot_folder(scene)
+    if camera is None or folder is None or camera == cameras.find(scene, folder, "CAMERA"):
+        return ""
+    return str(camera.name)
+
+
+def freeze_from(scene: Any, path: contract.CameraPath) -> contract.FreezeParams:
+    """Parameters of a take from a camera path, which is written into the shot. OSError if it cannot be."""
+    folder = shot_folder(scene)
+    if folder is None:
+        raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
+    file = folder / "paths" / f"{scene.splannequin.take_name}.json"
+    jobs.write_json(file, path.to_json())
+    params = params_of(scene, "freeze")
+    params.camera_path, params.width = str(file), path.width
     return params
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,24 @@ from . import backend, jobs, shots, steps, viewport
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
+SAMPLING_SECONDS = 0.02
+"""Of a turn, spent on reading a camera; one frame of a heavy scene may take longer."""
 _LOOK_SECONDS = 1.0
 """How often the shot folder is looked at for changes."""
+
+
+@dataclass
+class Sampling:
+    """A camera being read, a few frames per turn of the timer."""
+
+    scene: str
+    """Name of the scene."""
+    turns: Generator[int, None, contract.CameraPath]
+    """`cameras.sample_path`."""
+    total: int
+    """Frames in all."""
+    done: int = 0
+    """Frames read."""
 
 
 @dataclass
@@ -44,6 +61,8 @@ class Watch:
     """(sentence, hint) of what failed on Blender's side, by the step's name."""
     rendered: tuple[int, int] | None = None
     """(frames done, frames in all) of a render that runs."""
+    sampling: Sampling | None = None
+    """An artist's camera that is being read, before its take is asked for."""
     redraw: bool = False
     """Something changed outside the timer: draw at its next turn."""
 
@@ -51,6 +70,8 @@ class Watch:
         """Name of the step at work, if any."""
         if self.rendered is not None:
             return "bake"
+        if self.sampling is not None:
+            return "freeze"
         return next((step for step, job in self.jobs.items() if not job.ended), None)
 
 
@@ -86,6 +107,35 @@ def follow(step: str, job: jobs.Job) -> None:
     watch.failures.pop(step, None)
 
 
+def sample(scene: Any, shot: Path, turns: Generator[int, None, contract.CameraPath]) -> None:
+    """Has a camera read by the timer; then its take is begun."""
+    watch = watch_of(shot)
+    watch.notes.clear()
+    watch.failures.pop("freeze", None)
+    watch.sampling = Sampling(scene.name, turns, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
+
+
+def _read_on(watch: Watch) -> None:
+    """Reads a camera on for part of a turn; begins its take when all of it is read."""
+    sampling, until = watch.sampling, time.monotonic() + SAMPLING_SECONDS
+    if sampling is None:
+        return
+    try:
+        while time.monotonic() < until:
+            sampling.done = next(sampling.turns)
+        return
+    except StopIteration as end:
+        scene = bpy.data.scenes.get(sampling.scene)
+        try:
+            if scene is not None:
+                follow("freeze", steps.begin(scene, "freeze", steps.freeze_from(scene, end.value)))
+        except (contract.JobError, OSError) as error:
+            watch.failures["freeze"] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
+    except (contract.JobError, KeyError) as error:
+        watch.failures["freeze"] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
+    watch.sampling = None
+
+
 def refresh(watch: Watch) -> bool:
     """Reads the shot folder again if something in it changed. True if it did."""
     watch.looked = time.monotonic()
@@ -116,12 +166,13 @@ def tick() -> float:
             changed = True
     if changed:
         redraw()
-    return TICK_SECONDS
+    return TICK_SECONDS if all(w.sampling is None for w in _watches.values()) else 2 * SAMPLING_SECONDS
 
 
 def _turn(watch: Watch, until: float) -> bool:
     """One shot's part of a tick, `until` a time of `time.monotonic`; True if its panel should be drawn again."""
-    changed, watch.redraw = watch.redraw, False
+    changed, watch.redraw = watch.redraw or watch.sampling is not None, False
+    _read_on(watch)
     for step, job in list(watch.jobs.items()):
         if job.ended or time.monotonic() > until:
             continue
@@ -188,7 +239,7 @@ def _on_load(*_: Any) -> None:
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     for watch in _watches.values():
-        watch.rendered = None
+        watch.rendered = watch.sampling = None
 
 
 def render_began(shot: Path, frames: int) -> None:

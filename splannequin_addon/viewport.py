@@ -14,7 +14,6 @@ import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
-from mathutils import Matrix
 
 from ..torch_backend import contract
 from . import backend, cameras, live, steps
@@ -173,17 +172,8 @@ def view_of(
         return None
     shrink = min(1.0, (pixels / max(1, size[0] * size[1])) ** 0.5)
     width, height = max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
-    root = cameras.find(scene, shot, "EMPTY")
-    placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
-    to_view = cameras.FLIP @ np.array(matrices[0], dtype=np.float64) @ placed
-    to_view[:3] /= cameras.depth_scale(scene, shot)
-    K = [
-        0.5 * width * window[0, 0],
-        0.5 * height * window[1, 1],
-        0.5 * width * (1.0 - window[0, 2]),
-        0.5 * height * (1.0 + window[1, 2]),
-    ]
-    return contract.LiveView(0, 0, to_view.ravel().tolist(), K, width, height, t_star, show=scene.splannequin.live_show)
+    viewmat, K = cameras.in_solve(scene, shot, matrices[0], matrices[1], width, height)
+    return contract.LiveView(0, 0, viewmat, K, width, height, t_star, show=scene.splannequin.live_show)
 
 
 def _same(one: contract.LiveView, other: contract.LiveView) -> bool:

@@ -208,3 +208,67 @@ def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_pa
     pose = next(p for p in poses if p["frame"] == 6)
     expected = project(np.reshape(pose["viewmat"], (4, 4)), pose["K"], point)[0]
     np.testing.assert_allclose(found, expected, atol=0.1)
+
+
+def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
+    """A camera that copies the solved one, lens included, gives the solve back; its own lens and size are kept."""
+    cameras = addon("cameras")
+    scene.splannequin.shot_path = str(shot)
+    scene.splannequin.set_up_scene = True
+    addon("steps").load_camera(scene, shot)
+    root = cameras.find(scene, shot, "EMPTY")
+    root.scale = (2.0, 2.0, 2.0)
+    own = bpy.data.objects.new("mine", scene.camera.data.copy())
+    scene.collection.objects.link(own)
+    for kind in ("COPY_LOCATION", "COPY_ROTATION"):
+        own.constraints.new(kind).target = scene.camera
+    scene.splannequin.path_camera = own
+    assert addon("steps").own_camera(scene) == "mine"
+    scene.frame_start, scene.frame_end, scene.frame_step = 5, 7, 1
+    scene.frame_set(6)
+    path = run_out(cameras.sample_path(scene, "mine", shot, 0))
+    want = contract.CameraPath.load(shot / "solve" / "cameras.json")
+    assert scene.frame_current == 6
+    assert (path.width, path.height) == (want.width, want.height)
+    for found, solved in zip(path.frames, want.frames, strict=True):
+        assert (found.frame, found.source) == (solved.frame, "blender")
+        np.testing.assert_allclose(found.viewmat, solved.viewmat, atol=5e-5)
+        np.testing.assert_allclose(found.K, solved.K, rtol=1e-4)
+    own.data.lens *= 2.0
+    wide = run_out(cameras.sample_path(scene, "mine", shot, 64))
+    assert (wide.width, wide.height) == (64, 48)
+    np.testing.assert_allclose(wide.frames[0].K[0], 8 * want.frames[0].K[0], rtol=1e-4)
+    params = addon("steps").freeze_from(scene, wide)
+    assert contract.CameraPath.load(params.camera_path) == wide
+    assert params.width == 64
+    own.data.type = "ORTHO"
+    with pytest.raises(contract.JobError, match="mine is not a perspective camera"):
+        run_out(cameras.sample_path(scene, "mine", shot, 0))
+    scene.splannequin.path_camera = scene.camera
+    assert addon("steps").own_camera(scene) == "", "the clip's own camera is the clip's own move"
+
+
+def run_out(turns):
+    while True:
+        try:
+            next(turns)
+        except StopIteration as end:
+            return end.value
+
+
+def test_a_keyed_instant_is_followed_frame_by_frame(addon, scene, shot):
+    steps = addon("steps")
+    props = scene.splannequin
+    props.shot_path, props.choose_t_star = str(shot), True
+    scene.frame_start, scene.frame_end = 5, 9
+    assert steps.params_of(scene, "freeze").t_star_per_frame == {}
+    for frame, value in ((5, 5), (7, 7)):
+        props.t_star = value
+        assert scene.keyframe_insert("splannequin.t_star", frame=frame)
+    for curve in addon("compat").fcurves(scene):
+        for key in curve.keyframe_points:
+            key.interpolation = "LINEAR"
+    ramp = steps.params_of(scene, "freeze").t_star_per_frame
+    assert ramp == {"5": 5.0, "6": 6.0, "7": 7.0, "8": 7.0, "9": 7.0}
+    props.choose_t_star = False
+    assert steps.params_of(scene, "freeze").t_star_per_frame == {}
