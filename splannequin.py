@@ -667,12 +667,12 @@ def closing_figures(summary: dict[str, Any], output: Path) -> None:
     )
 
 
-def setup(series: Sequence[str], testing: bool, output: Path) -> int:
+def setup(series: Sequence[str], testing: bool, backend_only: bool, output: Path) -> int:
     """Makes the environments: the backend's, and the named bpy wheels (the one that fits, if none is named)."""
     stages = {"backend": round(set_up(backend_environment(testing), sys.executable), 2)}
     for name in series:
         stages[f"bpy-{name}"] = round(set_up_wheel(name, testing)[1], 2)
-    if not series:
+    if not series and not backend_only:
         blender, took = get_blender(testing)
         stages[blender.label.replace(" ", "-")] = round(took, 2)
     write_json(output / "summary.json", {"command": "setup", "exit_code": 0, "wall_seconds_by_stage": stages})
@@ -1009,6 +1009,7 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("--bpy", choices=sorted(BPY_WHEELS), help="the bpy wheel (default: one that fits)")
         if name == "setup":
             command.add_argument("--tests", action="store_true", help="with what `test` needs")
+            command.add_argument("--backend", action="store_true", help="the backend alone (for the add-on)")
         names = ("--output", "--results") if name == "bench" else ("--output",)
         command.add_argument(*names, metavar="DIR", help="folder for summary.json and results (output/...)")
     return top
@@ -1065,7 +1066,7 @@ def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
     if args.command == "freeze":
         return freeze(args.clip, output, rest)
     if args.command == "setup":
-        return setup([args.bpy] if args.bpy else [], args.tests, output)
+        return setup([args.bpy] if args.bpy else [], args.tests, args.backend, output)
     if args.command == "bench":
         return bench(rest, output)
     if args.command == "test":

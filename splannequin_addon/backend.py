@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 
 from ..torch_backend import contract
-from . import jobs
+from . import environment, jobs
 
 PACKAGE: str = (__package__ or "").rpartition(".")[0]
 """Name of the extension package, such as bl_ext.user_default.splannequin."""
@@ -40,7 +41,21 @@ def candidates() -> list[tuple[str, Path]]:
     if home:
         found.append(("SPLANNEQUIN_HOME", venv_python(Path(home) / ".venv")))
     found.append(("the checkout", venv_python(package_root() / ".venv")))
+    found.append(("the set-up", venv_python(folder() / ".venv")))
     return found
+
+
+def folder() -> Path:
+    """Folder of the backend's environment that is set up from the preferences."""
+    addon = bpy.context.preferences.addons.get(PACKAGE)
+    chosen = getattr(addon.preferences, "backend_folder", "") if addon and addon.preferences else ""
+    return Path(bpy.path.abspath(chosen)) if chosen else environment.default_folder()
+
+
+def device() -> str:
+    """Where jobs run, as the preferences say: auto, cpu or cuda."""
+    addon = bpy.context.preferences.addons.get(PACKAGE)
+    return str(getattr(addon.preferences, "device", "auto")) if addon and addon.preferences else "auto"
 
 
 def python() -> str:
@@ -56,8 +71,8 @@ def python() -> str:
             )
     raise contract.JobError(
         "Splannequin's backend is not set up: no Python environment for it was found.",
-        "Run `python3 splannequin.py setup`, then choose its .venv Python in the add-on's preferences "
-        f"(or in {PYTHON_VARIABLE}).",
+        "Press Set Up Backend in the add-on's preferences, or choose the Python of one that is there "
+        f"(or name it in {PYTHON_VARIABLE}).",
         contract.ExitCode.ENVIRONMENT,
     )
 
@@ -70,26 +85,59 @@ def available() -> bool:
         return False
 
 
-def doctor() -> str:
-    """What the backend's environment can do, as the JSON that `torch_backend doctor` prints. JobError if it fails."""
+@dataclass
+class Doctor:
+    """A backend that is asked what it can do, beside Blender."""
+
+    process: subprocess.Popen[str]
+
+    @property
+    def ended(self) -> bool:
+        """True once it has answered, or failed to."""
+        return self.process.poll() is not None
+
+    def wait(self, seconds: float = 120.0) -> None:
+        """Waits for the answer; after `seconds` it is no longer waited for."""
+        try:
+            self._told = self.process.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self._told = self.process.communicate()
+
+    def answer(self) -> str:
+        """The JSON that `torch_backend doctor` prints. JobError if it failed."""
+        out, errors = getattr(self, "_told", None) or self.process.communicate()
+        if self.process.returncode:
+            last = (errors.strip().splitlines() or ["no reason given"])[-1]
+            raise contract.JobError(
+                f"The backend's environment is incomplete: {last}.",
+                "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
+                contract.ExitCode.ENVIRONMENT,
+            )
+        return out
+
+
+def begin_doctor() -> Doctor:
+    """Asks the backend what it can do, without waiting. JobError if there is none, or it cannot be started."""
     root = package_root()
     command = [python(), "-m", "torch_backend", "doctor"]
     try:
-        done = subprocess.run(
-            command, cwd=root, env=jobs.backend_environ(root), capture_output=True, text=True, timeout=120, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
+        child = subprocess.Popen(
+            command, cwd=root, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+    except OSError as error:
         raise contract.JobError(
             f"The backend did not answer: {error}.", "Set it up again.", contract.ExitCode.ENVIRONMENT
         ) from error
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise contract.JobError(
-            f"The backend's environment is incomplete: {last}.",
-            "Run `python3 splannequin.py setup` again.",
-            contract.ExitCode.ENVIRONMENT,
-        )
-    return done.stdout
+    return Doctor(child)
+
+
+def doctor() -> str:
+    """What the backend's environment can do, as the JSON that `torch_backend doctor` prints. JobError if it fails."""
+    asked = begin_doctor()
+    asked.wait()
+    return asked.answer()
 
 
 def start(job: jobs.Job) -> None:

@@ -79,7 +79,7 @@ def params_of(scene: Any, step: str) -> Any:
     if step == "camera":
         return contract.SolveParams(camera_model=props.camera_model)
     if step == "train":
-        return contract.TrainParams(run=props.run_name, preset=props.preset)
+        return contract.TrainParams(run=props.run_name, preset=props.preset, device=backend.device())
     t_star = props.t_star if props.choose_t_star else None
     params = contract.FreezeParams(
         run=props.run_name,
@@ -88,6 +88,7 @@ def params_of(scene: Any, step: str) -> Any:
         t_star_per_frame=keyed_instants(scene),
         width=props.freeze_width,
         only_missing=True,
+        device=backend.device(),
     )
     folder = shot_folder(scene)
     if step == "bake" and folder is not None:

@@ -1,0 +1,74 @@
+"""Setting the backend up from the preferences: a real launcher that fails for want of a network, and removal."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import bpy
+import pytest
+
+
+def run_out(environment, setup, seconds=180.0):
+    until = time.monotonic() + seconds
+    while setup.running and time.monotonic() < until:
+        environment.poll(setup)
+        time.sleep(0.1)
+    assert not setup.running
+
+
+def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(addon, root, tmp_path, monkeypatch):
+    environment = addon("environment")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
+    folder = tmp_path / "bäckend"
+    setup = environment.start(folder, sys.executable, root)
+    run_out(environment, setup)
+    assert "failed at installing packages" in setup.failure, setup.said
+    assert str(folder) in setup.failure
+    made = (folder / ".venv" / "pyvenv.cfg").stat().st_mtime
+    again = environment.start(folder, sys.executable, root)
+    run_out(environment, again)
+    assert "failed at installing packages" in again.failure
+    assert (folder / ".venv" / "pyvenv.cfg").stat().st_mtime == made, "the retry went on in the same environment"
+    assert environment.remove(folder)
+    assert not (folder / ".venv").exists()
+    assert not environment.remove(folder)
+
+
+def test_a_cancelled_set_up_ends(addon, root, tmp_path):
+    environment = addon("environment")
+    setup = environment.start(tmp_path / "b", sys.executable, root)
+    environment.cancel(setup)
+    run_out(environment, setup)
+    assert setup.failure
+
+
+def test_a_folder_that_cannot_be_is_named(addon, contract, root, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(contract.JobError, match="cannot be set up in"):
+        addon("environment").start(tmp_path / "file" / "b", sys.executable, root)
+
+
+def test_what_is_not_ours_is_not_removed(addon, tmp_path):
+    (tmp_path / ".venv").mkdir()
+    with pytest.raises(ValueError, match="was not made by Splannequin"):
+        addon("environment").remove(tmp_path)
+    assert (tmp_path / ".venv").is_dir()
+
+
+def test_the_button_needs_leave_to_go_online(addon):
+    assert bpy.ops.splannequin.set_up.poll() == bool(bpy.app.online_access)
+
+
+def test_check_says_what_the_backend_can_do(addon):
+    """The real backend's doctor, in words."""
+    assert bpy.ops.splannequin.check_backend() == {"FINISHED"}
+    lines = addon("preferences")._findings
+    assert "torch 2." in lines[0]
+    assert lines[1].startswith("Trains on")
+
+
+def test_the_folder_is_short(addon):
+    assert len(str(addon("environment").default_folder())) < len(str(Path.home())) + 20
