@@ -48,6 +48,8 @@ class Job:
     """(sentence, hint) the job wants the artist to know."""
     metrics: dict[str, Any] = field(default_factory=dict)
     """Latest figures of the job, by name."""
+    history: list[tuple[float, float]] = field(default_factory=list)
+    """(seconds of training, dB on frames kept out) as they came."""
     images: dict[str, str] = field(default_factory=dict)
     """Latest picture by label: path."""
     result: Any = None
@@ -288,7 +290,10 @@ def _take_in(job: Job, event: contract.Event) -> None:
     if event.type == "warning":
         job.warnings.append((event.data["message"], event.data["hint"]))
     elif event.type == "metric":
-        job.metrics.update(event.data["values"])
+        values = event.data["values"]
+        job.metrics.update(values)
+        if values.get("heldout_psnr_db") is not None and "seconds" in values:
+            job.history.append((float(values["seconds"]), float(values["heldout_psnr_db"])))
     elif event.type == "image":
         job.images[event.data["label"]] = event.data["path"]
     elif event.type == "done":

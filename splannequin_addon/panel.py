@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import bpy
 
-from . import cameras, compat, compositor, scene_setup, shots, steps, supervisor, viewport
+from . import cameras, compat, compositor, pictures, scene_setup, shots, steps, supervisor, viewport
 
 CATEGORY = "Splannequin"
 
@@ -296,6 +297,33 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
         """The preset."""
         layout.row().prop(context.scene.splannequin, "preset", expand=True)
 
+    def draw(self, context: Any) -> None:
+        """The step's body, and the training in pictures."""
+        super().draw(context)
+        watch = self._watch(context)
+        if watch is None or watch.state is None:
+            return
+        job, run = watch.jobs.get("train"), watch.state.runs.get(context.scene.splannequin.run_name)
+        going = job is not None and watch.running() == "train"
+        if going and job is not None:
+            picture, points = job.images.get("preview"), job.history
+        elif run is not None:
+            picture, points = run.get("preview"), run.get("history", [])
+        else:
+            return
+        body = sub_panel(self.layout, "train_pictures", "Progress", folded=False)  # type: ignore[attr-defined]
+        if body is None:
+            return
+        icon = pictures.icon_of(Path(picture)) if picture else 0
+        if icon:
+            body.template_icon(icon_value=icon, scale=8.0)
+        icon = pictures.plot(points)
+        if icon:
+            body.template_icon(icon_value=icon, scale=5.0)
+        if points:
+            (_, first), (seconds, last) = points[0], points[-1]
+            wrap(body, context, f"{first:.1f} to {last:.1f} dB on frames kept out, in {minutes(seconds)}", "NONE")
+
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The run's name."""
         layout.prop(context.scene.splannequin, "run_name")
@@ -368,9 +396,9 @@ class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
         layout.operator("splannequin.remove_shot")
 
 
-def sub_panel(layout: Any, name: str, label: str) -> Any | None:
-    """A part of a panel that is folded away at first; None while it is."""
-    header, body = layout.panel(f"splannequin_{name}", default_closed=True)
+def sub_panel(layout: Any, name: str, label: str, folded: bool = True) -> Any | None:
+    """A part of a panel that can be folded away, `folded` at first; None while it is."""
+    header, body = layout.panel(f"splannequin_{name}", default_closed=folded)
     header.label(text=label)
     return body
 

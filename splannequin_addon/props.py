@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
@@ -12,6 +14,22 @@ PRESETS = [
     ("standard", "Standard", "For most shots"),
     ("final", "Final", "Largest pictures and most Gaussians: takes longest"),
 ]
+
+
+def names_of(props: Any, kind: str) -> list[tuple[str, str]]:
+    """(name, what it is) of the runs or takes of the shot that `props` names, for the field's list."""
+    from . import steps, supervisor  # they import this package's parts in turn
+
+    folder = steps.shot_folder(props.id_data)
+    state = supervisor.watch_of(folder).state if folder else None
+    if state is None:
+        return []
+    if kind == "runs":
+        return [
+            (name, f"{run.get('heldout_psnr_db') or 0:.1f} dB, {run.get('gaussians', 0):,} Gaussians")
+            for name, run in state.runs.items()
+        ]
+    return [(name, f"t* {take['t_star_frame']}, run {take['run']}") for name, take in state.takes.items()]
 
 
 class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
@@ -45,7 +63,12 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
     )
     preset: EnumProperty(name="Preset", description="How much to spend on training", items=PRESETS, options=set())
     run_name: StringProperty(
-        name="Run", description="Name of the training run; a new name keeps the old", default="main", options=set()
+        name="Run",
+        description="Name of the training run; a new name keeps the old",
+        default="main",
+        options=set(),
+        search=lambda props, context, text: names_of(props, "runs"),
+        search_options={"SUGGESTION"},
     )
     choose_t_star: BoolProperty(
         name="Choose the Instant",
@@ -88,7 +111,12 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
         options=set(),
     )
     take_name: StringProperty(
-        name="Take", description="Name of the frozen frames; a new name keeps the old", default="freeze", options=set()
+        name="Take",
+        description="Name of the frozen frames; a new name keeps the old",
+        default="freeze",
+        options=set(),
+        search=lambda props, context, text: names_of(props, "takes"),
+        search_options={"SUGGESTION"},
     )
     set_up_scene: BoolProperty(
         name="Fit Scene to Clip",

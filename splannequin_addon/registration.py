@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from . import cli, ops_jobs, ops_steps, panel, preferences, props, supervisor
+from . import cli, ops_jobs, ops_steps, panel, pictures, preferences, props, supervisor
 
 _CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *panel.CLASSES)
 
@@ -22,6 +22,7 @@ def register() -> None:
     preferences.register()
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
+    pictures.register()
     supervisor.register()
     cli.register()
 
@@ -32,6 +33,7 @@ def unregister() -> None:
         return
     cli.unregister()
     supervisor.unregister()
+    pictures.unregister()
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)
     preferences.unregister()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -64,6 +65,9 @@ def read(folder: Path) -> ShotState:
     if (folder / "solve" / "cameras.json").is_file():
         state.solve = contract.read_json(folder / "solve" / "solve.json")
     state.runs = _named(folder / "runs", "summary.json")
+    for name, run in state.runs.items():
+        run["history"] = _history(folder / "runs" / name / "metrics.jsonl")
+        run["preview"] = max((folder / "runs" / name / "previews").glob("*.png"), default=None)
     state.takes = _named(folder / "takes", "take.json")
     for name, take in state.takes.items():
         take["frame_count"] = sum(1 for p in (folder / "takes" / name).iterdir() if p.suffix == EXR)
@@ -81,6 +85,22 @@ def plate_range(folder: Path) -> tuple[int, int] | None:
     """First and last number of the undistorted plates, None before the solve."""
     numbers = [int(p.stem) for p in (folder / "frames").glob("*.png") if p.stem.lstrip("-").isdigit()]
     return (min(numbers), max(numbers)) if numbers else None
+
+
+def _history(path: Path) -> list[tuple[float, float]]:
+    """(seconds, dB on frames kept out) of a run's metrics.jsonl; what cannot be read is passed over."""
+    points = []
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return []
+    for line in lines:
+        try:
+            told = json.loads(line)
+            points.append((float(told["seconds"]), float(told["heldout_psnr_db"])))
+        except (ValueError, KeyError, TypeError):
+            continue
+    return points
 
 
 def _named(folder: Path, file: str) -> dict[str, dict[str, Any]]:
