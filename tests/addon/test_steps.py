@@ -261,3 +261,16 @@ def test_a_view_that_the_colour_configuration_lacks_is_said(addon, contract, sce
     monkeypatch.setitem(setup._VIEW, "view_transform", "Plain")
     with pytest.raises(contract.JobError, match="has no view transform 'Plain'"):
         setup.keep_plate_colours(scene)
+
+
+def test_a_dropped_video_becomes_the_clip_and_an_earlier_shot_stays_on_disk(scene, shot, clip):
+    props = scene.splannequin
+    props.shot_path = str(shot)
+    assert bpy.ops.splannequin.use_clip(filepath=str(clip)) == {"FINISHED"}
+    assert (props.clip, props.shot_path) == (str(clip), "")
+    props.shot_path = str(shot)
+    bpy.ops.splannequin.use_clip(filepath=str(clip))
+    assert props.shot_path == str(shot), "the same clip again changes nothing"
+    handler = bpy.types.SPLANNEQUIN_FH_video
+    assert handler.bl_import_operator == "splannequin.use_clip" and ".mp4" in handler.bl_file_extensions.split(";")
+    assert not bpy.ops.splannequin.use_movie_clip.poll()
