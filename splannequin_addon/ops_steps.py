@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, jobs, steps, supervisor, viewport
+from . import backend, bake, cameras, jobs, markers, steps, supervisor, viewport
 
 
 class _StepOperator:
@@ -257,6 +257,19 @@ class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class SPLANNEQUIN_OT_t_star_marker(bpy.types.Operator):
+    """Show t* as a marker on the timeline, to be dragged; press again to take it away"""
+
+    bl_idname = "splannequin.t_star_marker"
+    bl_label = "Marker for t*"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Adds or removes the marker."""
+        markers.toggle(context.scene)
+        return {"FINISHED"}
+
+
 class SPLANNEQUIN_OT_live(bpy.types.Operator):
     """Draw the frozen instant over the 3D view while you scrub t* and move the view; press again to stop"""
 
@@ -348,6 +361,7 @@ CLASSES = (
     SPLANNEQUIN_OT_combine_cg,
     SPLANNEQUIN_OT_remove_shot,
     SPLANNEQUIN_OT_t_star_here,
+    SPLANNEQUIN_OT_t_star_marker,
     SPLANNEQUIN_OT_live,
     SPLANNEQUIN_OT_suggested_instant,
 )

@@ -12,7 +12,7 @@ from typing import Any
 
 import bpy
 
-from . import cameras, compat, compositor, pictures, scene_setup, shots, steps, supervisor, viewport
+from . import cameras, compat, compositor, markers, pictures, scene_setup, shots, steps, supervisor, viewport
 
 CATEGORY = "Splannequin"
 
@@ -346,6 +346,8 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         value.enabled = props.choose_t_star
         value.prop(props, "t_star", text="")
         row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
+        shown = context.scene.timeline_markers.get(markers.NAME) is not None
+        row.operator("splannequin.t_star_marker", text="", icon="MARKER_HLT" if shown else "MARKER", depress=shown)
         self._live(context, layout)
 
     def _live(self, context: Any, layout: Any) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, compat, compositor, jobs, scene_setup, shots
+from . import backend, bake, cameras, compat, compositor, jobs, markers, scene_setup, shots
 
 
 @dataclass(frozen=True)
@@ -249,6 +249,8 @@ def remove_all(scene: Any, shot: Path) -> list[str]:
         done.append("The freeze left the compositor.")
     if cameras.remove(scene, shot):
         done.append("Camera and points were removed.")
+    if markers.remove(scene):
+        done.append("The marker t* was removed.")
     if scene_setup.restore(scene):
         done.append("The scene's settings are as they were.")
     return done

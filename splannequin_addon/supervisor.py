@@ -17,7 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, jobs, shots, steps, viewport
+from . import backend, jobs, markers, shots, steps, viewport
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
@@ -172,6 +172,8 @@ def tick() -> float:
 def _turn(watch: Watch, until: float) -> bool:
     """One shot's part of a tick, `until` a time of `time.monotonic`; True if its panel should be drawn again."""
     changed, watch.redraw = watch.redraw or watch.sampling is not None, False
+    for scene in steps.scenes_of(watch.shot):
+        changed |= markers.follow(scene)
     _read_on(watch)
     for step, job in list(watch.jobs.items()):
         if job.ended or time.monotonic() > until:
@@ -236,6 +238,7 @@ def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
 def _on_load(*_: Any) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
     viewport.end()
+    markers.forget()
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     for watch in _watches.values():

@@ -274,3 +274,23 @@ def test_a_dropped_video_becomes_the_clip_and_an_earlier_shot_stays_on_disk(scen
     handler = bpy.types.SPLANNEQUIN_FH_video
     assert handler.bl_import_operator == "splannequin.use_clip" and ".mp4" in handler.bl_file_extensions.split(";")
     assert not bpy.ops.splannequin.use_movie_clip.poll()
+
+
+def test_marker_and_instant_follow_whichever_changed_last(addon, with_shot, shot):
+    scene, markers = with_shot, addon("markers")
+    scene.splannequin.t_star = 6
+    bpy.ops.splannequin.t_star_marker()
+    marker = scene.timeline_markers[markers.NAME]
+    assert marker.frame == 6 and not markers.follow(scene)
+    marker.frame = 7
+    assert markers.follow(scene)
+    assert (scene.splannequin.t_star, scene.splannequin.choose_t_star) == (7, True)
+    scene.splannequin.t_star = 5
+    assert markers.follow(scene) and marker.frame == 5
+    markers.forget()
+    marker.frame = 6
+    markers.follow(scene)
+    assert marker.frame == 5, "after a file load the setting in the file leads"
+    other = scene.timeline_markers.new("mine", frame=3)
+    assert "The marker t* was removed." in addon("steps").remove_all(scene, shot)
+    assert list(scene.timeline_markers) == [other]

@@ -1,0 +1,49 @@
+"""The marker "t*" on the timeline: dragging it sets the instant, setting the instant moves it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+NAME = "t*"
+_known: dict[str, tuple[int, int]] = {}
+"""Scene -> (frame of the marker, t*) when they last agreed."""
+
+
+def toggle(scene: Any) -> bool:
+    """Puts the marker on the timeline, or takes it away. True if it is there now."""
+    if remove(scene):
+        return False
+    scene.timeline_markers.new(NAME, frame=scene.splannequin.t_star)
+    _known[scene.name] = (scene.splannequin.t_star, scene.splannequin.t_star)
+    return True
+
+
+def remove(scene: Any) -> bool:
+    """Takes the marker away. True if there was one."""
+    _known.pop(scene.name, None)
+    marker = scene.timeline_markers.get(NAME)
+    if marker is None:
+        return False
+    scene.timeline_markers.remove(marker)
+    return True
+
+
+def follow(scene: Any) -> bool:
+    """Lets whichever of marker and t* changed last lead. True if something was changed."""
+    marker, props = scene.timeline_markers.get(NAME), scene.splannequin
+    if marker is None or marker.frame == props.t_star:
+        if marker is not None:
+            _known[scene.name] = (marker.frame, props.t_star)
+        return False
+    before = _known.get(scene.name)
+    if before is not None and before[0] != marker.frame and before[1] == props.t_star:
+        props.t_star, props.choose_t_star = marker.frame, True
+    else:
+        marker.frame = props.t_star
+    _known[scene.name] = (marker.frame, props.t_star)
+    return True
+
+
+def forget() -> None:
+    """Drops what is known of scenes: another file may have others of the same names."""
+    _known.clear()
