@@ -20,6 +20,8 @@ from ..torch_backend import contract
 from . import compat, compositor, shots
 
 _TAG = "splannequin"
+_PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
+"""Kind of our objects -> last word of the name they are made with."""
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenCV camera axes to Blender's, and back."""
 SENSOR_MM = 36.0
@@ -211,7 +213,7 @@ def build(scene: Any, shot: Path) -> Any:
     camera = bpy.data.objects.new(f"{name} camera", camera_data)
     cloud = bpy.data.objects.new(f"{name} points", _point_mesh(f"{name} points", xyz, rgb))
     cloud.hide_render = True
-    cloud.color = (0.9, 0.9, 0.9, 1.0)
+    cloud.display_type = "BOUNDS"  # Blender draws loose points black, whatever their colour: points.py draws them
     root.empty_display_size = _extent(path)
     camera_data.display_size = max(_extent(path) * 0.5, 0.05)
     for item in (root, camera, cloud):
@@ -230,6 +232,9 @@ def build(scene: Any, shot: Path) -> Any:
 def find(scene: Any, shot: Path, kind: str) -> Any | None:
     """Our object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points)."""
     name = shot.name.removesuffix(shots.SHOT_SUFFIX)
+    usual = scene.objects.get(f"{name} {_PARTS[kind]}")  # every draw asks, also in scenes of many thousand objects
+    if usual is not None and usual.get(_TAG) == name and usual.type == kind:
+        return usual
     return next((o for o in scene.objects if o.get(_TAG) == name and o.type == kind), None)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from . import cli, ops_clip, ops_jobs, ops_steps, panel, pictures, preferences, props, supervisor
+from . import cli, ops_clip, ops_jobs, ops_steps, panel, pictures, points, preferences, props, supervisor
 
 _CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *ops_clip.CLASSES, *panel.CLASSES)
 
@@ -23,6 +23,7 @@ def register() -> None:
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
     pictures.register()
+    points.register()
     supervisor.register()
     cli.register()
 
@@ -33,6 +34,7 @@ def unregister() -> None:
         return
     cli.unregister()
     supervisor.unregister()
+    points.unregister()
     pictures.unregister()
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)

@@ -272,3 +272,18 @@ def test_a_keyed_instant_is_followed_frame_by_frame(addon, scene, shot):
     assert ramp == {"5": 5.0, "6": 6.0, "7": 7.0, "8": 7.0, "9": 7.0}
     props.choose_t_star = False
     assert steps.params_of(scene, "freeze").t_star_per_frame == {}
+
+
+def test_points_keep_their_own_colours(addon, scene, shot):
+    """What is drawn over the view: Blender itself draws loose points black, so the object shows its bounds only."""
+    cameras = addon("cameras")
+    cameras.build(scene, shot)
+    cloud = cameras.find(scene, shot, "MESH")
+    with np.load(shot / "solve" / "points.npz") as stored:
+        xyz, rgb = stored["xyz"], stored["rgb"]
+    places, colours = addon("points").coloured(cloud.data)
+    np.testing.assert_allclose(places, xyz, atol=1e-6)
+    np.testing.assert_allclose(colours[:, :3], rgb / 255.0, atol=1.1 / 255)
+    assert cloud.display_type == "BOUNDS"
+    cloud.name = "renamed"
+    assert cameras.find(scene, shot, "MESH") == cloud

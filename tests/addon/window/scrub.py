@@ -100,6 +100,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.splannequin.load_camera()
     yield 1.0
+    yield from press._shoot(work, "8-points")
     yield from press._click("splannequin.live")
     since = time.monotonic()
     while viewport.session() is None or not viewport.session().facts:
