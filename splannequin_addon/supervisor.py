@@ -178,9 +178,10 @@ def _turn(watch: Watch, until: float) -> bool:
     for step, job in list(watch.jobs.items()):
         if job.ended or time.monotonic() > until:
             continue
-        changed = True
         try:
+            before = _told(job)
             jobs.poll(job, max(until - time.monotonic(), 0.001))
+            changed |= before != _told(job)
         except (OSError, ValueError, KeyError) as error:
             watch.failures[step] = (f"The job in {job.folder} cannot be read: {error}", "")
             del watch.jobs[step]
@@ -196,12 +197,20 @@ def _turn(watch: Watch, until: float) -> bool:
     return changed
 
 
+def _told(job: jobs.Job) -> tuple[Any, ...]:
+    """What the panel shows of a job."""
+    status = job.status
+    shown = (status.state, status.stage, round(status.fraction, 2), status.message) if status is not None else ()
+    return (shown, len(job.warnings), len(job.history), *job.images.values())
+
+
 def redraw() -> None:
-    """Draws every 3D view again, so that the panel shows what is new."""
+    """Draws the sidebar of every 3D view again; the view itself, which may be a heavy scene, is left alone."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+            for region in area.regions if area.type == "VIEW_3D" else ():
+                if region.type == "UI":
+                    region.tag_redraw()
 
 
 def look_through_camera(window: Any) -> None:

@@ -78,18 +78,21 @@ def _serve(blender: subprocess.Popen[bytes], work: Path, output: Path, environ: 
     """Takes the pictures that the script inside asks for, until Blender ends."""
     until = time.monotonic() + limit
     while blender.poll() is None and time.monotonic() < until:
-        for request in sorted(work.glob("*.shoot")):
-            picture = output / f"window-{request.stem}.jpg"
-            dump = subprocess.run(["xwd", "-root", "-silent"], env=environ, capture_output=True, check=True).stdout
-            subprocess.run(
-                ["convert", "xwd:-", "-strip", "-resize", "1280x", "-quality", "85", str(picture)],
-                input=dump,
-                check=True,
-            )
-            request.unlink()
+        _photograph(work, output, environ)
         time.sleep(0.1)
     if blender.poll() is None:
         blender.kill()
+
+
+def _photograph(work: Path, output: Path, environ: dict[str, str]) -> None:
+    """Takes the pictures that have been asked for."""
+    for request in sorted(work.glob("*.shoot")):
+        picture = output / f"window-{request.stem}.jpg"
+        dump = subprocess.run(["xwd", "-root", "-silent"], env=environ, capture_output=True, check=True).stdout
+        subprocess.run(
+            ["convert", "xwd:-", "-strip", "-resize", "1280x", "-quality", "85", str(picture)], input=dump, check=True
+        )
+        request.unlink()
 
 
 # ------------------------------------------------------------------------------------------------- inside Blender
