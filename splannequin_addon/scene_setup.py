@@ -9,6 +9,13 @@ from ..torch_backend import contract
 from . import cameras
 
 _BEFORE = "splannequin_settings_before"
+_OURS = "splannequin_settings_ours"
+_TOGETHER = (
+    {"resolution_x", "resolution_y", "resolution_percentage"},
+    {"pixel_aspect_x", "pixel_aspect_y"},
+    {"fps", "fps_base"},
+    {"frame_start", "frame_end"},
+)
 _VIEW = {"view_transform": "Standard", "look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False}
 
 
@@ -46,21 +53,17 @@ def fit_clip(
     aspect = cameras.pixel_aspect(k) if k else (render.pixel_aspect_x, render.pixel_aspect_y)
     now = (render.resolution_x, render.resolution_y, render.resolution_percentage)
     if now != (*size, 100):
-        _remember(scene, "render", ("resolution_x", "resolution_y", "resolution_percentage"))
-        render.resolution_x, render.resolution_y, render.resolution_percentage = *size, 100
+        _set(scene, "render", {"resolution_x": size[0], "resolution_y": size[1], "resolution_percentage": 100})
         changes.append(f"Resolution set to {size[0]} x {size[1]}.")
     if (render.pixel_aspect_x, render.pixel_aspect_y) != aspect:
-        _remember(scene, "render", ("pixel_aspect_x", "pixel_aspect_y"))
-        render.pixel_aspect_x, render.pixel_aspect_y = aspect
+        _set(scene, "render", {"pixel_aspect_x": aspect[0], "pixel_aspect_y": aspect[1]})
         changes.append("Pixel aspect set to the lens's.")
     if fps > 0 and abs(render.fps / render.fps_base - fps) > 1e-4:
-        _remember(scene, "render", ("fps", "fps_base"))
-        render.fps = max(round(fps), 1)
-        render.fps_base = render.fps / fps
+        whole = max(round(fps), 1)
+        _set(scene, "render", {"fps": whole, "fps_base": whole / fps})
         changes.append(f"Frame rate set to {fps:g}.")
     if (scene.frame_start, scene.frame_end) != frames:
-        _remember(scene, "scene", ("frame_start", "frame_end"))
-        scene.frame_start, scene.frame_end = frames
+        _set(scene, "scene", {"frame_start": frames[0], "frame_end": frames[1]})
         changes.append(f"Frame range set to {frames[0]} to {frames[1]}.")
     if not frames[0] <= scene.frame_current <= frames[1]:
         scene.frame_set(frames[0])
@@ -78,10 +81,9 @@ def keep_plate_colours(scene: Any) -> list[str]:
     different = [name for name, value in _VIEW.items() if getattr(view, name) != value]
     if different:
         was = view.view_transform
-        _remember(scene, "view", tuple(_VIEW))
         for name, value in _VIEW.items():
             try:
-                setattr(view, name, value)
+                _set(scene, "view", {name: value})
             except TypeError as error:  # what an enumeration says to a value it lacks
                 raise contract.JobError(
                     f"This Blender's colour configuration has no {name.replace('_', ' ')} {value!r}.",
@@ -90,8 +92,7 @@ def keep_plate_colours(scene: Any) -> list[str]:
                 ) from error
         changes.append(f"View transform set from {was} to Standard, so that the plate keeps its colours.")
     if scene.render.dither_intensity:
-        _remember(scene, "render", ("dither_intensity",))
-        scene.render.dither_intensity = 0.0
+        _set(scene, "render", {"dither_intensity": 0.0})
         changes.append("Dither set to 0, so that pixels stay exact.")
     return changes
 
@@ -100,12 +101,10 @@ def render_cg(scene: Any) -> list[str]:
     """Has the scene rendered on a transparent film with a depth pass; returns what was changed, in words."""
     changes = []
     if not scene.render.film_transparent:
-        _remember(scene, "render", ("film_transparent",))
-        scene.render.film_transparent = True
+        _set(scene, "render", {"film_transparent": True})
         changes.append("Film set to transparent.")
     if not scene.view_layers[0].use_pass_z:
-        _remember(scene, "layer", ("use_pass_z",))
-        scene.view_layers[0].use_pass_z = True
+        _set(scene, "layer", {"use_pass_z": True})
         changes.append("The depth pass was switched on.")
     return changes
 
@@ -116,15 +115,30 @@ def keeps_plate_colours(scene: Any) -> bool:
 
 
 def restore(scene: Any) -> bool:
-    """Takes back every setting that was changed here. True if there was one."""
+    """Takes back the settings that were changed here, but what the artist has changed since. True if there was one.
+
+    Settings that belong together (a size, a rate, a range) are taken back together or not at all.
+    """
     stored = scene.get(_BEFORE)
     if not stored:
         return False
+    ours = json.loads(scene.get(_OURS, "{}"))
     for owner, values in json.loads(stored).items():
+        target, set_here = _owner(scene, owner), ours.get(owner, {})
+        touched = {n for n, v in set_here.items() if not _same(getattr(target, n), v)}
+        for group in _TOGETHER:
+            touched |= group if touched & group else set()
         for name, value in values.items():
-            setattr(_owner(scene, owner), name, value)
-    del scene[_BEFORE]
+            if name not in touched:
+                setattr(target, name, value)
+    for key in (_BEFORE, _OURS):
+        if key in scene:
+            del scene[key]
     return True
+
+
+def _same(one: Any, other: Any) -> bool:
+    return abs(one - other) < 1e-5 if isinstance(other, float) else bool(one == other)
 
 
 def _owner(scene: Any, name: str) -> Any:
@@ -133,10 +147,14 @@ def _owner(scene: Any, name: str) -> Any:
     }[name]  # fmt: skip
 
 
-def _remember(scene: Any, owner: str, names: tuple[str, ...]) -> None:
-    """Keeps the present values in the scene, unless older ones are kept already."""
-    before = json.loads(scene.get(_BEFORE, "{}"))
-    values = before.setdefault(owner, {})
-    for name in names:
-        values.setdefault(name, getattr(_owner(scene, owner), name))
-    scene[_BEFORE] = json.dumps(before)
+def _set(scene: Any, owner: str, values: dict[str, Any]) -> None:
+    """Changes settings; keeps in the scene what they were (unless that is kept already) and what they became."""
+    target = _owner(scene, owner)
+    before, ours = (json.loads(scene.get(key, "{}")) for key in (_BEFORE, _OURS))
+    was = {name: getattr(target, name) for name in values}
+    for name, value in values.items():
+        setattr(target, name, value)
+    for name in values:
+        before.setdefault(owner, {}).setdefault(name, was[name])
+        ours.setdefault(owner, {})[name] = getattr(target, name)
+    scene[_BEFORE], scene[_OURS] = json.dumps(before), json.dumps(ours)

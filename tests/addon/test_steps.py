@@ -294,3 +294,18 @@ def test_marker_and_instant_follow_whichever_changed_last(addon, with_shot, shot
     other = scene.timeline_markers.new("mine", frame=3)
     assert "The marker t* was removed." in addon("steps").remove_all(scene, shot)
     assert list(scene.timeline_markers) == [other]
+
+
+def test_what_the_artist_changed_since_is_not_taken_back(addon, scene, shot):
+    setup, steps = addon("scene_setup"), addon("steps")
+    scene.splannequin.shot_path = str(shot)
+    rate = scene.render.fps, scene.render.fps_base
+    setup.fit_clip(scene, (16, 12), 12.5, (5, 7))
+    setup.keep_plate_colours(scene)
+    scene.render.resolution_x = 4000
+    scene.view_settings.exposure = 1.5
+    steps.remove_all(scene, shot)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (4000, 12), "a size belongs together"
+    assert scene.view_settings.exposure == 1.5 and scene.view_settings.view_transform == "AgX"
+    assert (scene.render.fps, scene.render.fps_base) == rate and (scene.frame_start, scene.frame_end) == (1, 250)
+    assert not [key for key in scene.keys() if key.startswith("splannequin_")]  # noqa: SIM118
