@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_backend.contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, read_message, write_message
+from torch_backend.contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, LiveView, read_message, write_message
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.live import _Waiting
+from torch_backend.live import _TINT, _TINTED, LiveSession, _Waiting
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -83,12 +83,25 @@ def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
     assert np.abs(depth[seen] / want.depth[seen] - 1).max() < 1e-3
     assert bool((depth[rgba[..., 3] == 0] == np.float32(NO_DEPTH)).all())
     tinted, _ = picture(ask(session[0], view_of(world, 105, 112, show="guesses", exposed_like=105.0)))
-    changed = np.abs(tinted - rgba)[..., :3].max(-1)
-    assert changed[seen & (want.support > 0.999)].max() < 4e-3
-    assert changed[seen & (want.support < 0.5)].min() > 0.02
+    guess = _TINTED * (1.0 - want.support)[..., None]
+    expected = rgba[..., :3] * (1.0 - guess) + guess * rgba[..., 3:] * np.array(_TINT)
+    assert np.abs(tinted[..., :3] - expected)[seen].max() < 4e-3
     for show in ("support", "motion"):
         matte, _ = picture(ask(session[0], view_of(world, 105, 112, show=show)))
         assert np.abs(matte[..., 0] - getattr(want, show) * want.rgba[..., 3]).max() < 4e-3
+
+
+def test_guesses_are_tinted_by_how_ill_they_were_seen(trained):
+    world, _ = trained
+    session = LiveSession(world.shot, "main", "cpu")
+    session._at(112.0).support[:] = 0.25
+    asked = {k: v for k, v in view_of(world, 105, 112).items() if k != "kind"}
+    plain, tinted = (picture(session.draw(LiveView(**asked, show=show)))[0] for show in ("color", "guesses"))
+    guess = 0.75 * _TINTED
+    expected = plain[..., :3] * (1.0 - guess) + guess * plain[..., 3:] * np.array(_TINT)
+    seen = plain[..., 3] > 0.99
+    assert np.abs(tinted[..., :3] - expected)[seen].max() < 1e-3
+    assert np.abs(tinted - plain)[seen].max() > 0.1
 
 
 def test_two_instants_differ_where_the_patch_moved(session, trained):
