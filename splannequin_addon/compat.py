@@ -130,27 +130,15 @@ def new_over_node(tree: Any) -> tuple[Any, Any, Any]:
     return node, pictures[0], pictures[1]
 
 
-def new_stretch_node(tree: Any) -> Any:
-    """A Scale node that stretches inputs[0] to the render size."""
+def new_fit_node(tree: Any, how: str = "Fit") -> Any:
+    """A Scale node that brings inputs[0] to the render size: "Fit" keeps its shape, "Stretch" does not."""
     node = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Render Size"
-        node.inputs["Frame Type"].default_value = "Stretch"
+        node.inputs["Frame Type"].default_value = how
     else:
         node.space = "RENDER_SIZE"
-        node.frame_method = "STRETCH"
-    return node
-
-
-def new_fit_node(tree: Any) -> Any:
-    """A Scale node that fits inputs[0] into the render size, keeping its shape."""
-    node = tree.nodes.new("CompositorNodeScale")
-    if HAS_COMPOSITING_GROUP:
-        node.inputs["Type"].default_value = "Render Size"
-        node.inputs["Frame Type"].default_value = "Fit"
-    else:
-        node.space = "RENDER_SIZE"
-        node.frame_method = "FIT"
+        node.frame_method = how.upper()
     return node
 
 

@@ -351,7 +351,7 @@ def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     ramp = group.nodes.new("CompositorNodeImage")
     ramp.image = _ramp()
     ramp.label = "From left to right"
-    wide = compat.new_stretch_node(group)
+    wide = compat.new_fit_node(group, "Stretch")
     group.links.new(ramp.outputs["Image"], wide.inputs[0])
     # A scaled picture fades out over its last pixels: those of the ramp lie outside of the frame.
     larger = group.nodes.new("CompositorNodeScale")

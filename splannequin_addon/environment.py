@@ -15,7 +15,6 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from ..torch_backend import contract
 from . import jobs
@@ -81,9 +80,6 @@ def start(folder: Path, python: str, package_root: Path) -> SetUp:
     if sys.platform == "win32" and nvidia_card():
         environ.setdefault("SPLANNEQUIN_TORCH_INDEX", TORCH_INDEX)
     command = [python, str(package_root / "splannequin.py"), "setup", "--backend", "--output", str(setup.log.parent)]
-    detach: dict[str, Any] = {"start_new_session": True}
-    if sys.platform == "win32":
-        detach = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
     try:
         setup.log.parent.mkdir(parents=True, exist_ok=True)
         with open(setup.log, "wb") as log:
@@ -94,7 +90,7 @@ def start(folder: Path, python: str, package_root: Path) -> SetUp:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                **detach,
+                **jobs.detached(),
             )
     except OSError as error:
         raise contract.JobError(

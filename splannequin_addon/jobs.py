@@ -95,9 +95,6 @@ def start(job: Job, python: str, package_root: Path) -> None:
         contract.JobError: the interpreter cannot be started.
     """
     command = [python, "-m", "torch_backend", "run-job", str(job.folder)]
-    detach: dict[str, Any] = {"start_new_session": True}
-    if sys.platform == "win32":
-        detach = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
     try:
         with open(job.folder / contract.LOG_FILE, "ab") as log:
             job.process = subprocess.Popen(
@@ -107,7 +104,7 @@ def start(job: Job, python: str, package_root: Path) -> None:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                **detach,
+                **detached(),
             )
     except OSError as error:
         raise contract.JobError(
@@ -115,6 +112,13 @@ def start(job: Job, python: str, package_root: Path) -> None:
             "Choose the Python of the backend's environment in the add-on's preferences.",
             contract.ExitCode.ENVIRONMENT,
         ) from error
+
+
+def detached() -> dict[str, Any]:
+    """What `Popen` needs for a child that outlives this Blender and shows no window."""
+    if sys.platform == "win32":
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+    return {"start_new_session": True}
 
 
 def backend_environ(package_root: Path) -> dict[str, str]:

@@ -83,8 +83,8 @@ class Session:
 
     def busy(self, view: int) -> bool:
         """True while the last request for a view is not answered."""
-        asked, frame = self._asked.get(view), self.frames.get(view)
-        return asked is not None and (frame is None or frame.asked.seq != asked.seq)
+        with self._change:
+            return any(asked.view == view for asked in self._sent.values())
 
     def close(self) -> None:
         """Ends the child; returns at once. Its memory is free as soon as it has seen that its input ended."""
@@ -137,16 +137,23 @@ class Session:
             self.facts = header
         elif header["kind"] == "error" and "seq" not in header:
             self._fail(header["message"], header["hint"])
+        elif header["kind"] == "error":
+            self._answered(header["seq"])  # this view cannot be drawn; the next one may
         elif header["kind"] == "frame":
-            with self._change:
-                asked = self._sent.pop(header["seq"])
-                for seq in [s for s, v in self._sent.items() if v.view == asked.view and s < asked.seq]:
-                    del self._sent[seq]  # a newer one took its place
+            asked = self._answered(header["seq"])
             w, h = header["width"], header["height"]
             values = np.frombuffer(body, np.float32)
             rgba, depth = values[: 4 * w * h].reshape(h, w, 4), values[4 * w * h :].reshape(h, w)
             self.frames[asked.view] = Frame(asked, header["t_star"], rgba, depth, time.monotonic())
             self.drawn += 1
+
+    def _answered(self, seq: int) -> contract.LiveView:
+        """The request that was answered; it and those of its view that it took the place of wait no more."""
+        with self._change:
+            asked = self._sent.pop(seq)
+            for older in [s for s, v in self._sent.items() if v.view == asked.view and s < seq]:
+                del self._sent[older]
+        return asked
 
     def _fail(self, message: str, hint: str) -> None:
         with self._change:

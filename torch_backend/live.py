@@ -76,12 +76,10 @@ class LiveSession:
         trained = self.run.train_frames
         at = min(trained, key=lambda frame: abs(frame - view.t_star))
         like = at if view.exposed_like is None else view.exposed_like
-        viewmat = np.array(view.viewmat, dtype=np.float64).reshape(4, 4)
-        viewmat[:3, 3] = self.scene.scale * (viewmat[:3, 3] + viewmat[:3, :3] @ self.scene.centre)
         fx, fy, cx, cy = view.K
         image = render_frozen(
             self._at(float(at)),
-            torch.from_numpy(viewmat).float(),
+            self.scene.from_solve(np.reshape(view.viewmat, (4, 4))),
             torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device="cpu"),
             view.width,
             view.height,

@@ -58,6 +58,10 @@ class Scene:
         """Normalised time of a (possibly fractional) frame number, clamped to the range."""
         return float(np.interp(frame, self.frames, self.times))
 
+    def from_solve(self, viewmats: np.ndarray) -> Tensor:
+        """World-to-camera matrices [..., 4, 4] of solve units, in scene units, float32."""
+        return torch.from_numpy(_in_scene(viewmats, self.scale, self.centre)).float()
+
     def camera_at(self, width: int, height: int) -> Tensor:
         """`Ks` rescaled to another image size, [F, 3, 3]."""
         return resize_intrinsics(self.Ks, self.width, self.height, width, height)
@@ -84,7 +88,6 @@ def load_scene(shot: Shot) -> Scene:
     with np.load(points_path, allow_pickle=False) as stored:
         xyz, rgb = stored["xyz"].astype(np.float64), stored["rgb"]
     scale, centre = _normalisation(viewmats[solved], xyz)
-    viewmats[:, :3, 3] = scale * (viewmats[:, :3, 3] + viewmats[:, :3, :3] @ centre)
     seconds = np.array([table[f]["seconds"] for f in frames], dtype=np.float64)
     seconds -= seconds[0]
     start, end = seconds[solved[0]], seconds[solved[-1]]
@@ -94,7 +97,7 @@ def load_scene(shot: Shot) -> Scene:
         frames=frames,
         seconds=seconds,
         times=np.clip((seconds - start) / (end - start), 0.0, 1.0),
-        viewmats=torch.from_numpy(viewmats).float(),
+        viewmats=torch.from_numpy(_in_scene(viewmats, scale, centre)).float(),
         Ks=torch.tensor([[[c.K[0], 0, c.K[2]], [0, c.K[1], c.K[3]], [0, 0, 1]] for c in path.frames]).float(),
         width=path.width,
         height=path.height,
@@ -105,6 +108,13 @@ def load_scene(shot: Shot) -> Scene:
         centre=centre,
         folder=shot.frames,
     )
+
+
+def _in_scene(viewmats: np.ndarray, scale: float, centre: np.ndarray) -> np.ndarray:
+    """World-to-camera matrices [..., 4, 4] after the world was moved by -centre and scaled."""
+    moved = np.array(viewmats, dtype=np.float64)
+    moved[..., :3, 3] = scale * (moved[..., :3, 3] + moved[..., :3, :3] @ centre)
+    return moved
 
 
 def _normalisation(viewmats: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray]:

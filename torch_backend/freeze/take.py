@@ -124,10 +124,9 @@ def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tu
     if not path.frames:
         raise JobError("The camera path has no frames.", "Send at least one pose.", ExitCode.FREEZE)
     viewmats = np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4)
-    viewmats[:, :3, 3] = scene.scale * (viewmats[:, :3, 3] + viewmats[:, :3, :3] @ scene.centre)
     x, y = width / path.width, height / path.height
     Ks = [[[f.K[0] * x, 0, f.K[2] * x], [0, f.K[1] * y, f.K[3] * y], [0, 0, 1]] for f in path.frames]
-    return torch.from_numpy(viewmats).float(), torch.tensor(Ks, device="cpu").float(), [f.frame for f in path.frames]
+    return scene.from_solve(viewmats), torch.tensor(Ks, device="cpu").float(), [f.frame for f in path.frames]
 
 
 def take_key(

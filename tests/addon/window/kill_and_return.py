@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -44,28 +43,21 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="splannequin-kill-") as name:
         work = Path(name)
         environ = {**os.environ, "DISPLAY": args.display}
-        size = press.WINDOW
-        screen = subprocess.Popen(["Xvfb", args.display, "-screen", "0", f"{size[0]}x{size[1]}x24"])
         results: dict[str, Any] = {}
-        try:
-            time.sleep(2.0)
+        with press.screen(args.display):
             for turn in (1, 2):
                 plan = {"turn": turn, "work": name, "clip": str(Path(args.clip).absolute()), "last": args.last}
-                command = [args.blender, *([str(work / "shot.blend")] if turn == 2 else [])]
-                command += ["--gpu-backend", "opengl", "--enable-event-simulate"]
-                command += ["--window-geometry", "0", "0", str(size[0]), str(size[1]), "--python", __file__]
+                files = [str(work / "shot.blend")] if turn == 2 else []
+                command = press.command(args.blender, __file__, *files)
                 blender = subprocess.Popen(command, env={**environ, PLAN: json.dumps(plan)}, start_new_session=True)
-                if turn == 1:
-                    _serve_until(work / "kill.me", blender, work, output, environ, args.limit)
-                    os.killpg(blender.pid, signal.SIGKILL)
-                    blender.wait()
-                    time.sleep(3.0)
-                    results["job_after_kill"] = _state(work)
-                else:
+                if turn == 2:
                     press._serve(blender, work, output, environ, args.limit)
-        finally:
-            screen.terminate()
-            screen.wait()
+                    continue
+                _serve_until(work / "kill.me", blender, work, output, environ, args.limit)
+                os.killpg(blender.pid, signal.SIGKILL)
+                blender.wait()
+                time.sleep(3.0)
+                results["job_after_kill"] = _state(work)
         told = work / "told.json"
         results |= json.loads(told.read_text()) if told.is_file() else {"error": "the second Blender told nothing"}
         print(json.dumps(results, indent=1))
@@ -98,21 +90,7 @@ def inside() -> None:
 
     plan = json.loads(os.environ[PLAN])
     told: dict[str, Any] = {"blender": bpy.app.version_string, "ended": [], "longest_tick_ms": 0.0}
-    play = _first(plan) if plan["turn"] == 1 else _second(plan, told)
-
-    def turn() -> float | None:
-        try:
-            return next(play)
-        except StopIteration:
-            pass
-        except Exception as error:  # whatever it was: told, and Blender must not stand open until the limit
-            traceback.print_exc()
-            told["error"] = f"{type(error).__name__}: {error}"
-        (Path(plan["work"]) / "told.json").write_text(json.dumps(told))
-        bpy.ops.wm.quit_blender()
-        return None
-
-    bpy.app.timers.register(turn, first_interval=2.0, persistent=True)
+    press.act(_first(plan) if plan["turn"] == 1 else _second(plan, told), Path(plan["work"]), told)
 
 
 def _first(plan: dict[str, Any]) -> Iterator[float]:

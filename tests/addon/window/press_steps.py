@@ -10,6 +10,7 @@ over the sidebar with simulated events until the button it looks for is under it
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import subprocess
@@ -41,16 +42,9 @@ def main() -> int:
         plan = {"clip": str(Path(args.clip).absolute()), "last": args.last, "work": work, "t_star": args.t_star}
         plan |= {"stop_train": args.cancel_once}
         environ = {**os.environ, "DISPLAY": args.display, PLAN: json.dumps(plan)}
-        screen = subprocess.Popen(["Xvfb", args.display, "-screen", "0", f"{WINDOW[0]}x{WINDOW[1]}x24"])
-        try:
-            time.sleep(2.0)
-            command = [args.blender, "--gpu-backend", "opengl", "--enable-event-simulate"]
-            command += ["--window-geometry", "0", "0", str(WINDOW[0]), str(WINDOW[1]), "--python", __file__]
-            blender = subprocess.Popen(command, env=environ)
+        with screen(args.display):
+            blender = subprocess.Popen(command(args.blender, __file__), env=environ)
             _serve(blender, Path(work), output, environ, args.limit)
-        finally:
-            screen.terminate()
-            screen.wait()
         told = Path(work) / "told.json"
         if not told.is_file():
             print("Error: Blender ended without telling how the steps went.", file=sys.stderr)
@@ -58,6 +52,25 @@ def main() -> int:
         results = json.loads(told.read_text())
         print(json.dumps(results, indent=1))
         return 0 if results["ended"] == [name for name, _ in STEPS] else 1
+
+
+@contextlib.contextmanager
+def screen(display: str) -> Iterator[None]:
+    """An X display of the window's size, in memory."""
+    child = subprocess.Popen(["Xvfb", display, "-screen", "0", f"{WINDOW[0]}x{WINDOW[1]}x24"])
+    try:
+        time.sleep(2.0)
+        yield
+    finally:
+        child.terminate()
+        child.wait()
+
+
+def command(blender: str, script: str, *files: str) -> list[str]:
+    """A Blender in a window that fills the display, which takes simulated events and runs a script."""
+    size = [str(n) for n in WINDOW]
+    window = ["--gpu-backend", "opengl", "--enable-event-simulate", "--window-geometry", "0", "0", *size]
+    return [blender, *files, *window, "--python", script]
 
 
 def _arguments() -> argparse.Namespace:
@@ -100,18 +113,25 @@ def _photograph(work: Path, output: Path, environ: dict[str, str]) -> None:
 
 def inside() -> None:
     """Starts the script as a timer that walks through `_play`."""
-    import bpy
-
     plan = json.loads(os.environ[PLAN])
-    play = _play(plan)
+    act(_play(plan), Path(plan["work"]), None)
+
+
+def act(play: Iterator[float], work: Path, told: dict | None) -> None:
+    """Walks through a script, which yields seconds to wait; leaves `told` in the work folder and quits Blender."""
+    import bpy
 
     def turn() -> float | None:
         try:
             return next(play)
         except StopIteration:
             pass
-        except Exception:  # whatever it was: told, and Blender must not stand open until the limit
+        except Exception as error:  # whatever it was: told, and Blender must not stand open until the limit
             traceback.print_exc()
+            if told is not None:
+                told["error"] = f"{type(error).__name__}: {error}"
+        if told is not None:
+            (work / "told.json").write_text(json.dumps(told))
         bpy.ops.wm.quit_blender()
         return None
 

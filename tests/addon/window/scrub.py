@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -42,17 +41,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="splannequin-scrub-") as work:
         environ = {**os.environ, "DISPLAY": args.display}
         environ[PLAN] = json.dumps({"shot": str(Path(args.shot).absolute()), "work": work})
-        size = press.WINDOW
-        screen = subprocess.Popen(["Xvfb", args.display, "-screen", "0", f"{size[0]}x{size[1]}x24"])
-        try:
-            time.sleep(2.0)
-            command = [args.blender, "--gpu-backend", "opengl", "--enable-event-simulate"]
-            command += ["--window-geometry", "0", "0", str(size[0]), str(size[1]), "--python", __file__]
-            blender = subprocess.Popen(command, env=environ)
+        with press.screen(args.display):
+            blender = subprocess.Popen(press.command(args.blender, __file__), env=environ)
             press._serve(blender, Path(work), output, environ, args.limit)
-        finally:
-            screen.terminate()
-            screen.wait()
         told = Path(work) / "told.json"
         if not told.is_file():
             print("Error: Blender ended without telling how it went.", file=sys.stderr)
@@ -69,23 +60,8 @@ def inside() -> None:
     """Starts the script as a timer that walks through `_play`."""
     import bpy
 
-    plan = json.loads(os.environ[PLAN])
-    told: dict[str, Any] = {"blender": bpy.app.version_string}
-    play = _play(plan, told)
-
-    def turn() -> float | None:
-        try:
-            return next(play)
-        except StopIteration:
-            pass
-        except Exception as error:  # whatever it was: told, and Blender must not stand open until the limit
-            traceback.print_exc()
-            told["error"] = f"{type(error).__name__}: {error}"
-        (Path(plan["work"]) / "told.json").write_text(json.dumps(told))
-        bpy.ops.wm.quit_blender()
-        return None
-
-    bpy.app.timers.register(turn, first_interval=2.0, persistent=True)
+    plan, told = json.loads(os.environ[PLAN]), {"blender": bpy.app.version_string}
+    press.act(_play(plan, told), Path(plan["work"]), told)
 
 
 def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
