@@ -180,13 +180,15 @@ def plan(
     seeds: Sequence[int] = (0,),
     reference: bool = False,
     ablations: bool = False,
+    methods: Sequence[str] = (),
     **common: Any,
 ) -> tuple[list[RunSpec], list[str]]:
     """(runs, sentences about what is missing): hosts x {none, paper, support}, auto and static, then ablations.
 
     Runs are ordered so that an interrupted benchmark has compared something on every scene: by setting, then scene.
-    `reference` adds the hosts with the published sizes, rates and schedules, without and with `paper`. `common` goes to
-    every `RunSpec`: iterations, width, max_gaussians, device.
+    `reference` adds the hosts with the published sizes, rates and schedules, without and with `paper`. `methods`, where
+    given, are the only values of TrainConfig.method that run. `common` goes to every `RunSpec`: iterations, width,
+    max_gaussians, device.
     """
     offered = [host for host in HOSTS if host in METHODS]
     supervised = [s for s in ("none", "paper", "support") if s in SUPERVISIONS]
@@ -215,6 +217,7 @@ def plan(
                 said.append(f"The ablation {a.name!r} is not in this report: {error}.")
             else:
                 settings.append(spec)
+    settings = [setting for setting in settings if not methods or setting.host in methods]
     scenes = [(source, load_source(source, results)) for source in sources]
     runs = []
     for preset in presets:
@@ -429,10 +432,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     quick = {"max_gaussians": args.max_gaussians or QUICK_GAUSSIANS} if args.quick else {}
     sources = [f"truth:{Path(p).absolute()}" for p in args.truth] + [f"shot:{Path(p).absolute()}" for p in args.shot]
     try:
-        if not sources or args.size or args.quick:
+        if not sources or args.size or args.quick or args.limits:
             cameras = ("exact", "solved") if args.cameras == "both" else (args.cameras,)
             size = args.size or ("quick" if args.quick else "medium")
-            sources += make_scenes(size, args.tuning, cameras, Path(args.scenes).absolute(), args.bpy)
+            sources += make_scenes(size, args.tuning, cameras, Path(args.scenes).absolute(), args.bpy, args.limits)
         runs, said = plan(
             sources,
             results,
@@ -440,6 +443,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             seeds=range(args.seeds),
             reference=args.reference,
             ablations=args.ablations,
+            methods=args.methods or (),
             **{"iterations": args.iterations, "width": args.width, "max_gaussians": args.max_gaussians, **quick},
             device=args.device,
         )
@@ -476,10 +480,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cameras", choices=("exact", "solved", "both"), default="exact", help="of synthetic scenes")
     parser.add_argument("--scenes", default=str(default_folder()), metavar="DIR", help="of synthetic scenes")
     parser.add_argument("--tuning", action="store_true", help="scenes to tune on instead of those to report on")
+    parser.add_argument("--limits", action="store_true", help="the four scenes that break an assumption, alone")
     parser.add_argument("--truth", action="append", default=[], metavar="FOLDER", help="scene with rendered truth")
     parser.add_argument("--shot", action="append", default=[], metavar="SHOT", help="solved shot of a real clip")
     parser.add_argument("--results", default="output/bench", metavar="DIR", help="records, pictures and report")
     parser.add_argument("--preset", action="append", choices=tuple(PRESETS), help="default: preview")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="only these (default: all)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="training seeds 0 to N - 1")
     parser.add_argument("--reference", action="store_true", help="hosts in the published settings too: none and paper")
     parser.add_argument("--ablations", action="store_true", help="the paper's and ours")

@@ -23,7 +23,7 @@ from torch import Tensor
 from benchmarks.synthetic.folder import Regions, SyntheticScene
 from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, solved_shot
-from benchmarks.synthetic.sizes import REPORT_SEEDS, SIZES, TUNING_SEEDS
+from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import read_json
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key
@@ -99,15 +99,19 @@ def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
     return torch.nn.functional.interpolate(values, (height, width), mode="nearest-exact")[0, 0] > 0.5
 
 
-def make_scenes(size: str, tuning: bool, cameras: Sequence[str], folder: Path, bpy: str | None = None) -> list[str]:
+def make_scenes(
+    size: str, tuning: bool, cameras: Sequence[str], folder: Path, bpy: str | None = None, limits: bool = False
+) -> list[str]:
     """Sources of the synthetic scenes of a size, rendered first where they are not there (a child process).
 
-    `bpy` is a Python with Blender's module, found beside the repository if it is not given. RuntimeError with the
-    child's own last words if a scene cannot be made.
+    With `limits` those of the first seed that break an assumption of the method, instead of the plain ones. `bpy` is a
+    Python with Blender's module, found beside the repository if it is not given. RuntimeError with the child's own last
+    words if a scene cannot be made.
     """
-    seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: SIZES[size].scenes]
+    seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: 1 if limits else SIZES[size].scenes]
+    kinds = LIMITS if limits else ("plain",)
     command = [sys.executable, "-P", "-m", "benchmarks.sources", "--size", size, "--out", str(folder)]
-    command += [*(["--bpy", bpy] if bpy else []), "--seeds", *map(str, seeds)]
+    command += [*(["--bpy", bpy] if bpy else []), "--seeds", *map(str, seeds), "--kinds", *kinds]
     with subprocess.Popen(
         command, env=child_environ(), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
@@ -115,7 +119,7 @@ def make_scenes(size: str, tuning: bool, cameras: Sequence[str], folder: Path, b
     if child.returncode:
         last = said.strip().splitlines()[-1:] or ["no output"]
         raise RuntimeError(f"the synthetic scenes could not be made: {last[0]}")
-    return [f"{c}:{folder / size / scene_name(seed, 'plain')}" for c in cameras for seed in seeds]
+    return [f"{c}:{folder / size / scene_name(seed, kind)}" for c in cameras for kind in kinds for seed in seeds]
 
 
 def child_environ(**extra: str) -> dict[str, str]:
