@@ -168,6 +168,9 @@ class FreezeParams:
     """nearest: each Gaussian is asked at its nearest supported time to t*; plain: at t* itself."""
     width: int = 0
     """Width in pixels of the frozen frames; 0: the preset's delivery size."""
+    overscan: float = 0.0
+    """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
+    lens needs. `width` is that of the frame without it."""
     only_missing: bool = False
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
     device: str = "auto"
