@@ -177,6 +177,14 @@ class FreezeParams:
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
 
+def overscan(text: str) -> float:
+    """`FreezeParams.overscan` as a command line gives it: 0 to 100 percent, or "lens" (-1). ValueError on else."""
+    value = -1.0 if text == "lens" else float(text)
+    if text != "lens" and not 0.0 <= value <= 100.0:
+        raise ValueError(f"overscan is 0 to 100 percent, or lens, got {text!r}")
+    return value
+
+
 DEVICES = ("auto", "cpu", "cuda")
 """Where a run may train and freeze."""
 
