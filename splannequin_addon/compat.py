@@ -143,7 +143,7 @@ def new_fit_node(tree: Any, how: str = "Fit") -> Any:
 
 
 def new_crop_node(tree: Any, margin: tuple[int, int], size: tuple[int, int]) -> Any:
-    """A Crop node that leaves the middle, `size`, of inputs[0]: `margin` pixels are cut off each side, and up and down."""
+    """A Crop node that leaves the middle, `size`, of inputs[0]: `margin` pixels are cut off each side, up and down."""
     node = tree.nodes.new("CompositorNodeCrop")
     (left, low), (width, height) = margin, size
     if "Width" in node.inputs:  # 4.5 on

@@ -197,6 +197,18 @@ def test_a_lens_that_folds_over_is_said_on_the_panel(addon, scene, lens_shot):
     assert not list((lens_shot / "solve").glob("*.exr"))
 
 
+def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_shot):
+    stmaps, watch = addon("stmaps"), addon("supervisor").watch_of(lens_shot)
+    scene.splannequin.shot_path = str(lens_shot)
+    asked = stmaps.begin(lens_shot)
+    stmaps._asked.append(asked)
+    assert not bpy.ops.splannequin.write_stmaps.poll(), "one at a time"
+    asked.process.wait(60)
+    assert stmaps._tick() is None and not stmaps._asked
+    assert "stmap_redistort.exr" in watch.notes["camera"][0]
+    assert bpy.ops.splannequin.write_stmaps.poll()
+
+
 def test_without_a_solve_the_button_is_off(addon, scene, tmp_path):
     scene.splannequin.shot_path = str(tmp_path / "none.splannequin")
     assert not bpy.ops.splannequin.write_stmaps.poll()

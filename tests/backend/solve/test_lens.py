@@ -9,6 +9,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from torch_backend.cli import main, parser
 from torch_backend.contract import CameraFrame, CameraPath, ExitCode, FreezeParams, JobError
 from torch_backend.shot import Shot, write_json
 from torch_backend.solve.lens import Lens, load_lens
@@ -274,3 +275,27 @@ def test_overscan_in_percent_and_as_the_lens_needs(shot_of, tmp_path):
     np.testing.assert_array_equal(
         oiio.ImageBuf(str(written)).get_pixels(oiio.FLOAT), redistort_map(lens, 160, 120, (0.1, 0.1))
     )
+
+
+def test_the_command_line_writes_the_maps_or_says_why_not(shot_of, tmp_path, capsys):
+    shot = shot_of("barrel")
+    assert main(["stmaps", str(shot.root)]) == ExitCode.OK
+    said = capsys.readouterr().out
+    assert str(shot.solve / "stmap_redistort.exr") in said and "% of the width" in said
+    assert main(["--json", "stmaps", str(shot.root), "--width", "40"]) == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["height"] == 30
+    empty = Shot.create(tmp_path / "empty.splannequin")
+    assert main(["stmaps", str(empty.root)]) == ExitCode.SOLVE
+    assert capsys.readouterr().err.startswith("Error: empty.splannequin has no cameras yet.")
+
+
+@pytest.mark.parametrize(("text", "value"), [("lens", -1.0), ("12.5", 12.5), ("0", 0.0)])
+def test_overscan_on_the_command_line(text, value):
+    assert parser().parse_args(["take", "shot", "--overscan", text]).overscan == value
+
+
+@pytest.mark.parametrize("text", ["-1", "101", "nan", "much"])
+def test_overscan_out_of_range_is_refused(text, capsys):
+    with pytest.raises(SystemExit):
+        parser().parse_args(["take", "shot", f"--overscan={text}"])
+    assert "invalid overscan value" in capsys.readouterr().err
