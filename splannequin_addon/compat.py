@@ -142,6 +142,21 @@ def new_fit_node(tree: Any, how: str = "Fit") -> Any:
     return node
 
 
+def new_crop_node(tree: Any, margin: tuple[int, int], size: tuple[int, int]) -> Any:
+    """A Crop node that leaves the middle, `size`, of inputs[0]: `margin` pixels are cut off each side, up and down."""
+    node = tree.nodes.new("CompositorNodeCrop")
+    (left, low), (width, height) = margin, size
+    if "Width" in node.inputs:  # 4.5 on
+        node.inputs["Alpha Crop"].default_value = False
+        for name, value in (("X", left), ("Y", low), ("Width", width), ("Height", height)):
+            node.inputs[name].default_value = value
+    else:
+        node.use_crop_size, node.relative = True, False
+        node.min_x, node.max_x = left, left + width
+        node.min_y, node.max_y = low + height, low  # the upper one first
+    return node
+
+
 def set_png(settings: Any) -> None:
     """8-bit RGB PNG as a scene's output format. RGB, so that holes come out black instead of divided by alpha."""
     if hasattr(settings, "media_type"):

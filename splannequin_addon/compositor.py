@@ -39,7 +39,9 @@ class Take:
     depth_scale: float = 1.0
     """Scene units per solve unit: what the depth layer is multiplied by."""
     size: tuple[int, int] = (0, 0)
-    """Width and height of the frames in pixels."""
+    """Width and height of the frames in pixels, without overscan."""
+    margin: tuple[int, int] = (0, 0)
+    """Pixels beyond the frame on the left and right, and above and below: overscan."""
 
 
 def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
@@ -148,19 +150,36 @@ def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
     numbers = frame_numbers(folder)
     if not numbers:
         raise FileNotFoundError(f"{folder} holds no frozen frames (NNNNNN.exr)")
-    return Take(folder, numbers[0], numbers[-1], depth_scale, exr_size(frame_path(folder, numbers[0])))
+    return Take(folder, numbers[0], numbers[-1], depth_scale, *exr_windows(frame_path(folder, numbers[0])))
 
 
 def exr_size(path: Path) -> tuple[int, int]:
-    """Width and height of an EXR from its header: Blender says 0 x 0 of a multilayer file. ValueError without one."""
+    """Width and height of an EXR's frame, as `exr_windows`."""
+    return exr_windows(path)[0]
+
+
+def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
+    """An EXR's width and height, and the pixels it has beyond them left and right, and above and below.
+
+    From its header: Blender says 0 x 0 of a multilayer file. ValueError without one, or for margins that are not the
+    same on opposite sides: Blender centres the pixels, wherever the frame lies in them.
+    """
     with open(path, "rb") as source:
         header = source.read(16384)
-    key = b"dataWindow\0box2i\0"
-    at = header.find(key)
-    if header[:4] != b"\x76\x2f\x31\x01" or at < 0:
+    if header[:4] != b"\x76\x2f\x31\x01":
         raise ValueError(f"{path} is no OpenEXR file: render the take again")
-    left, top, right, bottom = struct.unpack_from("<4i", header, at + len(key) + 4)
-    return right - left + 1, bottom - top + 1
+    boxes = []
+    for name in (b"displayWindow", b"dataWindow"):
+        key = name + b"\0box2i\0"
+        at = header.find(key)
+        if at < 0:
+            raise ValueError(f"{path} is no OpenEXR file: render the take again")
+        boxes.append(struct.unpack_from("<4i", header, at + len(key) + 4))
+    (left, top, right, bottom), (data_left, data_top, data_right, data_bottom) = boxes
+    margin = (left - data_left, top - data_top)
+    if margin != (data_right - right, data_bottom - bottom) or min(margin) < 0:
+        raise ValueError(f"{path} does not reach equally far beyond its frame on all sides: render the take again")
+    return (right - left + 1, bottom - top + 1), margin
 
 
 def frame_numbers(folder: Path, suffix: str = ".exr") -> list[int]:
@@ -418,19 +437,25 @@ def show_sequence(user: Any, image: Any, first: int, last: int) -> None:
 
 
 def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
-    """The frozen layers' sockets; led through Scale nodes if the render size is not the frames' own."""
+    """The frozen layers' sockets: without overscan, and led through Scale nodes if the render size is not theirs."""
     names = ("Combined", "Depth", "Support", "Motion")
     missing = [n for n in names if n not in frozen.outputs]
     if missing:
         raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+    sockets = {n: frozen.outputs[n] for n in names}
+    for row, name in enumerate(names if any(take.margin) else ()):
+        node = compat.new_crop_node(group, take.margin, take.size)
+        node.label = f"{name} without overscan"
+        node.location = (-2 * _GAP, -50.0 - 170.0 * row)
+        group.links.new(sockets[name], node.inputs[0])
+        sockets[name] = node.outputs[0]
     if take.size == render_size(scene):
-        return {n: frozen.outputs[n] for n in names}
-    sockets = {}
+        return sockets
     for row, name in enumerate(names):
         node = compat.new_fit_node(group)
         node.label = f"Fit {name}"
         node.location = (-_GAP, 150.0 - 170.0 * row)
-        group.links.new(frozen.outputs[name], node.inputs[0])
+        group.links.new(sockets[name], node.inputs[0])
         sockets[name] = node.outputs[0]
     return sockets
 

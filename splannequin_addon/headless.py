@@ -23,7 +23,7 @@ import bpy
 
 from ..torch_backend import contract
 from ..torch_backend.contract import ExitCode
-from . import backend, bake, cameras, compositor, jobs, scene_setup, shots, steps
+from . import backend, bake, cameras, compositor, jobs, scene_setup, shots, steps, stmaps
 
 
 class Console:
@@ -140,7 +140,12 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
         "camera": contract.SolveParams(camera_model=args.camera_model),
         "train": _train_params(args),
         "freeze": contract.FreezeParams(
-            run=args.run_name, take=args.take, t_star=args.t_star, query=args.freeze_query, width=args.freeze_width
+            run=args.run_name,
+            take=args.take,
+            t_star=args.t_star,
+            query=args.freeze_query,
+            width=args.freeze_width,
+            overscan=args.overscan,
         ),
     }
     stages: dict[str, float] = {}
@@ -182,6 +187,21 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
     jobs.write_json(path, {**summary, **baked})
     console.say(f"Composited frames: {baked['composited_dir']}")
+    return ExitCode.OK
+
+
+def write_stmaps(args: argparse.Namespace, console: Console) -> int:
+    """`stmaps SHOT`: ST maps of the lens, both ways."""
+    shot = Path(args.shot).absolute()
+    if not shots.read(shot).info:
+        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+    asked = stmaps.begin(shot, args.width)
+    asked.wait()
+    facts = asked.answer()
+    if console.as_json:
+        print(json.dumps(facts))
+    for line in stmaps.sentences(facts):
+        console.say(line)
     return ExitCode.OK
 
 
@@ -329,6 +349,9 @@ def parser() -> argparse.ArgumentParser:
     whole.add_argument("--take", default="freeze", help="name of the take")
     whole.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"), help="see the user guide")
     whole.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
+    whole.add_argument(
+        "--overscan", type=contract.overscan, default=0.0, metavar="PERCENT", help="beyond the frame, or: lens"
+    )
     whole.add_argument("--shot-name", default="shot", help="name of the shot folder in OUTPUT")
     whole.add_argument("--output", default="output", metavar="DIR", help="folder for everything that comes out")
     whole.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
@@ -337,6 +360,9 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--take", default="freeze", help="name of the take")
     one.add_argument("--output", required=True, metavar="DIR", help="folder for what comes out")
     one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
+    one = add("stmaps", write_stmaps, "ST maps of the lens, both ways, into SHOT/solve.")
+    one.add_argument("shot", help="shot folder")
+    one.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")
     one = add("status", status, "Jobs of a shot.")
     one.add_argument("shot", help="shot folder")
     add("doctor", doctor, "What this Blender and its backend can do, as JSON.")

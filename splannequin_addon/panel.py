@@ -76,7 +76,9 @@ def view_freeze(scene: Any, state: shots.ShotState | None) -> View:
         return View(False, True, [], "Render the clip's move with time standing still.")
     frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
     instant = f"Time stands still at frame {take['t_star_frame']}"
-    return View(True, True, [frames, instant], "Next: bake it into your compositor.")
+    across, down = take.get("margin", (0, 0))
+    beyond = [f"Overscan: {across} pixels on each side, {down} above and below"] if across or down else []
+    return View(True, True, [frames, *beyond, instant], "Next: bake it into your compositor.")
 
 
 def view_bake(scene: Any, state: shots.ShotState | None) -> View:
@@ -273,6 +275,7 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The lens."""
         layout.prop(context.scene.splannequin, "camera_model")
+        layout.operator("splannequin.write_stmaps")
 
     def _button(self, context: Any, layout: Any, view: View, running: str | None) -> None:
         watch = self._watch(context)
@@ -371,6 +374,7 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         """The take's name, its size, and where it is seen from."""
         layout.prop(context.scene.splannequin, "take_name")
         layout.prop(context.scene.splannequin, "freeze_width")
+        layout.prop(context.scene.splannequin, "overscan")
         layout.prop(context.scene.splannequin, "path_camera")
         camera = context.scene.splannequin.path_camera
         if camera is not None and camera.data.dof.use_dof:

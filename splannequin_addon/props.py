@@ -99,6 +99,16 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
         max=16384,
         options=set(),
     )
+    overscan: EnumProperty(
+        name="Overscan",
+        description="Picture beyond the frame, for the way back into the original's lens distortion. The compositor "
+        "shows the frame as without it",
+        items=[
+            ("OFF", "Off", "Frozen frames end where the plate ends"),
+            ("LENS", "What the Lens Needs", "As much more on every side as the original, distorted frame shows"),
+        ],
+        options=set(),
+    )
     live_show: EnumProperty(
         name="Show",
         description="What is drawn over the view while scrubbing",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import bpy
 
-from . import cli, ops_clip, ops_jobs, ops_steps, panel, pictures, points, preferences, props, supervisor
+from . import cli, ops_clip, ops_jobs, ops_steps, panel, pictures, points, preferences, props, stmaps, supervisor
 
-_CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *ops_clip.CLASSES, *panel.CLASSES)
+_CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *ops_clip.CLASSES, *stmaps.CLASSES, *panel.CLASSES)
 
 
 def registered() -> bool:
@@ -33,6 +33,7 @@ def unregister() -> None:
     if not registered():
         return
     cli.unregister()
+    stmaps.unregister()
     supervisor.unregister()
     points.unregister()
     pictures.unregister()

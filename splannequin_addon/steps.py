@@ -87,6 +87,7 @@ def params_of(scene: Any, step: str) -> Any:
         t_star=t_star,
         t_star_per_frame=keyed_instants(scene),
         width=props.freeze_width,
+        overscan=-1.0 if props.overscan == "LENS" else 0.0,
         only_missing=True,
         device=backend.device(),
     )
@@ -142,6 +143,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         camera_path=facts.get("camera_path", ""),
         query=facts["query"],
         width=facts["width"],
+        overscan=facts.get("overscan", 0.0),
         only_missing=True,
     )
 

@@ -178,6 +178,31 @@ def status(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
+def stmaps(args: argparse.Namespace, console: Console) -> int:
+    """`stmaps SHOT`: ST maps of the lens into SHOT/solve."""
+    from .solve.stmap import write_maps
+
+    try:
+        facts = write_maps(Shot.open(args.shot), args.width)
+    except contract.JobError as error:
+        print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
+        return error.exit_code
+    except OSError as error:
+        print(f"Error: {error.strerror or error}: {error.filename or ''}", file=sys.stderr)
+        return ExitCode.DISK
+    if console.as_json:
+        print(json.dumps(facts), file=console.stream)
+        return ExitCode.OK
+    across, down = facts["overscan_percent"]
+    print(
+        f"Undistort: {facts['undistort']}\nRedistort: {facts['redistort']}\n"
+        f"The lens sees {across:.1f} % of the width beyond each side of the undistorted frames, "
+        f"and {down:.1f} % of the height: --overscan lens freezes that too.",
+        file=console.stream,
+    )
+    return ExitCode.OK
+
+
 def _train_params(args: argparse.Namespace) -> contract.TrainParams:
     return contract.TrainParams(
         run=args.run,
@@ -205,6 +230,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         camera_path=args.camera_path,
         query=args.freeze_query,
         width=args.freeze_width,
+        overscan=args.overscan,
         only_missing=True,
         device=args.device,
     )
@@ -267,6 +293,9 @@ def parser() -> argparse.ArgumentParser:
             _add_freeze_flags(one)
             _add_device_flag(one)
             one.add_argument("--run", default="main", help="run to freeze")
+    maps = commands.add_parser("stmaps", help="ST maps of the lens, both ways, into the shot's solve folder")
+    maps.add_argument("shot", help="shot folder")
+    maps.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")
     state = commands.add_parser("status", help="jobs of a shot")
     state.add_argument("shot")
     commands.add_parser("doctor", help="what this environment can do, as JSON")
@@ -317,6 +346,10 @@ def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--camera-path", default="", help="JSON camera path to render from (default: the clip's poses)")
     to.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"))
     to.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
+    to.add_argument(
+        "--overscan", type=contract.overscan, default=0.0, metavar="PERCENT",
+        help="picture beyond the frame on every side, or `lens`: what the way back through the lens needs",
+    )  # fmt: skip
 
 
 def _add_device_flag(to: argparse.ArgumentParser) -> None:
@@ -364,5 +397,5 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
     elif args.command == "take":
         run_station(Shot.open(args.shot), "freeze", _freeze_params(args), console)
     else:
-        return {"status": status, "doctor": doctor}[args.command](args, console)
+        return {"status": status, "doctor": doctor, "stmaps": stmaps}[args.command](args, console)
     return ExitCode.OK

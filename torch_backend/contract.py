@@ -168,10 +168,21 @@ class FreezeParams:
     """nearest: each Gaussian is asked at its nearest supported time to t*; plain: at t* itself."""
     width: int = 0
     """Width in pixels of the frozen frames; 0: the preset's delivery size."""
+    overscan: float = 0.0
+    """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
+    lens needs. `width` is that of the frame without it."""
     only_missing: bool = False
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
     device: str = "auto"
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
+
+
+def overscan(text: str) -> float:
+    """`FreezeParams.overscan` as a command line gives it: 0 to 100 percent, or "lens" (-1). ValueError on else."""
+    value = -1.0 if text == "lens" else float(text)
+    if text != "lens" and not 0.0 <= value <= 100.0:
+        raise ValueError(f"overscan is 0 to 100 percent, or lens, got {text!r}")
+    return value
 
 
 DEVICES = ("auto", "cpu", "cuda")

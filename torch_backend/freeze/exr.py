@@ -50,7 +50,7 @@ class FrameMetadata:
     viewmat: NDArray[np.float32]
     """[4,4] world-to-camera, OpenCV axes, column vectors (p_camera = viewmat @ p_world)."""
     K: NDArray[np.float32]
-    """[3,3] intrinsics in pixels, pixel centres at +0.5."""
+    """[3,3] intrinsics in pixels of the frame (without a margin), pixel centres at +0.5."""
     depth_units: str = "solve units"
     """Unit of depth and of the translation in `viewmat`."""
     version: int = EXR_VERSION
@@ -70,6 +70,8 @@ class FrozenFrame:
     motion: NDArray[np.float32]
     """[H,W] in 0..1: how much of the pixel belongs to what moves in the clip."""
     metadata: FrameMetadata
+    margin: tuple[int, int] = (0, 0)
+    """Pixels beyond the frame on the left and right, and above and below; the arrays hold them."""
 
 
 def write_frozen_exr(
@@ -79,6 +81,7 @@ def write_frozen_exr(
     support: ArrayLike,  # [H,W]
     motion: ArrayLike,  # [H,W]
     metadata: FrameMetadata,
+    margin: tuple[int, int] = (0, 0),
 ) -> Path:
     """Writes one frame atomically: half colour and mattes, float32 depth, ZIP. Arrays as in `FrozenFrame`.
 
@@ -87,12 +90,22 @@ def write_frozen_exr(
     M, translation in the last row); `splannequin:viewmat` and `splannequin:K`, row-major as in `FrameMetadata`;
     `splannequin:frame`, `:tStarFrame`, `:depthUnits`, `:version`. Half channels are clamped to +-65504.
 
+    With a `margin` the arrays are the data window, and the display window, in whose pixels K counts, is the frame
+    inside of them. Blender 4.2 to 5.2 reads the whole data window and puts its middle in the middle of the render,
+    wherever the display window lies; so margins are the same on opposite sides.
+
     ValueError names the layer whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be
     written (errno ENOSPC when the disk is full).
     """
     path = Path(path)
     pixels = _stack(rgba, depth, support, motion)
     spec = _spec(pixels.shape[1], pixels.shape[0], metadata)
+    across, down = margin
+    if not (0 <= 2 * across < pixels.shape[1] and 0 <= 2 * down < pixels.shape[0]):
+        raise ValueError(f"a margin of {margin} pixels leaves nothing of {pixels.shape[1]} x {pixels.shape[0]}")
+    spec.x, spec.y = -across, -down
+    spec.full_x, spec.full_y = 0, 0
+    spec.full_width, spec.full_height = pixels.shape[1] - 2 * across, pixels.shape[0] - 2 * down
     with atomic_path(path) as beside:
         output = oiio.ImageOutput.create(str(beside))
         if output is None:
@@ -129,7 +142,8 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
     order = [names.index(name) for name in CHANNELS]
     pixels = np.asarray(pixels, dtype=np.float32)
     depth, support, motion = (np.ascontiguousarray(pixels[..., i]) for i in order[4:])
-    return FrozenFrame(np.ascontiguousarray(pixels[..., order[:4]]), depth, support, motion, metadata)
+    beyond = (spec.full_x - spec.x, spec.full_y - spec.y)
+    return FrozenFrame(np.ascontiguousarray(pixels[..., order[:4]]), depth, support, motion, metadata, beyond)
 
 
 def _stack(rgba: ArrayLike, depth: ArrayLike, support: ArrayLike, motion: ArrayLike) -> NDArray[np.float32]:

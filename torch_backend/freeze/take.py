@@ -17,6 +17,7 @@ from ..footage.images import read_png
 from ..gaussians.ply import write_ply
 from ..scene import Scene, load_scene
 from ..shot import Shot, content_key, disk_error, is_disk_full, need_disk, write_json
+from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
 from ..train.run import save_png
 from .contact_sheet import write_contact_sheet
@@ -38,7 +39,7 @@ class OutputFrame:
     viewmat: Tensor
     """[4, 4] world-to-camera, scene units."""
     K: Tensor
-    """[3, 3] pixels of the output size."""
+    """[3, 3] pixels of the output size, without overscan."""
     t_star: float
     """Frame number at which time stands still."""
     exposed_like: float
@@ -56,12 +57,14 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     width, height = output_size(scene, run, params)
     frames = plan(scene, params, t_star, width, height)
     folder = shot.take(params.take)
-    key = take_key(run, params, t_star, width, height, frames)
+    beyond = margin(shot, params, width, height, intrinsics(frames))
+    key = take_key(run, params, t_star, width, height, frames, beyond)
     done = _prepare(folder, key, params.only_missing)
-    need_disk(folder, (len(frames) - len(done)) * width * height * 20.0, "the take")
+    pixels = (width + 2 * beyond[0]) * (height + 2 * beyond[1])
+    need_disk(folder, (len(frames) - len(done)) * pixels * 20.0, "the take")
     try:
-        _render_all(folder, frames, done, scene, run, params.query, (width, height), report)
-        return _finish(shot, scene, run, params, t_star, frames, (width, height), key, report)
+        _render_all(folder, frames, done, scene, run, params.query, (width, height), beyond, report)
+        return _finish(shot, scene, run, params, t_star, frames, (width, height), beyond, key, report)
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
 
@@ -119,6 +122,11 @@ def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: in
     return frames
 
 
+def intrinsics(frames: list[OutputFrame]) -> np.ndarray:
+    """[F, 4]: fx, fy, cx, cy of the frames, pixels of the output size."""
+    return np.array([[f.K[0, 0], f.K[1, 1], f.K[0, 2], f.K[1, 2]] for f in frames], np.float64)
+
+
 def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tuple[Tensor, Tensor, list[int]]:
     """A Blender path, in solve units and its own resolution, as scene cameras of the output size."""
     if not path.frames:
@@ -130,8 +138,9 @@ def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tu
 
 
 def take_key(
-    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, frames: list[OutputFrame]
-) -> str:
+    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, frames: list[OutputFrame],
+    beyond: tuple[int, int] = (0, 0),
+) -> str:  # fmt: skip
     """Identifies what a take shows, to tell stale frames from good ones. The frame range is not part of it."""
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
@@ -143,6 +152,7 @@ def take_key(
         width,
         height,
         path,
+        *([beyond] if any(beyond) else []),
     )
 
 
@@ -163,8 +173,9 @@ def _prepare(folder: Path, key: str, only_missing: bool) -> set[int]:
 
 def _render_all(
     folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, run: LoadedRun, query: str,
-    size: tuple[int, int], report: Reporter,
+    size: tuple[int, int], beyond: tuple[int, int], report: Reporter,
 ) -> None:  # fmt: skip
+    whole = (size[0] + 2 * beyond[0], size[1] + 2 * beyond[1])
     frozen: FrozenGaussians | None = None
     at = float("nan")
     for n, output in enumerate(frames):
@@ -178,8 +189,10 @@ def _render_all(
                 output.t_star,
             )
         exposed_at = scene.time_of_frame(output.exposed_like)
-        image = render_frozen(frozen, output.viewmat, output.K, *size, run.model.exposure, exposed_at)
-        _write_frame(folder, output, image, scene)
+        K = output.K.clone()
+        K[:2, 2] += torch.tensor(beyond, dtype=K.dtype)  # the same camera, with more pixels around
+        image = render_frozen(frozen, output.viewmat, K, *whole, run.model.exposure, exposed_at)
+        _write_frame(folder, output, image, scene, beyond)
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
 
 
@@ -189,8 +202,12 @@ def span_of(scene: Scene, run: LoadedRun) -> float:
     return max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
 
 
-def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: Scene) -> None:
-    save_png(folder / "preview" / frame_file(output.frame, ".png"), image.color + (1.0 - image.alpha[..., None]) * 0.5)
+def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: Scene, beyond: tuple[int, int]) -> None:
+    shown = image.color + (1.0 - image.alpha[..., None]) * 0.5
+    height, width = shown.shape[0] - 2 * beyond[1], shown.shape[1] - 2 * beyond[0]
+    # Previews, and so contact sheet and video, show the frame as it stands over the plate.
+    shown = shown[beyond[1] : beyond[1] + height, beyond[0] : beyond[0] + width]
+    save_png(folder / "preview" / frame_file(output.frame, ".png"), shown)
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ torch.from_numpy(scene.centre)
     depth = torch.where(image.depth < NO_DEPTH, image.depth / scene.scale, NO_DEPTH)
@@ -201,6 +218,7 @@ def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: S
         image.support.numpy(),
         image.motion.numpy(),
         FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy()),
+        beyond,
     )
 
 
@@ -216,7 +234,7 @@ def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 def _finish(
     shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, t_star: int, frames: list[OutputFrame],
-    size: tuple[int, int], key: str, report: Reporter,
+    size: tuple[int, int], beyond: tuple[int, int], key: str, report: Reporter,
 ) -> dict[str, Any]:  # fmt: skip
     """Contact sheet, video, PLY and take.json; the frames are on disk."""
     folder = shot.take(params.take)
@@ -234,6 +252,7 @@ def _finish(
     report.progress("finishing the take", 2, 3, "PLY")
     frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), params.query)
     _write_ply(folder / "frozen.ply", frozen, scene)
+    redistort = _redistort(shot, folder, size, beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
         "key": key,
@@ -245,6 +264,9 @@ def _finish(
         "query": params.query,
         "width": size[0],
         "height": size[1],
+        "overscan": params.overscan,
+        "margin": list(beyond),
+        "redistort": str(redistort or ""),
         "first": numbers[0],
         "last": numbers[-1],
         "frames": len(numbers),
@@ -260,6 +282,22 @@ def _finish(
     report.image("contact sheet", sheet)
     report.progress("finishing the take", 3, 3, "done")
     return facts
+
+
+def _redistort(
+    shot: Shot, folder: Path, size: tuple[int, int], beyond: tuple[int, int], Ks: np.ndarray, report: Reporter
+) -> Path | None:
+    """The map back through the lens over overscanned frames; None where the shot's own map fits, or none does."""
+    (folder / TAKE_REDISTORT).unlink(missing_ok=True)
+    if not any(beyond):
+        return None
+    try:
+        return write_take_map(shot, folder, *size, beyond, Ks)
+    except JobError as error:
+        if error.exit_code != ExitCode.SOLVE:
+            raise
+        report.warning(f"{error.message} The take has no ST map.", error.hint)
+        return None
 
 
 def _contact_sheet(

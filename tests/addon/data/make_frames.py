@@ -1,4 +1,5 @@
-"""The frozen frames of the add-on's tests: three files of 16 x 12 pixels whose every value can be computed again.
+"""The frozen frames of the add-on's tests: three files of 16 x 12 pixels whose every value can be computed again, and
+in overscan/ one whose frame is the 12 x 10 pixels in the middle.
 
     python tests/addon/data/make_frames.py      (with the backend's Python: it uses the backend's own EXR writer)
 
@@ -12,6 +13,8 @@ import numpy as np
 WIDTH, HEIGHT = 16, 12
 FRAMES = (5, 6, 7)
 NO_DEPTH = 1e10
+MARGIN = (2, 1)
+"""Pixels beyond the frame of overscan/000006.exr, left and right, and above and below."""
 
 
 def layers(frame: int) -> dict[str, np.ndarray]:
@@ -39,6 +42,10 @@ def main() -> None:
         about = FrameMetadata(frame, 6.0, np.eye(4, dtype=np.float32), k)
         path = Path(__file__).with_name(f"{frame:06d}.exr")
         write_frozen_exr(path, data["rgba"], data["depth"], data["support"], data["motion"], about)
+        if frame == 6:
+            over = path.parent / "overscan" / path.name
+            over.parent.mkdir(exist_ok=True)
+            write_frozen_exr(over, data["rgba"], data["depth"], data["support"], data["motion"], about, MARGIN)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,113 @@
+"""A take with overscan: the same camera with more pixels, a frame in a larger picture, and the way back to the lens."""
+
+import json
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from torch_backend.contract import CameraFrame, CameraPath, FreezeParams, JobError
+from torch_backend.footage.images import read_png
+from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.shot import write_json
+from torch_backend.solve.lens import load_lens
+from torch_backend.solve.stmap import needed_margin, redistort_map
+
+RANGE = {"t_star": 105, "first": 104, "last": 105}
+
+
+@pytest.fixture(scope="module")
+def lens(trained):
+    """The tiny world filmed through a barrel lens, as its solve would tell it."""
+    world, _ = trained
+    told = {"version": 1, "camera_model": "SIMPLE_RADIAL", "distortion": [-0.2], "focal_px": 61.9}
+    write_json(world.shot.solve / "solve.json", told)
+    yield load_lens(world.shot)
+    (world.shot.solve / "solve.json").unlink()
+
+
+@pytest.fixture(scope="module")
+def plain(trained, lens, quiet):
+    world, _ = trained
+    freeze_shot(world.shot, FreezeParams(take="plain", **RANGE), quiet())
+    return world.shot.take("plain")
+
+
+def test_the_frame_inside_is_the_take_without_overscan(trained, lens, plain, quiet):
+    world, _ = trained
+    facts = freeze_shot(world.shot, FreezeParams(take="over", overscan=12.5, **RANGE), quiet())
+    folder = world.shot.take("over")
+    assert (facts["width"], facts["height"], facts["margin"]) == (64, 48, [8, 6])
+    for n in (104, 105):
+        whole, frame = read_frozen_exr(folder / f"{n:06d}.exr"), read_frozen_exr(plain / f"{n:06d}.exr")
+        assert whole.rgba.shape == (60, 80, 4) and whole.margin == (8, 6) and frame.margin == (0, 0)
+        np.testing.assert_array_equal(whole.metadata.K, frame.metadata.K)
+        for name in ("rgba", "support", "motion"):
+            off = np.abs(getattr(whole, name)[6:-6, 8:-8] - getattr(frame, name))
+            # The slope of a Gaussian's projection is held at a little beyond the frame, and the frame is larger here.
+            assert off.max() < 2e-2, name
+            if name == "rgba":
+                aside = np.abs(whole.rgba[6:-6, 9:-7] - frame.rgba).mean()
+                assert off.mean() < 0.02 * aside, "not a fraction of a pixel aside"
+        off = np.abs(whole.depth[6:-6, 8:-8] / frame.depth - 1.0)
+        assert np.quantile(off, 0.99) < 1e-3  # the median jumps from one Gaussian to another here and there
+        assert whole.rgba[:6, :, 3].mean() > 0.5, "there is picture beyond the frame: the wall goes on"
+        np.testing.assert_array_equal(
+            read_png(folder / "preview" / f"{n:06d}.png").shape, read_png(plain / "preview" / f"{n:06d}.png").shape
+        )
+    spec = oiio.ImageBuf(str(folder / "000104.exr")).spec()
+    assert (spec.x, spec.y, spec.width, spec.height) == (-8, -6, 80, 60)
+    assert (spec.full_x, spec.full_y, spec.full_width, spec.full_height) == (0, 0, 64, 48)
+
+
+def test_what_the_lens_needs_is_rendered_and_its_map_is_with_the_take(trained, lens, quiet):
+    world, _ = trained
+    facts = freeze_shot(world.shot, FreezeParams(take="lens", overscan=-1.0, **RANGE), quiet())
+    across, down = needed_margin(lens, 64, 48)
+    assert facts["margin"] == [across, down] and across > 2 and facts["overscan"] == -1.0
+    frame = read_frozen_exr(world.shot.take("lens") / "000105.exr")
+    assert frame.rgba.shape == (48 + 2 * down, 64 + 2 * across, 4)
+    found = oiio.ImageBuf(facts["redistort"]).get_pixels(oiio.FLOAT)
+    np.testing.assert_array_equal(found, redistort_map(lens, 64, 48, (across / 64, down / 48)))
+    assert found[..., :2].min() >= 0.0 and found[..., :2].max() <= 1.0
+
+
+def test_another_overscan_makes_the_frames_stale_and_none_leaves_no_map(trained, lens, quiet):
+    world, _ = trained
+    folder = world.shot.take("change")
+    sizes = []
+    for overscan in (0.0, 12.5, 12.5, 0.0):
+        freeze_shot(world.shot, FreezeParams(take="change", overscan=overscan, only_missing=True, **RANGE), quiet())
+        sizes.append(read_frozen_exr(folder / "000104.exr").rgba.shape[1])
+        assert (folder / "stmap" / "redistort.exr").is_file() == bool(overscan)
+    assert sizes == [64, 80, 80, 64]
+    assert json.loads((folder / "take.json").read_text())["redistort"] == ""
+
+
+def test_a_camera_of_ones_own_has_overscan_in_percent_and_no_map(trained, lens, quiet, tmp_path):
+    world, _ = trained
+    pose = world.viewmats[7].flatten().tolist()
+    path = CameraPath(64, 48, [CameraFrame(1, pose, [90.0, 90.0, 32.0, 24.0], "blender")])
+    write_json(tmp_path / "path.json", path.to_json())
+    asked = {"take": "own", "t_star": 108, "camera_path": str(tmp_path / "path.json"), "width": 64}
+    facts = freeze_shot(world.shot, FreezeParams(overscan=25.0, **asked), quiet())
+    assert facts["margin"] == [16, 12] and facts["redistort"] == ""
+    with pytest.raises(JobError, match="clip's own camera only"):
+        freeze_shot(world.shot, FreezeParams(overscan=-1.0, **asked), quiet())
+
+
+def test_a_lens_without_a_way_back_is_said_and_the_percentage_still_rendered(trained, lens, quiet):
+    world, _ = trained
+    record = world.shot.solve / "solve.json"
+    before = json.loads(record.read_text())
+    write_json(record, {**before, "distortion": [-2.0]})
+    try:
+        report = quiet()
+        facts = freeze_shot(world.shot, FreezeParams(take="fold", overscan=12.5, **RANGE), report)
+        assert facts["margin"] == [8, 6] and facts["redistort"] == ""
+        assert any(e[0] == "warning" and "folds over" in e[1] for e in report.events)
+        with pytest.raises(JobError, match="folds over"):
+            freeze_shot(world.shot, FreezeParams(take="fold", overscan=-1.0, **RANGE), quiet())
+    finally:
+        write_json(record, before)
