@@ -132,6 +132,22 @@ ANSWERS = (
         f"{TEST}cameras.py::test_quaternions_take_the_short_way",
     ),
     Answer(
+        7,
+        "the original comes back out of the undistorted plate",
+        "torch_backend/solve/stmap.py",
+        "        at = _st(lens.to_plate(_centres(lens, width, height, top)), lens)\n",
+        "        at = _st(lens.to_original(_centres(lens, width, height, top)), lens)\n",
+        f"{TEST}overscan.py::test_blenders_map_uv_undistorts_and_gives_the_original_back",
+    ),
+    Answer(
+        7,
+        "overscan is as much as the lens and a filter need",
+        "torch_backend/solve/stmap.py",
+        "    across, down = (math.ceil(p) + _FILTER_PX if p > _TOUCHING_PX else 0 for p in past)\n",
+        "    across, down = (0 for p in past)\n",
+        "tests/backend/solve/test_lens.py::test_with_overscan_no_pixel_lacks_data",
+    ),
+    Answer(
         8,
         "frame n shows plate n",
         COMPOSITOR,
