@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
-from . import compat
+from . import compat, made
 
 PRESETS = [
     ("preview", "Preview", "Small and quick: to see whether the shot holds, minutes on a laptop"),
@@ -132,10 +132,14 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
         default=True,
         options=set(),
     )
+    made: CollectionProperty(
+        name="Made", description="What was put into this scene, by shot", type=made.SPLANNEQUIN_PG_made, options=set()
+    )
 
 
 def register() -> None:
-    """Registers the property group and hangs it on the scene."""
+    """Registers the property groups and hangs them on the scene."""
+    bpy.utils.register_class(made.SPLANNEQUIN_PG_made)
     bpy.utils.register_class(SPLANNEQUIN_PG_scene)
     bpy.types.Scene.splannequin = PointerProperty(type=SPLANNEQUIN_PG_scene)
 
@@ -144,3 +148,4 @@ def unregister() -> None:
     """Undoes `register`."""
     del bpy.types.Scene.splannequin
     bpy.utils.unregister_class(SPLANNEQUIN_PG_scene)
+    bpy.utils.unregister_class(made.SPLANNEQUIN_PG_made)

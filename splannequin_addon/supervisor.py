@@ -17,7 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, jobs, markers, shots, steps, viewport
+from . import backend, jobs, made, markers, shots, steps, viewport
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
@@ -174,6 +174,7 @@ def _turn(watch: Watch, until: float) -> bool:
     changed, watch.redraw = watch.redraw or watch.sampling is not None, False
     for scene in steps.scenes_of(watch.shot):
         changed |= markers.follow(scene)
+        made.tidy(scene)
     _read_on(watch)
     for step, job in list(watch.jobs.items()):
         if job.ended or time.monotonic() > until:
@@ -248,6 +249,10 @@ def _on_load(*_: Any) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
     viewport.end()
     markers.forget()
+    for scene in bpy.data.scenes:
+        folder = steps.shot_folder(scene)
+        if folder is not None:
+            made.adopt(scene, folder)
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     for watch in _watches.values():
