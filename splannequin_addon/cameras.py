@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix, Quaternion
 
 from ..torch_backend import contract
-from . import compat, compositor, made, shots
+from . import alignment, compat, compositor, made, shots
 
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 """Kind of our objects -> which of `made.PARTS` it is, and last word of the name it is made with."""
@@ -155,7 +155,9 @@ def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[in
 
 
 def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarray:
-    """A first guess of the solve-to-scene transform: cameras upright, floor at z = 0, shot around the origin.
+    """A first guess of the solve-to-scene transform: floor at z = 0, cameras upright, shot around the origin.
+
+    Without a floor among the points the cameras' mean up is taken for up, and what is lowest for the floor.
 
     Args:
         path: the solved cameras, solve units.
@@ -168,6 +170,8 @@ def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarra
     up = matrices[:, :3, 1].mean(axis=0)
     forward = -matrices[:, :3, 2].mean(axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
+    floor = alignment.floor(points, matrices[:, :3, 3], matrices[:, :3, 1])
+    up = up if floor is None else floor[0]
     ahead = forward - up * float(forward @ up)
     if np.linalg.norm(ahead) < 1e-6:  # looking straight up or down
         ahead = np.cross(up, np.roll(up, 1))
@@ -175,7 +179,7 @@ def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarra
     rotation = np.stack([np.cross(ahead, up), ahead, up])  # scene x, y, z in solve coordinates
     seen = (points if len(points) else matrices[:, :3, 3]) @ rotation.T
     centre = np.median(seen, axis=0)
-    centre[2] = np.percentile(seen[:, 2], 2.0)
+    centre[2] = np.percentile(seen[:, 2], 2.0) if floor is None else floor[1]
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = rotation, -centre
     return result
@@ -224,7 +228,7 @@ def build(scene: Any, shot: Path) -> Any:
         item.parent = root
         item.hide_select = item is cloud
     _animate(camera, path)
-    camera_data.clip_start, camera_data.clip_end = _clip(path, xyz)
+    camera_data.clip_start, camera_data.clip_end = (v * depth_scale(scene, shot) for v in _clip(path, xyz))
     _show_plate(camera_data, shot, name)
     scene.camera = camera
     return camera

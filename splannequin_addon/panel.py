@@ -12,7 +12,20 @@ from typing import Any
 
 import bpy
 
-from . import cameras, compat, compositor, markers, pictures, scene_setup, shots, steps, supervisor, viewport
+from . import (
+    bake,
+    cameras,
+    compat,
+    compositor,
+    markers,
+    ops_align,
+    pictures,
+    scene_setup,
+    shots,
+    steps,
+    supervisor,
+    viewport,
+)
 
 CATEGORY = "Splannequin"
 
@@ -87,6 +100,8 @@ def view_bake(scene: Any, state: shots.ShotState | None) -> View:
     if tree is None or compositor.group_node(tree) is None:
         return View(False, True, [], "Put the freeze before your compositor's output and render.")
     lines = ["The freeze is in your compositor."]
+    if bake.stale_scale(scene, state.folder):
+        lines.append("The shot was scaled since: its depth is stale until you bake again.")
     if not scene_setup.keeps_plate_colours(scene):
         lines.append(f"The view transform {scene.view_settings.view_transform} changes the plate's colours.")
     return View(True, True, lines, f"Frames go to {scene.render.filepath}")
@@ -269,6 +284,16 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
     bl_idname = "SPLANNEQUIN_PT_camera"
     step = "camera"
     operator = "splannequin.solve_camera"
+
+    def draw(self, context: Any) -> None:
+        """The step's body, and where the solve stands in the scene."""
+        super().draw(context)
+        watch = self._watch(context)
+        if watch is None or cameras.find(context.scene, watch.shot, "EMPTY") is None:
+            return
+        body = sub_panel(self.layout, "camera_alignment", "Alignment")  # type: ignore[attr-defined]
+        if body is not None:
+            ops_align.draw(body)
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The lens."""

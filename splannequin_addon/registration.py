@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import bpy
 
-from . import cli, ops_clip, ops_jobs, ops_steps, panel, pictures, points, preferences, props, supervisor
+from . import cli, ops_align, ops_clip, ops_jobs, ops_steps, panel, pictures, points, preferences, props, supervisor
 
-_CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *ops_clip.CLASSES, *panel.CLASSES)
+_CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *ops_clip.CLASSES, *ops_align.CLASSES, *panel.CLASSES)
 
 
 def registered() -> bool:
@@ -32,6 +32,7 @@ def unregister() -> None:
     """Undoes `register`, in reverse."""
     if not registered():
         return
+    ops_align.stop()
     cli.unregister()
     supervisor.unregister()
     points.unregister()
