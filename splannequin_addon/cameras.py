@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix, Quaternion
 
 from ..torch_backend import contract
-from . import alignment, compat, compositor, made, shots
+from . import alignment, compat, compositor, guesses, made, shots
 
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 """Kind of our objects -> which of `made.PARTS` it is, and last word of the name it is made with."""
@@ -230,6 +230,7 @@ def build(scene: Any, shot: Path) -> Any:
     _animate(camera, path)
     camera_data.clip_start, camera_data.clip_end = (v * depth_scale(scene, shot) for v in _clip(path, xyz))
     _show_plate(camera_data, shot, name)
+    guesses.mark(scene, shot, path)
     scene.camera = camera
     return camera
 
@@ -263,6 +264,7 @@ def _clear(scene: Any, shot: Path, but: tuple[str, ...] = ()) -> None:
     entry = made.of(scene, shot)
     if entry is None:
         return
+    guesses.unmark(scene, shot)
     for item in [getattr(entry, name) for name in made.PARTS if name not in but]:
         if item is None or (item.users_scene and scene not in item.users_scene):
             continue
@@ -310,7 +312,8 @@ def _animate(camera: Any, path: contract.CameraPath) -> None:
     frames = [frame.frame for frame in path.frames]
     camera.location, camera.rotation_quaternion = places[-1], turns[-1]
     data.lens, data.shift_x, data.shift_y = lenses[-1]
-    compat.set_keys(camera, frames, {"location": np.array(places), "rotation_quaternion": np.array(turns)})
+    keyed = {"location": np.array(places), "rotation_quaternion": np.array(turns)}
+    compat.set_keys(camera, frames, keyed, guesses.key_types(path))
     if varies:
         columns = np.array(lenses).T
         compat.set_keys(data, frames, {n: columns[i][:, None] for i, n in enumerate(("lens", "shift_x", "shift_y"))})

@@ -178,14 +178,18 @@ def fcurves(datablock: Any) -> Iterator[Any]:
         yield from data.action.fcurves
 
 
-def set_keys(datablock: Any, frames: Sequence[int], channels: Mapping[str, np.ndarray]) -> None:
+def set_keys(
+    datablock: Any, frames: Sequence[int], channels: Mapping[str, np.ndarray], types: Sequence[str] = ()
+) -> None:
     """Keys channels of a data-block that has no action yet, straight between keys, all at once.
 
     Args:
         datablock: what is animated.
         frames: [F] ascending frame numbers.
         channels: data path -> values [F, C], a column per array index.
+        types: [F] type of each key, which has a colour of its own: KEYFRAME, JITTER, EXTREME; empty: all KEYFRAME.
     """
+    known = {i.identifier: i.value for i in bpy.types.Keyframe.bl_rna.properties["type"].enum_items}
     action = bpy.data.actions.new(f"{datablock.name}Action")
     animation = datablock.animation_data_create()
     if hasattr(action, "slots"):
@@ -206,4 +210,6 @@ def set_keys(datablock: Any, frames: Sequence[int], channels: Mapping[str, np.nd
             keys.add(len(frames))
             keys.foreach_set("co", np.stack([np.asarray(frames, float), values[:, index]], axis=1).ravel())
             keys.foreach_set("interpolation", np.full(len(frames), straight, dtype=np.int32))
+            if any(kind != "KEYFRAME" for kind in types):
+                keys.foreach_set("type", np.array([known[kind] for kind in types], dtype=np.int32))
             curve.update()

@@ -322,7 +322,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
 
 
 def view_under(window: Any, x: int, y: int) -> tuple[Any, Any] | None:
-    """(region, RegionView3D) of the 3D view under a place of a window in pixels; None beside it and over its sidebar."""
+    """(region, RegionView3D) of the 3D view under a place of a window in pixels; None beside it or over its sidebar."""
     for area in window.screen.areas:
         if area.type != "VIEW_3D":
             continue

@@ -17,6 +17,7 @@ from . import (
     cameras,
     compat,
     compositor,
+    guesses,
     markers,
     ops_align,
     pictures,
@@ -61,7 +62,7 @@ def view_camera(scene: Any, state: shots.ShotState | None) -> View:
     if not state.solve:
         return View(False, True, [], "Find where the camera was on every frame.")
     told = state.solve.get("result", state.solve)
-    lines = [told["quality"]] if told.get("quality") else []
+    lines = [line for line in (told.get("quality"), guesses.told(told)) if line]
     if cameras.find(scene, state.folder, "CAMERA") is None:
         return View(True, True, lines, "The solve is not in this scene: load it.")
     return View(True, True, lines, "Look through the camera, then train.")
