@@ -178,6 +178,25 @@ def fcurves(datablock: Any) -> Iterator[Any]:
         yield from data.action.fcurves
 
 
+def remove_fcurves(datablock: Any, data_path: str) -> None:
+    """Removes the F-curves and drivers of a data-block that lead to a data path."""
+    data = datablock.animation_data
+    if data is None:
+        return
+    for driver in [d for d in data.drivers if d.data_path == data_path]:
+        data.drivers.remove(driver)
+    if data.action is None:
+        return
+    if hasattr(data.action, "layers") and data.action.layers:
+        strips = [strip for layer in data.action.layers for strip in layer.strips]
+        held = [bag.fcurves for bag in (s.channelbag(data.action_slot) for s in strips) if bag is not None]
+    else:
+        held = [data.action.fcurves] if hasattr(data.action, "fcurves") else []
+    for curves in held:
+        for curve in [c for c in curves if c.data_path == data_path]:
+            curves.remove(curve)
+
+
 def set_keys(
     datablock: Any, frames: Sequence[int], channels: Mapping[str, np.ndarray], types: Sequence[str] = ()
 ) -> None:

@@ -18,6 +18,7 @@ from . import (
     compat,
     compositor,
     guesses,
+    made,
     markers,
     ops_align,
     pictures,
@@ -100,6 +101,11 @@ def view_bake(scene: Any, state: shots.ShotState | None) -> View:
     tree = compat.compositor_tree(scene)
     if tree is None or compositor.group_node(tree) is None:
         return View(False, True, [], "Put the freeze before your compositor's output and render.")
+    there, take = compositor.shown(scene), bake.shown(scene, state.folder)
+    if there is not None and take != scene.splannequin.take_name:
+        shown = f"take {take}" if take else f"another shot, {made.name_of(there[0].parent.parent)}"
+        lines = [f"Your compositor shows {shown}: the one that was baked last."]
+        return View(False, True, lines, "Baking puts this take in its place.")
     lines = ["The freeze is in your compositor."]
     if bake.stale_scale(scene, state.folder):
         lines.append("The shot was scaled since: its depth is stale until you bake again.")
