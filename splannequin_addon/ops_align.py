@@ -75,6 +75,13 @@ def move(scene: Any, shot: Path, change: np.ndarray) -> list[str]:
     return bake.follow_scale(scene, shot)
 
 
+def _shot_of(scene: Any) -> Path:
+    """The scene's shot; `poll` has seen to it that there is one."""
+    shot = steps.shot_folder(scene)
+    assert shot is not None
+    return shot
+
+
 def _centres(scene: Any, shot: Path) -> tuple[np.ndarray, np.ndarray]:
     """Where the camera was and its upward directions, [F, 3] each, world."""
     poses = cameras.poses(contract.CameraPath.load(shot / "solve" / "cameras.json"))
@@ -114,7 +121,7 @@ class _Aligns:
 
     def execute(self, context: Any) -> set[str]:
         """Moves the root."""
-        scene, shot = context.scene, steps.shot_folder(context.scene)
+        scene, shot = context.scene, _shot_of(context.scene)
         context.view_layer.update()
         try:
             notes = move(scene, shot, self.change(scene, shot, self._places(context, shot)))
@@ -147,7 +154,7 @@ class _Aligns:
 
     def _begin(self, context: Any) -> set[str]:
         global _picking
-        scene, shot = context.scene, steps.shot_folder(context.scene)
+        scene, shot = context.scene, _shot_of(context.scene)
         cloud = cameras.find(scene, shot, "MESH")
         xyz = points.coloured(cloud.data)[0] if cloud is not None else np.zeros((0, 3), np.float32)
         if bpy.app.background or not len(xyz):
@@ -312,7 +319,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
     def ready(self, context: Any) -> set[str]:
         """Asks for the distance, with what it is now."""
         try:
-            one, other = self._places(context, steps.shot_folder(context.scene))
+            one, other = self._places(context, _shot_of(context.scene))
         except contract.JobError as error:
             self.report({"ERROR"}, f"{error.message} {error.hint}")
             return {"CANCELLED"}
