@@ -31,6 +31,29 @@ def insert(scene: Any, shot: Path, take: str) -> list[str]:
     return compositor.insert(scene, frozen, plate if plate.is_file() else None)
 
 
+def shown(scene: Any, shot: Path) -> str:
+    """Name of the take of this shot that the scene's compositor shows; empty if there is none, or another shot's."""
+    there = compositor.shown(scene)
+    return there[0].name if there is not None and there[0].parent == shot / "takes" else ""
+
+
+def stale_scale(scene: Any, shot: Path) -> bool:
+    """True if the shot was scaled since its take was put into the compositor: its depth does not fit the scene's."""
+    there = compositor.shown(scene)
+    if there is None or not shown(scene, shot):
+        return False
+    scale = cameras.depth_scale(scene, shot)
+    return abs(there[1] - scale) > 1e-4 * scale
+
+
+def follow_scale(scene: Any, shot: Path) -> list[str]:
+    """Brings the depth of a take in the compositor to the shot's scale; returns what was changed, in words."""
+    if not stale_scale(scene, shot):
+        return []
+    compositor.set_depth_scale(scene, cameras.depth_scale(scene, shot))
+    return ["Depth in the compositor follows the new scale."]
+
+
 def remove(scene: Any) -> bool:
     """Takes the freeze out of the scene's compositor. True if it was there."""
     return compositor.remove(scene)

@@ -17,11 +17,10 @@ import numpy as np
 from mathutils import Matrix, Quaternion
 
 from ..torch_backend import contract
-from . import compat, compositor, shots
+from . import alignment, compat, compositor, guesses, made, shots
 
-_TAG = "splannequin"
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
-"""Kind of our objects -> last word of the name they are made with."""
+"""Kind of our objects -> which of `made.PARTS` it is, and last word of the name it is made with."""
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenCV camera axes to Blender's, and back."""
 SENSOR_MM = 36.0
@@ -156,7 +155,9 @@ def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[in
 
 
 def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarray:
-    """A first guess of the solve-to-scene transform: cameras upright, floor at z = 0, shot around the origin.
+    """A first guess of the solve-to-scene transform: floor at z = 0, cameras upright, shot around the origin.
+
+    Without a floor among the points the cameras' mean up is taken for up, and what is lowest for the floor.
 
     Args:
         path: the solved cameras, solve units.
@@ -169,6 +170,8 @@ def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarra
     up = matrices[:, :3, 1].mean(axis=0)
     forward = -matrices[:, :3, 2].mean(axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
+    floor = alignment.floor(points, matrices[:, :3, 3], matrices[:, :3, 1])
+    up = up if floor is None else floor[0]
     ahead = forward - up * float(forward @ up)
     if np.linalg.norm(ahead) < 1e-6:  # looking straight up or down
         ahead = np.cross(up, np.roll(up, 1))
@@ -176,7 +179,7 @@ def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarra
     rotation = np.stack([np.cross(ahead, up), ahead, up])  # scene x, y, z in solve coordinates
     seen = (points if len(points) else matrices[:, :3, 3]) @ rotation.T
     centre = np.median(seen, axis=0)
-    centre[2] = np.percentile(seen[:, 2], 2.0)
+    centre[2] = np.percentile(seen[:, 2], 2.0) if floor is None else floor[1]
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = rotation, -centre
     return result
@@ -199,43 +202,43 @@ def build(scene: Any, shot: Path) -> Any:
     """
     path = contract.CameraPath.load(shot / "solve" / "cameras.json")
     xyz, rgb = _points(shot)
-    name = shot.name.removesuffix(shots.SHOT_SUFFIX)
-    kept = _clear(scene, name)
-    collection = bpy.data.collections.new(f"Splannequin {name}")
-    collection[_TAG] = name
-    scene.collection.children.link(collection)
+    name = made.name_of(shot)
+    _clear(scene, shot, but=("root",))  # what the artist hung on the root, and where it stands, stays
+    entry = made.new(scene, shot)
+    collection = entry.collection
+    if collection is None or collection not in scene.collection.children_recursive:
+        collection = entry.collection = bpy.data.collections.new(f"Splannequin {name}")
+        scene.collection.children.link(collection)
 
-    root = bpy.data.objects.new(f"{name} root", None)
-    root.empty_display_type = "ARROWS"
-    root[_TAG] = name
-    root.matrix_world = kept if kept is not None else Matrix(scene_from_solve(path, xyz).tolist())
+    root = made.part(scene, shot, "root")
+    if root is None:
+        root = entry.root = bpy.data.objects.new(f"{name} root", None)
+        root.empty_display_type = "ARROWS"
+        root.matrix_world = Matrix(scene_from_solve(path, xyz).tolist())
+        root.empty_display_size = _extent(path)
+        collection.objects.link(root)
     camera_data = bpy.data.cameras.new(f"{name} camera")
-    camera = bpy.data.objects.new(f"{name} camera", camera_data)
-    cloud = bpy.data.objects.new(f"{name} points", _point_mesh(f"{name} points", xyz, rgb))
+    camera = entry.camera = bpy.data.objects.new(f"{name} camera", camera_data)
+    cloud = entry.points = bpy.data.objects.new(f"{name} points", _point_mesh(f"{name} points", xyz, rgb))
     cloud.hide_render = True
     cloud.display_type = "BOUNDS"  # Blender draws loose points black, whatever their colour: points.py draws them
-    root.empty_display_size = _extent(path)
     camera_data.display_size = max(_extent(path) * 0.5, 0.05)
-    for item in (root, camera, cloud):
-        collection.objects.link(item)
-        item[_TAG] = name
     for item in (camera, cloud):
+        collection.objects.link(item)
         item.parent = root
         item.hide_select = item is cloud
     _animate(camera, path)
-    camera_data.clip_start, camera_data.clip_end = _clip(path, xyz)
+    camera_data.clip_start, camera_data.clip_end = (v * depth_scale(scene, shot) for v in _clip(path, xyz))
     _show_plate(camera_data, shot, name)
+    guesses.mark(scene, shot, path)
     scene.camera = camera
     return camera
 
 
 def find(scene: Any, shot: Path, kind: str) -> Any | None:
-    """Our object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points)."""
-    name = shot.name.removesuffix(shots.SHOT_SUFFIX)
-    usual = scene.objects.get(f"{name} {_PARTS[kind]}")  # every draw asks, also in scenes of many thousand objects
-    if usual is not None and usual.get(_TAG) == name and usual.type == kind:
-        return usual
-    return next((o for o in scene.objects if o.get(_TAG) == name and o.type == kind), None)
+    """Our object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points). Never a copy that
+    the artist made of it."""
+    return made.part(scene, shot, _PARTS[kind])
 
 
 def depth_scale(scene: Any, shot: Path) -> float:
@@ -245,27 +248,46 @@ def depth_scale(scene: Any, shot: Path) -> float:
 
 
 def remove(scene: Any, shot: Path) -> bool:
-    """Takes everything that `build` made out of the file. True if there was something."""
-    return _clear(scene, shot.name.removesuffix(shots.SHOT_SUFFIX)) is not None
+    """Takes everything that `build` made out of the file. True if there was something.
+
+    What the artist hung on the root or put into the collection stays where it is in the scene.
+    """
+    if made.of(scene, shot) is None:
+        return False
+    _clear(scene, shot)
+    made.drop(scene, shot)
+    return True
 
 
-def _clear(scene: Any, name: str) -> Matrix | None:
-    """Removes what was built for a shot; returns the transform its root had."""
-    kept = None
-    for item in [o for o in scene.objects if o.get(_TAG) == name]:
+def _clear(scene: Any, shot: Path, but: tuple[str, ...] = ()) -> None:
+    """Removes what was built for a shot, except for the named parts and, with them, the collection."""
+    entry = made.of(scene, shot)
+    if entry is None:
+        return
+    guesses.unmark(scene, shot)
+    for item in [getattr(entry, name) for name in made.PARTS if name not in but]:
+        if item is None or (item.users_scene and scene not in item.users_scene):
+            continue
+        for child in [c for c in item.children if c not in [getattr(entry, name) for name in made.PARTS]]:
+            stood = child.matrix_world.copy()
+            child.parent = None
+            child.matrix_world = stood
         data, images = item.data, []
         actions = [b.animation_data.action for b in (item, data) if b is not None and b.animation_data]
-        if item.type == "EMPTY":
-            kept = item.matrix_world.copy()
         if item.type == "CAMERA":
             images = [b.image for b in data.background_images]
         bpy.data.objects.remove(item)
         unused = [b for b in (data, *actions) if b is not None and b.users <= int(b.use_fake_user)]
         bpy.data.batch_remove(unused)
         bpy.data.batch_remove([i for i in images if i is not None and i.users == 0])
-    for collection in [c for c in bpy.data.collections if c.get(_TAG) == name and not c.objects]:
-        bpy.data.collections.remove(collection)
-    return kept
+    collection = entry.collection
+    if but or collection is None:
+        return
+    for item in [o for o in collection.objects if o.users_collection == (collection,)]:
+        scene.collection.objects.link(item)
+    for child in collection.children:
+        scene.collection.children.link(child)
+    bpy.data.collections.remove(collection)
 
 
 def _animate(camera: Any, path: contract.CameraPath) -> None:
@@ -290,7 +312,8 @@ def _animate(camera: Any, path: contract.CameraPath) -> None:
     frames = [frame.frame for frame in path.frames]
     camera.location, camera.rotation_quaternion = places[-1], turns[-1]
     data.lens, data.shift_x, data.shift_y = lenses[-1]
-    compat.set_keys(camera, frames, {"location": np.array(places), "rotation_quaternion": np.array(turns)})
+    keyed = {"location": np.array(places), "rotation_quaternion": np.array(turns)}
+    compat.set_keys(camera, frames, keyed, guesses.key_types(path))
     if varies:
         columns = np.array(lenses).T
         compat.set_keys(data, frames, {n: columns[i][:, None] for i, n in enumerate(("lens", "shift_x", "shift_y"))})

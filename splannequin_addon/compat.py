@@ -193,14 +193,37 @@ def fcurves(datablock: Any) -> Iterator[Any]:
         yield from data.action.fcurves
 
 
-def set_keys(datablock: Any, frames: Sequence[int], channels: Mapping[str, np.ndarray]) -> None:
+def remove_fcurves(datablock: Any, data_path: str) -> None:
+    """Removes the F-curves and drivers of a data-block that lead to a data path."""
+    data = datablock.animation_data
+    if data is None:
+        return
+    for driver in [d for d in data.drivers if d.data_path == data_path]:
+        data.drivers.remove(driver)
+    if data.action is None:
+        return
+    if hasattr(data.action, "layers") and data.action.layers:
+        strips = [strip for layer in data.action.layers for strip in layer.strips]
+        held = [bag.fcurves for bag in (s.channelbag(data.action_slot) for s in strips) if bag is not None]
+    else:
+        held = [data.action.fcurves] if hasattr(data.action, "fcurves") else []
+    for curves in held:
+        for curve in [c for c in curves if c.data_path == data_path]:
+            curves.remove(curve)
+
+
+def set_keys(
+    datablock: Any, frames: Sequence[int], channels: Mapping[str, np.ndarray], types: Sequence[str] = ()
+) -> None:
     """Keys channels of a data-block that has no action yet, straight between keys, all at once.
 
     Args:
         datablock: what is animated.
         frames: [F] ascending frame numbers.
         channels: data path -> values [F, C], a column per array index.
+        types: [F] type of each key, which has a colour of its own: KEYFRAME, JITTER, EXTREME; empty: all KEYFRAME.
     """
+    known = {i.identifier: i.value for i in bpy.types.Keyframe.bl_rna.properties["type"].enum_items}
     action = bpy.data.actions.new(f"{datablock.name}Action")
     animation = datablock.animation_data_create()
     if hasattr(action, "slots"):
@@ -221,4 +244,6 @@ def set_keys(datablock: Any, frames: Sequence[int], channels: Mapping[str, np.nd
             keys.add(len(frames))
             keys.foreach_set("co", np.stack([np.asarray(frames, float), values[:, index]], axis=1).ravel())
             keys.foreach_set("interpolation", np.full(len(frames), straight, dtype=np.int32))
+            if any(kind != "KEYFRAME" for kind in types):
+                keys.foreach_set("type", np.array([known[kind] for kind in types], dtype=np.int32))
             curve.update()

@@ -23,6 +23,8 @@ GROUP_NAME = "Splannequin Freeze"
 _TAG = "splannequin"
 _BEFORE = "splannequin_before"
 _CG = "cg"
+_FROZEN, _DEPTH = "Frozen", "Depth in scene units"
+"""Nodes inside the group."""
 _GAP = 200.0
 
 
@@ -114,6 +116,25 @@ def combine_cg(scene: Any) -> list[str]:
 def group_node(tree: Any) -> Any | None:
     """Our group's node in a compositor tree, or None."""
     return next((n for n in tree.nodes if n.bl_idname == "CompositorNodeGroup" and _is_ours(n.node_tree)), None)
+
+
+def shown(scene: Any) -> tuple[Path, float] | None:
+    """(folder of the take that the freeze group shows, what its depth is multiplied by); None without the group."""
+    tree = compat.compositor_tree(scene)
+    node = group_node(tree) if tree else None
+    if node is None:
+        return None
+    frozen, depth = node.node_tree.nodes.get(_FROZEN), node.node_tree.nodes.get(_DEPTH)
+    if frozen is None or frozen.image is None or depth is None:
+        return None
+    file = Path(os.path.abspath(bpy.path.abspath(frozen.image.filepath)))
+    return file.parent, float(depth.inputs[1].default_value)
+
+
+def set_depth_scale(scene: Any, scale: float) -> None:
+    """Has the freeze group multiply depth by another scale. Only where `shown` says that there is one."""
+    node = group_node(compat.compositor_tree(scene))
+    node.node_tree.nodes[_DEPTH].inputs[1].default_value = scale
 
 
 def remove(scene: Any) -> bool:
@@ -317,11 +338,11 @@ def _fill_group(scene: Any, group: Any, take: Take) -> None:
     leave = group.nodes.new("NodeGroupOutput")
     frozen = group.nodes.new("CompositorNodeImage")
     image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
-    frozen.name = frozen.label = "Frozen"
+    frozen.name = frozen.label = _FROZEN
     show_sequence(frozen, image, take.first, take.last)
     mix, factor, first, second, mixed = compat.new_mix_node(group)
     depth = compat.new_math_node(group)
-    depth.name = depth.label = "Depth in scene units"
+    depth.name = depth.label = _DEPTH
     depth.inputs[1].default_value = take.depth_scale
     enter.location, frozen.location = (-2 * _GAP, 150.0), (-3 * _GAP, -100.0)
     mix.location, depth.location, leave.location = (_GAP, 150.0), (_GAP, -100.0), (2 * _GAP, 0.0)

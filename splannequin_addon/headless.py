@@ -23,7 +23,7 @@ import bpy
 
 from ..torch_backend import contract
 from ..torch_backend.contract import ExitCode
-from . import backend, bake, cameras, compositor, jobs, scene_setup, shots, steps, stmaps
+from . import backend, bake, cameras, compositor, jobs, made, scene_setup, shots, steps, stmaps
 
 
 class Console:
@@ -285,6 +285,7 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
         files.save_version = 0
         scene = bpy.context.scene
         compositor.relative_images()
+        made.relative_folders(scene)
         scene.render.filepath = compositor.blend_path(frames / bake.DIGITS)
         scene.splannequin.shot_path = compositor.blend_path(Path(bpy.path.abspath(scene.splannequin.shot_path)))
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)

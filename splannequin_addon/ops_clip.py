@@ -7,6 +7,8 @@ from typing import Any
 import bpy
 from bpy.props import StringProperty
 
+from . import shot_list, steps, supervisor
+
 VIDEO = ".mp4;.mov;.m4v;.mkv;.avi;.mxf;.mts;.webm;.mpg;.mpeg"
 """Endings of what is taken for footage when it is dropped. Images stay Blender's: they are often references."""
 
@@ -21,12 +23,19 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
     filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
 
     def execute(self, context: Any) -> set[str]:
-        """Sets the clip; another clip than before begins with a shot of its own."""
+        """Sets the clip; another clip than before begins with a shot of its own, beside one that was imported."""
         props = context.scene.splannequin
         if not self.filepath:
             self.report({"ERROR"}, "No file was given")
             return {"CANCELLED"}
-        if props.clip != self.filepath:
+        known = [i for i, one in enumerate(shot_list.settings(context.scene)) if one.clip == self.filepath]
+        if known and len(props.shots):
+            shot_list.choose(context.scene, known[0])
+        elif props.clip != self.filepath:
+            folder = steps.shot_folder(context.scene)
+            state = supervisor.watch_of(folder).state if folder is not None else None
+            if state is not None and state.frames:
+                shot_list.add(context.scene)
             props.clip, props.shot_path = self.filepath, ""
         self.report({"INFO"}, "Clip chosen: press Import Clip in the Splannequin tab")
         return {"FINISHED"}

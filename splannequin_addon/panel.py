@@ -12,7 +12,22 @@ from typing import Any
 
 import bpy
 
-from . import cameras, compat, compositor, markers, pictures, scene_setup, shots, steps, supervisor, viewport
+from . import (
+    bake,
+    cameras,
+    compat,
+    compositor,
+    guesses,
+    made,
+    markers,
+    ops_align,
+    pictures,
+    scene_setup,
+    shots,
+    steps,
+    supervisor,
+    viewport,
+)
 
 CATEGORY = "Splannequin"
 
@@ -48,7 +63,7 @@ def view_camera(scene: Any, state: shots.ShotState | None) -> View:
     if not state.solve:
         return View(False, True, [], "Find where the camera was on every frame.")
     told = state.solve.get("result", state.solve)
-    lines = [told["quality"]] if told.get("quality") else []
+    lines = [line for line in (told.get("quality"), guesses.told(told)) if line]
     if cameras.find(scene, state.folder, "CAMERA") is None:
         return View(True, True, lines, "The solve is not in this scene: load it.")
     return View(True, True, lines, "Look through the camera, then train.")
@@ -88,7 +103,14 @@ def view_bake(scene: Any, state: shots.ShotState | None) -> View:
     tree = compat.compositor_tree(scene)
     if tree is None or compositor.group_node(tree) is None:
         return View(False, True, [], "Put the freeze before your compositor's output and render.")
+    there, take = compositor.shown(scene), bake.shown(scene, state.folder)
+    if there is not None and take != scene.splannequin.take_name:
+        shown = f"take {take}" if take else f"another shot, {made.name_of(there[0].parent.parent)}"
+        lines = [f"Your compositor shows {shown}: the one that was baked last."]
+        return View(False, True, lines, "Baking puts this take in its place.")
     lines = ["The freeze is in your compositor."]
+    if bake.stale_scale(scene, state.folder):
+        lines.append("The shot was scaled since: its depth is stale until you bake again.")
     if not scene_setup.keeps_plate_colours(scene):
         lines.append(f"The view transform {scene.view_settings.view_transform} changes the plate's colours.")
     return View(True, True, lines, f"Frames go to {scene.render.filepath}")
@@ -271,6 +293,16 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
     bl_idname = "SPLANNEQUIN_PT_camera"
     step = "camera"
     operator = "splannequin.solve_camera"
+
+    def draw(self, context: Any) -> None:
+        """The step's body, and where the solve stands in the scene."""
+        super().draw(context)
+        watch = self._watch(context)
+        if watch is None or cameras.find(context.scene, watch.shot, "EMPTY") is None:
+            return
+        body = sub_panel(self.layout, "camera_alignment", "Alignment")  # type: ignore[attr-defined]
+        if body is not None:
+            ops_align.draw(body)
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The lens."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
-from . import compat
+from . import compat, made
 
 PRESETS = [
     ("preview", "Preview", "Small and quick: to see whether the shot holds, minutes on a laptop"),
@@ -32,8 +32,15 @@ def names_of(props: Any, kind: str) -> list[tuple[str, str]]:
     return [(name, f"t* {take['t_star_frame']}, run {take['run']}") for name, take in state.takes.items()]
 
 
-class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
-    """One shot of the scene and what is to be done with it."""
+def _chosen(props: Any, context: Any) -> None:
+    """Another shot of the list was clicked."""
+    from . import shot_list  # it imports this module in turn
+
+    shot_list.choose(props.id_data, props.active_shot)
+
+
+class ShotSettings:
+    """One shot and what is to be done with it. What is named here is put away when another shot is chosen."""
 
     clip: StringProperty(
         name="Clip",
@@ -128,6 +135,15 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
         search=lambda props, context, text: names_of(props, "takes"),
         search_options={"SUGGESTION"},
     )
+
+
+class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
+    """Settings of a shot of the scene that is not the chosen one."""
+
+
+class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
+    """The chosen shot of the scene, and what is the scene's own."""
+
     set_up_scene: BoolProperty(
         name="Fit Scene to Clip",
         description="Set resolution, frame rate and frame range of the scene to the clip's. "
@@ -142,10 +158,27 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
         default=True,
         options=set(),
     )
+    shots: CollectionProperty(
+        name="Shots",
+        description="All shots of the scene if there are several",
+        type=SPLANNEQUIN_PG_shot,
+        options=set(),
+    )
+    active_shot: IntProperty(
+        name="Shot", description="The shot that the steps are about", default=0, min=0, options=set(), update=_chosen
+    )
+    loaded_shot: IntProperty(
+        name="Loaded", description="Shot of the list whose settings are the scene's", default=0, options={"HIDDEN"}
+    )
+    made: CollectionProperty(
+        name="Made", description="What was put into this scene, by shot", type=made.SPLANNEQUIN_PG_made, options=set()
+    )
 
 
 def register() -> None:
-    """Registers the property group and hangs it on the scene."""
+    """Registers the property groups and hangs them on the scene."""
+    bpy.utils.register_class(made.SPLANNEQUIN_PG_made)
+    bpy.utils.register_class(SPLANNEQUIN_PG_shot)
     bpy.utils.register_class(SPLANNEQUIN_PG_scene)
     bpy.types.Scene.splannequin = PointerProperty(type=SPLANNEQUIN_PG_scene)
 
@@ -154,3 +187,5 @@ def unregister() -> None:
     """Undoes `register`."""
     del bpy.types.Scene.splannequin
     bpy.utils.unregister_class(SPLANNEQUIN_PG_scene)
+    bpy.utils.unregister_class(SPLANNEQUIN_PG_shot)
+    bpy.utils.unregister_class(made.SPLANNEQUIN_PG_made)

@@ -4,9 +4,31 @@ from __future__ import annotations
 
 import bpy
 
-from . import cli, ops_clip, ops_jobs, ops_steps, panel, pictures, points, preferences, props, stmaps, supervisor
+from . import (
+    cli,
+    ops_align,
+    ops_clip,
+    ops_jobs,
+    ops_shots,
+    ops_steps,
+    panel,
+    pictures,
+    points,
+    preferences,
+    props,
+    stmaps,
+    supervisor,
+)
 
-_CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *ops_clip.CLASSES, *stmaps.CLASSES, *panel.CLASSES)
+_CLASSES = (
+    *ops_steps.CLASSES,
+    *ops_jobs.CLASSES,
+    *ops_clip.CLASSES,
+    *ops_align.CLASSES,
+    *ops_shots.CLASSES,
+    *stmaps.CLASSES,
+    *panel.CLASSES,
+)
 
 
 def registered() -> bool:
@@ -32,6 +54,7 @@ def unregister() -> None:
     """Undoes `register`, in reverse."""
     if not registered():
         return
+    ops_align.stop()
     cli.unregister()
     stmaps.unregister()
     supervisor.unregister()

@@ -15,7 +15,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, compat, compositor, jobs, markers, scene_setup, shots
+from . import backend, bake, cameras, compat, compositor, jobs, made, markers, scene_setup, shot_list, shots
 
 
 @dataclass(frozen=True)
@@ -53,19 +53,18 @@ _STEP_FILE = "step"
 
 
 def shot_folder(scene: Any) -> Path | None:
-    """Folder of the scene's shot; None while neither it nor a clip is chosen."""
-    props = scene.splannequin
-    if props.shot_path:
-        return Path(os.path.abspath(bpy.path.abspath(props.shot_path)))
-    if not props.clip:
-        return None
-    clip = Path(os.path.abspath(bpy.path.abspath(props.clip)))
-    return clip.with_name(clip.stem + shots.SHOT_SUFFIX)
+    """Folder of the scene's shot, of several the chosen one; None while neither it nor a clip is chosen."""
+    return shot_list.folder_of(scene.splannequin)
 
 
 def scenes_of(shot: Path) -> list[Any]:
-    """Scenes of the file that work on a shot."""
+    """Scenes of the file that work on a shot: of several, it is the chosen one."""
     return [s for s in bpy.data.scenes if shot_folder(s) == shot]
+
+
+def scenes_with(shot: Path) -> list[Any]:
+    """Scenes of the file that have a shot, chosen or not."""
+    return [s for s in bpy.data.scenes if shot in shot_list.folders(s)]
 
 
 def params_of(scene: Any, step: str) -> Any:
@@ -245,12 +244,21 @@ def combine_cg(scene: Any, shot: Path) -> list[str]:
 
 
 def remove_all(scene: Any, shot: Path) -> list[str]:
-    """Takes everything of a shot out of the file; its folder on disk stays. Returns what was done, in words."""
+    """Takes everything of a shot out of the file; its folder on disk stays. Returns what was done, in words.
+
+    What another shot of the scene needs stays: its own things, and the settings of the scene.
+    """
     done = []
-    if bake.remove(scene):
+    there = compositor.shown(scene)
+    baked = there[0].parent.parent if there is not None else None
+    others = [f for f in shot_list.folders(scene) if f is not None and f != shot]
+    others = [f for f in others if f == baked or made.of(scene, f) is not None]
+    if baked not in others and bake.remove(scene):
         done.append("The freeze left the compositor.")
     if cameras.remove(scene, shot):
         done.append("Camera and points were removed.")
+    if others:
+        return done
     if markers.remove(scene):
         done.append("The marker t* was removed.")
     if scene_setup.restore(scene):

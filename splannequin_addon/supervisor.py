@@ -17,7 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, jobs, markers, shots, steps, viewport
+from . import backend, jobs, made, markers, shots, steps, viewport
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
@@ -63,6 +63,8 @@ class Watch:
     """(frames done, frames in all) of a render that runs."""
     sampling: Sampling | None = None
     """An artist's camera that is being read, before its take is asked for."""
+    pending: dict[str, jobs.Job] = field(default_factory=dict)
+    """Jobs that ended well while another shot of the scene was chosen, by the step's name: they wait for this one."""
     redraw: bool = False
     """Something changed outside the timer: draw at its next turn."""
 
@@ -127,7 +129,12 @@ def _read_on(watch: Watch) -> None:
     except StopIteration as end:
         scene = bpy.data.scenes.get(sampling.scene)
         try:
-            if scene is not None:
+            if scene is not None and steps.shot_folder(scene) != watch.shot:
+                watch.failures["freeze"] = (
+                    "Another shot was chosen while the camera was read.",
+                    "Choose this one and freeze again.",
+                )
+            elif scene is not None:
                 follow("freeze", steps.begin(scene, "freeze", steps.freeze_from(scene, end.value)))
         except (contract.JobError, OSError) as error:
             watch.failures["freeze"] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
@@ -174,6 +181,7 @@ def _turn(watch: Watch, until: float) -> bool:
     changed, watch.redraw = watch.redraw or watch.sampling is not None, False
     for scene in steps.scenes_of(watch.shot):
         changed |= markers.follow(scene)
+        made.tidy(scene)
     _read_on(watch)
     for step, job in list(watch.jobs.items()):
         if job.ended or time.monotonic() > until:
@@ -188,9 +196,17 @@ def _turn(watch: Watch, until: float) -> bool:
             continue
         if job.ended:
             refresh(watch)
-            _apply(watch, step, job)
+            if steps.scenes_of(watch.shot) or job.state != "done":
+                _apply(watch, step, job)
+            else:
+                watch.pending[step] = job
+    if watch.pending and steps.scenes_of(watch.shot):
+        for step, job in watch.pending.items():
+            _apply_late(watch, step, job)
+        watch.pending.clear()
+        changed = True
     if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
-        if watch.running() is None and not steps.scenes_of(watch.shot):
+        if watch.running() is None and not steps.scenes_with(watch.shot):
             del _watches[watch.shot]  # a path that was typed and left again
             return changed
         changed |= refresh(watch)
@@ -243,15 +259,29 @@ def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
             watch.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
 
 
+def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
+    """`_apply` for a job that had ended before its shot was chosen. Choosing a shot starts no render, and leaves the
+    other's take in the compositor."""
+    if step == "bake":
+        watch.notes[step] = ["Its frames were rendered meanwhile. Bake again to put them into your compositor."]
+    else:
+        _apply(watch, step, job)
+
+
 @persistent
 def _on_load(*_: Any) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
     viewport.end()
     markers.forget()
+    for scene in bpy.data.scenes:
+        folder = steps.shot_folder(scene)
+        if folder is not None:
+            made.adopt(scene, folder)
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     for watch in _watches.values():
         watch.rendered = watch.sampling = None
+        watch.pending.clear()
 
 
 def render_began(shot: Path, frames: int) -> None:

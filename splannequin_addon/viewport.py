@@ -67,7 +67,7 @@ def end() -> None:
     global _session, _handler
     if _session is not None:
         _session.close()
-        for scene in steps.scenes_of(_session.shot):
+        for scene in bpy.data.scenes:  # also where another shot was chosen since
             _show_points(scene, _session.shot, True)
         _session = None
     if _handler is not None:

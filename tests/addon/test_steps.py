@@ -179,7 +179,8 @@ def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
 
 
 def test_every_button_and_setting_has_a_tooltip(addon):
-    for cls in (*addon("ops_steps").CLASSES, *addon("ops_jobs").CLASSES):
+    operators = [*addon("ops_steps").CLASSES, *addon("ops_jobs").CLASSES, *addon("ops_align").CLASSES]
+    for cls in [*operators, *(c for c in addon("ops_shots").CLASSES if issubclass(c, bpy.types.Operator))]:
         kind = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type()
         assert len(kind.description) > 10 and not kind.description.endswith("."), cls
         for prop in kind.properties:

@@ -140,7 +140,7 @@ def _free_view(scene: Any, work: Path) -> Iterator[float]:
     window = bpy.context.window_manager.windows[0]
     area = press._view(window)
     region = next(r for r in area.regions if r.type == "WINDOW")
-    cloud = next(o for o in scene.objects if o.type == "MESH" and o.get("splannequin"))
+    cloud = scene.splannequin.made[0].points
     places = sorted((cloud.matrix_world @ v.co for v in cloud.data.vertices), key=lambda p: p.y)
     middle = sum(places[len(places) // 4 : len(places) // 2], Vector()) / max(1, len(places) // 2 - len(places) // 4)
     with bpy.context.temp_override(window=window, area=area, region=region):

@@ -1,0 +1,112 @@
+"""The list of a scene's shots at the top of the tab: choose, add, remove."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.props import BoolProperty
+
+from . import shot_list, steps, supervisor
+
+
+class SPLANNEQUIN_UL_shots(bpy.types.UIList):
+    """Shots of the scene"""
+
+    bl_idname = "SPLANNEQUIN_UL_shots"
+
+    def draw_item(
+        self, context: Any, layout: Any, data: Any, item: Any, icon: Any, active_data: Any, active: str, index: int
+    ) -> None:
+        """Name, and whether a step of it runs."""
+        one = shot_list.settings(context.scene)[index]
+        folder = shot_list.folder_of(one)
+        running = supervisor.watch_of(folder).running() if folder is not None else None
+        layout.label(text=shot_list.label(one), icon="SORTTIME" if running else "FILE_MOVIE", translate=False)
+
+
+class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
+    """Begin another shot in this scene. The ones that are there keep their settings, cameras and frames"""
+
+    bl_idname = "splannequin.shot_add"
+    bl_label = "New Shot"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off while the chosen shot has no clip: it is a new one."""
+        if steps.shot_folder(context.scene) is None:
+            cls.poll_message_set("Choose a clip for this shot first")
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Adds and chooses it."""
+        shot_list.add(context.scene)
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
+    """Take the chosen shot off the list. Its folder on disk stays"""
+
+    bl_idname = "splannequin.shot_remove"
+    bl_label = "Remove Shot from List"
+    bl_options = {"REGISTER", "UNDO"}
+
+    things: BoolProperty(
+        name="Remove Its Things from the File",
+        description="Take its camera, points, markers and compositor group out of the file, too",
+        default=True,
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """On for one of several."""
+        if len(context.scene.splannequin.shots) < 2:
+            cls.poll_message_set("This is the only shot of the scene")
+            return False
+        return True
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Asks what is to be done with its things."""
+        return context.window_manager.invoke_props_dialog(self)
+
+    def execute(self, context: Any) -> set[str]:
+        """Removes it."""
+        scene = context.scene
+        folder = steps.shot_folder(scene)
+        if self.things and folder is not None:
+            for note in steps.remove_all(scene, folder):
+                self.report({"INFO"}, note)
+        shot_list.remove(scene, scene.splannequin.loaded_shot)
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_PT_shots(bpy.types.Panel):
+    """Which shot of the scene the five steps below are about"""
+
+    bl_label = "Shots"
+    bl_idname = "SPLANNEQUIN_PT_shots"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Splannequin"
+    bl_options = {"HIDE_HEADER"}
+
+    def draw(self, context: Any) -> None:
+        """A list once there are several; before, a button."""
+        props = context.scene.splannequin
+        row = self.layout.row()
+        if len(props.shots) < 2:
+            row.label(text=shot_list.label(props), icon="FILE_MOVIE", translate=False)
+            row.operator("splannequin.shot_add", icon="ADD")
+            return
+        row.template_list(
+            "SPLANNEQUIN_UL_shots", "", props, "shots", props, "active_shot", rows=min(len(props.shots), 5)
+        )
+        column = row.column(align=True)
+        column.operator("splannequin.shot_add", text="", icon="ADD")
+        column.operator("splannequin.shot_remove", text="", icon="REMOVE")
+
+
+CLASSES = (SPLANNEQUIN_UL_shots, SPLANNEQUIN_OT_shot_add, SPLANNEQUIN_OT_shot_remove, SPLANNEQUIN_PT_shots)

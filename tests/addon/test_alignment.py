@@ -1,0 +1,246 @@
+"""Floor, origin and scale: the maths against float64 truth, and the buttons on a scene."""
+
+import bpy
+import numpy as np
+import pytest
+
+
+def turned(seed: int) -> np.ndarray:
+    """A random rotation [3, 3]."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+@pytest.fixture
+def maths(addon):
+    return addon("alignment")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_three_points_lie_in_the_floor_with_the_cameras_above(maths, seed):
+    rng = np.random.default_rng(seed)
+    rotation, shift = turned(seed), rng.normal(size=3) * 5
+    flat = np.concatenate([rng.uniform(-2, 2, (3, 2)), np.zeros((3, 1))], axis=1)
+    centres = np.array([0, 0, 1.5]) + rng.normal(size=(9, 3)) * 0.2
+    places, above = flat @ rotation.T + shift, centres @ rotation.T + shift
+    change = maths.level(places, above, np.zeros((9, 3)))
+    np.testing.assert_allclose(change[:3, :3] @ change[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(change[:3, :3]) == pytest.approx(1.0)
+    laid = places @ change[:3, :3].T + change[:3, 3]
+    np.testing.assert_allclose(laid[:, 2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(laid.mean(axis=0)[:2], places.mean(axis=0)[:2], atol=1e-12)
+    assert ((above @ change[:3, :3].T + change[:3, 3])[:, 2] > 0.5).all()
+    swapped = maths.level(places[[1, 0, 2]], above, np.zeros((9, 3)))
+    np.testing.assert_allclose(swapped, change, atol=1e-12, err_msg="the order of the clicks says nothing")
+
+
+def test_a_camera_level_with_the_points_is_turned_by_its_up(maths):
+    places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
+    centres, ups = np.array([[0.5, 0.5, 0.0]]), np.array([[0.1, 0.0, -1.0]])
+    np.testing.assert_allclose(maths.level(places, centres, ups)[:3, :3] @ [0, 0, -1], [0, 0, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [((0, 0, 1), (0, 0, 1)), ((0, 0, -2), (0, 0, 1)), ((1, 2, 3), (-1, -2, -3)), ((1, 2, 3), (3, -1, 0))],
+)
+def test_the_shortest_turn(maths, one, other):
+    rotation = maths.turn(np.array(one, float), np.array(other, float))
+    np.testing.assert_allclose(rotation @ maths.unit(one), maths.unit(other), atol=1e-12)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    cosine = maths.unit(one) @ maths.unit(other)
+    assert np.trace(rotation) == pytest.approx(1 + 2 * cosine), "no turn beyond what is needed"
+
+
+def test_what_cannot_be_aligned_is_said(maths, contract):
+    line, centre = np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2.01]]), np.zeros((1, 3))
+    with pytest.raises(contract.JobError, match="on one line"):
+        maths.level(line, centre, centre)
+    with pytest.raises(contract.JobError, match="on one line"):
+        maths.level(np.zeros((3, 3)), centre, centre)
+    with pytest.raises(contract.JobError, match="the same"):
+        maths.scaled(np.ones((2, 3)), 1.0)
+    for distance in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(contract.JobError, match="above 0"):
+            maths.scaled(np.eye(3)[:2], distance)
+
+
+def room(seed: int, floor_share: float = 0.15, count: int = 3000, pitch: float = 25.0):
+    """Points, centres and ups of a room: floor z = 0, a table with more points than it, walls, people, outliers."""
+    rng = np.random.default_rng(seed)
+    on_floor = int(floor_share * count)
+    ground = np.concatenate([rng.uniform(-3, 3, (on_floor, 2)), rng.normal(0, 0.01, (on_floor, 1))], axis=1)
+    table = np.concatenate([rng.uniform(-1, 1, (count // 4, 2)), rng.normal(0.8, 0.005, (count // 4, 1))], axis=1)
+    wall = np.stack([rng.uniform(-3, 3, count // 3), np.full(count // 3, 3.0), rng.uniform(0.1, 2.5, count // 3)], 1)
+    outliers = rng.uniform(-4, 4, (count // 33, 3))
+    people = rng.normal((0, 0, 1.0), (0.6, 0.6, 0.25), (count - on_floor - count // 4 - count // 3 - count // 33, 3))
+    centres = np.array([0, -3, 1.6]) + np.stack([np.linspace(-0.5, 0.5, 20), *rng.normal(0, 0.03, (2, 20))], 1)
+    tilt = np.radians(pitch)  # looking down on the table: the camera's up leans forward
+    ups = np.array([0, np.sin(tilt), np.cos(tilt)]) + rng.normal(0, 0.03, (20, 3))
+    return np.concatenate([ground, table, wall, outliers, people]), centres, ups
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_floor_is_found_under_a_table_among_outliers(maths, seed):
+    points, centres, ups = room(seed)
+    rotation, shift, size = turned(seed + 10), np.array([2.0, -7.0, 0.5]), 0.3
+    found = maths.floor(size * points @ rotation.T + shift, size * centres @ rotation.T + shift, ups @ rotation.T)
+    assert found is not None
+    normal, height = found
+    assert np.degrees(np.arccos(min(1.0, normal @ rotation[:, 2]))) < 0.5
+    assert height == pytest.approx(shift @ rotation[:, 2], abs=0.02 * size)
+    again = maths.floor(size * points @ rotation.T + shift, size * centres @ rotation.T + shift, ups @ rotation.T)
+    assert np.array_equal(again[0], normal) and again[1] == height, "the same points, the same floor"
+
+
+def test_no_floor_is_made_up(maths):
+    points, centres, ups = room(0)
+    assert maths.floor(points[:49], centres, ups) is None
+    rng = np.random.default_rng(1)
+    assert maths.floor(rng.normal((0, 3, 0), 1, (2000, 3)), centres, ups) is None, "a cloud has none"
+    walls = points[np.abs(points[:, 1] - 3) < 1e-6]
+    assert maths.floor(walls, centres, ups) is None, "a wall is none"
+
+
+def test_the_first_guess_stands_on_the_floor(addon, contract):
+    cameras = addon("cameras")
+    points, centres, ups = room(3)
+    frames = []
+    for n, (centre, up) in enumerate(zip(centres, ups, strict=True)):
+        down = -up / np.linalg.norm(up)
+        right = np.array([1.0, 0, 0]) - down[0] * down
+        right /= np.linalg.norm(right)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = [right, down, np.cross(right, down)]
+        viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+        frames.append(contract.CameraFrame(n, viewmat.ravel().tolist(), [500, 500, 320, 240]))
+    placed = cameras.scene_from_solve(contract.CameraPath(640, 480, frames), points)
+    np.testing.assert_allclose(placed[:3, :3] @ [0, 0, 1], [0, 0, 1], atol=0.01)
+    ground = points[:450] @ placed[:3, :3].T + placed[:3, 3]
+    assert abs(np.median(ground[:, 2])) < 0.01 and ground[:, 2].std() < 0.03
+    assert ((centres @ placed[:3, :3].T + placed[:3, 3])[:, 2] > 1.0).all()
+
+
+def test_the_nearest_point_under_the_mouse(maths):
+    places = np.array([[0, 0, -5], [1, 0, -5], [0, 0, 5.0]])  # the last is behind
+    matrix = np.array([[1.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, -1, -0.2], [0, 0, -1, 0]])
+    at, before = maths.seen(places, matrix, (200, 100))
+    np.testing.assert_allclose(at[:2], [[100, 50], [120, 50]])
+    assert before.tolist() == [True, True, False]
+    assert maths.nearest((103, 54), places, matrix, (200, 100), 15) == 0
+    assert maths.nearest((115, 50), places, matrix, (200, 100), 15) == 1
+    assert maths.nearest((150, 50), places, matrix, (200, 100), 15) == -1
+    assert maths.nearest((100, 50), np.zeros((0, 3)), matrix, (200, 100), 15) == -1
+
+
+@pytest.fixture
+def built(addon, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    addon("steps").load_camera(scene, shot)
+    bpy.context.view_layer.update()
+    return scene
+
+
+def world(addon, scene, shot) -> np.ndarray:
+    """The solve's points where they stand, [P, 3], from the file and the root."""
+    bpy.context.view_layer.update()
+    matrix = np.array(addon("cameras").find(scene, shot, "EMPTY").matrix_world, dtype=np.float64)
+    return np.load(shot / "solve" / "points.npz")["xyz"] @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def test_the_buttons_turn_move_and_scale_the_root(addon, built, shot):
+    cameras, ops = addon("cameras"), bpy.ops.splannequin
+    root = cameras.find(built, shot, "EMPTY")
+    root.rotation_euler = (0.4, -0.7, 0.2)
+    before = world(addon, built, shot)
+    assert ops.align_floor(places=before[[0, 4, 9]].ravel()) == {"FINISHED"}
+    np.testing.assert_allclose(world(addon, built, shot)[[0, 4, 9], 2], 0.0, atol=1e-5)
+    for frame in (5, 6, 7):
+        built.frame_set(frame)
+        assert built.camera.matrix_world.translation.z > 0
+    assert ops.align_origin(places=world(addon, built, shot)[4]) == {"FINISHED"}
+    np.testing.assert_allclose(world(addon, built, shot)[4], 0.0, atol=1e-5)
+    clip = built.camera.data.clip_end
+    assert ops.align_scale(places=world(addon, built, shot)[[0, 9]].ravel(), distance=2.5) == {"FINISHED"}
+    now = world(addon, built, shot)
+    assert np.linalg.norm(now[0] - now[9]) == pytest.approx(2.5, abs=1e-4)
+    np.testing.assert_allclose(now[[0, 4, 9], 2], 0.0, atol=1e-5, err_msg="the floor stays the floor")
+    np.testing.assert_allclose(now[4], 0.0, atol=1e-5, err_msg="and the origin the origin")
+    grown = np.linalg.norm(now[1:] - now[0], axis=1) / np.linalg.norm(before[1:] - before[0], axis=1)
+    np.testing.assert_allclose(grown, grown[0], rtol=1e-4, err_msg="one factor for all axes")
+    assert len(set(root.scale)) == 1 and root.scale[0] == pytest.approx(grown[0], rel=1e-4)
+    assert built.camera.data.clip_end == pytest.approx(clip * grown[0], rel=1e-3)
+    cameras.build(built, shot)
+    np.testing.assert_allclose(world(addon, built, shot), now, atol=1e-6, err_msg="a new solve stands there, too")
+    assert built.camera.data.clip_end == pytest.approx(clip * grown[0], rel=1e-3)
+
+
+def test_selected_objects_serve_as_points(addon, built, shot):
+    empties = []
+    for place in ((0, 0, 1.0), (1, 0, 1.5), (0, 1, 1.0)):
+        empties.append(bpy.data.objects.new("at", None))
+        built.collection.objects.link(empties[-1])
+        empties[-1].location = place
+    bpy.ops.object.select_all(action="DESELECT")
+    with pytest.raises(RuntimeError, match="0 objects are selected, 3 are needed"):
+        bpy.ops.splannequin.align_floor(selected=True)
+    for empty in empties:
+        empty.select_set(True)
+    addon("cameras").find(built, shot, "EMPTY").select_set(True)  # ours does not count
+    root = addon("cameras").find(built, shot, "EMPTY")
+    bpy.context.view_layer.update()
+    relative = [root.matrix_world.inverted() @ e.matrix_world.translation for e in empties]
+    assert bpy.ops.splannequin.align_floor(selected=True) == {"FINISHED"}
+    np.testing.assert_allclose([(root.matrix_world @ at).z for at in relative], 0.0, atol=1e-5)
+    with pytest.raises(RuntimeError, match="3 objects are selected, 2 are needed"):
+        bpy.ops.splannequin.align_scale(selected=True)
+
+
+def test_alignment_is_one_undo_step(addon, built, shot):
+    place = world(addon, built, shot)[3]
+    stood = np.array(addon("cameras").find(built, shot, "EMPTY").matrix_world)
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.splannequin.align_origin("EXEC_DEFAULT", True, places=place) == {"FINISHED"}
+    bpy.ops.ed.undo()
+    root = addon("cameras").find(bpy.context.scene, shot, "EMPTY")
+    np.testing.assert_allclose(root.matrix_world, stood, atol=1e-6)
+
+
+def test_points_on_a_line_leave_the_root_alone(addon, built, shot):
+    stood = np.array(addon("cameras").find(built, shot, "EMPTY").matrix_world)
+    with pytest.raises(RuntimeError, match="one line"):
+        bpy.ops.splannequin.align_floor(places=[0, 0, 0, 1, 1, 1, 2, 2, 2])
+    np.testing.assert_array_equal(addon("cameras").find(built, shot, "EMPTY").matrix_world, stood)
+
+
+def test_no_solve_no_alignment(scene):
+    assert not bpy.ops.splannequin.align_floor.poll()
+
+
+def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, built, shot):
+    bake, compositor, cameras = addon("bake"), addon("compositor"), addon("cameras")
+    panel, state = addon("panel"), addon("shots").read(shot)
+    addon("steps").insert_freeze(built, shot, "freeze")
+    assert compositor.shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
+    places = world(addon, built, shot)[[0, 1]]
+    apart = float(np.linalg.norm(places[1] - places[0]))
+    bpy.ops.splannequin.align_scale(places=places.ravel(), distance=3 * apart)
+    assert compositor.shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not bake.stale_scale(built, shot)
+    assert "compositor follows" in addon("supervisor").watch_of(shot).notes["camera"][0]
+    root = cameras.find(built, shot, "EMPTY")
+    root.scale = (5.0, 5.0, 5.0)  # by hand
+    bpy.context.view_layer.update()
+    assert bake.stale_scale(built, shot)
+    assert any("stale" in line for line in panel.view_bake(built, state).state)
+    addon("steps").insert_freeze(built, shot, "freeze")
+    assert compositor.shown(built)[1] == pytest.approx(5.0) and not bake.stale_scale(built, shot)
+    assert panel.view_bake(built, state).state[0] == "The freeze is in your compositor."
+    built.frame_set(6)
+    graph = bpy.context.evaluated_depsgraph_get()
+    camera = built.camera.evaluated_get(graph)
+    window = camera.calc_matrix_camera(graph, x=16, y=12)
+    viewmat, _ = cameras.in_solve(built, shot, camera.matrix_world.normalized().inverted(), window, 16, 12)
+    want = contract.CameraPath.load(shot / "solve" / "cameras.json").frames[1].viewmat
+    np.testing.assert_allclose(viewmat, want, atol=1e-4)

@@ -1,0 +1,127 @@
+"""What is ours in a scene, and what the artist's: copies, renamed objects, things hung on the root, other files."""
+
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+
+
+def duplicate(*items):
+    """Shift-D on objects; returns the copies by the original's name."""
+    for item in items:
+        item.hide_select = False
+    bpy.ops.object.select_all(action="DESELECT")
+    before = set(bpy.context.scene.objects)
+    for item in items:
+        item.select_set(True)
+    bpy.ops.object.duplicate()
+    return {o.name.partition(".")[0]: o for o in bpy.context.scene.objects if o not in before}
+
+
+@pytest.fixture
+def built(addon, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    addon("steps").load_camera(scene, shot)
+    return scene
+
+
+def test_copies_of_ours_are_the_artists(addon, built, shot):
+    cameras = addon("cameras")
+    ours = {kind: cameras.find(built, shot, kind) for kind in ("EMPTY", "CAMERA", "MESH")}
+    ours["CAMERA"].name, ours["EMPTY"].name = "zz renamed", "aa renamed"  # in either order of the names
+    copies = duplicate(*ours.values())
+    assert len(copies) == 3
+    assert {kind: cameras.find(built, shot, kind) for kind in ours} == ours
+    copies["aa renamed"].scale = (3.0, 3.0, 3.0)
+    bpy.context.view_layer.update()
+    assert cameras.depth_scale(built, shot) == pytest.approx(1.0)
+    names = sorted(c.name for c in copies.values())
+    cameras.build(built, shot)
+    assert sorted(c.name for c in copies.values()) == names, "a second build spares them"
+    assert cameras.find(built, shot, "CAMERA") not in copies.values()
+    assert addon("cameras").remove(built, shot)
+    assert sorted(c.name for c in copies.values()) == names, "and so does removal"
+    for copy in copies.values():
+        assert copy.name in built.objects and not copy.keys()
+    assert len(copies["zz renamed"].data.background_images) == 1 and not len(built.splannequin.made)
+    assert not [c for c in bpy.data.collections if c.name.startswith("Splannequin")]
+
+
+def test_what_hangs_on_the_root_stays_where_it_is(addon, built, shot):
+    cameras = addon("cameras")
+    root = cameras.find(built, shot, "EMPTY")
+    root.location, root.scale = (1.0, 2.0, 3.0), (2.0, 2.0, 2.0)
+    cube = built.objects["Cube"]
+    cube.parent, cube.location = root, (0.5, 0.0, 0.0)
+    bpy.context.view_layer.update()
+    stood = np.array(cube.matrix_world)
+    cameras.build(built, shot)
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(cube.matrix_world, stood, atol=1e-6)
+    assert cube.parent == cameras.find(built, shot, "EMPTY"), "a new solve comes in under the same root"
+    cameras.remove(built, shot)
+    bpy.context.view_layer.update()
+    assert cube.parent is None
+    np.testing.assert_allclose(cube.matrix_world, stood, atol=1e-6)
+
+
+def test_what_the_artist_deleted_is_let_go(addon, built, shot):
+    cameras, supervisor = addon("cameras"), addon("supervisor")
+    bpy.ops.object.select_all(action="DESELECT")
+    cameras.find(built, shot, "CAMERA").select_set(True)
+    bpy.ops.object.delete()
+    assert cameras.find(built, shot, "CAMERA") is None
+    supervisor.watch_of(shot)
+    supervisor.tick()
+    assert built.splannequin.made[0].camera is None
+    assert bpy.data.objects.get("my shot é camera") is None or not bpy.data.objects["my shot é camera"].users
+    cameras.build(built, shot)
+    assert cameras.find(built, shot, "CAMERA")
+
+
+def test_ours_are_found_after_saving_and_in_a_full_copy_of_the_scene(addon, built, shot, tmp_path):
+    cameras = addon("cameras")
+    duplicate(cameras.find(built, shot, "CAMERA"))
+    name = cameras.find(built, shot, "CAMERA").name
+    bpy.ops.scene.new(type="FULL_COPY")
+    copy = bpy.context.scene
+    assert cameras.find(copy, shot, "CAMERA").name in copy.objects
+    assert cameras.remove(copy, shot)
+    assert cameras.find(built, shot, "CAMERA").name == name, "removal in the copy leaves the first scene alone"
+    bpy.context.window.scene = built
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert cameras.find(bpy.context.scene, shot, "CAMERA").name == name
+
+
+def test_two_shots_of_one_name_are_two(addon, built, shot, tmp_path):
+    cameras, made = addon("cameras"), addon("made")
+    other = tmp_path / "elsewhere" / shot.name
+    shutil.copytree(shot, other)
+    assert cameras.find(built, other, "CAMERA") is None
+    cameras.build(built, other)
+    cameras.remove(built, other)
+    assert cameras.find(built, shot, "CAMERA")
+    moved = tmp_path / "moved" / shot.name
+    shutil.move(shot, moved)
+    assert cameras.find(built, moved, "CAMERA"), "a folder that was moved is the same shot"
+    made.new(built, moved)
+    assert cameras.find(built, shot, "CAMERA") is None and len(built.splannequin.made) == 1
+
+
+def test_a_file_of_0_2_0_is_taken_over(addon, built, shot, tmp_path):
+    cameras = addon("cameras")
+    name = addon("made").name_of(shot)
+    for kind in ("EMPTY", "CAMERA", "MESH"):  # as 0.2.0 left it: marks, no pointers
+        cameras.find(built, shot, kind)["splannequin"] = name
+    built.splannequin.made[0].collection["splannequin"] = name
+    built.splannequin.made.clear()
+    duplicate(built.objects[f"{name} camera"])
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "old.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "old.blend"))
+    scene = bpy.context.scene
+    assert cameras.find(scene, shot, "CAMERA").name == f"{name} camera"
+    assert cameras.remove(scene, shot)
+    assert [o.name for o in scene.objects if o.name.startswith(name)] == [f"{name} camera.001"]
+    assert not any("splannequin" in o for o in scene.objects)

@@ -1,0 +1,242 @@
+"""Several shots in one scene: settings, keys, cameras, jobs and removal of one leave the others alone."""
+
+import json
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def other(shot, tmp_path):
+    """A second solved shot, over frames 5 to 7 as well."""
+    folder = tmp_path / "second.splannequin"
+    shutil.copytree(shot, folder)
+    return folder
+
+
+@pytest.fixture
+def two(addon, scene, shot, other):
+    """Both in the scene with their cameras; the second is chosen."""
+    props = scene.splannequin
+    props.shot_path, props.run_name = str(shot), "first run"
+    addon("steps").load_camera(scene, shot)
+    assert bpy.ops.splannequin.shot_add() == {"FINISHED"}
+    props.shot_path = str(other)
+    addon("steps").load_camera(scene, other)
+    return scene
+
+
+def test_settings_are_put_away_and_come_back(addon, scene, shot, other):
+    props, steps, shot_list = scene.splannequin, addon("steps"), addon("shot_list")
+    assert not bpy.ops.splannequin.shot_add.poll(), "there is no first shot yet"
+    props.shot_path, props.clip = str(shot), "//first.mov"
+    own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
+    scene.collection.objects.link(own)
+    values = {"run_name": "b", "preset": "final", "use_range": True, "first": 3, "last": 9, "t_star": 6}
+    values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
+    values |= {"take_name": "x", "camera_model": "OPENCV"}
+    for name, value in values.items():
+        setattr(props, name, value)
+    assert set(shot_list.names()) == {*values, "clip", "shot_path"}, "a setting that is not tested here"
+    props.set_up_scene = True
+    bpy.ops.splannequin.shot_add()
+    assert (props.clip, props.shot_path, props.run_name, props.path_camera) == ("", "", "main", None)
+    assert props.set_up_scene, "what is the scene's own stays"
+    props.shot_path, props.t_star = str(other), 7
+    assert shot_list.folders(scene) == [shot, other] and steps.shot_folder(scene) == other
+    assert [shot_list.label(one) for one in shot_list.settings(scene)] == ["my shot é", "second"]
+    props.active_shot = 0
+    assert steps.shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
+    assert shot_list.folders(scene) == [shot, other]
+    props.active_shot = 1
+    assert (props.shot_path, props.t_star, props.run_name) == (str(other), 7, "main")
+    props.active_shot = 99
+    assert props.active_shot == 1, "no shot, no change"
+
+
+def keyed(addon, scene):
+    """Data path -> values of the keys."""
+    return {c.data_path: [k.co[1] for k in c.keyframe_points] for c in addon("compat").fcurves(scene)}
+
+
+def test_a_keyed_instant_goes_with_its_shot(addon, two):
+    props, steps = two.splannequin, addon("steps")
+    two["mine"] = 1.0
+    two.keyframe_insert('["mine"]', frame=1)
+    artists = set(keyed(addon, two))
+    for index, value in ((1, 7), (0, 5)):
+        props.active_shot = index
+        props.t_star, props.choose_t_star = value, True
+        two.keyframe_insert("splannequin.t_star", frame=5)
+    ours = {"splannequin.t_star": [5.0], "splannequin.shots[1].t_star": [7.0]}
+    assert {k: v for k, v in keyed(addon, two).items() if k not in artists} == ours
+    assert steps.keyed_instants(two)["6"] == 5.0
+    props.active_shot = 1
+    assert steps.keyed_instants(two)["6"] == 7.0
+    two.frame_set(6)
+    assert props.t_star == 7 and props.shots[0].t_star == 5
+    assert set(keyed(addon, two)) == {*artists, "splannequin.t_star", "splannequin.shots[0].t_star"}
+    bpy.ops.splannequin.shot_remove(things=False)
+    assert {k: v for k, v in keyed(addon, two).items() if k not in artists} == {"splannequin.t_star": [5.0]}
+    assert artists <= set(keyed(addon, two))
+
+
+def test_keys_move_up_when_a_shot_before_them_goes(addon, two, shot, tmp_path):
+    props = two.splannequin
+    bpy.ops.splannequin.shot_add()
+    props.shot_path = str(tmp_path / "third")
+    props.t_star = 33
+    two.keyframe_insert("splannequin.t_star", frame=1)
+    props.active_shot = 0
+    bpy.ops.splannequin.shot_remove(things=False)
+    assert len(props.shots) == 2 and props.shot_path.endswith("second.splannequin") and props.active_shot == 0
+    assert keyed(addon, two) == {"splannequin.shots[1].t_star": [33.0]}
+    props.active_shot = 1
+    assert props.t_star == 33 and keyed(addon, two) == {"splannequin.t_star": [33.0]}
+
+
+def test_the_chosen_shots_camera_is_the_scenes(addon, two, shot, other):
+    cameras, props = addon("cameras"), two.splannequin
+    assert two.camera == cameras.find(two, other, "CAMERA")
+    props.active_shot = 0
+    assert two.camera == cameras.find(two, shot, "CAMERA")
+    two.camera = None
+    cameras.remove(two, other)
+    props.active_shot = 1
+    assert two.camera is None, "a shot without a camera here changes nothing"
+
+
+def things(scene) -> set[str]:
+    kinds = (bpy.data.objects, bpy.data.meshes, bpy.data.images, bpy.data.actions, bpy.data.collections)
+    return {item.name for kind in kinds for item in kind}
+
+
+def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
+    props, steps, compositor = scene.splannequin, addon("steps"), addon("compositor")
+    props.shot_path = str(shot)
+    steps.load_camera(scene, shot)
+    steps.insert_freeze(scene, shot, "freeze")
+    before = things(scene)
+    bpy.context.view_layer.update()
+    pose = np.array(addon("cameras").find(scene, shot, "CAMERA").matrix_world)
+    bpy.ops.splannequin.shot_add()
+    props.shot_path = str(other)
+    steps.load_camera(scene, other)
+    assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
+    assert things(scene) == before
+    assert not len(props.shots) and steps.shot_folder(scene) == shot
+    assert scene.camera == addon("cameras").find(scene, shot, "CAMERA")
+    bpy.context.view_layer.update()
+    np.testing.assert_array_equal(scene.camera.matrix_world, pose)
+    assert compositor.shown(scene)[0] == shot / "takes" / "freeze"
+    assert scene.view_settings.view_transform == "Standard", "the shot that stays needs its settings"
+    assert not bpy.ops.splannequin.shot_remove.poll()
+    steps.remove_all(scene, shot)
+    assert compositor.shown(scene) is None and scene.view_settings.view_transform == "AgX"
+    assert scene.render.resolution_x == 1920
+
+
+def test_removing_the_baked_shot_takes_its_group_out(addon, two, shot, other):
+    steps, compositor = addon("steps"), addon("compositor")
+    steps.insert_freeze(two, other, "freeze")
+    steps.remove_all(two, other)
+    assert compositor.shown(two) is None and addon("cameras").find(two, shot, "CAMERA")
+    assert two.render.resolution_x == 16, "the settings go with the last shot"
+
+
+def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other, new_take):
+    steps, panel, shots = addon("steps"), addon("panel"), addon("shots")
+    steps.insert_freeze(two, other, "freeze")
+    assert panel.view_bake(two, shots.read(other)).done
+    two.splannequin.active_shot = 0
+    view = panel.view_bake(two, shots.read(shot))
+    assert not view.done and "another shot, second" in view.state[0]
+    steps.insert_freeze(two, shot, "freeze")
+    assert panel.view_bake(two, shots.read(shot)).done
+    new_take(shot, "later")
+    two.splannequin.take_name = "later"
+    assert "take freeze" in panel.view_bake(two, shots.read(shot)).state[0]
+
+
+def test_undo_brings_a_shot_back(addon, two, shot, other):
+    bpy.ops.ed.undo_push(message="two shots")
+    assert bpy.ops.splannequin.shot_remove("EXEC_DEFAULT", True) == {"FINISHED"}
+    assert addon("shot_list").folders(bpy.context.scene) == [shot]
+    bpy.ops.ed.undo()
+    scene = bpy.context.scene
+    assert addon("shot_list").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
+    assert scene.camera == addon("cameras").find(scene, other, "CAMERA")
+    scene.splannequin.active_shot = 0
+    assert addon("steps").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
+
+
+def ended(addon, contract, folder, step, kind, params, result):
+    """A job of a shot that the supervisor follows and that has just ended well."""
+    jobs = addon("jobs")
+    job = jobs.new_job(folder, kind, params)
+    (job.folder / "step").write_text(step)
+    addon("supervisor").follow(step, job)
+    event = contract.Event("done", 1, 1.0, {"result": result})
+    (job.folder / contract.EVENTS_FILE).write_text(json.dumps(event.__dict__) + "\n")
+    status = contract.Status(job.folder.name, "done", 1, 1.0, 2.0, 2.0, fraction=1.0)
+    (job.folder / contract.STATUS_FILE).write_text(json.dumps(status.__dict__))
+    return job
+
+
+def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene, shot, other):
+    props, supervisor, cameras = scene.splannequin, addon("supervisor"), addon("cameras")
+    props.shot_path, props.t_star = str(shot), 2
+    bpy.ops.splannequin.shot_add()
+    props.shot_path, props.t_star = str(other), 3
+    frozen = ended(addon, contract, shot, "freeze", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
+    solved = ended(addon, contract, shot, "camera", "solve", contract.SolveParams(), {})
+    baked = ended(addon, contract, shot, "bake", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
+    for _ in range(100):  # a turn has a budget, and the machine may be busy
+        supervisor.tick()
+        if all(job.ended for job in (frozen, solved, baked)):
+            break
+    assert solved.ended and baked.ended and props.t_star == 3 and props.shots[0].t_star == 2
+    assert cameras.find(scene, shot, "CAMERA") is None and set(supervisor.watch_of(shot).pending) == {
+        "freeze", "camera", "bake",
+    }  # fmt: skip
+    supervisor.tick()
+    assert supervisor.watch_of(shot).jobs, "a shot of the list is followed on"
+    props.active_shot = 0
+    supervisor.tick()
+    assert props.t_star == 6 and cameras.find(scene, shot, "CAMERA") == scene.camera
+    assert addon("compositor").shown(scene) is None, "choosing a shot bakes nothing"
+    assert "Bake again" in supervisor.watch_of(shot).notes["bake"][0]
+    props.t_star = 7
+    supervisor.tick()
+    assert props.t_star == 7, "it is applied once"
+    assert props.shots[1].t_star == 3
+
+
+def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, other):
+    supervisor = addon("supervisor")
+    supervisor.sample(two, other, iter_path(contract))
+    two.splannequin.active_shot = 0
+    while supervisor.watch_of(other).sampling is not None:
+        supervisor.tick()
+    assert "Another shot was chosen" in supervisor.watch_of(other).failures["freeze"][0]
+    assert not (shot / "jobs").exists() and not (other / "jobs").exists()
+
+
+def iter_path(contract):
+    yield 1
+    return contract.CameraPath(8, 8, [])
+
+
+def test_a_dropped_video_begins_a_shot_beside_one_that_was_imported(addon, scene, shot, clip):
+    props = scene.splannequin
+    props.shot_path = str(shot)
+    bpy.ops.splannequin.use_clip(filepath=str(clip))
+    assert len(props.shots) == 2 and props.clip == str(clip)
+    bpy.ops.splannequin.use_clip(filepath="/another.mov")
+    assert len(props.shots) == 2 and props.clip == "/another.mov", "a clip that was not imported is replaced"
+    bpy.ops.splannequin.use_clip(filepath=str(clip))
+    props.active_shot = 0
+    bpy.ops.splannequin.use_clip(filepath=str(clip))
+    assert len(props.shots) == 2 and props.active_shot == 1, "one that is in the list is chosen"
