@@ -159,7 +159,7 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
     """Start the backend once and say what it can do on this machine"""
 
     bl_idname = "splannequin.check_backend"
-    bl_label = "Check"
+    bl_label = "Check Backend"
     bl_options = {"REGISTER"}
 
     def execute(self, context: Any) -> set[str]:
@@ -185,7 +185,7 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
     """Delete the environment that Set Up Backend made. Shots and their runs stay"""
 
     bl_idname = "splannequin.remove_backend"
-    bl_label = "Remove"
+    bl_label = "Remove Backend"
     bl_options = {"REGISTER"}
 
     def invoke(self, context: Any, event: Any) -> set[str]:
