@@ -2,8 +2,8 @@
 
 Sentences are composed, kept and logged in English, here and in the backend's process, and translated where they are
 shown: Blender looks up what its own widgets say (labels of buttons, tooltips), `tr` what was composed. `{}` in a key
-stands for any value, so that "74 frames, 1 to 74" is found under "{} frames, {} to {}". In the translation `{}` is the next
-value, `{1}` the second, and `{0!t}` a value that is itself translated.
+stands for any value, so that "74 frames, 1 to 74" is found under "{} frames, {} to {}". In the translation `{}` is the
+next value, `{1}` the second, and `{!t}` a value that is itself translated.
 
 tests/addon/test_translations.py prints the lines that a language lacks.
 """

@@ -25,7 +25,7 @@ SHOWN_POSITIONS = {
 """Calls whose arguments are drawn."""
 TRANSLATED_BY_BLENDER = {"label", "operator", "prop", "row", "column", "split", "progress", "report"}
 """Calls that look a literal up by themselves, but no composed text."""
-A_SENTENCE = re.compile(r"[A-Z{][^\n]* [^\n]*[.]")
+A_SENTENCE = re.compile(r"[A-Z{][^\n]* [^\n]*([.]|: \{\})")
 
 
 def strings(node: ast.AST) -> Iterator[str]:
@@ -68,8 +68,8 @@ def shown_by(path: Path) -> Iterator[tuple[str, int]]:
                 yield from ((text, node.lineno) for text in strings(value))
         elif isinstance(node, ast.Constant | ast.JoinedStr) and id(node) not in skip:
             everything = path.name == "panel.py"
-            for text in strings(node):
-                if A_SENTENCE.fullmatch(text) or (everything and " " in text.strip()):
+            for text in map(str.strip, strings(node)):
+                if A_SENTENCE.fullmatch(text) or (everything and " " in text):
                     yield text, node.lineno
 
 
@@ -92,9 +92,12 @@ def registered() -> Iterator[tuple[str, str]]:
     for cls in classes():
         for text in (getattr(cls, "bl_label", ""), getattr(cls, "bl_description", "")):
             yield text, cls.__name__
-        base = {p.identifier for p in cls.bl_rna.base.properties}
-        for prop in cls.bl_rna.properties:
-            if prop.identifier in base or prop.identifier in ("name", "rna_type"):
+        known = cls.bl_rna
+        if issubclass(cls, bpy.types.Operator):
+            known = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type()
+        base = {p.identifier for p in known.base.properties} | {"name", "rna_type"}
+        for prop in known.properties:
+            if prop.identifier in base:
                 continue
             yield from ((text, f"{cls.__name__}.{prop.identifier}") for text in (prop.name, prop.description))
             for item in getattr(prop, "enum_items", ()):
@@ -114,12 +117,12 @@ def shown(package, root) -> dict[str, str]:
     return {text: where for text, where in found.items() if worth_translating(text)}
 
 
-def said_by_backend(root: Path) -> set[str]:
-    """What the backend's sources hold of texts, and its stages as the panel writes them."""
+def written(root: Path) -> set[str]:
+    """All texts in the sources, and the backend's stages as the panel writes them."""
     found: set[str] = set()
-    for path in sorted((root / "torch_backend").rglob("*.py")):
+    for path in [*(root / "torch_backend").rglob("*.py"), *(root / "splannequin_addon").glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            found.update(strings(node))
+            found.update(map(str.strip, strings(node)))
     return found | {text[:1].upper() + text[1:] for text in found}
 
 
@@ -128,11 +131,11 @@ def languages(addon) -> dict[str, dict[str, str]]:
 
 
 def test_every_language_has_what_is_shown_and_nothing_else(addon, shown, root):
-    backend = said_by_backend(root)
+    there = written(root)
     for locale, messages in languages(addon).items():
         missing = "\n".join(f"    {text!r}: {''!r},  # {shown[text]}" for text in shown if text not in messages)
         assert not missing, f"paste into splannequin_addon/translations/{locale}.py and translate:\n{missing}\n"
-        extra = "\n".join(repr(text) for text in messages if text not in shown and text not in backend)
+        extra = "\n".join(repr(text) for text in messages if text not in shown and text not in there)
         assert not extra, f"nothing shows these any more, take them out of translations/{locale}.py:\n{extra}\n"
 
 
@@ -202,7 +205,8 @@ def test_blender_shows_german_when_its_language_is_german(addon):
         view.language, view.use_translate_interface, view.use_translate_tooltips = "de_DE", True, True
         look_up = bpy.app.translations.pgettext_iface
         assert look_up("Import Clip", "Operator") == look_up("Import Clip") == "Clip importieren"
-        assert bpy.app.translations.pgettext_tip("Learn the scene and what moves in it from the clip").startswith("Die Sz")
+        tip = bpy.app.translations.pgettext_tip("Learn the scene and what moves in it from the clip")
+        assert tip == "Die Szene und was sich darin bewegt aus dem Clip lernen"
         assert tr("74 frames, 1 to 74") == "74 Bilder, 1 bis 74"
         view.use_translate_interface = False
         assert look_up("Import Clip") == "Import Clip" and tr("74 frames, 1 to 74") == "74 frames, 1 to 74"
