@@ -4,8 +4,8 @@
     blender --background --factory-startup --python examples/make_example.py
     .venv-bpy-4.2/bin/python examples/make_example.py -- --shot my_shot.splannequin --output my_example.blend
 
-The file names its pictures relative to itself and holds none, so it stays small and shows them wherever the folder of the
-shot lies beside it as it did when it was made. Made in Blender 4.2, it opens in every later version.
+The file names its pictures relative to itself and holds none, so it stays small, and shows them as long as the shot's
+folder lies where it did, seen from the file. Made in Blender 4.2, it opens in every later version.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def make(shot: Path, take: str, output: Path) -> None:
     """
     import bpy
 
-    def ours(name: str):  # noqa: ANN202
+    def ours(name: str):
         return importlib.import_module(f"{_package().__name__}.splannequin_addon.{name}")
 
     bake, compositor, shots, steps = ours("bake"), ours("compositor"), ours("shots"), ours("steps")
@@ -102,7 +102,7 @@ def make(shot: Path, take: str, output: Path) -> None:
         bpy.context.preferences.filepaths.save_version = before
 
 
-def _package():  # noqa: ANN202
+def _package():
     """The add-on under its name in Blender, from this repository."""
     name = "_splannequin_run_in_bpy"
     if name not in sys.modules:
