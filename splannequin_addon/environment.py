@@ -19,9 +19,11 @@ from pathlib import Path
 from ..torch_backend import contract
 from . import jobs
 
-TORCH_INDEX = "https://download.pytorch.org/whl/cu130"
+CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
 """Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
-SIZE = "about 1.5 GB on disk (6 GB with CUDA), downloaded from PyPI"
+CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+"""Where torch without CUDA comes from on Linux, whose PyPI build brings 4 GB for a card that is not there."""
+SIZE = "about 1.5 GB on disk (6 GB with CUDA)"
 LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp (Apache) and what they need"
 _STATE = "setup"
 _SHOWN = 6
@@ -32,6 +34,18 @@ def default_folder() -> Path:
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home()) / "Splannequin"
     return Path.home() / ".splannequin"
+
+
+def torch_index() -> str:
+    """Package index, beside PyPI, that has the torch this machine needs; empty if PyPI's own is the one."""
+    if sys.platform == "win32":
+        return CUDA_INDEX if nvidia_card() else ""
+    return "" if sys.platform != "linux" or nvidia_card() else CPU_INDEX
+
+
+def sources() -> str:
+    """Where the packages come from, in words."""
+    return "PyPI and PyTorch's own index" if torch_index() else "PyPI"
 
 
 def nvidia_card() -> bool:
@@ -77,8 +91,8 @@ def start(folder: Path, python: str, package_root: Path) -> SetUp:
     """
     setup = SetUp(folder)
     environ = {**jobs.backend_environ(package_root), "SPLANNEQUIN_HOME": str(folder)}
-    if sys.platform == "win32" and nvidia_card():
-        environ.setdefault("SPLANNEQUIN_TORCH_INDEX", TORCH_INDEX)
+    if torch_index():
+        environ.setdefault("SPLANNEQUIN_TORCH_INDEX", torch_index())
     command = [python, str(package_root / "splannequin.py"), "setup", "--backend", "--output", str(setup.log.parent)]
     try:
         setup.log.parent.mkdir(parents=True, exist_ok=True)

@@ -22,6 +22,8 @@ from ..torch_backend import contract
 from . import jobs
 
 _LOG = "live.log"
+_PATIENCE_SECONDS = 10.0
+"""How long a closed child may take to end by itself."""
 
 
 @dataclass
@@ -111,7 +113,7 @@ class Session:
         with contextlib.suppress(OSError):
             process.stdin.close()
         try:
-            process.wait(10.0)
+            process.wait(_PATIENCE_SECONDS)
         except subprocess.TimeoutExpired:
             process.kill()
 

@@ -46,8 +46,9 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         """What is used, its set-up, the device."""
         layout = self.layout
         try:
-            layout.label(text=tr(f"In use: {backend.python()}"), icon="CHECKMARK")
-            there = True
+            there = bool(backend.python())
+            if not busy():  # a half-made one is not in use yet
+                layout.label(text=tr(f"In use: {backend.python()}"), icon="CHECKMARK")
         except contract.JobError as error:
             column = layout.column(align=True)
             column.alert = True
@@ -83,7 +84,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
                 column.label(text=tr(_setup.failure), icon="ERROR")
                 column.label(text="Repair goes on where it stopped.")
         elif not there:
-            box.label(text=tr(f"Makes a Python environment of its own: {environment.SIZE}."), icon="INFO")
+            box.label(text=tr(f"Makes a Python environment of its own, {environment.SIZE}."), icon="INFO")
             box.label(text=tr(f"It installs {environment.LICENCES}."))
         if not bpy.app.online_access:
             box.label(text="Blender may not go online: allow it in Preferences > System > Network.", icon="ERROR")
@@ -111,12 +112,13 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         """Asks first."""
-        return context.window_manager.invoke_props_dialog(self, width=480, confirm_text="Download and Install")
+        return context.window_manager.invoke_props_dialog(self, width=640, confirm_text="Download and Install")
 
     def draw(self, context: Any) -> None:
         """What is asked."""
         column = self.layout.column(align=True)
-        column.label(text=tr(f"Into {backend.folder()}: {environment.SIZE}."))
+        column.label(text=tr(f"Makes a Python environment in {backend.folder()}"))
+        column.label(text=tr(f"Needs {environment.SIZE}, downloaded from {environment.sources()}."))
         column.label(text=tr(f"Installs {environment.LICENCES}."))
         column.label(text="Nothing is changed in Blender's own Python.")
 

@@ -88,6 +88,12 @@ def dangers(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield node.lineno, "pickled arrays"
 
 
+def test_no_module_of_the_addon_has_both_threads_and_bpy():
+    for path in sources("splannequin_addon"):
+        names = {name.split(".")[0] for _, name in imports(read(path), package_of(path))}
+        assert not (names & {"threading", "concurrent", "asyncio"} and names & BLENDER), path
+
+
 @pytest.mark.parametrize("path", sources("splannequin_addon"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_addon_imports_blender_numpy_and_the_contract_only(path: Path):
     wrong = [

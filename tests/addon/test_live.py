@@ -1,5 +1,6 @@
 """What a 3D view asks the live session for, and a session that cannot begin. Drawing is seen in window/scrub.py."""
 
+import sys
 import time
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix
+
+VIEWMAT = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
@@ -61,17 +64,36 @@ def test_a_session_that_cannot_begin_says_why_and_ends(addon, shot, root):
     assert session._process.wait(20) != 0
 
 
-def test_a_closed_session_leaves_no_process(addon, contract, shot, root):
+def _stand_in(tmp_path, name, body):
+    """A program in place of the backend's Python, to see what becomes of a child that would live on."""
+    program = tmp_path / name
+    program.write_text(f"#!/bin/sh\n{body}\n")
+    program.chmod(0o755)
+    return str(program)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
+def test_a_closed_session_leaves_no_process(addon, contract, shot, root, tmp_path):
     live = addon("live")
-    session = live.open_session(shot, "nothing", addon("backend").python(), root)
-    view = contract.LiveView(1, 0, [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], [9.0, 9, 8, 6], 16, 12, 6.0)
+    session = live.open_session(shot, "main", _stand_in(tmp_path, "listens", "exec cat > /dev/null"), root)
+    session.ask(contract.LiveView(1, 0, VIEWMAT, [9.0, 9, 8, 6], 16, 12, 6.0))
+    time.sleep(0.2)
+    assert session._process.poll() is None
     began = time.perf_counter()
-    session.ask(view)
     session.close()
-    assert time.perf_counter() - began < 1.0, "neither waits for the child"
+    assert time.perf_counter() - began < 1.0, "does not wait for the child"
     assert session.busy(1)
-    assert session._process.wait(120) is not None
+    assert session._process.wait(5) == 0, "its input ended"
     assert not session.open
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
+def test_a_session_that_hangs_is_ended(addon, shot, root, tmp_path, monkeypatch):
+    live = addon("live")
+    monkeypatch.setattr(live, "_PATIENCE_SECONDS", 0.2)
+    session = live.open_session(shot, "main", _stand_in(tmp_path, "hangs", "exec sleep 600"), root)
+    session.close()
+    assert session._process.wait(30) < 0
 
 
 def test_a_python_that_does_not_start_is_named(addon, contract, shot, root):

@@ -236,17 +236,20 @@ def _move(window, x: int, y: int) -> None:
     window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=x, y=y)
 
 
-def _click(operator: str) -> Iterator[float]:
-    """Finds the operator's button under the mouse, scrolling the sidebar if need be, and clicks it."""
+def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
+    """Finds the operator's button under the mouse, scrolling if need be, and clicks it.
+
+    Looked for in the sidebar of the 3D view, or in the window region of another kind of area.
+    """
     import bpy
 
     window = bpy.context.window_manager.windows[0]
     wanted = f"bpy.ops.{operator}("
     for _ in range(6):
-        area = _view(window)
-        region = _sidebar(area)
-        x = region.x + int(region.width * (0.8 if operator.endswith(".cancel") else 0.33))
-        for y in range(region.y + region.height - 8, region.y + 4, -9):
+        area, region = _place(window, kind)
+        shares = (0.8,) if operator.endswith(".cancel") else (0.33, 0.78, 0.83, 0.88)  # small ones stand at the right
+        rows = range(region.y + region.height - 8, region.y + 4, -9)
+        for x, y in ((region.x + int(region.width * share), y) for share in shares for y in rows):
             _move(window, x + (y % 2), y)
             yield 0.03
             if not _under_mouse(window, area, region).startswith(wanted):
@@ -254,19 +257,28 @@ def _click(operator: str) -> Iterator[float]:
             window.event_simulate(type="LEFTMOUSE", value="PRESS", x=x, y=y)
             window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=x, y=y)
             yield 0.5
-            _move(window, region.x - 200, y)
-            yield 0.3
+            if kind == "VIEW_3D":  # else what the button opened would close
+                _move(window, region.x - 200, y)
+                yield 0.3
             return
-        yield from _scroll_down()
-    raise RuntimeError(f"no button of {operator} was found in the sidebar")
+        yield from _scroll_down(kind)
+    raise RuntimeError(f"no button of {operator} was found in {kind}")
 
 
-def _scroll_down() -> Iterator[float]:
-    """Turns the wheel over the sidebar."""
+def _place(window, kind: str):
+    """(area, region) whose buttons are looked for."""
+    if kind == "VIEW_3D":
+        return _view(window), _sidebar(_view(window))
+    area = next(a for a in window.screen.areas if a.type == kind)
+    return area, next(r for r in area.regions if r.type == "WINDOW")
+
+
+def _scroll_down(kind: str = "VIEW_3D") -> Iterator[float]:
+    """Turns the wheel over the buttons."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]
-    region = _sidebar(_view(window))
+    _, region = _place(window, kind)
     x, y = region.x + region.width // 3, region.y + region.height // 2
     _move(window, x, y)
     yield 0.1
