@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.props import StringProperty
+from bpy.props import BoolProperty, StringProperty
+
+from . import icons
 
 from . import shot_list, steps, supervisor
 
@@ -20,7 +22,18 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
     bl_label = "Use as Splannequin Clip"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(
+        name="File", description="Video to be used", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    filter_movie: BoolProperty(name="Movies Only", description="Show videos only", default=True, options={"HIDDEN"})
+    filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """A file that was dropped is used; from a menu, one is chosen."""
+        if self.filepath:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
 
     def execute(self, context: Any) -> set[str]:
         """Sets the clip; another clip than before begins with a shot of its own, beside one that was imported."""
@@ -69,7 +82,7 @@ class SPLANNEQUIN_PT_movie_clip(bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         """One button; the five steps are in the 3D view."""
-        self.layout.operator("splannequin.use_movie_clip")
+        self.layout.operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
         self.layout.label(text="Then see the 3D view's sidebar.", icon="INFO")
 
 

@@ -15,15 +15,18 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
     """Stop this step. It saves what it has first; pressed again after 20 seconds, it is ended by force"""
 
     bl_idname = "splannequin.cancel"
-    bl_label = "Cancel"
-    bl_options = {"REGISTER", "INTERNAL"}
+    bl_label = "Cancel Step"
+    bl_options = {"REGISTER"}
 
-    step: StringProperty(name="Step", description="Name of the step to cancel", options={"SKIP_SAVE"})
+    step: StringProperty(
+        name="Step", description="Name of the step to cancel; empty: the one that runs", options={"SKIP_SAVE"}
+    )
 
     def execute(self, context: Any) -> set[str]:
         """Asks the job to stop."""
         folder = steps.shot_folder(context.scene)
-        job = supervisor.watch_of(folder).jobs.get(self.step) if folder else None
+        watch = supervisor.watch_of(folder) if folder else None
+        job = watch.jobs.get(self.step or watch.running() or "") if watch else None
         if job is None or job.ended:
             self.report({"WARNING"}, "Nothing is running")
             return {"CANCELLED"}

@@ -8,6 +8,7 @@ import bpy
 
 from ..torch_backend import contract
 from . import backend, bake, cameras, jobs, markers, steps, supervisor, viewport
+from .translations import tr
 
 
 class _StepOperator:
@@ -20,7 +21,7 @@ class _StepOperator:
         """Off while a step of this shot runs."""
         folder = steps.shot_folder(context.scene)
         if folder is not None and supervisor.watch_of(folder).running():
-            cls.poll_message_set("A step of this shot is running")  # type: ignore[attr-defined]
+            cls.poll_message_set(tr("A step of this shot is running"))  # type: ignore[attr-defined]
             return False
         return True
 
@@ -42,10 +43,10 @@ class _StepOperator:
             sentence = getattr(error, "message", str(error))
             if folder is not None:
                 supervisor.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
-            self.report({"ERROR"}, f"{sentence} {getattr(error, 'hint', '')}".strip())  # type: ignore[attr-defined]
+            self.report({"ERROR"}, tr(f"{sentence} {getattr(error, 'hint', '')}".strip()))  # type: ignore[attr-defined]
             return {"CANCELLED"}
         for note in notes:
-            self.report({"INFO"}, note)  # type: ignore[attr-defined]
+            self.report({"INFO"}, tr(note))  # type: ignore[attr-defined]
         return {"FINISHED"}
 
     def params(self, scene: Any) -> Any:
@@ -131,6 +132,7 @@ class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
             return super().execute(context)
         outcome = _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take))
         if outcome == {"FINISHED"}:
+            supervisor.undo_step("bake")
             try:
                 bpy.ops.splannequin.render("EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT")
             except RuntimeError as error:
@@ -168,6 +170,8 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
             self.report({"ERROR"}, "No shot is chosen: import a clip first")
             return {"CANCELLED"}
         notes = bake.choose_output(scene, folder, scene.splannequin.take_name)
+        if notes:
+            supervisor.undo_step("bake")
         supervisor.render_began(folder, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
         try:
             refused = "CANCELLED" in bpy.ops.render.render(how, animation=True, scene=scene.name) and "it was cancelled"
@@ -175,10 +179,10 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
             refused = str(error).strip()
         if refused:
             supervisor.watch_of(folder).rendered = None  # nothing else would tell the panel that no render runs
-            self.report({"ERROR"}, f"Blender did not render the scene: {refused}")
+            self.report({"ERROR"}, tr(f"Blender did not render the scene: {refused}"))
             return {"CANCELLED"}
         for note in notes:
-            self.report({"INFO"}, note)
+            self.report({"INFO"}, tr(note))
         return {"FINISHED"}
 
 
@@ -281,12 +285,12 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         """Off without a trained run, and where there is no view."""
         if bpy.app.background:
-            cls.poll_message_set("There is no 3D view")
+            cls.poll_message_set(tr("There is no 3D view"))
             return False
         folder = steps.shot_folder(context.scene)
         state = supervisor.watch_of(folder).state if folder else None
         if state is None or context.scene.splannequin.run_name not in state.runs:
-            cls.poll_message_set("Train first")
+            cls.poll_message_set(tr("Train first"))
             return False
         return True
 
@@ -298,7 +302,7 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
         try:
             viewport.begin(context.scene)
         except contract.JobError as error:
-            self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -316,7 +320,7 @@ class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         """On while scrubbing: the backend ranks the instants."""
         if not viewport.suggestions():
-            cls.poll_message_set("Suggestions come with Scrub in View")
+            cls.poll_message_set(tr("Suggestions come with Scrub in View"))
             return False
         return True
 
@@ -341,11 +345,11 @@ def _edit(operator: Any, context: Any, step: str, change: Any) -> set[str]:
     try:
         notes = change(context.scene, folder)
     except (contract.JobError, OSError, ValueError) as error:
-        operator.report({"ERROR"}, f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip())
+        operator.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
         return {"CANCELLED"}
     supervisor.watch_of(folder).notes[step] = notes
     for note in notes:
-        operator.report({"INFO"}, note)
+        operator.report({"INFO"}, tr(note))
     return {"FINISHED"}
 
 

@@ -18,6 +18,7 @@ from . import (
     compat,
     compositor,
     guesses,
+    icons,
     made,
     markers,
     ops_align,
@@ -28,6 +29,7 @@ from . import (
     supervisor,
     viewport,
 )
+from .translations import tr
 
 CATEGORY = "Splannequin"
 
@@ -120,13 +122,14 @@ VIEWS = {"footage": view_footage, "camera": view_camera, "train": view_train, "f
 
 
 def wrap(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:
-    """A sentence in as many lines as the sidebar's width asks for."""
+    """A sentence, in the interface's language, in as many lines as the sidebar's width asks for."""
+    text = tr(text)
     scale = context.preferences.system.ui_scale
     room = context.region.width / scale - (75 if icon != "NONE" else 50)
     column = layout.column(align=True)
     column.scale_y = 0.8
     for number, line in enumerate(textwrap.wrap(text, max(int(room / 6.2), 16)) or [""]):
-        column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+        column.label(text=line, translate=False, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 
 
 class _StepPanel:
@@ -201,31 +204,31 @@ class _StepPanel:
         row.scale_y = 1.0 if view.done else 1.4
         row.enabled = view.ready and running is None
         step = steps.STEPS[self.step]
-        row.operator(self.operator, text=step.again if view.done else step.button)
+        row.operator(self.operator, text=step.again if view.done else step.button, icon=icons.of(self.operator))
 
     def _progress(self, context: Any, watch: supervisor.Watch) -> None:
         layout = self.layout  # type: ignore[attr-defined]
         if watch.rendered is not None:
             done, total = watch.rendered
-            layout.progress(factor=done / max(total, 1), type="BAR", text=f"Rendering, frame {done} of {total}")
+            text = tr(f"Rendering, frame {done} of {total}")
+            layout.progress(factor=done / max(total, 1), type="BAR", text=text)
             wrap(layout, context, "Press Esc in the render window to stop.", "INFO")
             return
         if watch.sampling is not None:
             done, total = watch.sampling.done, watch.sampling.total
-            layout.progress(
-                factor=done / max(total, 1), type="BAR", text=f"Reading the camera, frame {done} of {total}"
-            )
+            text = tr(f"Reading the camera, frame {done} of {total}")
+            layout.progress(factor=done / max(total, 1), type="BAR", text=text)
             return
         job = watch.jobs[self.step]
         status = job.status
         row = layout.split(factor=0.7, align=True)
         text = f"{status.stage.capitalize()} {100 * status.fraction:.0f} %" if status and status.stage else "Starting"
-        row.progress(factor=status.fraction if status else 0.0, type="BAR", text=text)
-        row.operator("splannequin.cancel", text="Cancel").step = self.step
+        row.progress(factor=status.fraction if status else 0.0, type="BAR", text=tr(text))
+        row.operator("splannequin.cancel", text="Cancel", icon=icons.of("splannequin.cancel")).step = self.step
         detail = [status.message] if status and status.message else []
         if status and status.eta_seconds is not None:
             detail.append(f"about {minutes(status.eta_seconds)} left")
-        wrap(layout, context, ", ".join(detail) if detail else "The backend is starting.", "INFO")
+        wrap(layout, context, ", ".join(tr(part) for part in detail) if detail else "The backend is starting.", "INFO")
 
     def _outcome(self, context: Any, layout: Any, watch: supervisor.Watch | None) -> None:
         """What went wrong, or what was changed."""
@@ -315,7 +318,7 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
             row = layout.row()
             row.scale_y = 1.4
             row.enabled = running is None
-            row.operator("splannequin.load_camera")
+            row.operator("splannequin.load_camera", icon=icons.of("splannequin.load_camera"))
             return
         super()._button(context, layout, view, running)
 
@@ -429,9 +432,10 @@ class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """Colours, and the parts of the step one by one."""
         layout.prop(context.scene.splannequin, "keep_colours")
-        layout.operator("splannequin.insert_freeze", text="Insert in Compositor Only")
-        layout.operator("splannequin.combine_cg")
-        layout.operator("splannequin.remove_shot")
+        name = "splannequin.insert_freeze"
+        layout.operator(name, text="Insert in Compositor Only", icon=icons.of(name))
+        for name in ("splannequin.combine_cg", "splannequin.remove_shot"):
+            layout.operator(name, icon=icons.of(name))
 
 
 def sub_panel(layout: Any, name: str, label: str, folded: bool = True) -> Any | None:

@@ -10,6 +10,7 @@ from bpy.props import EnumProperty, StringProperty
 
 from ..torch_backend import contract
 from . import backend, environment
+from .translations import tr
 
 _TICK_SECONDS = 0.5
 _setup: environment.SetUp | None = None
@@ -47,15 +48,15 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         try:
             there = bool(backend.python())
             if not busy():  # a half-made one is not in use yet
-                layout.label(text=f"In use: {backend.python()}", icon="CHECKMARK")
+                layout.label(text=tr(f"In use: {backend.python()}"), icon="CHECKMARK")
         except contract.JobError as error:
             column = layout.column(align=True)
             column.alert = True
-            column.label(text=error.message, icon="ERROR")
-            column.label(text=error.hint)
+            column.label(text=tr(error.message), icon="ERROR")
+            column.label(text=tr(error.hint))
             there = False
         for line in _findings:
-            layout.label(text=line, icon="DOT")
+            layout.label(text=tr(line), icon="DOT")
         self._draw_setup(there)
         layout.prop(self, "device")
         layout.prop(self, "backend_python")
@@ -64,7 +65,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         box = self.layout.box()
         row = box.row()
         row.enabled = not busy()
-        row.prop(self, "backend_folder", text=f"Folder (empty: {environment.default_folder()})")
+        row.prop(self, "backend_folder", text=tr(f"Folder (empty: {environment.default_folder()})"))
         row = box.row(align=True)
         ours = backend.venv_python(backend.folder() / ".venv").is_file()
         if busy():
@@ -80,11 +81,11 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
             if _setup.failure:
                 column = box.column(align=True)
                 column.alert = True
-                column.label(text=_setup.failure, icon="ERROR")
+                column.label(text=tr(_setup.failure), icon="ERROR")
                 column.label(text="Repair goes on where it stopped.")
         elif not there:
-            box.label(text=f"Makes a Python environment of its own, {environment.SIZE}.", icon="INFO")
-            box.label(text=f"It installs {environment.LICENCES}.")
+            box.label(text=tr(f"Makes a Python environment of its own, {environment.SIZE}."), icon="INFO")
+            box.label(text=tr(f"It installs {environment.LICENCES}."))
         if not bpy.app.online_access:
             box.label(text="Blender may not go online: allow it in Preferences > System > Network.", icon="ERROR")
 
@@ -105,7 +106,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         """Only where Blender may go online, and one at a time."""
         if not bpy.app.online_access:
-            cls.poll_message_set("Blender may not go online: allow it in Preferences > System > Network")
+            cls.poll_message_set(tr("Blender may not go online: allow it in Preferences > System > Network"))
             return False
         return not busy()
 
@@ -116,9 +117,9 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
     def draw(self, context: Any) -> None:
         """What is asked."""
         column = self.layout.column(align=True)
-        column.label(text=f"Makes a Python environment in {backend.folder()}")
-        column.label(text=f"Needs {environment.SIZE}, downloaded from {environment.sources()}.")
-        column.label(text=f"Installs {environment.LICENCES}.")
+        column.label(text=tr(f"Makes a Python environment in {backend.folder()}"))
+        column.label(text=tr(f"Needs {environment.SIZE}, downloaded from {environment.sources()}."))
+        column.label(text=tr(f"Installs {environment.LICENCES}."))
         column.label(text="Nothing is changed in Blender's own Python.")
 
     def execute(self, context: Any) -> set[str]:
@@ -127,7 +128,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
         try:
             _setup = environment.start(backend.folder(), sys.executable, backend.package_root())
         except contract.JobError as error:
-            self.report({"ERROR"}, f"{error.message} {error.hint}")
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
             return {"CANCELLED"}
         _findings.clear()
         if not bpy.app.background:
@@ -161,7 +162,7 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
     """Start the backend once and say what it can do on this machine"""
 
     bl_idname = "splannequin.check_backend"
-    bl_label = "Check"
+    bl_label = "Check Backend"
     bl_options = {"REGISTER"}
 
     def execute(self, context: Any) -> set[str]:
@@ -171,13 +172,13 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
             _checks.append(backend.begin_doctor())
         except contract.JobError as error:
             _findings.clear()
-            self.report({"ERROR"}, f"{error.message} {error.hint}")
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
             return {"CANCELLED"}
         if bpy.app.background:
             _checks[-1].wait()
             _finish_checks()
             for line in _findings:
-                self.report({"INFO"}, line)
+                self.report({"INFO"}, tr(line))
         elif not bpy.app.timers.is_registered(_tick):
             bpy.app.timers.register(_tick, first_interval=_TICK_SECONDS, persistent=True)
         return {"FINISHED"}
@@ -187,7 +188,7 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
     """Delete the environment that Set Up Backend made. Shots and their runs stay"""
 
     bl_idname = "splannequin.remove_backend"
-    bl_label = "Remove"
+    bl_label = "Remove Backend"
     bl_options = {"REGISTER"}
 
     def invoke(self, context: Any, event: Any) -> set[str]:
@@ -199,7 +200,7 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
         try:
             there = environment.remove(backend.folder())
         except (OSError, ValueError) as error:
-            self.report({"ERROR"}, f"The environment stays: {error}")
+            self.report({"ERROR"}, tr(f"The environment stays: {error}"))
             return {"CANCELLED"}
         _findings.clear()
         self.report({"INFO"}, "The backend's environment was removed" if there else "There was nothing to remove")

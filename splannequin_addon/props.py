@@ -8,6 +8,7 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
 from . import compat, made
+from .translations import tr
 
 PRESETS = [
     ("preview", "Preview", "Small and quick: to see whether the shot holds, minutes on a laptop"),
@@ -26,10 +27,10 @@ def names_of(props: Any, kind: str) -> list[tuple[str, str]]:
         return []
     if kind == "runs":
         return [
-            (name, f"{run.get('heldout_psnr_db') or 0:.1f} dB, {run.get('gaussians', 0):,} Gaussians")
+            (name, tr(f"{run.get('heldout_psnr_db') or 0:.1f} dB, {run.get('gaussians', 0):,} Gaussians"))
             for name, run in state.runs.items()
         ]
-    return [(name, f"t* {take['t_star_frame']}, run {take['run']}") for name, take in state.takes.items()]
+    return [(name, tr(f"t* {take['t_star_frame']}, run {take['run']}")) for name, take in state.takes.items()]
 
 
 def _chosen(props: Any, context: Any) -> None:

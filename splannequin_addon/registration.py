@@ -6,6 +6,7 @@ import bpy
 
 from . import (
     cli,
+    menu,
     ops_align,
     ops_clip,
     ops_jobs,
@@ -18,6 +19,7 @@ from . import (
     props,
     stmaps,
     supervisor,
+    translations,
 )
 
 _CLASSES = (
@@ -40,10 +42,13 @@ def register() -> None:
     """Makes the add-on's classes, properties, timer, handlers and command known to Blender."""
     if registered():
         return
+    _take_tooltips_from_docstrings()
+    translations.register()
     props.register()
     preferences.register()
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
+    menu.register()
     pictures.register()
     points.register()
     supervisor.register()
@@ -60,7 +65,18 @@ def unregister() -> None:
     supervisor.unregister()
     points.unregister()
     pictures.unregister()
+    menu.unregister()
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)
     preferences.unregister()
     props.unregister()
+    translations.unregister()
+
+
+def _take_tooltips_from_docstrings() -> None:
+    """Gives each of our classes its docstring as tooltip, on one line: Blender would keep the source's line breaks, and
+    translations would be looked up with them."""
+    for kind in (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu):
+        for cls in kind.__subclasses__():
+            if cls.__module__.startswith(f"{__package__}.") and cls.__doc__ and "bl_description" not in vars(cls):
+                cls.bl_description = " ".join(cls.__doc__.split())

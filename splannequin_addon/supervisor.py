@@ -18,6 +18,7 @@ from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
 from . import backend, jobs, made, markers, shots, steps, viewport
+from .translations import tr
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
@@ -237,6 +238,12 @@ def look_through_camera(window: Any) -> None:
             return
 
 
+def undo_step(step: str) -> None:
+    """Ends an undo step, named after a step of ours, for a change of the scene that no operator's own undo covers."""
+    if not bpy.app.background:
+        bpy.ops.ed.undo_push(message=tr(f"Splannequin {steps.STEPS[step].label}"))
+
+
 def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
     """Lets a job that ended well change the scenes that work on its shot: in a window, as one undo step each."""
     if job.state != "done":
@@ -248,11 +255,12 @@ def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
                 watch.notes[step] = steps.finish(scene, step, job)
                 continue
             with bpy.context.temp_override(window=window, scene=scene):
+                before = scene.splannequin.t_star
                 watch.notes[step] = steps.finish(scene, step, job)
                 if step == "camera":
                     look_through_camera(window)
-                if watch.notes[step]:
-                    bpy.ops.ed.undo_push(message=f"Splannequin {steps.STEPS[step].label}")
+                if watch.notes[step] or before != scene.splannequin.t_star:
+                    undo_step(step)
                 if step == "bake":
                     bpy.ops.splannequin.render("INVOKE_DEFAULT")
         except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:

@@ -112,9 +112,8 @@ def reason(scene: Any) -> str:
         if one["frame"] == at:
             share, sharp = round(100 * one["seen"]), round(100 * one["sharpness"])
             return f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, as sharp as {sharp} %."
-    frames = ", ".join(str(one["frame"]) for one in suggestions())
-    snapped = f"Shown: frame {shown.pop()}. " if len(shown) == 1 and at not in shown else ""
-    return f"{snapped}Suggested: {frames}."
+    suggested = f"Suggested: {', '.join(str(one['frame']) for one in suggestions())}."
+    return f"Shown: frame {shown.pop()}. " + suggested if len(shown) == 1 and at not in shown else suggested
 
 
 def redraw() -> None:

@@ -13,5 +13,8 @@ def test_the_bundled_clip_carries_its_licence_and_credit():
 
 
 def test_no_other_footage_is_bundled():
-    footage = {p.name for p in Path(splannequin.DEMO_CLIP).parent.iterdir() if p.suffix != ".md"}
-    assert footage == {splannequin.DEMO_CLIP.name}
+    """But a small .blend that is made from the clip and holds no pictures, and the script that makes it."""
+    folder = Path(splannequin.DEMO_CLIP).parent
+    footage = {p.name for p in folder.iterdir() if p.suffix not in (".md", ".py") and p.is_file()}
+    assert footage == {splannequin.DEMO_CLIP.name, "sitting_frozen.blend"}
+    assert (folder / "sitting_frozen.blend").stat().st_size < 1_000_000

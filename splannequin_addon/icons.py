@@ -1,0 +1,34 @@
+"""Blender's own icons for our buttons, the same in the panel and in the menu. All are in every version from 4.2 on."""
+
+from __future__ import annotations
+
+OF = {
+    "splannequin.bake": "RENDER_ANIMATION",
+    "splannequin.cancel": "CANCEL",
+    "splannequin.cancel_setup": "CANCEL",
+    "splannequin.check_backend": "VIEWZOOM",
+    "splannequin.combine_cg": "MESH_CUBE",
+    "splannequin.freeze": "FREEZE",
+    "splannequin.import_clip": "IMPORT",
+    "splannequin.insert_freeze": "NODE_COMPOSITING",
+    "splannequin.live": "HIDE_OFF",
+    "splannequin.load_camera": "OUTLINER_OB_CAMERA",
+    "splannequin.open_log": "TEXT",
+    "splannequin.remove_backend": "TRASH",
+    "splannequin.remove_shot": "TRASH",
+    "splannequin.render": "RENDER_ANIMATION",
+    "splannequin.set_up": "IMPORT",
+    "splannequin.solve_camera": "CON_CAMERASOLVER",
+    "splannequin.suggested_instant": "TRIA_RIGHT",
+    "splannequin.t_star_here": "EYEDROPPER",
+    "splannequin.t_star_marker": "MARKER",
+    "splannequin.train": "POINTCLOUD_DATA",
+    "splannequin.use_clip": "FILE_MOVIE",
+    "splannequin.use_movie_clip": "TRACKER",
+}
+"""Operator -> icon."""
+
+
+def of(operator: str) -> str:
+    """Icon of an operator, NONE if it has none."""
+    return OF.get(operator, "NONE")

@@ -1,0 +1,77 @@
+"""The menu Render > Splannequin. What Blender's search (F3) finds is what stands in a menu: all our operators do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import bpy
+
+from . import icons
+
+_GROUPS = (
+    ("use_clip", "import_clip", "solve_camera", "load_camera", "train", "cancel"),
+    ("t_star_here", "t_star_marker", "suggested_instant", "live", "freeze"),
+    ("bake", "insert_freeze", "combine_cg", "render"),
+    ("set_up", "check_backend", "remove_backend"),
+    ("remove_shot",),
+)
+"""Names of operators in the order of the work; those that are named nowhere come last."""
+_ELSEWHERE = {"use_movie_clip"}
+"""In a menu of the editor that it needs."""
+
+
+def searchable() -> set[str]:
+    """Names of the operators that can be called without being told what for: all but the internal ones."""
+    names = dir(bpy.ops.splannequin)
+    return {n for n in names if "INTERNAL" not in getattr(bpy.types, f"SPLANNEQUIN_OT_{n}").bl_options}
+
+
+def entries() -> Iterator[list[str]]:
+    """Names of the operators in the menu, a list per group."""
+    left = searchable() - _ELSEWHERE
+    for group in _GROUPS:
+        yield [name for name in group if name in left]
+        left -= set(group)
+    yield sorted(left)
+
+
+class SPLANNEQUIN_MT_shot(bpy.types.Menu):
+    """Freeze time in a handheld clip of people holding still"""
+
+    bl_idname = "SPLANNEQUIN_MT_shot"
+    bl_label = "Splannequin"
+
+    def draw(self, context: Any) -> None:
+        """Every operator, in the order of the work."""
+        first = True
+        for group in entries():
+            if group and not first:
+                self.layout.separator()
+            for name in group:
+                self.layout.operator(f"splannequin.{name}", icon=icons.of(f"splannequin.{name}"))
+                first = False
+
+
+def _in_render(self: Any, context: Any) -> None:
+    self.layout.separator()
+    self.layout.menu(SPLANNEQUIN_MT_shot.bl_idname, icon="FREEZE")
+
+
+def _in_clip(self: Any, context: Any) -> None:
+    self.layout.separator()
+    self.layout.operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
+
+
+def register() -> None:
+    """Registers the menu and hangs it into Blender's."""
+    bpy.utils.register_class(SPLANNEQUIN_MT_shot)
+    bpy.types.TOPBAR_MT_render.append(_in_render)
+    bpy.types.CLIP_MT_clip.append(_in_clip)
+
+
+def unregister() -> None:
+    """Undoes `register`."""
+    bpy.types.CLIP_MT_clip.remove(_in_clip)
+    bpy.types.TOPBAR_MT_render.remove(_in_render)
+    bpy.utils.unregister_class(SPLANNEQUIN_MT_shot)

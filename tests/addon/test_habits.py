@@ -1,0 +1,115 @@
+"""What artists expect of any add-on: plain names that the search finds, tooltips, undo, no keymap, icons that exist."""
+
+import ast
+import re
+
+import bpy
+
+CHANGES_NO_SCENE = {
+    "import_clip", "solve_camera", "train", "freeze", "bake",  # start a job; its end is an undo step of its own
+    "render", "cancel", "live", "open_log", "set_up", "cancel_setup", "check_backend", "remove_backend",
+}  # fmt: skip
+
+
+def operators() -> dict[str, type]:
+    names = dir(bpy.ops.splannequin)
+    assert len(names) > 15
+    return {name: getattr(bpy.types, f"SPLANNEQUIN_OT_{name}") for name in names}
+
+
+def test_operators_have_plain_names_and_tooltips():
+    for name, cls in operators().items():
+        shown = getattr(bpy.ops.splannequin, name).get_rna_type()
+        assert re.fullmatch(r"[A-Z][A-Za-z*' ]+", shown.name), f"{name}: {shown.name}"
+        assert shown.description[0].isupper() and "\n" not in shown.description and "  " not in shown.description, name
+        assert not shown.description.endswith("."), f"{name}: Blender adds the full stop"
+        if "INTERNAL" not in cls.bl_options:
+            assert len(shown.name.split()) > 1 or shown.name in ("Train", "Freeze"), f"{name}: too short to be searched"
+
+
+def test_no_two_operators_have_the_same_name():
+    said = [c.bl_label for c in operators().values() if "INTERNAL" not in c.bl_options]
+    assert len(set(said)) == len(said)
+
+
+def test_operators_are_registered_and_undone():
+    for name, cls in operators().items():
+        assert "INTERNAL" in cls.bl_options or "REGISTER" in cls.bl_options, name
+        assert ("UNDO" in cls.bl_options) == (name not in CHANGES_NO_SCENE), name
+
+
+def test_all_operators_are_in_our_name(package):
+    for cls in bpy.types.Operator.__subclasses__():
+        if cls.__module__.startswith(f"{package.__name__}."):
+            assert cls.bl_idname.startswith("splannequin."), cls.bl_idname
+
+
+def test_settings_have_names_and_tooltips(package):
+    """In plain words, without the full stop that Blender adds."""
+    holders = [c for c in bpy.types.PropertyGroup.__subclasses__() + bpy.types.AddonPreferences.__subclasses__()]
+    ours = [c for c in holders if c.__module__.startswith(f"{package.__name__}.") and c.is_registered]
+    assert len(ours) >= 2
+    for cls in ours:
+        for name in cls.__annotations__:
+            prop = cls.bl_rna.properties[name]
+            assert prop.name and (prop.description or prop.type == "COLLECTION"), f"{cls.__name__}.{name}"
+            assert not prop.description.endswith("."), f"{cls.__name__}.{name}"
+
+
+def test_no_keymap_is_touched(package, root):
+    """Nothing is bound to a key: neither here, as headless Blender has no key configuration, nor in the source."""
+    for config in bpy.context.window_manager.keyconfigs if bpy.context.window_manager else ():
+        for keymap in config.keymaps:
+            assert not [i for i in keymap.keymap_items if i.idname.startswith("splannequin.")]
+    for path in (root / "splannequin_addon").rglob("*.py"):
+        assert "keymap" not in path.read_text(encoding="utf-8"), path
+
+
+def test_the_search_finds_every_operator(addon):
+    """It finds what stands in a menu."""
+    menu = addon("menu")
+    listed = [name for group in menu.entries() for name in group]
+    assert len(set(listed)) == len(listed)
+    assert {*listed, "use_movie_clip"} == menu.searchable()
+    assert menu.searchable() == {n for n, c in operators().items() if "INTERNAL" not in c.bl_options}
+    assert menu._in_render in bpy.types.TOPBAR_MT_render.draw._draw_funcs
+    assert menu._in_clip in bpy.types.CLIP_MT_clip.draw._draw_funcs
+
+
+def test_an_operator_that_is_in_no_group_of_the_menu_comes_last(addon, monkeypatch):
+    menu = addon("menu")
+    monkeypatch.setattr(menu, "_GROUPS", (("bake",),))
+    first, rest = menu.entries()
+    assert first == ["bake"] and "train" in rest and rest == sorted(rest)
+
+
+def icons_in(tree: ast.AST) -> set[str]:
+    """Texts given to `icon=`, assigned to `icon`, or after a sentence for `wrap`."""
+    values = [k.value for n in ast.walk(tree) if isinstance(n, ast.Call) for k in n.keywords if k.arg == "icon"]
+    values += [n.value for n in ast.walk(tree) if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "icon"]
+    values += [
+        n.args[3]
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Call) and ast.unparse(n.func) == "wrap" and len(n.args) > 3
+    ]
+    found = [part.value for v in values if not isinstance(v, ast.Call) for part in ast.walk(v)
+             if isinstance(part, ast.Constant) and isinstance(part.value, str)]  # fmt: skip
+    return {text for text in found if text and "." not in text}
+
+
+def test_icons_exist_in_this_blender(addon, root):
+    known = set(bpy.types.UILayout.bl_rna.functions["prop"].parameters["icon"].enum_items.keys())
+    used = set(addon("icons").OF.values())
+    for path in (root / "splannequin_addon").glob("*.py"):
+        used |= icons_in(ast.parse(path.read_text(encoding="utf-8")))
+    assert {"CHECKMARK", "INFO", "FREEZE"} <= used
+    assert used <= known, sorted(used - known)
+
+
+def test_every_operator_has_an_icon(addon):
+    assert set(addon("icons").OF) == {f"splannequin.{name}" for name in operators()}
+
+
+def test_a_video_from_the_menu_is_chosen_in_the_file_browser_and_a_dropped_one_at_once(scene, tmp_path):
+    assert bpy.ops.splannequin.use_clip("INVOKE_DEFAULT", filepath=str(tmp_path / "a clip.mp4")) == {"FINISHED"}
+    assert scene.splannequin.clip.endswith("a clip.mp4")

@@ -1,0 +1,66 @@
+"""What the documents refer to is there, and the manual says what the buttons say."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "README.md"]
+MANUAL = ROOT / "docs" / "manual"
+STEPS = ("footage", "camera", "train", "freeze", "bake")
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def anchors(page: Path) -> set[str]:
+    """As GitHub makes them from headings."""
+    headings = re.findall(r"^#+ (.+)$", text_of(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_and_pictures_are_there(page: Path):
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            broken.append(target)
+    assert not broken
+
+
+def test_the_manual_has_a_page_per_step_with_its_picture_and_its_button():
+    tree = ast.parse(text_of(ROOT / "splannequin_addon" / "steps.py"))
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and ast.unparse(n.func) == "Step"]
+    buttons = {c.args[0].value: c.args[3].value for c in calls}
+    assert tuple(buttons) == STEPS
+    index = text_of(MANUAL / "README.md")
+    for number, step in enumerate(STEPS, 1):
+        page = text_of(MANUAL / f"{step}.md")
+        assert f"*{buttons[step]}*" in page and f"*{buttons[step]}*" in index
+        assert f"window-{number}-{step}-done.jpg" in page
+        assert f"({step}.md)" in index
+
+
+def test_all_pages_of_the_manual_are_in_its_index():
+    index = text_of(MANUAL / "README.md")
+    assert all(f"({page.name})" in index for page in MANUAL.glob("*.md") if page.name != "README.md")
+
+
+def test_what_the_manual_sets_in_italics_is_on_the_screen_or_in_a_message():
+    """Labels are written *so*: a button that is renamed does not stay in the manual under its old name."""
+    sources = "".join(text_of(p) for p in (ROOT / "splannequin_addon").glob("*.py"))
+    sources += "".join(text_of(p) for p in (ROOT / "torch_backend").rglob("*.py"))
+    lost = []
+    for page in MANUAL.glob("*.md"):
+        for label in re.findall(r"(?<!\*)\*([^*\n]+)\*(?!\*)", text_of(page).replace("t\\*", "t\N{ASTERISK OPERATOR}")):
+            plain = label.replace("\N{ASTERISK OPERATOR}", "*")
+            if not plain.startswith(("Render >", "Splannequin")) and plain not in sources:
+                lost.append(f"{page.name}: {plain}")
+    assert not lost
