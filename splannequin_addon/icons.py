@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 OF = {
+    "splannequin.align_floor": "GRID",
+    "splannequin.align_origin": "OBJECT_ORIGIN",
+    "splannequin.align_scale": "ARROW_LEFTRIGHT",
     "splannequin.bake": "RENDER_ANIMATION",
     "splannequin.cancel": "CANCEL",
     "splannequin.cancel_setup": "CANCEL",
@@ -17,12 +20,15 @@ OF = {
     "splannequin.remove_backend": "TRASH",
     "splannequin.remove_shot": "TRASH",
     "splannequin.render": "RENDER_ANIMATION",
+    "splannequin.shot_add": "ADD",
+    "splannequin.shot_remove": "REMOVE",
     "splannequin.set_up": "IMPORT",
     "splannequin.solve_camera": "CON_CAMERASOLVER",
     "splannequin.suggested_instant": "TRIA_RIGHT",
     "splannequin.t_star_here": "EYEDROPPER",
     "splannequin.t_star_marker": "MARKER",
     "splannequin.train": "POINTCLOUD_DATA",
+    "splannequin.write_stmaps": "TEXTURE",
     "splannequin.use_clip": "FILE_MOVIE",
     "splannequin.use_movie_clip": "TRACKER",
 }

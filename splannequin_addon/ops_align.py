@@ -20,6 +20,7 @@ from mathutils import Matrix
 
 from ..torch_backend import contract
 from . import alignment, bake, cameras, points, steps, supervisor
+from .translations import tr
 
 REACH_PIXELS = 18.0
 """How far from the mouse a point may be seen, at a user interface scale of 1."""
@@ -100,7 +101,7 @@ class _Aligns:
         """Off without the solve in the scene."""
         shot = steps.shot_folder(context.scene)
         if shot is None or cameras.find(context.scene, shot, "EMPTY") is None:
-            cls.poll_message_set("Load the camera of this shot first")  # type: ignore[attr-defined]
+            cls.poll_message_set(tr("Load the camera of this shot first"))  # type: ignore[attr-defined]
             return False
         return True
 
@@ -321,7 +322,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
         try:
             one, other = self._places(context, _shot_of(context.scene))
         except contract.JobError as error:
-            self.report({"ERROR"}, f"{error.message} {error.hint}")
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
             return {"CANCELLED"}
         self.places = np.concatenate([one, other]).tolist()
         self.distance = float(np.linalg.norm(other - one))

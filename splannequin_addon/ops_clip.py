@@ -7,9 +7,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from . import icons
-
-from . import shot_list, steps, supervisor
+from . import icons, shot_list, steps, supervisor
 
 VIDEO = ".mp4;.mov;.m4v;.mkv;.avi;.mxf;.mts;.webm;.mpg;.mpeg"
 """Endings of what is taken for footage when it is dropped. Images stay Blender's: they are often references."""

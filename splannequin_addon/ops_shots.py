@@ -8,6 +8,7 @@ import bpy
 from bpy.props import BoolProperty
 
 from . import shot_list, steps, supervisor
+from .translations import tr
 
 
 class SPLANNEQUIN_UL_shots(bpy.types.UIList):
@@ -36,7 +37,7 @@ class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         """Off while the chosen shot has no clip: it is a new one."""
         if steps.shot_folder(context.scene) is None:
-            cls.poll_message_set("Choose a clip for this shot first")
+            cls.poll_message_set(tr("Choose a clip for this shot first"))
             return False
         return True
 
@@ -64,7 +65,7 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         """On for one of several."""
         if len(context.scene.splannequin.shots) < 2:
-            cls.poll_message_set("This is the only shot of the scene")
+            cls.poll_message_set(tr("This is the only shot of the scene"))
             return False
         return True
 

@@ -310,7 +310,7 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The lens."""
         layout.prop(context.scene.splannequin, "camera_model")
-        layout.operator("splannequin.write_stmaps")
+        layout.operator("splannequin.write_stmaps", icon=icons.of("splannequin.write_stmaps"))
 
     def _button(self, context: Any, layout: Any, view: View, running: str | None) -> None:
         watch = self._watch(context)

@@ -12,6 +12,7 @@ import bpy
 
 from ..torch_backend import contract
 from . import backend, jobs, steps, supervisor
+from .translations import tr
 
 _TICK_SECONDS = 0.2
 _LONGEST_SECONDS = 600.0
@@ -114,13 +115,13 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         folder = steps.shot_folder(context.scene)
         watch = supervisor.watch_of(folder) if folder else None
         if watch is None or watch.state is None or not watch.state.solve:
-            cls.poll_message_set("Solve the camera first")
+            cls.poll_message_set(tr("Solve the camera first"))
             return False
         if watch.running():
-            cls.poll_message_set("A step of this shot is running")
+            cls.poll_message_set(tr("A step of this shot is running"))
             return False
         if any(asked.shot == folder for asked in _asked):
-            cls.poll_message_set("The maps are being written")
+            cls.poll_message_set(tr("The maps are being written"))
             return False
         return True
 
