@@ -7,6 +7,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
+from ..torch_backend import contract
 from . import compat
 
 PRESETS = [
@@ -30,6 +31,15 @@ def names_of(props: Any, kind: str) -> list[tuple[str, str]]:
             for name, run in state.runs.items()
         ]
     return [(name, f"t* {take['t_star_frame']}, run {take['run']}") for name, take in state.takes.items()]
+
+
+def _third_of(steps: int) -> int:
+    return round(steps / 3)
+
+
+def _preset_chosen(props: Any, context: Any) -> None:
+    """More steps are a third of the preset's unless the artist says otherwise."""
+    props.extend_steps = _third_of(contract.PRESET_STEPS[props.preset])
 
 
 class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
@@ -61,7 +71,21 @@ class SPLANNEQUIN_PG_scene(bpy.types.PropertyGroup):
         ],
         options=set(),
     )
-    preset: EnumProperty(name="Preset", description="How much to spend on training", items=PRESETS, options=set())
+    preset: EnumProperty(
+        name="Preset",
+        description="How much to spend on training",
+        items=PRESETS,
+        options=set(),
+        update=_preset_chosen,
+    )
+    extend_steps: IntProperty(
+        name="More Steps",
+        description="How many steps Train On adds to a finished run; a third of the preset's at first",
+        default=_third_of(contract.PRESET_STEPS["preview"]),
+        min=10,
+        soft_max=30_000,
+        options=set(),
+    )
     run_name: StringProperty(
         name="Run",
         description="Name of the training run; a new name keeps the old",

@@ -17,7 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, jobs, markers, shots, steps, viewport
+from . import backend, jobs, markers, pictures, shots, steps, viewport
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
@@ -105,6 +105,8 @@ def follow(step: str, job: jobs.Job) -> None:
     watch.jobs[step] = job
     watch.notes.clear()  # what earlier steps said has been read
     watch.failures.pop(step, None)
+    if step == "train":
+        pictures.forget()
 
 
 def sample(scene: Any, shot: Path, turns: Generator[int, None, contract.CameraPath]) -> None:

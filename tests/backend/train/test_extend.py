@@ -54,7 +54,7 @@ def test_an_interrupted_extension_ends_exactly_where_an_unbroken_one_does(world,
     assert 80 <= read_meta(paused / EXTENSION_FILE)["iteration"] < 100
     report = quiet()
     train_shot(world.shot, more("ext-paused"), report)
-    assert [e for e in report.events if e[0] == "progress" and e[1] == "training"][0][2:4] == (20, 40)
+    assert next(e for e in report.events if e[:2] == ("progress", "training"))[2:4] == (20, 40)
     same(whole, paused)
 
     class Dies(quiet):
