@@ -11,26 +11,30 @@ from typing import Any
 
 from . import shots
 
-_RUN_HEAD = ("Run", "dB", "Gaussians", "Moves", "Time")
-_RUN_WIDTHS = (0.32, 0.17, 0.21, 0.17, 0.13)
+_RUN_HEAD = ("Run", "dB", "Size", "Move", "Time")
+_RUN_WIDTHS = (0.27, 0.2, 0.18, 0.18, 0.17)  # a sidebar of Blender's own width shows all of it
 _TAKE_HEAD = ("Take", "t*", "Frames", "Run")
-_TAKE_WIDTHS = (0.36, 0.18, 0.2, 0.26)
+_TAKE_WIDTHS = (0.3, 0.18, 0.24, 0.28)
 
 
 def run_rows(state: shots.ShotState) -> list[tuple[str, ...]]:
-    """(name, dB on frames kept out, Gaussians, share that moves, time trained) of every run, as shown."""
+    """(name, dB on frames kept out, Gaussians, share that moves, time trained) of every run, as shown.
+
+    Of one that is not finished (name, how far it came).
+    """
     rows = []
     for name in sorted({*state.runs, *state.unfinished}):
         run = state.runs.get(name)
         if run is None:
             told = state.unfinished[name]
             share = 100.0 * told["iteration"] / max(1, told["end"])
-            rows.append((name, "paused", f"{share:.0f} %", "", ""))
+            rows.append((name, f"paused at {share:.0f} %"))
             continue
         psnr = run.get("heldout_psnr_db")
-        moves = f"{100.0 * (run.get('moving_share') or 0.0):.1f} %"
+        moves = f"{100.0 * (run.get('moving_share') or 0.0):.3g}%"
         quality = "-" if psnr is None else f"{psnr:.2f}"
-        rows.append((name, quality, f"{run.get('gaussians', 0):,}", moves, duration(run.get("train_seconds"))))
+        size = f"{run.get('gaussians', 0) / 1000.0:.3g}k"
+        rows.append((name, quality, size, moves, duration(run.get("train_seconds"))))
     return rows
 
 
@@ -60,7 +64,7 @@ def draw(layout: Any, kind: str, state: shots.ShotState, chosen: str) -> None:
     column = layout.column(align=True)
     for row in (head, *rows):
         line = column.row(align=True)
-        cells = _cells(line.row(align=True), widths)
+        cells = _cells(line.row(align=True), widths if len(row) == len(head) else (widths[0], 1.0 - widths[0]))
         if row is head:
             cells[0].label(text=row[0])
             line.label(text="", icon="BLANK1")

@@ -122,8 +122,8 @@ def test_runs_and_takes_stand_side_by_side(addon, with_runs, shot, new_take):
     new_take(shot, "second")
     state, listing = addon("shots").read(shot), addon("listing")
     assert listing.run_rows(state) == [
-        ("better", "paused", "33 %", "", ""),
-        ("main", "24.00", "12,345", "5.0 %", "2m"),
+        ("better", "paused at 33 %"),
+        ("main", "24.00", "12.3k", "5%", "2m"),
     ]
     assert listing.take_rows(state) == [("freeze", "6", "3", "main"), ("second", "6", "3", "main")]
     assert [listing.duration(s) for s in (None, 44.6, 600.0, 5400.0)] == ["-", "45s", "10m", "1.5h"]
