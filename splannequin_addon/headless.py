@@ -314,6 +314,7 @@ def _train_params(args: argparse.Namespace) -> contract.TrainParams:
         holdout=args.holdout,
         seed=args.seed,
         resume=not args.restart,
+        extend=getattr(args, "extend", 0),
     )
 
 
@@ -342,6 +343,8 @@ def parser() -> argparse.ArgumentParser:
     one = add("train", train, "Train a run of a shot.")
     one.add_argument("shot", help="shot folder")
     _add_train_flags(one)
+    text = "add N steps to a finished run, which keeps its settings (other flags are passed over)"
+    one.add_argument("--extend", type=int, default=0, metavar="N", help=text)
     whole = add("freeze", freeze, "Clip to baked shot: import, solve, train, freeze, bake; writes OUTPUT/shot.blend.")
     _add_import_flags(whole)
     _add_solve_flags(whole)

@@ -12,7 +12,8 @@ from . import jobs, steps, supervisor
 
 
 class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
-    """Stop this step. It saves what it has first; pressed again after 20 seconds, it is ended by force"""
+    """Stop this step. It saves what it has first, so that it can go on later; pressed again after 20 seconds, it is
+    ended by force"""
 
     bl_idname = "splannequin.cancel"
     bl_label = "Cancel Step"

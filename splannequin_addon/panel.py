@@ -19,6 +19,7 @@ from . import (
     compositor,
     guesses,
     icons,
+    listing,
     made,
     markers,
     ops_align,
@@ -27,6 +28,7 @@ from . import (
     shots,
     steps,
     supervisor,
+    training,
     viewport,
 )
 from .translations import tr
@@ -76,6 +78,8 @@ def view_train(scene: Any, state: shots.ShotState | None) -> View:
     if state is None or not state.solve:
         return View(False, False, [], steps.STEPS["train"].needs)
     run = state.runs.get(scene.splannequin.run_name)
+    if run is None and scene.splannequin.run_name in state.unfinished:
+        return View(False, True, [], "Resume it, or pick another run.")
     if run is None:
         return View(False, True, [], "Learn the scene and what moves in it.")
     psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
@@ -203,8 +207,12 @@ class _StepPanel:
         row = layout.row()
         row.scale_y = 1.0 if view.done else 1.4
         row.enabled = view.ready and running is None
+        row.operator(self.operator, text=self._label(context, view), icon=icons.of(self.operator))
+
+    def _label(self, context: Any, view: View) -> str:
+        """What the button says."""
         step = steps.STEPS[self.step]
-        row.operator(self.operator, text=step.again if view.done else step.button, icon=icons.of(self.operator))
+        return step.again if view.done else step.button
 
     def _progress(self, context: Any, watch: supervisor.Watch) -> None:
         layout = self.layout  # type: ignore[attr-defined]
@@ -224,7 +232,8 @@ class _StepPanel:
         row = layout.split(factor=0.7, align=True)
         text = f"{status.stage.capitalize()} {100 * status.fraction:.0f} %" if status and status.stage else "Starting"
         row.progress(factor=status.fraction if status else 0.0, type="BAR", text=tr(text))
-        row.operator("splannequin.cancel", text="Cancel", icon=icons.of("splannequin.cancel")).step = self.step
+        stop = "Pause" if self.step == "train" else "Cancel"
+        row.operator("splannequin.cancel", text=stop, icon=icons.of("splannequin.cancel")).step = self.step
         detail = [status.message] if status and status.message else []
         if status and status.eta_seconds is not None:
             detail.append(f"about {minutes(status.eta_seconds)} left")
@@ -247,12 +256,16 @@ class _StepPanel:
             if job is not None:
                 box.operator("splannequin.open_log", text="Open Log", icon="TEXT").step = self.step
             return
-        if job is not None and job.state == "cancelled":
+        if job is not None and job.state == "cancelled" and not self._paused(context):
             wrap(layout, context, "Cancelled. Finished work is kept: start it again to go on.", "CANCEL")
         for message, hint in job.warnings if job is not None else []:
             wrap(layout, context, f"{message} {hint}".strip(), "ERROR")
         for note in watch.notes.get(self.step, []):
             wrap(layout, context, note, "DOT")
+
+    def _paused(self, context: Any) -> bool:
+        """True if the panel says already that what was stopped can go on."""
+        return False
 
 
 def minutes(seconds: float) -> str:
@@ -332,8 +345,26 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
     operator = "splannequin.train"
 
     def draw_settings(self, context: Any, layout: Any) -> None:
-        """The preset."""
-        layout.row().prop(context.scene.splannequin, "preset", expand=True)
+        """The preset; what the button will do to the run that is there."""
+        props = context.scene.splannequin
+        layout.row().prop(props, "preset", expand=True)
+        watch, plan = self._watch(context), self._plan(context)
+        if watch is None or watch.running() is not None:
+            return
+        if plan.kind == "extend":
+            layout.prop(props, "extend_steps")
+        if plan.words:
+            wrap(layout, context, plan.words, "PAUSE" if self._paused(context) else "INFO")
+
+    def _plan(self, context: Any) -> training.Plan:
+        props, watch = context.scene.splannequin, self._watch(context)
+        return training.plan(watch.state if watch else None, props.run_name, props.preset)
+
+    def _label(self, context: Any, view: View) -> str:
+        return self._plan(context).button
+
+    def _paused(self, context: Any) -> bool:
+        return self._plan(context).kind in ("resume", "extension")
 
     def draw(self, context: Any) -> None:
         """The step's body, and the training in pictures."""
@@ -341,11 +372,13 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
         watch = self._watch(context)
         if watch is None or watch.state is None:
             return
-        job, run = watch.jobs.get("train"), watch.state.runs.get(context.scene.splannequin.run_name)
+        self._runs(context, watch.state)
+        name, job = context.scene.splannequin.run_name, watch.jobs.get("train")
+        run = watch.state.runs.get(name) or watch.state.unfinished.get(name) or {}
         going = job is not None and watch.running() == "train"
         if going and job is not None:
-            picture, points = job.images.get("preview"), job.history
-        elif run is not None:
+            picture, points = job.images.get("preview"), training.history(run, job.history)
+        elif run:
             picture, points = run.get("preview"), run.get("history", [])
         else:
             return
@@ -361,6 +394,14 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
         if points:
             (_, first), (seconds, last) = points[0], points[-1]
             wrap(body, context, f"{first:.1f} to {last:.1f} dB on frames kept out, in {minutes(seconds)}", "NONE")
+
+    def _runs(self, context: Any, state: shots.ShotState) -> None:
+        """All runs of the shot, to compare and pick."""
+        if not state.runs and not state.unfinished:
+            return
+        body = sub_panel(self.layout, "runs", "Runs")  # type: ignore[attr-defined]
+        if body is not None:
+            listing.draw(body, "run", state, context.scene.splannequin.run_name)
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The run's name."""
@@ -387,6 +428,16 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         shown = context.scene.timeline_markers.get(markers.NAME) is not None
         row.operator("splannequin.t_star_marker", text="", icon="MARKER_HLT" if shown else "MARKER", depress=shown)
         self._live(context, layout)
+
+    def draw(self, context: Any) -> None:
+        """The step's body, and the takes to compare."""
+        super().draw(context)
+        watch = self._watch(context)
+        if watch is None or watch.state is None or not watch.state.takes:
+            return
+        body = sub_panel(self.layout, "takes", "Takes")  # type: ignore[attr-defined]
+        if body is not None:
+            listing.draw(body, "take", watch.state, context.scene.splannequin.take_name)
 
     def _live(self, context: Any, layout: Any) -> None:
         """Scrubbing: on or off, what is shown, suggestions and why."""

@@ -17,7 +17,7 @@ _collection: Any = None
 
 
 def icon_of(path: Path) -> int:
-    """Icon of a picture file, 0 if there is none. Read once; the backend never rewrites one."""
+    """Icon of a picture file, 0 if there is none. Read once: who has one rewritten calls `forget`."""
     if _collection is None:
         return 0
     name = str(path)
@@ -58,6 +58,12 @@ def curve(points: Sequence[tuple[float, float]], size: tuple[int, int]) -> np.nd
     for offset in (-1, 0, 1):
         picture[np.clip(rows.round().astype(int) + offset, 0, height - 1), columns, :3] = (0.95, 0.6, 0.15)
     return picture
+
+
+def forget() -> None:
+    """Drops all pictures: a run that is trained anew writes others under the same names."""
+    if _collection is not None:
+        _collection.clear()
 
 
 def _make_room() -> None:

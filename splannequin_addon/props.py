@@ -7,6 +7,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
+from ..torch_backend import contract
 from . import compat, made
 from .translations import tr
 
@@ -31,6 +32,15 @@ def names_of(props: Any, kind: str) -> list[tuple[str, str]]:
             for name, run in state.runs.items()
         ]
     return [(name, tr(f"t* {take['t_star_frame']}, run {take['run']}")) for name, take in state.takes.items()]
+
+
+def _third_of(steps: int) -> int:
+    return round(steps / 3)
+
+
+def _preset_chosen(props: Any, context: Any) -> None:
+    """More steps are a third of the preset's unless the artist says otherwise."""
+    props.extend_steps = _third_of(contract.PRESET_STEPS[props.preset])
 
 
 def _chosen(props: Any, context: Any) -> None:
@@ -69,7 +79,21 @@ class ShotSettings:
         ],
         options=set(),
     )
-    preset: EnumProperty(name="Preset", description="How much to spend on training", items=PRESETS, options=set())
+    preset: EnumProperty(
+        name="Preset",
+        description="How much to spend on training",
+        items=PRESETS,
+        options=set(),
+        update=_preset_chosen,
+    )
+    extend_steps: IntProperty(
+        name="More Steps",
+        description="How many steps Train On adds to a finished run; a third of the preset's at first",
+        default=_third_of(contract.PRESET_STEPS["preview"]),
+        min=10,
+        soft_max=30_000,
+        options=set(),
+    )
     run_name: StringProperty(
         name="Run",
         description="Name of the training run; a new name keeps the old",

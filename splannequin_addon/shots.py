@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..torch_backend import contract
-from . import jobs
+from . import checkpoints, jobs
 
 SHOT_SUFFIX = ".splannequin"
 EXR = ".exr"
@@ -28,7 +28,10 @@ class ShotState:
     solve: dict[str, Any] = field(default_factory=dict)
     """solve.json; empty before the solve."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Trained runs: name -> summary.json."""
+    """Trained runs: name -> summary.json, with `history`, `preview`, `extension` (see `checkpoints.extension`) and
+    `other_cameras` added."""
+    unfinished: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells."""
     takes: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Frozen takes: name -> take.json, with `frame_count` added."""
 
@@ -66,6 +69,13 @@ def read(folder: Path) -> ShotState:
         state.solve = contract.read_json(folder / "solve" / "solve.json")
     state.runs = _named(folder / "runs", "summary.json")
     for name, run in state.runs.items():
+        run["extension"] = checkpoints.extension(folder / "runs" / name)
+    for path in sorted((folder / "runs").glob(f"*/{checkpoints.CHECKPOINT}")):
+        told = checkpoints.paused(path.parent) if path.parent.name not in state.runs else None
+        if told is not None:
+            state.unfinished[path.parent.name] = told
+    for name, run in [*state.runs.items(), *state.unfinished.items()]:
+        run["other_cameras"] = checkpoints.other_cameras(folder, folder / "runs" / name)
         run["history"] = _history(folder / "runs" / name / "metrics.jsonl")
         run["preview"] = max((folder / "runs" / name / "previews").glob("*.png"), default=None)
     state.takes = _named(folder / "takes", "take.json")

@@ -15,7 +15,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, compat, compositor, jobs, made, markers, scene_setup, shot_list, shots
+from . import backend, bake, cameras, compat, compositor, jobs, made, markers, scene_setup, shot_list, shots, training
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,9 @@ def params_of(scene: Any, step: str) -> Any:
     if step == "camera":
         return contract.SolveParams(camera_model=props.camera_model)
     if step == "train":
-        return contract.TrainParams(run=props.run_name, preset=props.preset, device=backend.device())
+        folder = shot_folder(scene)
+        state = shots.read(folder) if folder is not None else None
+        return training.params(state, props.run_name, props.preset, props.extend_steps, backend.device())
     t_star = props.t_star if props.choose_t_star else None
     params = contract.FreezeParams(
         run=props.run_name,

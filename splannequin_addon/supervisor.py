@@ -17,7 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, jobs, made, markers, shots, steps, viewport
+from . import backend, jobs, made, markers, pictures, shots, steps, viewport
 from .translations import tr
 
 TICK_SECONDS = 0.25
@@ -108,6 +108,8 @@ def follow(step: str, job: jobs.Job) -> None:
     watch.jobs[step] = job
     watch.notes.clear()  # what earlier steps said has been read
     watch.failures.pop(step, None)
+    if step == "train":
+        pictures.forget()
 
 
 def sample(scene: Any, shot: Path, turns: Generator[int, None, contract.CameraPath]) -> None:

@@ -219,6 +219,7 @@ def _train_params(args: argparse.Namespace) -> contract.TrainParams:
         seed=args.seed,
         resume=not args.restart,
         device=args.device,
+        extend=getattr(args, "extend", 0),
     )
 
 
@@ -288,6 +289,8 @@ def parser() -> argparse.ArgumentParser:
             one.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
         elif name == "train":
             _add_train_flags(one)
+            text = "add N steps to a finished run, which keeps its settings (other flags are passed over)"
+            one.add_argument("--extend", type=int, default=0, metavar="N", help=text)
             _add_device_flag(one)
         else:
             _add_freeze_flags(one)

@@ -144,6 +144,12 @@ class TrainParams:
     """Go on from the run's checkpoint if there is one."""
     device: str = "auto"
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used. A run may go on on another device."""
+    extend: int = 0
+    """Steps to add to a finished run, whose own settings are kept; 0: none."""
+
+
+PRESET_STEPS = {"preview": 3000, "standard": 9000, "final": 30_000}
+"""Training steps of each preset."""
 
 
 @dataclass

@@ -409,7 +409,9 @@ def modelled(trainer: Trainer) -> list[dict[str, Any]]:
         if c.supervision.preset != "none":
             rows.append(_row("anchors", c.supervision.preset))
     if needs.stopped is not None:
-        rows.append(_row("end", f"stopped at step {trainer.iteration} of {c.iterations}: nothing more was gained"))
+        end = needs.end(c.iterations)
+        rows.append(_row("end", f"stopped at step {end} of {c.iterations}: nothing more was gained"))
+    rows += [_row("extension", f"{e.steps} steps from step {e.from_iteration} on") for e in trainer.extensions]
     return rows
 
 

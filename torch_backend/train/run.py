@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +18,12 @@ from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
-from ..shot import Shot, content_key, write_json
+from ..shot import Shot, content_key, write_atomic, write_json
 from . import adam
 from .checkpoint import load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .device import choose_device
+from .extend import EXTENSION_FILE, pending
 from .model import DynamicModel
 from .needs import modelled
 from .trainer import Trainer, restore_model
@@ -49,15 +51,13 @@ class LoadedRun:
 
 
 def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
-    """Trains one run; resumes its checkpoint if asked to and the settings are the same.
+    """Trains one run; resumes its checkpoint if asked to and the settings are the same; or extends a finished one.
 
     Returns the run's figures, also written to runs/<name>/summary.json. JobError in words if it cannot be done.
     """
-    config, device = config_from_params(params), choose_device(params.device)
-    torch.set_num_threads(default_threads())
-    if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
-        for module in (raster_cpu, ssim, adam, planes):
-            module.warm_up()
+    if params.extend:
+        return extend_run(shot, params, report)
+    config, device = config_from_params(params), _prepared_device(params)
     folder = shot.run(params.run)
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
@@ -72,9 +72,10 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
     checkpoint = folder / "checkpoint.safetensors"
     resumed = _resume(trainer, checkpoint, params.resume, report)
-    (folder / "summary.json").unlink(missing_ok=True)  # it speaks of the checkpoint that is about to be replaced
+    for name in ("summary.json", EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
+        (folder / name).unlink(missing_ok=True)
     write_json(folder / "config.json", {"version": 1, **identity, "config": config_to_json(config)})
-    metrics = Metrics(folder, report, fresh=not resumed)
+    metrics = Metrics(folder, report, trainer.iteration if resumed else -1)
     held_out = images[len(train) :]
 
     def evaluate(t: Trainer) -> None:
@@ -92,6 +93,62 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     return summary
 
 
+def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
+    """Adds `params.extend` steps to a finished run, with the run's own settings; goes on with them if they were begun.
+
+    The run stays as it is, for whoever freezes from it, until the last step is done. Returns its new figures.
+    JobError in words if there is nothing to extend.
+    """
+    if params.extend < 0:
+        raise ValueError(f"extend is {params.extend}: it is a number of steps to add")
+    folder, again = shot.run(params.run), "Train it without --extend first."
+    checkpoint, beside = folder / "checkpoint.safetensors", folder / EXTENSION_FILE
+    facts = read_meta(checkpoint) if checkpoint.is_file() else {}
+    if not facts:
+        raise JobError(f"{shot.root.name} has no trained run {params.run!r} to extend.", again, ExitCode.TRAIN)
+    before = read_json(folder / "summary.json") if (folder / "summary.json").is_file() else {}
+    if before.get("key") != facts["key"]:
+        raise JobError(f"The run {params.run!r} is not finished: it cannot be extended yet.", again, ExitCode.TRAIN)
+    if facts["solve"] != solve_key(shot):
+        message = f"The run {params.run!r} was trained on other cameras than the shot has now: it cannot be extended."
+        raise JobError(message, "Remove the run or name another one, then train.", ExitCode.TRAIN)
+    config, device, scene = config_from_json(facts["config"]), _prepared_device(params), load_scene(shot)
+    train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
+    images = place_images(load_images(scene, train + test, *training_size(scene, config.width), report), device)
+    held_out = images[len(train) :]
+    identity = {"key": facts["key"], "solve": facts["solve"]}
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
+    begun = pending(folder, facts) if params.resume else None
+    if before["iterations"] != facts["iteration"]:  # it was killed between its last two files: only figures are missing
+        trainer.restore(checkpoint)
+    elif begun is not None and begun.steps == params.extend:
+        trainer.restore(beside)
+        done = trainer.iteration - begun.from_iteration
+        report.progress("training", done, begun.steps, f"resumed at step {trainer.iteration}")
+    else:
+        if begun is not None:
+            report.warning(f"{begun.steps} steps were begun, {params.extend} are asked for: they begin anew.")
+        trainer.restore(checkpoint)
+        trainer.extend(params.extend, before["heldout_psnr_db"])
+    metrics = Metrics(folder, report, trainer.iteration)
+    trainer.run(beside, lambda t: metrics.add(t, test, held_out))
+    summary = summarise(trainer, params.run, test, held_out, facts["key"])
+    trainer.save(checkpoint)
+    write_json(folder / "summary.json", summary)
+    beside.unlink(missing_ok=True)
+    report.metric("train", summary)
+    return summary
+
+
+def _prepared_device(params: TrainParams) -> torch.device:
+    device = choose_device(params.device)
+    torch.set_num_threads(default_threads())
+    if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
+        for module in (raster_cpu, ssim, adam, planes):
+            module.warm_up()
+    return device
+
+
 def place_images(images: Tensor, device: torch.device) -> Tensor:
     """Images [I, H, W, 3] on the device, or in pinned host memory if they would fill half of what is free there."""
     if device.type == "cpu":
@@ -107,13 +164,14 @@ def training_size(scene: Scene, wanted: int) -> tuple[int, int]:
 
 
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
-    """The summary of a run that was finished with the same settings on the same solve, or None."""
+    """The summary of a run that was finished with the same settings on the same solve, extended or not; or None."""
     path = folder / "summary.json"
     checkpoint = folder / "checkpoint.safetensors"
     if not path.is_file() or not checkpoint.is_file():
         return None
-    summary = read_json(path)
-    return summary if summary.get("key") == key == read_meta(checkpoint).get("key") else None
+    summary, facts = read_json(path), read_meta(checkpoint)
+    current = summary.get("iterations") == facts.get("iteration")
+    return summary if current and summary.get("key") == key == facts.get("key") else None
 
 
 def solve_key(shot: Shot) -> str:
@@ -133,14 +191,22 @@ def _resume(trainer: Trainer, checkpoint: Path, wanted: bool, report: Reporter) 
 
 
 class Metrics:
-    """metrics.jsonl and preview images of a run, while it trains."""
+    """metrics.jsonl and preview images of a run, while it trains.
 
-    def __init__(self, folder: Path, report: Reporter, fresh: bool) -> None:
+    iteration: where the run goes on; what an earlier process measured later than that is dropped. -1: it begins.
+    """
+
+    def __init__(self, folder: Path, report: Reporter, iteration: int) -> None:
         self.folder, self.report = folder, report
         self.path = folder / "metrics.jsonl"
         (folder / "previews").mkdir(parents=True, exist_ok=True)
-        if fresh:
-            self.path.unlink(missing_ok=True)
+        for picture in (folder / "previews").glob("*.png"):
+            if picture.stem.isdigit() and int(picture.stem) > iteration:
+                picture.unlink()
+        lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
+        kept = [line for line in lines if _iteration_of(line) <= iteration]
+        if kept != lines:
+            write_atomic(self.path, "".join(f"{line}\n" for line in kept).encode("utf-8"))
 
     def add(self, trainer: Trainer, test: list[int], held_out: Tensor) -> None:
         """Measures on the held-out frames, appends a line, shows a preview."""
@@ -159,6 +225,14 @@ class Metrics:
         preview = self.folder / "previews" / f"{trainer.iteration:06d}.png"
         save_png(preview, trainer.render_frame(index))
         self.report.image("preview", preview)
+
+
+def _iteration_of(line: str) -> float:
+    """Of a line of metrics.jsonl; infinite if it was half written."""
+    try:
+        return float(json.loads(line)["iteration"])
+    except (ValueError, KeyError, TypeError):
+        return float("inf")
 
 
 def moving_share(model: DynamicModel) -> float:
@@ -185,6 +259,7 @@ def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, ke
         "host_config": trainer.config.host_config,
         "supervision": trainer.config.supervision.preset,
         "iterations": trainer.iteration,
+        "extensions": [dataclasses.asdict(extension) for extension in trainer.extensions],
         "width_px": trainer.width,
         "height_px": trainer.height,
         "train_frames": len(trainer.train_ids),

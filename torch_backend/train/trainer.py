@@ -47,6 +47,7 @@ from .adam import FusedAdam
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
+from .extend import Extension
 from .losses import photometric, psnr
 from .model import DynamicModel, render
 from .needs import Needs
@@ -105,6 +106,7 @@ class Trainer:
         self.initial = len(gaussians)
         decides = config.method == "auto" and config.host_config == "default"
         self.needs = Needs(config.needs, len(train) if decides else 0)
+        self.extensions: list[Extension] = []
         self.iteration = 0
         self.trained_seconds = 0.0
         self.bad_steps = 0
@@ -125,17 +127,28 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """Share of the run that is done."""
-        return self.iteration / self.config.iterations
+        """Share of the run that is done; an extended one stays at its end, where every schedule has run out."""
+        return 1.0 if self.extensions else self.iteration / self.config.iterations
 
     @property
     def end(self) -> int:
         """Iterations after which the run is over: the configured ones, or fewer if it has what the scene needs."""
-        return self.needs.end(self.config.iterations)
+        return self.extensions[-1].end if self.extensions else self.needs.end(self.config.iterations)
+
+    def extend(self, steps: int, heldout_psnr_db: float | None) -> None:
+        """Adds steps to a run that has ended; `heldout_psnr_db` is what it was worth on held-out frames until now.
+
+        The gate stays as it is, nothing grows, anchors and price go on in full, and no early end is looked for.
+        """
+        self.extensions.append(Extension(self.iteration, steps, heldout_psnr_db, self.trained_seconds))
+        self.needs.joined = True  # a run that ended early may still hold its probe frames back
 
     def run(self, checkpoint: Path, evaluate: Callable[[Trainer], None]) -> None:
         """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured."""
-        every = max(1, round(self.config.evaluate_every * self.config.iterations))
+        begin, length = 0, self.config.iterations
+        if self.extensions:
+            begin, length = self.extensions[-1].from_iteration, self.extensions[-1].steps
+        every = max(1, round(self.config.evaluate_every * length))
         since = time.perf_counter() - self.trained_seconds
         started = self.iteration
         try:
@@ -145,12 +158,12 @@ class Trainer:
                 loss = self.step()
                 self.iteration += 1
                 self.trained_seconds = time.perf_counter() - since
-                if self.iteration % every == 0:
+                if (self.iteration - begin) % every == 0:
                     evaluate(self)
                 if self.iteration % _LOOK_EVERY == 0 or self.iteration == self.end:
                     self._look()
                     text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {float(loss):.4f}"
-                    self.report.progress("training", self.iteration, self.end, text)
+                    self.report.progress("training", self.iteration - begin, self.end - begin, text)
                 if time.perf_counter() - self._saved_at > self.config.checkpoint_seconds:
                     self.save(checkpoint)
         except Cancelled:
@@ -234,6 +247,8 @@ class Trainer:
 
     def _milestones(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
+        if self.extensions:
+            return
         c = self.config
         self.needs.decide(self)
         degree = min(c.sh_degree, int(self.progress / c.sh_every)) if c.sh_every > 0 else c.sh_degree
@@ -546,7 +561,8 @@ class Trainer:
 
     def _schedule(self) -> None:
         """Log-linear learning rates from start to end over the run or a host's part of it (3DGS get_expon_lr_func)."""
-        progress = self.needs.rate_progress(self.iteration, self.config.iterations)
+        schedule = self.extensions[-1] if self.extensions else self.needs
+        progress = schedule.rate_progress(self.iteration, self.config.iterations)
         for group in self.optimizer.param_groups:
             since, until = group.get("since", 0.0), group.get("until", 1.0)
             share = min(max((progress - since) / (until - since), 0.0), 1.0)
@@ -602,6 +618,7 @@ class Trainer:
             "config": config_to_json(self.config),
             "iteration": self.iteration,
             "initial": self.initial,
+            "extensions": [dataclasses.asdict(extension) for extension in self.extensions],
             "needs": self.needs.state(),
             "trained_seconds": self.trained_seconds,
             "sh_degree": self.model.sh_degree,
@@ -633,6 +650,7 @@ class Trainer:
         self.generator.set_state(tensors["generator"])
         self.order = tensors["order"].tolist()
         self.iteration, self.initial = int(meta["iteration"]), int(meta["initial"])
+        self.extensions = [Extension(**facts) for facts in meta.get("extensions", [])]
         self.needs.restore(meta["needs"])
         if self.config.poses.on and self.progress >= self.config.poses.until:
             self._freeze_poses()

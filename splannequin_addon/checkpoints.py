@@ -1,0 +1,77 @@
+"""What a checkpoint of the backend says about itself, read without the backend. No bpy: a file in, plain values out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+from ..torch_backend import contract
+
+CHECKPOINT = "checkpoint.safetensors"
+EXTENSION = "extension.safetensors"
+"""Of steps that are added to a finished run and are not done."""
+_LONGEST = 1 << 26
+
+
+def facts(path: Path) -> dict[str, Any]:
+    """The facts that the backend stored in a checkpoint, read from the file's header; empty if there is none."""
+    try:
+        with open(path, "rb") as source:
+            (length,) = struct.unpack("<Q", source.read(8))
+            header = json.loads(source.read(length)) if length < _LONGEST else {}
+        told = json.loads(header["__metadata__"]["splannequin"])
+    except (OSError, ValueError, KeyError, TypeError, struct.error):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def paused(run: Path) -> dict[str, Any] | None:
+    """Of a run that has a checkpoint and is not finished: at which `iteration` of `end`, `preset` and `config`."""
+    told = facts(run / CHECKPOINT)
+    try:
+        config = told["config"]
+        return {"iteration": int(told["iteration"]), "end": int(config["iterations"]), "preset": config["preset"],
+                "config": config}  # fmt: skip
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def extension(run: Path) -> dict[str, int] | None:
+    """Of steps that were begun to be added to a finished run: how many of `steps` are `done`."""
+    if not (run / EXTENSION).is_file():
+        return None
+    told, base = facts(run / EXTENSION), facts(run / CHECKPOINT)
+    try:
+        last = told["extensions"][-1]
+        if (told["key"], last["from_iteration"]) != (base["key"], base["iteration"]):
+            return None
+        return {"done": int(told["iteration"]) - int(last["from_iteration"]), "steps": int(last["steps"])}
+    except (KeyError, TypeError, ValueError, IndexError):
+        return None
+
+
+def params_of(config: dict[str, Any]) -> dict[str, Any]:
+    """Fields of `contract.TrainParams` that ask for the run of a stored `config` again, whatever it was begun with."""
+    anchors = config.get("supervision", {})
+    return {
+        "preset": config["preset"], "method": config["method"], "host": config.get("host", "hexplane"),
+        "host_config": config.get("host_config", "default"), "iterations": config["iterations"],
+        "width": config["width"], "max_gaussians": config["densify"]["budget"], "holdout": config["holdout"],
+        "seed": config["seed"], "supervision": anchors["preset"], "detector": anchors.get("detector", "grad_norm"),
+    }  # fmt: skip
+
+
+def other_cameras(shot: Path, run: Path) -> bool:
+    """True if the shot was solved again, with another result, after the run was trained."""
+    cameras, trained = shot / "solve" / "cameras.json", run / CHECKPOINT
+    try:
+        if cameras.stat().st_mtime <= trained.stat().st_mtime:
+            return False
+        told = contract.read_json(run / "config.json")["solve"]
+        text = json.dumps(contract.read_json(cameras), sort_keys=True)
+    except (OSError, ValueError, KeyError):
+        return False
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16] != told  # as torch_backend.shot.content_key

@@ -1,0 +1,66 @@
+"""What the Train button will do: begin, go on where it was paused, add steps, or begin anew. No bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..torch_backend import contract
+from . import checkpoints, shots
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What pressing the button comes to."""
+
+    kind: str
+    """train, resume, extension (go on with steps that were begun to be added), extend, or anew."""
+    button: str
+    """What the button says."""
+    words: str
+    """What will happen, in a sentence; empty if that needs no saying."""
+
+
+def plan(state: shots.ShotState | None, run: str, preset: str) -> Plan:
+    """What training the run of a name with a preset means, as the shot stands."""
+    finished = state.runs.get(run) if state is not None else None
+    paused = state.unfinished.get(run) if state is not None else None
+    told = finished or paused
+    if told is None:
+        return Plan("train", "Train", "")
+    if told.get("other_cameras"):
+        return Plan(
+            "anew", "Train Anew", "The camera was solved again: training begins anew and replaces this run. "
+            "Give the run another name to keep it."
+        )  # fmt: skip
+    if told.get("preset", preset) != preset:
+        return Plan(
+            "anew", "Train Anew", "This run has another preset: training begins anew and replaces it. "
+            "Give the run another name to keep it."
+        )  # fmt: skip
+    if finished is None:
+        return Plan("resume", "Resume", "Paused. It goes on exactly where it stopped.")
+    if finished.get("extension") is not None:
+        return Plan("extension", "Resume", "Paused while steps were added. The run is as it was until all are done.")
+    return Plan("extend", "Train On", "Adds these steps to the run. It stays as it is until all are done.")
+
+
+def params(state: shots.ShotState | None, run: str, preset: str, steps: int, device: str) -> contract.TrainParams:
+    """What the backend is asked for; `steps` is how many are added if the run is finished."""
+    kind = plan(state, run, preset).kind
+    if state is not None and kind == "resume":
+        # Its own settings, not the panel's: a run that was begun on the command line goes on too.
+        settings = checkpoints.params_of(state.unfinished[run]["config"])
+        return contract.TrainParams(run=run, device=device, **settings)
+    extend = 0
+    if state is not None and kind == "extension":
+        extend = int(state.runs[run]["extension"]["steps"])
+    elif kind == "extend":
+        extend = steps
+    return contract.TrainParams(run=run, preset=preset, device=device, extend=extend)
+
+
+def history(told: dict[str, Any], now: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """(seconds, dB) of a run, what a job measures `now` after what is known from before it."""
+    before = told.get("history", [])
+    return [point for point in before if not now or point[0] < now[0][0]] + list(now)

@@ -1,0 +1,229 @@
+"""Pause, resume, train on; runs and takes side by side: on files of the real formats, and once on a real backend."""
+
+import json
+import os
+import struct
+import subprocess
+from pathlib import Path
+
+import bpy
+import pytest
+
+CONFIG = {
+    "preset": "preview", "iterations": 900, "width": 48, "method": "auto", "host": "mlp", "host_config": "reference",
+    "holdout": 5, "seed": 7, "densify": {"budget": 1234}, "supervision": {"preset": "paper", "detector": "weight"},
+}  # fmt: skip
+
+
+def checkpoint(path: Path, **facts) -> None:
+    """The header of a checkpoint as safetensors writes it, with one tensor."""
+    told = {"version": 1, "key": "k", "config": CONFIG, "trained_seconds": 10.0, **facts}
+    tensor = {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}
+    header = json.dumps({"__metadata__": {"splannequin": json.dumps(told)}, "means": tensor}).encode()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(struct.pack("<Q", len(header)) + header + b"\0\0\0\0")
+
+
+@pytest.fixture
+def with_runs(scene, shot):
+    """The test shot with a finished run main, a paused run better, and a second take."""
+    scene.splannequin.shot_path = str(shot)
+    summary = shot / "runs" / "main" / "summary.json"
+    told = {**json.loads(summary.read_text()), "preset": "preview", "key": "k", "train_seconds": 125.0}
+    summary.write_text(json.dumps(told))
+    checkpoint(shot / "runs" / "main" / "checkpoint.safetensors", iteration=900)
+    checkpoint(shot / "runs" / "better" / "checkpoint.safetensors", iteration=300)
+    return scene
+
+
+def plan(addon, scene):
+    state = addon("shots").read(addon("steps").shot_folder(scene))
+    return addon("training").plan(state, scene.splannequin.run_name, scene.splannequin.preset)
+
+
+def test_the_button_says_what_it_will_do(addon, with_runs, shot):
+    props = with_runs.splannequin
+    assert plan(addon, with_runs).button == "Train On"
+    props.run_name = "new"
+    assert (plan(addon, with_runs).button, plan(addon, with_runs).words) == ("Train", "")
+    props.run_name = "better"
+    assert (plan(addon, with_runs).kind, plan(addon, with_runs).button) == ("resume", "Resume")
+    props.preset = "final"
+    assert plan(addon, with_runs).button == "Train Anew" and "another preset" in plan(addon, with_runs).words
+    props.run_name = "main"
+    assert plan(addon, with_runs).kind == "anew"
+    props.preset = "preview"
+    grown = [{"from_iteration": 900, "steps": 300}]
+    checkpoint(shot / "runs" / "main" / "extension.safetensors", iteration=1000, extensions=grown)
+    assert (plan(addon, with_runs).kind, plan(addon, with_runs).button) == ("extension", "Resume")
+    assert addon("shots").read(shot).runs["main"]["extension"] == {"done": 100, "steps": 300}
+    grown[0]["from_iteration"] = 600
+    checkpoint(shot / "runs" / "main" / "extension.safetensors", iteration=700, extensions=grown)
+    assert plan(addon, with_runs).kind == "extend", "it was begun on a run that is no longer there"
+
+
+def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
+    props, params_of = with_runs.splannequin, addon("steps").params_of
+    props.extend_steps = 70
+    asked = params_of(with_runs, "train")
+    assert (asked.run, asked.extend, asked.iterations) == ("main", 70, 0)
+    checkpoint(
+        shot / "runs" / "main" / "extension.safetensors", iteration=1000,
+        extensions=[{"from_iteration": 900, "steps": 300}],
+    )  # fmt: skip
+    assert params_of(with_runs, "train").extend == 300, "the steps that were begun, not those in the field"
+    props.run_name = "better"
+    asked = params_of(with_runs, "train")
+    assert (asked.run, asked.extend, asked.iterations, asked.width) == ("better", 0, 900, 48)
+    assert (asked.max_gaussians, asked.holdout, asked.seed) == (1234, 5, 7)
+    assert (asked.host, asked.host_config, asked.supervision, asked.detector) == ("mlp", "reference", "paper", "weight")
+    props.preset = "standard"
+    assert (params_of(with_runs, "train").preset, params_of(with_runs, "train").iterations) == ("standard", 0)
+    props.run_name = "new"
+    assert params_of(with_runs, "train").extend == 0
+
+
+def test_more_steps_are_a_third_of_the_presets_at_first(scene, contract):
+    props = scene.splannequin
+    assert props.extend_steps == 1000
+    for preset, steps in contract.PRESET_STEPS.items():
+        props.preset = preset
+        assert props.extend_steps == steps // 3
+    props.extend_steps = 42
+    assert props.extend_steps == 42
+
+
+def test_after_another_solve_training_begins_anew(addon, with_runs, shot):
+    import hashlib
+
+    run, cameras = shot / "runs" / "main", shot / "solve" / "cameras.json"
+    key = hashlib.sha256(json.dumps(json.loads(cameras.read_text()), sort_keys=True).encode()).hexdigest()[:16]
+    (run / "config.json").write_text(json.dumps({"version": 1, "solve": key}))
+    later = (run / "checkpoint.safetensors").stat().st_mtime + 10
+    os.utime(cameras, (later, later))
+    assert plan(addon, with_runs).kind == "extend", "the same cameras, written again"
+    cameras.write_text(cameras.read_text().replace("20.0", "21.0"))
+    os.utime(cameras, (later, later))
+    assert plan(addon, with_runs).kind == "anew" and "solved again" in plan(addon, with_runs).words
+
+
+def test_broken_checkpoints_are_passed_over(addon, shot, tmp_path):
+    read = addon("checkpoints").facts
+    assert read(tmp_path / "none") == {}
+    for content in (b"", b"\x05", struct.pack("<Q", 1 << 60) + b"{}", struct.pack("<Q", 2) + b"[]"):
+        (tmp_path / "bad").write_bytes(content)
+        assert read(tmp_path / "bad") == {}
+    (shot / "runs" / "odd").mkdir()
+    (shot / "runs" / "odd" / "checkpoint.safetensors").write_bytes(b"odd")
+    assert addon("shots").read(shot).unfinished == {}
+
+
+def test_runs_and_takes_stand_side_by_side(addon, with_runs, shot, new_take):
+    new_take(shot, "second")
+    state, listing = addon("shots").read(shot), addon("listing")
+    assert listing.run_rows(state) == [
+        ("better", "paused at 33 %"),
+        ("main", "24.00", "12.3k", "5%", "2m"),
+    ]
+    assert listing.take_rows(state) == [("freeze", "6", "3", "main"), ("second", "6", "3", "main")]
+    assert [listing.duration(s) for s in (None, 44.6, 600.0, 5400.0)] == ["-", "45s", "10m", "1.5h"]
+
+
+def test_a_click_picks_a_run_with_its_preset_and_a_take(addon, with_runs, shot, new_take):
+    new_take(shot, "second")
+    props = with_runs.splannequin
+    checkpoint(shot / "runs" / "better" / "checkpoint.safetensors", iteration=300, config={**CONFIG, "preset": "final"})
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.splannequin.pick_run("EXEC_DEFAULT", True, name="better") == {"FINISHED"}
+    assert (props.run_name, props.preset) == ("better", "final")
+    bpy.ops.ed.undo()
+    props = bpy.context.scene.splannequin
+    assert (props.run_name, props.preset) == ("main", "preview")
+    bpy.ops.splannequin.pick_take(name="second")
+    assert props.take_name == "second"
+    for pick in (bpy.ops.splannequin.pick_run, bpy.ops.splannequin.pick_take):
+        with pytest.raises(RuntimeError, match="This shot has no"):
+            pick(name="nowhere")
+
+
+def test_removing_a_run_removes_its_folder_and_nothing_else(addon, with_runs, shot):
+    kept = sorted(p for p in shot.rglob("*") if "better" not in p.parts)
+    watch = addon("supervisor").watch_of(shot)
+    assert set(watch.state.unfinished) == {"better"}
+    assert bpy.ops.splannequin.remove_run(name="better") == {"FINISHED"}
+    assert sorted(shot.rglob("*")) == kept, "nor is there a trash left"
+    assert watch.state.unfinished == {} and set(watch.state.runs) == {"main"}
+    for name in ("better", "", "..", "../solve", "main/../../solve", str(shot / "solve")):
+        with pytest.raises(RuntimeError, match="This shot has no run"):
+            bpy.ops.splannequin.remove_run(name=name)
+    assert sorted(shot.rglob("*")) == kept
+
+
+def test_a_take_that_the_compositor_shows_is_not_removed(addon, with_runs, shot, new_take):
+    new_take(shot, "second")
+    bpy.ops.splannequin.insert_freeze()
+    with pytest.raises(RuntimeError, match="The compositor shows this take"):
+        bpy.ops.splannequin.remove_take(name="freeze")
+    assert bpy.ops.splannequin.remove_take(name="second") == {"FINISHED"}
+    assert [p.name for p in (shot / "takes").iterdir()] == ["freeze"]
+    bpy.ops.splannequin.remove_shot()
+    assert bpy.ops.splannequin.remove_take(name="freeze") == {"FINISHED"}
+    assert list((shot / "takes").iterdir()) == []
+
+
+def test_nothing_is_picked_or_removed_while_a_step_runs(addon, contract, with_runs, shot):
+    addon("jobs").new_job(shot, "train", contract.TrainParams())
+    assert addon("supervisor").watch_of(shot).running() == "train"
+    for name in ("pick_run", "pick_take", "remove_run", "remove_take"):
+        assert not getattr(bpy.ops.splannequin, name).poll(), name
+
+
+def test_new_buttons_have_tooltips(addon):
+    for cls in addon("ops_runs").CLASSES:
+        kind = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type()
+        assert len(kind.description) > 10 and not kind.description.endswith("."), cls
+        assert all(p.identifier == "rna_type" or p.description for p in kind.properties), cls
+
+
+def test_the_curve_of_an_added_stretch_follows_the_runs_own(addon):
+    told = {"history": [(1.0, 20.0), (2.0, 21.0), (3.0, 22.0)]}
+    history = addon("training").history
+    assert history(told, []) == told["history"]
+    assert history(told, [(2.5, 21.5), (4.0, 23.0)]) == [(1.0, 20.0), (2.0, 21.0), (2.5, 21.5), (4.0, 23.0)]
+    assert history({}, [(1.0, 9.0)]) == [(1.0, 9.0)]
+
+
+_WORLD = "import sys; from pathlib import Path; from tests.backend.conftest import build_world; build_world(Path({!r}))"
+
+
+def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root, tmp_path, capfd):
+    steps, jobs, shots, python = addon("steps"), addon("jobs"), addon("shots"), addon("backend").python()
+    subprocess.run([python, "-c", _WORLD.format(str(tmp_path))], cwd=root, check=True)
+    shot = tmp_path / "tiny.splannequin"
+    (shot / "solve" / "solve.json").write_text('{"version": 1, "quality": "true"}')
+    arguments = ["train", str(shot), "--run", "main", "--iterations", "150", "--max-gaussians", "1500"]
+    assert addon("headless").main(arguments) == 0
+    scene.splannequin.shot_path = str(shot)
+    assert plan(addon, scene).kind == "extend"
+
+    scene.splannequin.extend_steps = 200
+    job = steps.begin(scene, "train")
+    while "preview" not in job.images and not job.ended:
+        jobs.poll(job, 0.05)
+    assert job.images["preview"].endswith("000170.png")
+    jobs.cancel(job)
+    job.process.wait()
+    assert plan(addon, scene).button == "Resume"
+    state = shots.read(shot)
+    assert state.runs["main"]["iterations"] == 150 and 20 <= state.runs["main"]["extension"]["done"] < 200
+    addon("supervisor").forget()
+    assert bpy.ops.splannequin.train() == {"FINISHED"}
+    run = shots.read(shot).runs["main"]
+    assert (run["iterations"], run["extension"]) == (350, None)
+    assert [seconds for seconds, _ in run["history"]] == sorted({seconds for seconds, _ in run["history"]})
+    assert run["preview"].name == "000350.png"
+
+    assert addon("headless").main(["train", str(shot), "--extend", "10"]) == 0
+    assert shots.read(shot).runs["main"]["iterations"] == 360
+    assert addon("headless").main(["train", str(shot), "--run", "none", "--extend", "10"]) == 5
+    assert "no trained run 'none'" in capfd.readouterr().err

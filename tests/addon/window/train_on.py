@@ -1,0 +1,118 @@
+"""Presses Train On, Pause and Resume in a real Blender window, on a tiny world trained before; pictures of each.
+
+    python tests/addon/window/train_on.py --blender BLENDER --backend PYTHON [--output DIR]
+
+BLENDER is any Blender: the add-on is loaded from this checkout. PYTHON is the backend's. Fails unless the preview in
+the panel changed while it trained, the paused run was whole, and the resumed one has all its steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import press_steps as press
+
+PLAN = "SPLANNEQUIN_TRAIN_ON_PLAN"
+ROOT = Path(__file__).resolve().parents[3]
+WORLD = "from pathlib import Path; from tests.backend.conftest import build_world; build_world(Path({!r}))"
+
+
+def main() -> int:
+    """The host's side: makes the world, trains two runs, opens Blender on a display."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--blender", required=True)
+    parser.add_argument("--backend", required=True, help="Python of the backend's environment")
+    parser.add_argument("--output", default=str(ROOT / "docs" / "images"))
+    parser.add_argument("--display", default=":96")
+    parser.add_argument("--limit", type=float, default=500.0)
+    args = parser.parse_args()
+    output = Path(args.output).absolute()
+    output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="splannequin-train-on-") as name:
+        shot = Path(name) / "tiny.splannequin"
+        subprocess.run([args.backend, "-c", WORLD.format(name)], cwd=ROOT, check=True)
+        (shot / "solve" / "solve.json").write_text('{"version": 1, "quality": "Known by construction."}')
+        for run in ("main", "static"):
+            flags = ["--iterations", "150", "--max-gaussians", "1500", "--method", "auto" if run == "main" else run]
+            command = [args.backend, "-m", "torch_backend", "train", str(shot), "--run", run, *flags]
+            subprocess.run(command, cwd=ROOT, check=True)
+        environ = {**os.environ, "DISPLAY": args.display, PLAN: name, "SPLANNEQUIN_BACKEND_PYTHON": args.backend}
+        with press.screen(args.display):
+            blender = subprocess.Popen([*press.command(args.blender, __file__), "--factory-startup"], env=environ)
+            press._serve(blender, Path(name), output, environ, args.limit)
+        told = Path(name) / "told.json"
+        results = json.loads(told.read_text()) if told.is_file() else {"error": "Blender told nothing"}
+        print(json.dumps(results, indent=1))
+        good = results.get("button_when_paused") == "Resume" and results.get("iterations_when_paused") == 150
+        good = good and results.get("iterations") == 650 and results.get("previews_seen", 0) >= 3
+        return 0 if good else 1
+
+
+def inside() -> None:
+    """Loads the add-on from the checkout and starts the script as a timer."""
+    sys.path.insert(0, str(ROOT / "splannequin_addon"))
+    package = importlib.import_module("run_in_bpy").load_package()
+    package.register()
+    told: dict[str, Any] = {"longest_tick_ms": 0.0}
+    press.act(_play(package.__name__, told), Path(os.environ[PLAN]), told)
+
+
+def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
+    """The artist: yields seconds to wait between what it does."""
+    import bpy
+
+    def module(name: str) -> Any:
+        return importlib.import_module(f"{package}.splannequin_addon.{name}")
+
+    work, pictures, panel = Path(os.environ[PLAN]), module("pictures"), module("panel")
+    yield from press._arrange()
+    props = bpy.context.scene.splannequin
+    props.shot_path, props.extend_steps = str(work / "tiny.splannequin"), 500
+    sub_panel = panel.sub_panel
+    panel.sub_panel = lambda layout, name, label, folded=True: sub_panel(layout, name, label, name.endswith("_more"))
+    yield 1.0
+    yield from press._scroll_down()
+    yield from press._shoot(work, "10-runs")
+    watch = module("supervisor").watch_of(work / "tiny.splannequin")
+    yield from press._click("splannequin.train")
+    shown: dict[str, int] = {}
+    while len(shown) < 4 and watch.running() == "train":
+        path = watch.jobs["train"].images.get("preview")
+        if path in (pictures._collection or {}):  # drawn, not only told of
+            shown[path] = pictures.icon_of(Path(path))
+        yield 0.1
+    told["previews_seen"] = len(set(shown.values()))
+    yield from press._shoot(work, "10-train-on-running", settle=2)
+    yield from press._click("splannequin.cancel")
+    while watch.running() is not None:
+        yield 0.2
+    yield 1.5
+    plan = module("training").plan(watch.state, props.run_name, props.preset)
+    told["button_when_paused"] = plan.button
+    told["iterations_when_paused"] = watch.state.runs["main"]["iterations"]
+    yield from press._shoot(work, "10-paused")
+    yield from press._click("splannequin.train")
+    yield 1.0
+    while watch.running() is not None:
+        yield 0.2
+    yield 1.5
+    told["iterations"] = watch.state.runs["main"]["iterations"]
+    yield from press._shoot(work, "10-train-on-done")
+
+
+if __name__ == "__main__":
+    if PLAN in os.environ and "bpy" in sys.modules:
+        inside()
+    else:
+        sys.exit(main())

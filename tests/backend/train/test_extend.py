@@ -1,0 +1,230 @@
+"""A finished run is trained on: exactly resumed, never lost on the way, and not worse for it."""
+
+import json
+import math
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torch_backend.cli import main, parser
+from torch_backend.contract import PRESET_STEPS, Cancelled, FreezeParams, JobError, TrainParams, read_json
+from torch_backend.freeze import freeze_shot
+from torch_backend.train import PRESETS, run, train_shot
+from torch_backend.train.checkpoint import load_checkpoint, read_meta
+from torch_backend.train.extend import EXTENSION_FILE, Extension
+
+
+def short(name, **changes):
+    return TrainParams(run=name, iterations=60, max_gaussians=1500, **changes)
+
+
+def more(name, steps=40, **changes):
+    return TrainParams(run=name, extend=steps, **changes)
+
+
+@pytest.fixture
+def finished(world, quiet):
+    """finished("x") is the folder of a finished run x of 60 steps, a copy of one that was trained once."""
+    master = world.shot.run("to extend")
+    if not (master / "summary.json").is_file():
+        train_shot(world.shot, short("to extend"), quiet())
+
+    def copy(name):
+        return shutil.copytree(master, world.shot.run(name))
+
+    return copy
+
+
+def same(one, other):
+    a, b = (load_checkpoint(path / "checkpoint.safetensors") for path in (one, other))
+    assert a[0].keys() == b[0].keys()
+    for name, value in a[0].items():
+        torch.testing.assert_close(b[0][name], value, rtol=1e-4, atol=1e-5, msg=name)
+    assert a[1]["iteration"] == b[1]["iteration"]
+
+
+def test_an_interrupted_extension_ends_exactly_where_an_unbroken_one_does(world, quiet, finished, monkeypatch):
+    whole, paused, killed = (finished(name) for name in ("ext-whole", "ext-paused", "ext-killed"))
+    summary = train_shot(world.shot, more("ext-whole"), quiet())
+    assert summary["iterations"] == 100
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, more("ext-paused"), quiet(cancel_at=("training", 0.5)))
+    assert 80 <= read_meta(paused / EXTENSION_FILE)["iteration"] < 100
+    report = quiet()
+    train_shot(world.shot, more("ext-paused"), report)
+    assert next(e for e in report.events if e[:2] == ("progress", "training"))[2:4] == (20, 40)
+    same(whole, paused)
+
+    class Dies(quiet):
+        def image(self, label, path):
+            super().image(label, path)
+            if path.stem == "000088":
+                raise MemoryError
+
+    read = run.config_from_json
+    monkeypatch.setattr(run, "config_from_json", lambda data: replace(read(data), checkpoint_seconds=0.0))
+    with pytest.raises(MemoryError):
+        train_shot(world.shot, more("ext-killed"), Dies())
+    assert read_meta(killed / EXTENSION_FILE)["iteration"] == 87
+    assert read_meta(killed / "checkpoint.safetensors")["iteration"] == 60
+    train_shot(world.shot, more("ext-killed"), quiet())
+    same(whole, killed)
+    for folder in (whole, paused, killed):
+        assert not (folder / EXTENSION_FILE).exists()
+        rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        assert [r["iteration"] for r in rows] == [*range(6, 61, 6), *range(64, 101, 4)]
+        seconds = [r["seconds"] for r in rows]
+        assert seconds == sorted(seconds)
+        assert max(int(p.stem) for p in (folder / "previews").glob("*.png")) == 100
+
+
+def test_the_finished_run_stays_until_the_last_added_step(world, quiet, finished):
+    folder = finished("ext-kept")
+    kept = {name: (folder / name).read_bytes() for name in ("summary.json", "checkpoint.safetensors")}
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, more("ext-kept"), quiet(cancel_at=("training", 0.5)))
+    assert (folder / EXTENSION_FILE).is_file()
+    assert {name: (folder / name).read_bytes() for name in kept} == kept
+    report = quiet()
+    assert train_shot(world.shot, short("ext-kept"), report)["iterations"] == 60
+    assert ("progress", "training", 1, 1, "already trained") in report.events
+    take = freeze_shot(world.shot, FreezeParams(run="ext-kept", take="ext-kept", first=104, last=104), quiet())
+    assert take["run"] == "ext-kept"
+    assert {name: (folder / name).read_bytes() for name in kept} == kept
+
+
+def test_an_extension_of_other_length_begins_anew_and_says_so(world, quiet, finished):
+    folder = finished("ext-other")
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, more("ext-other"), quiet(cancel_at=("training", 0.5)))
+    report = quiet()
+    assert train_shot(world.shot, more("ext-other", 20), report)["iterations"] == 80
+    assert any(e[0] == "warning" and "40 steps were begun, 20 are asked for" in e[1] for e in report.events)
+    rows = [json.loads(line)["iteration"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert rows == [*range(6, 61, 6), *range(62, 81, 2)]
+
+
+def test_a_run_is_extended_again_and_again(world, quiet, finished):
+    folder = finished("ext-again")
+    before = read_json(folder / "summary.json")
+    first = train_shot(world.shot, more("ext-again", 20), quiet())
+    second = train_shot(world.shot, more("ext-again", 30), quiet())
+    assert (first["iterations"], second["iterations"]) == (80, 110)
+    assert second["gaussians"] == before["gaussians"]
+    assert second["moving_gaussians"] == before["moving_gaussians"]
+    told = [(e["from_iteration"], e["steps"], e["heldout_psnr_db_before"]) for e in second["extensions"]]
+    assert told == [(60, 20, before["heldout_psnr_db"]), (80, 30, first["heldout_psnr_db"])]
+    assert before["train_seconds"] < first["train_seconds"] < second["train_seconds"]
+    rows = [row["detail"] for row in second["modelled"] if row["what"] == "extension"]
+    assert rows == ["20 steps from step 60 on", "30 steps from step 80 on"]
+    report = quiet()
+    assert train_shot(world.shot, short("ext-again"), report) == second, "the command that trained it finds it trained"
+    assert ("progress", "training", 1, 1, "already trained") in report.events
+
+
+def test_figures_that_a_kill_left_behind_are_made_up_for(world, quiet, finished):
+    folder = finished("ext-figures")
+    stale = (folder / "summary.json").read_bytes()
+    train_shot(world.shot, more("ext-figures"), quiet())
+    expected = read_json(folder / "summary.json")
+    (folder / "summary.json").write_bytes(stale)
+    summary = train_shot(world.shot, more("ext-figures"), quiet())
+    assert summary["iterations"] == 100, "the added steps are in: none are trained once more"
+    assert summary["heldout_psnr_db"] == expected["heldout_psnr_db"]
+    (folder / "summary.json").write_bytes(stale)
+    assert train_shot(world.shot, short("ext-figures"), quiet())["extensions"] == expected["extensions"]
+
+
+def test_more_steps_do_not_make_it_worse(trained, quiet):
+    world, before = trained
+    shutil.copytree(world.shot.run("main"), world.shot.run("ext-better"))
+    after = train_shot(world.shot, more("ext-better", 300), quiet())
+    assert after["heldout_psnr_db"] > before["heldout_psnr_db"] - 0.02
+    losses = {}
+    for name in ("main", "ext-better"):
+        rows = [json.loads(line) for line in (world.shot.run(name) / "metrics.jsonl").read_text().splitlines()]
+        losses[name] = rows[-1]["heldout_psnr_db"]
+    assert losses["ext-better"] == pytest.approx(after["heldout_psnr_db"], abs=1e-3)
+
+
+def test_rates_go_back_by_what_is_added_and_fall_to_their_end():
+    short_one, long_one = Extension(3000, 300, None, 0.0), Extension(3000, 6000, None, 0.0)
+    assert short_one.rate_progress(3000, 3000) == pytest.approx(0.9)
+    assert short_one.rate_progress(3150, 3000) == pytest.approx(0.95)
+    assert short_one.rate_progress(3300, 3000) == 1.0
+    assert long_one.rate_progress(3000, 3000) == pytest.approx(2.0 / 3.0)
+    assert long_one.rate_progress(9000, 3000) == 1.0
+
+
+def test_what_cannot_be_extended_is_said_in_words(world, quiet, finished, capsys):
+    with pytest.raises(JobError, match="no trained run 'ext-none'"):
+        train_shot(world.shot, more("ext-none"), quiet())
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, short("ext-unfinished"), quiet(cancel_at=("training", 0.5)))
+    with pytest.raises(JobError, match="is not finished"):
+        train_shot(world.shot, more("ext-unfinished"), quiet())
+    with pytest.raises(ValueError, match="extend is -3"):
+        train_shot(world.shot, more("ext-none", -3), quiet())
+    folder = finished("ext-cameras")
+    path = world.shot.solve / "cameras.json"
+    cameras = path.read_text()
+    try:
+        path.write_text(cameras.replace("registered", "localised", 1))
+        with pytest.raises(JobError, match="other cameras"):
+            train_shot(world.shot, more("ext-cameras"), quiet())
+    finally:
+        path.write_text(cameras)
+    assert (folder / "summary.json").is_file()
+
+
+def test_a_new_training_drops_the_extension_that_was_begun(world, quiet, finished):
+    folder = finished("ext-dropped")
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, more("ext-dropped"), quiet(cancel_at=("training", 0.5)))
+    train_shot(world.shot, short("ext-dropped", seed=3), quiet())
+    assert not (folder / EXTENSION_FILE).exists()
+    assert [p.stem for p in sorted((folder / "previews").glob("*.png"))] == [f"{n:06d}" for n in range(6, 61, 6)]
+
+
+@pytest.mark.parametrize("host", ["mlp", "control_points"])
+def test_hosts_that_move_everything_are_extended_too(world, quiet, host):
+    train_shot(world.shot, short(f"ext-{host}", method=host, supervision="paper"), quiet())
+    summary = train_shot(world.shot, more(f"ext-{host}", 20), quiet())
+    assert math.isfinite(summary["heldout_psnr_db"])
+    assert summary["moving_share"] == 1.0
+
+
+def test_a_run_that_ended_early_goes_on_over_all_its_frames(world, quiet, monkeypatch):
+    preview = PRESETS["preview"]
+
+    def easily_satisfied():
+        config = preview()
+        config.needs.stop_gain, config.needs.least = 1e9, 12
+        return config
+
+    monkeypatch.setitem(PRESETS, "preview", easily_satisfied)
+    params = TrainParams(run="ext-early", iterations=500, max_gaussians=1500, holdout=0)
+    before = train_shot(world.shot, params, quiet())
+    assert before["iterations"] < 500
+    after = train_shot(world.shot, more("ext-early", 30), quiet())
+    assert after["iterations"] == before["iterations"] + 30
+    facts = read_meta(world.shot.run("ext-early") / "checkpoint.safetensors")
+    assert facts["needs"]["joined"]
+    ends = [row["detail"] for row in after["modelled"] if row["what"] == "end"]
+    assert ends == [f"stopped at step {before['iterations']} of 500: nothing more was gained"]
+
+
+def test_the_command_line_takes_it(world, quiet, finished, capsys):
+    finished("ext-cli")
+    args = parser().parse_args(["train", "x", "--run", "y", "--extend", "12"])
+    assert args.extend == 12
+    assert main(["train", str(world.shot.root), "--run", "ext-cli", "--extend", "10"]) == 0
+    assert read_json(world.shot.run("ext-cli") / "summary.json")["iterations"] == 70
+    assert main(["train", str(world.shot.root), "--run", "ext-gone", "--extend", "10"]) == 5
+    assert "no trained run 'ext-gone' to extend" in capsys.readouterr().out
+
+
+def test_the_steps_of_the_presets_are_what_blender_is_told():
+    assert {name: preset().iterations for name, preset in PRESETS.items()} == PRESET_STEPS
