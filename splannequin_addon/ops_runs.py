@@ -10,6 +10,7 @@ import bpy
 from bpy.props import StringProperty
 
 from . import listing, props, steps, supervisor, viewport
+from .translations import tr
 
 
 def _known(context: Any) -> tuple[supervisor.Watch | None, Any]:
@@ -27,10 +28,10 @@ class _Pick:
         """Off while a step of this shot runs: what it works on is named by the settings."""
         watch, state = _known(context)
         if watch is None or state is None:
-            cls.poll_message_set("No shot is chosen: import a clip first")  # type: ignore[attr-defined]
+            cls.poll_message_set(tr("No shot is chosen: import a clip first"))  # type: ignore[attr-defined]
             return False
         if watch.running():
-            cls.poll_message_set("A step of this shot is running")  # type: ignore[attr-defined]
+            cls.poll_message_set(tr("A step of this shot is running"))  # type: ignore[attr-defined]
             return False
         return True
 
@@ -49,7 +50,7 @@ class SPLANNEQUIN_OT_pick_run(_Pick, bpy.types.Operator):
         state = _known(context)[1]
         run = state.runs.get(self.name) or state.unfinished.get(self.name)
         if run is None:
-            self.report({"ERROR"}, f"This shot has no run {self.name!r}")
+            self.report({"ERROR"}, tr(f"This shot has no run {self.name!r}"))
             return {"CANCELLED"}
         settings = context.scene.splannequin
         settings.run_name = self.name
@@ -70,7 +71,7 @@ class SPLANNEQUIN_OT_pick_take(_Pick, bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         """Sets the take's name."""
         if self.name not in _known(context)[1].takes:
-            self.report({"ERROR"}, f"This shot has no take {self.name!r}")
+            self.report({"ERROR"}, tr(f"This shot has no take {self.name!r}"))
             return {"CANCELLED"}
         context.scene.splannequin.take_name = self.name
         return {"FINISHED"}

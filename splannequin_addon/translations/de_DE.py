@@ -128,7 +128,6 @@ MESSAGES: dict[str, str] = {
     "The clip of this editor for a frozen shot": "Der Clip dieses Editors für einen eingefrorenen Shot",
     "Then see the 3D view's sidebar.": "Weiter in der Seitenleiste der 3D-Ansicht.",
     "Cancel Step": "Schritt abbrechen",
-    "Stop this step. It saves what it has first; pressed again after 20 seconds, it is ended by force": "Diesen Schritt anhalten. Er sichert zuerst, was er hat; nach 20 Sekunden erneut gedrückt, wird er gewaltsam beendet",
     "Name of the step to cancel; empty: the one that runs": "Name des Schritts, der abgebrochen wird; leer: der laufende",
     "Open the log of this step in the system's viewer": "Das Protokoll dieses Schritts im Betrachter des Systems öffnen",
     "Name of the step": "Name des Schritts",

@@ -36,7 +36,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other):
     scene.collection.objects.link(own)
     values = {"run_name": "b", "preset": "final", "use_range": True, "first": 3, "last": 9, "t_star": 6}
     values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
-    values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS"}
+    values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
     for name, value in values.items():
         setattr(props, name, value)
     assert set(shot_list.names()) == {*values, "clip", "shot_path"}, "a setting that is not tested here"
