@@ -3,7 +3,8 @@
 Channel names were chosen by experiment with the bpy wheels 4.2.23, 4.5.15, 5.0.1 and 5.2.3. With `CHANNELS`, Blender
 loads the file as MULTILAYER, "Linear Rec.709", and the compositor's Image node shows the sockets Combined, Alpha,
 Depth, Motion and Support in all four versions, values bit-exact; R G B A Z are plain, so Nuke and other readers show
-`rgba` and `depth` at once and find `Support` and `Motion` as further layers. Rejected: `Frozen.Combined.R ...` (same
+`rgba` and `depth` at once and find `Support` and `Motion` as further layers. With `GRAIN_CHANNELS` a socket Grain joins
+them, a colour. Rejected: `Frozen.Combined.R ...` (same
 sockets, but no plain RGBA elsewhere); plain RGBA with `Frozen.Support.V` (a second layer, so the mattes are not on
 the same node); a lone `.R` or `.A` in a matte (aborts 5.2.3 with corrupted memory).
 """
@@ -25,6 +26,8 @@ from ..shot import atomic_path
 
 CHANNELS = ("R", "G", "B", "A", "Z", "Support.V", "Motion.V")
 """Channel names in the order of the arrays: colour, depth, support matte, motion matte."""
+GRAIN_CHANNELS = ("Grain.R", "Grain.G", "Grain.B")
+"""Channel names of the grain, which a frame may lack."""
 BLENDER_SOCKETS = ("Combined", "Alpha", "Depth", "Motion", "Support")
 """Outputs of Blender's compositor Image node for such a file, 4.2 to 5.2."""
 HALF_MAX = 65504.0
@@ -55,6 +58,8 @@ class FrameMetadata:
     """Unit of depth and of the translation in `viewmat`."""
     version: int = EXR_VERSION
     """Version of these attributes."""
+    key: str = ""
+    """What the frame was rendered from, to tell a stale one; empty in frames of before it was noted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +75,8 @@ class FrozenFrame:
     motion: NDArray[np.float32]
     """[H,W] in 0..1: how much of the pixel belongs to what moves in the clip."""
     metadata: FrameMetadata
+    grain: NDArray[np.float32] | None = None
+    """[H,W,3] scene-linear, premultiplied: what added to `rgba` gives it the plate's grain. None: not in the file."""
 
 
 def write_frozen_exr(
@@ -79,20 +86,25 @@ def write_frozen_exr(
     support: ArrayLike,  # [H,W]
     motion: ArrayLike,  # [H,W]
     metadata: FrameMetadata,
+    grain: ArrayLike | None = None,  # [H,W,3]
 ) -> Path:
     """Writes one frame atomically: half colour and mattes, float32 depth, ZIP. Arrays as in `FrozenFrame`.
+
+    Grain is noise, which does not compress: it keeps 5 bits of its mantissa, 3 % of itself at most.
 
     Attributes: `chromaticities` and `colorInteropID` (Rec.709); `worldToCamera`, the OpenEXR standard matrix, in the
     renderer axes of Blender and Nuke (x right, y up, looking along -z) for Imath's row vectors (p_camera = p_world @
     M, translation in the last row); `splannequin:viewmat` and `splannequin:K`, row-major as in `FrameMetadata`;
-    `splannequin:frame`, `:tStarFrame`, `:depthUnits`, `:version`. Half channels are clamped to +-65504.
+    `splannequin:frame`, `:tStarFrame`, `:depthUnits`, `:version`, `:key`. Half channels are clamped to +-65504.
 
     ValueError names the layer whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be
     written (errno ENOSPC when the disk is full).
     """
     path = Path(path)
     pixels = _stack(rgba, depth, support, motion)
-    spec = _spec(pixels.shape[1], pixels.shape[0], metadata)
+    if grain is not None:
+        pixels = np.concatenate([pixels, _coarse(grain, pixels.shape[:2])], axis=2)
+    spec = _spec(pixels.shape[1], pixels.shape[0], metadata, grain is not None)
     with atomic_path(path) as beside:
         output = oiio.ImageOutput.create(str(beside))
         if output is None:
@@ -129,7 +141,33 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
     order = [names.index(name) for name in CHANNELS]
     pixels = np.asarray(pixels, dtype=np.float32)
     depth, support, motion = (np.ascontiguousarray(pixels[..., i]) for i in order[4:])
-    return FrozenFrame(np.ascontiguousarray(pixels[..., order[:4]]), depth, support, motion, metadata)
+    grain = None
+    if all(name in names for name in GRAIN_CHANNELS):
+        grain = np.ascontiguousarray(pixels[..., [names.index(name) for name in GRAIN_CHANNELS]])
+    return FrozenFrame(np.ascontiguousarray(pixels[..., order[:4]]), depth, support, motion, metadata, grain)
+
+
+def read_key(path: str | Path) -> str | None:
+    """`FrameMetadata.key` of a frame, from its header alone; None if the file cannot be read as one."""
+    image = oiio.ImageInput.open(str(path))
+    if image is None:
+        oiio.geterror()  # else it is told to whoever asks next
+        return None
+    try:
+        return str(image.spec().getattribute("splannequin:key") or "")
+    finally:
+        image.close()
+
+
+def _coarse(grain: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Grain [H,W,3], checked, as half floats whose five lowest bits are 0."""
+    half = np.asarray(grain, dtype=np.float32).astype(np.float16)
+    if half.shape != (*shape, 3):
+        raise ValueError(f"grain should be {[*shape, 3]} like rgba, got shape {list(half.shape)}")
+    if not np.isfinite(half).all():
+        raise ValueError("grain has NaN or infinite values")
+    # Rounded to the nearest: cut off, it would lose 1.5 % of its strength.
+    return ((half.view(np.uint16) + np.uint16(0x10)) & np.uint16(0xFFE0)).view(np.float16).astype(np.float32)
 
 
 def _stack(rgba: ArrayLike, depth: ArrayLike, support: ArrayLike, motion: ArrayLike) -> NDArray[np.float32]:
@@ -152,7 +190,7 @@ def _stack(rgba: ArrayLike, depth: ArrayLike, support: ArrayLike, motion: ArrayL
     return pixels
 
 
-def _spec(width: int, height: int, metadata: FrameMetadata) -> oiio.ImageSpec:
+def _spec(width: int, height: int, metadata: FrameMetadata, with_grain: bool) -> oiio.ImageSpec:
     viewmat = np.asarray(metadata.viewmat, dtype=np.float32)
     intrinsics = np.asarray(metadata.K, dtype=np.float32)
     for name, matrix, shape in (("viewmat", viewmat, (4, 4)), ("K", intrinsics, (3, 3))):
@@ -160,9 +198,10 @@ def _spec(width: int, height: int, metadata: FrameMetadata) -> oiio.ImageSpec:
             raise ValueError(f"metadata.{name} should be a finite matrix of shape {shape}, got {matrix.tolist()}")
     if not math.isfinite(metadata.t_star_frame):
         raise ValueError(f"metadata.t_star_frame should be finite, got {metadata.t_star_frame}")
-    spec = oiio.ImageSpec(width, height, len(CHANNELS), oiio.FLOAT)
-    spec.channelnames = CHANNELS
-    spec.channelformats = _FORMATS
+    names = CHANNELS + (GRAIN_CHANNELS if with_grain else ())
+    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
+    spec.channelnames = names
+    spec.channelformats = _FORMATS + (oiio.HALF,) * (len(names) - len(CHANNELS))
     spec.attribute("compression", "zip")
     spec.attribute("oiio:ColorSpace", COLOR_SPACE)
     spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), _REC709)
@@ -173,6 +212,8 @@ def _spec(width: int, height: int, metadata: FrameMetadata) -> oiio.ImageSpec:
     spec.attribute("splannequin:tStarFrame", float(metadata.t_star_frame))
     spec.attribute("splannequin:depthUnits", metadata.depth_units)
     spec.attribute("splannequin:version", int(metadata.version))
+    if metadata.key:
+        spec.attribute("splannequin:key", metadata.key)
     return spec
 
 
@@ -195,6 +236,7 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> FrameMetadata:
         K=np.array(values["K"], dtype=np.float32).reshape(3, 3),
         depth_units=str(values["depthUnits"]),
         version=int(values["version"]),
+        key=str(spec.getattribute("splannequin:key") or ""),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from ..shot import Shot, content_key, disk_error, is_disk_full, need_disk, write
 from ..train import LoadedRun, choose_device, load_run
 from ..train.run import save_png
 from .contact_sheet import write_contact_sheet
-from .exr import FrameMetadata, write_frozen_exr
+from .exr import FrameMetadata, read_key, write_frozen_exr
+from .grain import Grain, draw, measure_plate
 from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen, suggest_t_star
 from .video import write_video
 
@@ -54,16 +56,61 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     scene = load_scene(shot)
     t_star = choose_t_star(shot, scene, run, params, report)
     width, height = output_size(scene, run, params)
-    frames = plan(scene, params, t_star, width, height)
+    whole = plan(scene, params, t_star, width, height)
+    frames = in_range(whole, params)
     folder = shot.take(params.take)
-    key = take_key(run, params, t_star, width, height, frames)
-    done = _prepare(folder, key, params.only_missing)
-    need_disk(folder, (len(frames) - len(done)) * width * height * 20.0, "the take")
+    grain = plate_grain(shot, scene) if params.grain else None
+    # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
+    look = Look(
+        run, params.query, (width, height), grain, (shot.info().width, round(shot.info().width * height / width))
+    )
+    keys = {f.frame: look.key(f) for f in whole}
+    key = take_key(run, params, t_star, width, height)
+    done = _prepare(folder, keys, key, params)
+    frames_left = [f for f in frames if f.frame not in done]
+    need_disk(folder, len(frames_left) * width * height * (26.0 if grain else 20.0), "the take")
     try:
-        _render_all(folder, frames, done, scene, run, params.query, (width, height), report)
-        return _finish(shot, scene, run, params, t_star, frames, (width, height), key, report)
+        _render_all(folder, frames, done, scene, look, keys, report)
+        there = done | {f.frame for f in frames}
+        return _finish(shot, scene, params, t_star, [f.frame for f in whole if f.frame in there], look, key, report)
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
+
+
+@dataclass
+class Look:
+    """What every frame of a take has in common."""
+
+    run: LoadedRun
+    """The run that is frozen."""
+    query: str
+    """As in `FreezeParams`."""
+    size: tuple[int, int]
+    """Width and height of the frames in pixels."""
+    grain: Grain | None
+    """The plate's, None if it is not wanted."""
+    grain_size: tuple[int, int]
+    """Width and height in pixels at which grain is drawn."""
+
+    def key(self, output: OutputFrame) -> str:
+        """Identifies what a frame shows and from what, to tell stale frames from good ones."""
+        return content_key(
+            TAKE_VERSION,
+            self.run.folder / "checkpoint.safetensors",
+            self.query,
+            self.size,
+            None if self.grain is None else [self.grain.to_json(), self.grain_size],
+            output.t_star,
+            output.exposed_like,
+            output.viewmat.flatten().tolist(),
+            output.K.flatten().tolist(),
+        )
+
+
+def plate_grain(shot: Shot, scene: Scene) -> Grain:
+    """Grain of the shot's undistorted frames, which frozen ones are mixed with."""
+    files = [shot.frames / frame_file(n, ".png") for n in scene.frames]
+    return measure_plate([path for path in files if path.is_file()])
 
 
 def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, report: Reporter) -> int:
@@ -98,25 +145,32 @@ def output_size(scene: Scene, run: LoadedRun, params: FreezeParams) -> tuple[int
 
 
 def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: int) -> list[OutputFrame]:
-    """The frames of a take: the clip's own poses, or a camera path in solve units."""
+    """All frames that a take can have: the clip's own poses, or a camera path in solve units."""
     if params.camera_path:
         viewmats, Ks, numbers = _path_cameras(scene, CameraPath.load(params.camera_path), width, height)
     else:
         viewmats, Ks, numbers = scene.viewmats, scene.camera_at(width, height), scene.frames
-    first = numbers[0] if params.first is None else params.first
-    last = numbers[-1] if params.last is None else params.last
     ramp = {int(k): float(v) for k, v in params.t_star_per_frame.items()}
     frames = []
     for i, n in enumerate(numbers):
-        if first <= n <= last:
-            at = ramp.get(n, float(t_star))
-            frames.append(OutputFrame(n, viewmats[i], Ks[i], at, at if params.camera_path else float(n)))
-    if not frames:
+        at = ramp.get(n, float(t_star))
+        frames.append(OutputFrame(n, viewmats[i], Ks[i], at, at if params.camera_path else float(n)))
+    return frames
+
+
+def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFrame]:
+    """Those of ascending frames that are asked for now: first, last and step. JobError if there is none."""
+    numbers = [f.frame for f in frames]
+    first = numbers[0] if params.first is None else params.first
+    last = numbers[-1] if params.last is None else params.last
+    asked = set(range(first, last + 1, max(1, params.step)))
+    chosen = [f for f in frames if f.frame in asked]
+    if not chosen:
         raise JobError(
             f"No frame lies between {first} and {last}.", f"The path has frames {numbers[0]} to {numbers[-1]}.",
             ExitCode.FREEZE,
         )  # fmt: skip
-    return frames
+    return chosen
 
 
 def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tuple[Tensor, Tensor, list[int]]:
@@ -129,10 +183,9 @@ def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tu
     return scene.from_solve(viewmats), torch.tensor(Ks, device="cpu").float(), [f.frame for f in path.frames]
 
 
-def take_key(
-    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, frames: list[OutputFrame]
-) -> str:
-    """Identifies what a take shows, to tell stale frames from good ones. The frame range is not part of it."""
+def take_key(run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int) -> str:
+    """Identifies what a take shows. The frame range is not part of it. Frames have keys of their own, see `Look.key`;
+    this one tells about frames that were rendered before they had."""
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
         TAKE_VERSION,
@@ -146,25 +199,39 @@ def take_key(
     )
 
 
-def _prepare(folder: Path, key: str, only_missing: bool) -> set[int]:
-    """Makes the take's folder; returns the frames in it that are already right. Stale frames are removed."""
+def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams) -> set[int]:
+    """Makes the take's folder; returns the frames in it that are already right. All others are removed.
+
+    A frame that is not asked for now stays if it is right: a part of the range does not undo the rest of the take.
+    """
     (folder / "preview").mkdir(parents=True, exist_ok=True)
     state = folder / "state.json"
-    same = state.is_file() and read_json(state).get("key") == key
-    if same and only_missing:
-        have = {int(p.stem) for p in folder.glob("*.exr") if _FRAME.fullmatch(p.stem)}
-        return {n for n in have if (folder / "preview" / frame_file(n, ".png")).is_file()}
+    # Frames without a key of their own are of before grain, too.
+    old_are_right = not params.grain and state.is_file() and read_json(state).get("key") == key
+    done = set()
+    for n in frames_in(folder.glob("*.exr")) if params.only_missing else ():
+        told = read_key(folder / frame_file(n, ".exr"))
+        right = n in keys and (told == keys[n] or (told == "" and old_are_right))
+        if right and (folder / "preview" / frame_file(n, ".png")).is_file():
+            done.add(n)
     stale = [p for p in [*folder.glob("*.exr"), *(folder / "preview").glob("*.png")] if _FRAME.fullmatch(p.stem)]
-    for old in [folder / "take.json", *stale]:
+    stale = [p for p in stale if int(p.stem) not in done]
+    for old in [folder / "take.json", *stale] if stale else ():
         old.unlink(missing_ok=True)
     write_json(state, {"version": 1, "key": key})
-    return set()
+    return done
+
+
+def frames_in(paths: Iterable[Path]) -> list[int]:
+    """Numbers of those files that are frames, ascending."""
+    return sorted(int(p.stem) for p in paths if _FRAME.fullmatch(p.stem))
 
 
 def _render_all(
-    folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, run: LoadedRun, query: str,
-    size: tuple[int, int], report: Reporter,
+    folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, look: Look, keys: dict[int, str],
+    report: Reporter,
 ) -> None:  # fmt: skip
+    run = look.run
     frozen: FrozenGaussians | None = None
     at = float("nan")
     for n, output in enumerate(frames):
@@ -174,12 +241,12 @@ def _render_all(
             continue
         if frozen is None or output.t_star != at:
             frozen, at = (
-                freeze_at(run.model, scene.time_of_frame(output.t_star), span_of(scene, run), query),
+                freeze_at(run.model, scene.time_of_frame(output.t_star), span_of(scene, run), look.query),
                 output.t_star,
             )
         exposed_at = scene.time_of_frame(output.exposed_like)
-        image = render_frozen(frozen, output.viewmat, output.K, *size, run.model.exposure, exposed_at)
-        _write_frame(folder, output, image, scene)
+        image = render_frozen(frozen, output.viewmat, output.K, *look.size, run.model.exposure, exposed_at)
+        _write_frame(folder, output, image, scene, look, keys[output.frame])
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
 
 
@@ -189,18 +256,23 @@ def span_of(scene: Scene, run: LoadedRun) -> float:
     return max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
 
 
-def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: Scene) -> None:
+def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: Scene, look: Look, key: str) -> None:
     save_png(folder / "preview" / frame_file(output.frame, ".png"), image.color + (1.0 - image.alpha[..., None]) * 0.5)
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ torch.from_numpy(scene.centre)
     depth = torch.where(image.depth < NO_DEPTH, image.depth / scene.scale, NO_DEPTH)
+    grain = None
+    if look.grain is not None:
+        rgba = np.concatenate([image.color.numpy(), image.alpha.numpy()[..., None]], axis=2)
+        grain = draw(look.grain, output.frame, rgba, look.grain_size)
     write_frozen_exr(
         folder / frame_file(output.frame, ".exr"),
         scene_linear(image.color.numpy(), image.alpha.numpy()),
         depth.numpy(),
         image.support.numpy(),
         image.motion.numpy(),
-        FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy()),
+        FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy(), key=key),
+        grain,
     )
 
 
@@ -215,13 +287,12 @@ def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def _finish(
-    shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, t_star: int, frames: list[OutputFrame],
-    size: tuple[int, int], key: str, report: Reporter,
+    shot: Shot, scene: Scene, params: FreezeParams, t_star: int, numbers: list[int], look: Look, key: str,
+    report: Reporter,
 ) -> dict[str, Any]:  # fmt: skip
-    """Contact sheet, video, PLY and take.json; the frames are on disk."""
-    folder = shot.take(params.take)
+    """Contact sheet, video, PLY and take.json of all frames that the take has by now; they are on disk."""
+    folder, run, size = shot.take(params.take), look.run, look.size
     report.progress("finishing the take", 0, 3, "contact sheet")
-    numbers = [f.frame for f in frames]
     previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
     sheet = _contact_sheet(
         shot, params, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}", t_star
@@ -250,6 +321,7 @@ def _finish(
         "frames": len(numbers),
         "fps": shot.info().fps,
         "scale": scene.scale,
+        "grain": None if look.grain is None else look.grain.to_json(),
         "exr_dir": str(folder),
         "contact_sheet": str(sheet),
         "video": str(folder / "video.mp4"),
