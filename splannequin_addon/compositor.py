@@ -251,7 +251,9 @@ def _give_sockets(group: Any) -> set[str]:
         socket = new(name, "INPUT", "NodeSocketFloat", text)
         if socket is not None:
             socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
-    grain = new(_GRAIN, "INPUT", "NodeSocketFloat", "0: the frozen frame is clean, 1: it has as much grain as the plate")
+    grain = new(
+        _GRAIN, "INPUT", "NodeSocketFloat", "0: the frozen frame is clean, 1: it has as much grain as the plate"
+    )
     if grain is not None:
         grain.default_value, grain.min_value, grain.max_value = 0.0, 0.0, 10.0
     cg = new("CG", "INPUT", "NodeSocketColor", "Rendered objects on a transparent film, to stand among the frozen")

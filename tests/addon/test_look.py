@@ -1,4 +1,4 @@
-"""What leaves the compositor: grain on the frozen frame, and a plate that passes through untouched. Pixels of renders."""
+"""What leaves the compositor: the frozen frame with grain, the plate untouched, all or a part. Pixels of renders."""
 
 import importlib.util
 import shutil

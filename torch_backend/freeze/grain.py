@@ -47,7 +47,7 @@ class Grain:
     deviation: NDArray[np.float32]
     """[3, BINS] standard deviation per channel at the middles of `BINS` equal levels of that channel's brightness."""
     softness: float
-    """Deviation in pixels of the Gaussian that white noise is blurred with to look like it; 0: every pixel by itself."""
+    """Deviation in pixels of the Gaussian that white noise is blurred with to look like it; 0: none."""
     correlation: NDArray[np.float32]
     """[3, 3] between the channels; 1 on the diagonal."""
 

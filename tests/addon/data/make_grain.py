@@ -1,6 +1,6 @@
 """Two frozen frames with grain for the add-on's tests: flat grey, half of it half covered, 96 x 64 pixels.
 
-    python tests/addon/data/make_grain.py      (with the backend's Python: the backend draws and writes them)
+python tests/addon/data/make_grain.py      (with the backend's Python: the backend draws and writes them)
 """
 
 from pathlib import Path
