@@ -90,7 +90,8 @@ def write_frozen_exr(
 ) -> Path:
     """Writes one frame atomically: half colour and mattes, float32 depth, ZIP. Arrays as in `FrozenFrame`.
 
-    Grain is noise, which does not compress: it keeps 5 bits of its mantissa, 3 % of itself at most.
+    Grain is noise, which does not compress: it keeps 2 bits of its mantissa and is off by an eighth of itself at most,
+    which takes a third off what it adds to the file (0.74 instead of 1.25 MB at 640 x 480).
 
     Attributes: `chromaticities` and `colorInteropID` (Rec.709); `worldToCamera`, the OpenEXR standard matrix, in the
     renderer axes of Blender and Nuke (x right, y up, looking along -z) for Imath's row vectors (p_camera = p_world @
@@ -160,14 +161,14 @@ def read_key(path: str | Path) -> str | None:
 
 
 def _coarse(grain: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Grain [H,W,3], checked, as half floats whose five lowest bits are 0."""
+    """Grain [H,W,3], checked, as half floats whose eight lowest bits are 0."""
     half = np.asarray(grain, dtype=np.float32).astype(np.float16)
     if half.shape != (*shape, 3):
         raise ValueError(f"grain should be {[*shape, 3]} like rgba, got shape {list(half.shape)}")
     if not np.isfinite(half).all():
         raise ValueError("grain has NaN or infinite values")
-    # Rounded to the nearest: cut off, it would lose 1.5 % of its strength.
-    return ((half.view(np.uint16) + np.uint16(0x10)) & np.uint16(0xFFE0)).view(np.float16).astype(np.float32)
+    # Rounded to the nearest: cut off, it would lose a tenth of its strength.
+    return ((half.view(np.uint16) + np.uint16(0x80)) & np.uint16(0xFF00)).view(np.float16).astype(np.float32)
 
 
 def _stack(rgba: ArrayLike, depth: ArrayLike, support: ArrayLike, motion: ArrayLike) -> NDArray[np.float32]:

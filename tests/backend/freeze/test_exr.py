@@ -40,13 +40,13 @@ def test_round_trip_keeps_depth_exact_and_the_rest_to_half(tmp_path):
     assert [p.name for p in (tmp_path / "Größe 測試").iterdir()] == ["001012.exr"]
 
 
-def test_grain_comes_back_to_a_thirtieth_and_unbiased_and_may_be_absent(tmp_path):
+def test_grain_comes_back_to_an_eighth_and_unbiased_and_may_be_absent(tmp_path):
     stored = layers(120, 160)
     grain = np.random.default_rng(3).normal(0.0, 0.02, (120, 160, 3)).astype(np.float32)
     path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, grain=grain, **stored)
     frame = read_frozen_exr(path)
-    np.testing.assert_allclose(frame.grain, grain, rtol=0.5**5, atol=2e-6)
-    assert frame.grain.std() == pytest.approx(grain.std(), rel=1e-3)
+    np.testing.assert_allclose(frame.grain, grain, rtol=0.5**3, atol=1e-5)
+    assert frame.grain.std() == pytest.approx(grain.std(), rel=0.01)
     np.testing.assert_array_equal(frame.depth, stored["depth"])
     spec = oiio.ImageBuf(str(path)).spec()
     kinds = dict(zip(spec.channelnames, map(str, spec.channelformats), strict=True))
