@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,11 @@ def insert(scene: Any, shot: Path, take: str) -> list[str]:
             f"The take {take!r} of {shot.name} holds no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
         ) from error
     plate = compositor.frame_path(shot / "frames", frozen.first, ".png")
-    return compositor.insert(scene, frozen, plate if plate.is_file() else None)
+    changes = compositor.insert(scene, frozen, plate if plate.is_file() else None)
+    lacking = missing_frames(shot, take, frames_of(scene))
+    if lacking:
+        changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
+    return changes
 
 
 def shown(scene: Any, shot: Path) -> str:
@@ -59,10 +63,15 @@ def remove(scene: Any) -> bool:
     return compositor.remove(scene)
 
 
-def missing_frames(shot: Path, take: str, first: int, last: int) -> list[int]:
-    """Frames of a range that a take lacks."""
+def frames_of(scene: Any) -> range:
+    """Frames that a bake is about: the scene's range and step, as Blender renders them."""
+    return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+
+
+def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
+    """Those of some frames that a take lacks."""
     there = set(compositor.frame_numbers(shot / "takes" / take))
-    return [n for n in range(first, last + 1) if n not in there]
+    return [n for n in frames if n not in there]
 
 
 def default_output(shot: Path, take: str) -> Path:
@@ -100,34 +109,39 @@ def render(
         folder: where the pictures go.
         png: write 8-bit RGB PNG; else what the scene's output format says.
         on_frame: called with (frames done, frames in all).
-        check_cancelled: called between frames (after the last one of a movie file); what it raises ends the bake.
+        check_cancelled: called between frames; what it raises ends the bake. Frames written so far stay, a movie file
+            is closed and holds them.
 
     Raises:
         contract.JobError: Blender refused, or a frame is not on disk afterwards.
     """
-    wanted = list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
+    wanted = list(frames_of(scene))
     folder.mkdir(parents=True, exist_ok=True)
     scene.render.filepath = str(folder / DIGITS)
     scene.render.use_file_extension = True
     scene.render.use_overwrite = True
     if png:
         compat.set_png(scene.render.image_settings)
-    done = []
+    done: list[int] = []
+    stopped: list[BaseException] = []
 
-    def count(*_: Any) -> None:
-        done.append(scene.frame_current)
-        if on_frame:
-            on_frame(len(done), len(wanted))
-
-    bpy.app.handlers.render_write.append(count)
-    span = (scene.frame_start, scene.frame_end)
-    # Blender cannot be stopped within a call; a movie file must be written in one.
-    parts = [span] if scene.render.is_movie_format else [(n, n) for n in wanted]
-    try:
-        for scene.frame_start, scene.frame_end in parts:
-            bpy.ops.render.render(animation=True, scene=scene.name)
+    def count(rendered: Any, *_: Any) -> None:
+        try:
+            done.append(rendered.frame_current)
+            if on_frame:
+                on_frame(len(done), len(wanted))
             if check_cancelled:
                 check_cancelled()
+        except BaseException as error:  # Blender prints what a handler raises, and renders on
+            stopped.append(error)
+        if stopped:
+            # The render's loop counts on from here: at the last frame it ends, and closes what it writes to.
+            rendered.frame_current = rendered.frame_end
+
+    now = scene.frame_current
+    bpy.app.handlers.render_write.append(count)
+    try:
+        bpy.ops.render.render(animation=True, scene=scene.name)
     except RuntimeError as error:
         raise contract.JobError(
             f"Blender could not render the scene: {str(error).strip()}",
@@ -135,8 +149,12 @@ def render(
             contract.ExitCode.BAKE,
         ) from error
     finally:
-        scene.frame_start, scene.frame_end = span
         bpy.app.handlers.render_write.remove(count)
+    scene.frame_set(now)
+    if not stopped and check_cancelled:
+        check_cancelled()  # asked for while Blender was at work, in a handler of someone else's
+    if stopped:
+        raise stopped[0]
     lost = [n for n in wanted if not Path(scene.render.frame_path(frame=n)).is_file()]
     if lost:
         raise contract.JobError(

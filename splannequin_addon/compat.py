@@ -101,18 +101,18 @@ def new_output_node(tree: Any) -> Any:
     return output_socket(tree)
 
 
-def new_mix_node(tree: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """A colour mix node: (node, factor socket, first colour, second colour, result)."""
+def new_mix_node(tree: Any, blend: str = "MIX") -> tuple[Any, Any, Any, Any, Any]:
+    """A colour mix node: (node, factor socket, first colour, second colour, result). Only MIX clamps its factor."""
     if HAS_COMPOSITING_GROUP:
         node = tree.nodes.new("ShaderNodeMix")
         node.data_type = "RGBA"
-        node.blend_type = "MIX"
-        node.clamp_factor = True
+        node.blend_type = blend
+        node.clamp_factor = blend == "MIX"
         enabled = [s for s in node.inputs if s.enabled]
         result = next(s for s in node.outputs if s.enabled)
         return node, enabled[0], enabled[1], enabled[2], result
     node = tree.nodes.new("CompositorNodeMixRGB")
-    node.blend_type = "MIX"
+    node.blend_type = blend
     return node, node.inputs[0], node.inputs[1], node.inputs[2], node.outputs[0]
 
 

@@ -77,6 +77,8 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
         _set_defaults(node, _give_sockets(node.node_tree))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
     _fill_group(scene, node.node_tree, take)
+    if node.inputs[_GRAIN].default_value and _GRAIN not in node.node_tree.nodes:
+        changes.append("The take has no grain to add: freeze it again.")
     if plate is not None and json.loads(node.node_tree[_BEFORE])["made_tree"]:
         _show_plate(scene, tree, node, plate, take)
     return changes
@@ -262,6 +264,7 @@ _FACTORS = (
     ("Only Supported", 0.0, "1: your stream shows through where the frozen frame is a guess"),
     ("Only Moving", 0.0, "1: your stream shows through where nothing moves in the footage"),
 )
+_GRAIN = "Grain"
 _OUT = (
     ("Image", "NodeSocketColor", "Frozen frame, scene-linear"),
     ("Depth", "NodeSocketFloat", "Distance along the camera's axis in scene units; 1e10 where there is nothing"),
@@ -288,6 +291,11 @@ def _give_sockets(group: Any) -> set[str]:
         socket = new(name, "INPUT", "NodeSocketFloat", text)
         if socket is not None:
             socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
+    grain = new(
+        _GRAIN, "INPUT", "NodeSocketFloat", "0: the frozen frame is clean, 1: it has as much grain as the plate"
+    )
+    if grain is not None:
+        grain.default_value, grain.min_value, grain.max_value = 0.0, 0.0, 10.0
     cg = new("CG", "INPUT", "NodeSocketColor", "Rendered objects on a transparent film, to stand among the frozen")
     if cg is not None:
         cg.default_value = (0.0, 0.0, 0.0, 0.0)
@@ -304,6 +312,8 @@ def _set_defaults(node: Any, names: set[str]) -> None:
     for name, value, _ in _FACTORS:
         if name in names:
             node.inputs[name].default_value = value
+    if _GRAIN in names:
+        node.inputs[_GRAIN].default_value = 0.0
     if "CG" in names:
         node.inputs["CG"].default_value = (0.0, 0.0, 0.0, 0.0)
     if "CG Depth" in names:
@@ -351,7 +361,7 @@ def _fill_group(scene: Any, group: Any, take: Take) -> None:
     share = _share(group, enter, fitted)
     group.links.new(share, factor)
     group.links.new(enter.outputs["Image"], first)
-    group.links.new(_among(group, enter, fitted["Combined"], depth.outputs[0]), second)
+    group.links.new(_among(group, enter, _grainy(group, enter, fitted), depth.outputs[0]), second)
     group.links.new(mixed, leave.inputs["Image"])
     group.links.new(fitted["Depth"], depth.inputs[0])
     group.links.new(depth.outputs[0], leave.inputs["Depth"])
@@ -361,6 +371,19 @@ def _fill_group(scene: Any, group: Any, take: Take) -> None:
         stale = bpy.data.images.get(name)
         if stale is not None and stale.users == 0:
             bpy.data.images.remove(stale)
+
+
+def _grainy(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+    """Socket of the frozen picture with as much of its grain as is asked for; takes of before have none."""
+    if _GRAIN not in layers:
+        return layers["Combined"]
+    node, factor, first, second, summed = compat.new_mix_node(group, "ADD")
+    node.name = node.label = _GRAIN
+    node.location = (0.0, -900.0)
+    group.links.new(enter.outputs[_GRAIN], factor)
+    group.links.new(layers["Combined"], first)
+    group.links.new(layers[_GRAIN], second)
+    return summed
 
 
 def _among(group: Any, enter: Any, frozen: Any, depth: Any) -> Any:
@@ -463,6 +486,7 @@ def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
     missing = [n for n in names if n not in frozen.outputs]
     if missing:
         raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+    names += (_GRAIN,) if _GRAIN in frozen.outputs else ()
     sockets = {n: frozen.outputs[n] for n in names}
     for row, name in enumerate(names if any(take.margin) else ()):
         node = compat.new_crop_node(group, take.margin, take.size)

@@ -176,12 +176,25 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
     output.mkdir(parents=True, exist_ok=True)
     scene, fresh = _scene(args.blend)
     scene.splannequin.shot_path = str(shot)
-    if not steps.complete(shot, args.take):
+    if fresh:  # else the range is the artist's, like everything else in the file
+        _fit_range(scene, shot, args.take)
+    first = scene.frame_start if args.first is None else args.first
+    last = scene.frame_end if args.last is None else args.last
+    if last < first:
+        raise contract.JobError(
+            f"The last frame, {last}, comes before the first, {first}.",
+            "Name both with --first and --last.",
+            ExitCode.USAGE,
+        )
+    span = range(first, last + 1, args.step if args.step > 0 else scene.frame_step)
+    stale = backend.available() and steps.may_be_stale(shot, args.take)
+    if stale or not steps.complete(shot, args.take, span):
         params = steps.take_params(shot, args.take) or contract.FreezeParams(take=args.take, only_missing=True)
+        params.first, params.last, params.step = span.start, span.stop - 1, span.step
         steps.run(scene, "freeze", params, console)
     if cameras.find(scene, shot, "CAMERA") is None and (shot / "solve" / "cameras.json").is_file():
         steps.load_camera(scene, shot)
-    baked = _bake(scene, fresh, shot, args.take, output, console)
+    baked = _bake(scene, fresh, shot, args.take, output, console, span)
     path = output / "summary.json"
     summary = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
@@ -255,9 +268,20 @@ def _scene(blend: str) -> tuple[Any, bool]:
     return bpy.context.scene, True
 
 
-def _bake(scene: Any, fresh: bool, shot: Path, take: str, output: Path, console: Console) -> dict[str, Any]:
-    """Compositor, render, shot.blend; returns what the summary tells of it."""
+def _fit_range(scene: Any, shot: Path, take: str) -> None:
+    """A new scene's range: the take's, or the clip's before there is a take."""
+    state = shots.read(shot)
+    facts = state.takes.get(take)
+    scene.frame_start, scene.frame_end = (facts["first"], facts["last"]) if facts else state.frame_range
+
+
+def _bake(
+    scene: Any, fresh: bool, shot: Path, take: str, output: Path, console: Console, span: range | None = None
+) -> dict[str, Any]:
+    """Compositor, render of `span` (None: the scene's range), shot.blend; returns what the summary tells of it."""
     changes = bake.fit_take(scene, shot, take) if fresh or scene_setup.fitted(scene) else []
+    if span is not None:
+        scene.frame_start, scene.frame_end, scene.frame_step = span.start, span.stop - 1, span.step
     changes += steps.insert_freeze(scene, shot, take)
     for change in changes:
         console.say(f"  {change}")
@@ -363,6 +387,9 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--shot", required=True, help="shot folder")
     one.add_argument("--take", default="freeze", help="name of the take")
     one.add_argument("--output", required=True, metavar="DIR", help="folder for what comes out")
+    one.add_argument("--first", type=int, help="first frame to bake (default: the take's, or the .blend's range)")
+    one.add_argument("--last", type=int, help="last frame to bake, inclusive")
+    one.add_argument("--step", type=int, default=0, help="bake every n-th frame (0: the scene's step)")
     one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
     one = add("stmaps", write_stmaps, "ST maps of the lens, both ways, into SHOT/solve.")
     one.add_argument("shot", help="shot folder")

@@ -20,9 +20,7 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
     bl_label = "Use as Splannequin Clip"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath: StringProperty(
-        name="File", description="Video to be used", subtype="FILE_PATH", options={"SKIP_SAVE"}
-    )
+    filepath: StringProperty(name="File", description="Video to be used", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_movie: BoolProperty(name="Movies Only", description="Show videos only", default=True, options={"HIDDEN"})
     filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 

@@ -58,6 +58,21 @@ class _StepOperator:
         return steps.finish(scene, self.step, job)
 
 
+def _read_camera(turns: Any, scene: Any, step: str) -> Any:
+    """Reads a camera all at once; returns what a step asks for from it."""
+    while True:
+        try:
+            next(turns)
+        except StopIteration as end:
+            return steps.freeze_from(scene, end.value, step)
+
+
+def _turns(scene: Any, folder: Any) -> Any:
+    """`cameras.sample_path` of the artist's camera, at the size of the take that is to be baked."""
+    width = steps.params_of(scene, "bake").width
+    return cameras.sample_path(scene, steps.own_camera(scene), folder, width)
+
+
 class SPLANNEQUIN_OT_import_clip(_StepOperator, bpy.types.Operator):
     """Take the clip's frames into the shot folder and check them"""
 
@@ -107,17 +122,12 @@ class SPLANNEQUIN_OT_freeze(_StepOperator, bpy.types.Operator):
         name, folder = steps.own_camera(scene), steps.shot_folder(scene)
         if not name or folder is None:
             return None
-        turns = cameras.sample_path(scene, name, folder, scene.splannequin.freeze_width)
-        while True:
-            try:
-                next(turns)
-            except StopIteration as end:
-                return steps.freeze_from(scene, end.value)
+        return _read_camera(cameras.sample_path(scene, name, folder, scene.splannequin.freeze_width), scene, "freeze")
 
 
 class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
-    """Render frames that are missing or stale, put the freeze before the output of the scene's compositor, and render
-    the scene's range to its output path"""
+    """Freeze those frames of the scene's range that are missing or stale, put the freeze before the output of the
+    scene's compositor, and render the range to the scene's output path"""
 
     bl_idname = "splannequin.bake"
     bl_label = "Bake and Render"
@@ -126,9 +136,16 @@ class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Bakes; a complete take needs no backend."""
-        folder = steps.shot_folder(context.scene)
-        take = context.scene.splannequin.take_name
-        if folder is None or backend.available() or not steps.complete(folder, take):
+        scene = context.scene
+        folder = steps.shot_folder(scene)
+        take = scene.splannequin.take_name
+        if folder is None or backend.available() or not steps.complete(folder, take, bake.frames_of(scene)):
+            if folder is not None and not bpy.app.background and steps.follows_camera(scene):
+                width = steps.params_of(scene, "bake").width
+                supervisor.sample(
+                    scene, folder, cameras.sample_path(scene, steps.own_camera(scene), folder, width), "bake"
+                )
+                return {"FINISHED"}
             return super().execute(context)
         outcome = _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take))
         if outcome == {"FINISHED"}:
@@ -139,6 +156,13 @@ class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
                 self.report({"ERROR"}, str(error).strip())
                 return {"CANCELLED"}
         return outcome
+
+    def params(self, scene: Any) -> Any:
+        """Reads the artist's camera again, if the take is seen from one: what moved since is stale."""
+        folder = steps.shot_folder(scene)
+        if folder is None or not steps.follows_camera(scene):
+            return None
+        return _read_camera(_turns(scene, folder), scene, "bake")
 
     def after(self, scene: Any, job: Any) -> list[str]:
         """Inserts the freeze, then renders."""

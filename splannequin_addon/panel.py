@@ -480,6 +480,14 @@ class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
     step = "bake"
     operator = "splannequin.bake"
 
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """Which take, and which of its frames: Blender's own range and step."""
+        layout.prop(context.scene.splannequin, "take_name")
+        row = layout.row(align=True)
+        row.prop(context.scene, "frame_start", text="First")
+        row.prop(context.scene, "frame_end", text="Last")
+        row.prop(context.scene, "frame_step", text="Step")
+
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """Colours, and the parts of the step one by one."""
         layout.prop(context.scene.splannequin, "keep_colours")

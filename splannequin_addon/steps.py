@@ -5,9 +5,10 @@ The same functions serve the buttons, the timer and the command line.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,7 +95,12 @@ def params_of(scene: Any, step: str) -> Any:
     )
     folder = shot_folder(scene)
     if step == "bake" and folder is not None:
-        params = take_params(folder, props.take_name, t_star) or params
+        asked = take_params(folder, props.take_name, t_star)
+        if asked is not None and props.choose_t_star:
+            asked.t_star_per_frame = params.t_star_per_frame
+        params = asked or params
+        params.device = backend.device()
+        params.first, params.last, params.step = scene.frame_start, scene.frame_end, scene.frame_step
     return params
 
 
@@ -117,16 +123,37 @@ def own_camera(scene: Any) -> str:
     return str(camera.name)
 
 
-def freeze_from(scene: Any, path: contract.CameraPath) -> contract.FreezeParams:
-    """Parameters of a take from a camera path, which is written into the shot. OSError if it cannot be."""
+def follows_camera(scene: Any) -> bool:
+    """True if a bake has to look at the artist's camera again: the take was seen from one, and one is chosen."""
+    folder = shot_folder(scene)
+    if folder is None or not own_camera(scene):
+        return False
+    return bool(shots.read(folder).takes.get(scene.splannequin.take_name, {}).get("camera_path"))
+
+
+def freeze_from(scene: Any, path: contract.CameraPath, step: str = "freeze") -> contract.FreezeParams:
+    """Parameters of a take from a camera path, which is written into the shot. OSError if it cannot be.
+
+    A bake is about a part of the take: where the camera was not looked at now, it stays as it was.
+    """
     folder = shot_folder(scene)
     if folder is None:
         raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
     file = folder / "paths" / f"{scene.splannequin.take_name}.json"
+    if step == "bake" and file.is_file():
+        path = _with_rest(path, contract.CameraPath.load(file))
     jobs.write_json(file, path.to_json())
-    params = params_of(scene, "freeze")
+    params = params_of(scene, step)
     params.camera_path, params.width = str(file), path.width
     return params
+
+
+def _with_rest(path: contract.CameraPath, old: contract.CameraPath) -> contract.CameraPath:
+    """A camera path, and of an older one of the same size the frames that it lacks."""
+    if (path.width, path.height) != (old.width, old.height):
+        return path
+    frames = {f.frame: f for f in [*old.frames, *path.frames]}
+    return dataclasses.replace(path, frames=[frames[n] for n in sorted(frames)])
 
 
 def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.FreezeParams | None:
@@ -146,13 +173,45 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         width=facts["width"],
         overscan=facts.get("overscan", 0.0),
         only_missing=True,
+        grain=bool(facts.get("grain")),
     )
 
 
-def complete(shot: Path, take: str) -> bool:
-    """True if every frame of a finished take is on disk: it can be baked without a backend."""
+def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool:
+    """True if every frame of a finished take is on disk: it can be baked without a backend.
+
+    Args:
+        shot: the shot folder.
+        take: name of the take.
+        frames: only these are asked for, as far as the clip or the take's camera has them; None: all between the
+            take's first and last.
+    """
     facts = shots.read(shot).takes.get(take)
-    return facts is not None and not bake.missing_frames(shot, take, facts["first"], facts["last"])
+    if facts is None:
+        return False
+    if frames is None:
+        wanted: Iterable[int] = range(facts["first"], facts["last"] + 1)
+    else:
+        can = _possible(shot, facts)
+        wanted = [n for n in frames if n in can]
+    return not bake.missing_frames(shot, take, wanted)
+
+
+def may_be_stale(shot: Path, take: str) -> bool:
+    """True if a take's run was trained on after the take was frozen: the backend can tell which frames that changed."""
+    facts = shots.read(shot).takes.get(take, {})
+    trained = shot / "runs" / str(facts.get("run", "")) / "checkpoint.safetensors"
+    told = shot / "takes" / take / "take.json"
+    return trained.is_file() and told.is_file() and trained.stat().st_mtime > told.stat().st_mtime
+
+
+def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
+    """Frames that a take can have: those of its camera's path, or the clip's."""
+    path = facts.get("camera_path", "")
+    if path and Path(path).is_file():
+        return {f.frame for f in contract.CameraPath.load(path).frames}
+    first, last = (facts["first"], facts["last"]) if path else shots.read(shot).frame_range
+    return set(range(first, last + 1))
 
 
 def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:

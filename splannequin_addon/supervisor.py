@@ -17,7 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, jobs, made, markers, pictures, shots, steps, viewport
+from . import backend, bake, jobs, made, markers, pictures, shots, steps, viewport
 from .translations import tr
 
 TICK_SECONDS = 0.25
@@ -38,6 +38,8 @@ class Sampling:
     """`cameras.sample_path`."""
     total: int
     """Frames in all."""
+    step: str
+    """Step that asks for the take: freeze or bake."""
     done: int = 0
     """Frames read."""
 
@@ -74,7 +76,7 @@ class Watch:
         if self.rendered is not None:
             return "bake"
         if self.sampling is not None:
-            return "freeze"
+            return self.sampling.step
         return next((step for step, job in self.jobs.items() if not job.ended), None)
 
 
@@ -112,12 +114,12 @@ def follow(step: str, job: jobs.Job) -> None:
         pictures.forget()
 
 
-def sample(scene: Any, shot: Path, turns: Generator[int, None, contract.CameraPath]) -> None:
-    """Has a camera read by the timer; then its take is begun."""
+def sample(scene: Any, shot: Path, turns: Generator[int, None, contract.CameraPath], step: str = "freeze") -> None:
+    """Has a camera read by the timer; then its take is begun, by the step freeze or bake."""
     watch = watch_of(shot)
     watch.notes.clear()
-    watch.failures.pop("freeze", None)
-    watch.sampling = Sampling(scene.name, turns, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
+    watch.failures.pop(step, None)
+    watch.sampling = Sampling(scene.name, turns, len(bake.frames_of(scene)), step)
 
 
 def _read_on(watch: Watch) -> None:
@@ -133,16 +135,17 @@ def _read_on(watch: Watch) -> None:
         scene = bpy.data.scenes.get(sampling.scene)
         try:
             if scene is not None and steps.shot_folder(scene) != watch.shot:
-                watch.failures["freeze"] = (
+                watch.failures[sampling.step] = (
                     "Another shot was chosen while the camera was read.",
                     "Choose this one and freeze again.",
                 )
             elif scene is not None:
-                follow("freeze", steps.begin(scene, "freeze", steps.freeze_from(scene, end.value)))
+                step = sampling.step
+                follow(step, steps.begin(scene, step, steps.freeze_from(scene, end.value, step)))
         except (contract.JobError, OSError) as error:
-            watch.failures["freeze"] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
+            watch.failures[sampling.step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
     except (contract.JobError, KeyError) as error:
-        watch.failures["freeze"] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
+        watch.failures[sampling.step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
     watch.sampling = None
 
 

@@ -168,6 +168,8 @@ class FreezeParams:
     """First output frame; None: the clip's first."""
     last: int | None = None
     """Last output frame, inclusive; None: the clip's last."""
+    step: int = 1
+    """Every how many frames, from `first`, one is rendered. Frames of the take that were rendered before stay."""
     camera_path: str = ""
     """JSON file of a CameraPath, in solve units, to render from; empty: the clip's own poses."""
     query: str = "nearest"
@@ -179,6 +181,8 @@ class FreezeParams:
     lens needs. `width` is that of the frame without it."""
     only_missing: bool = False
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
+    grain: bool = True
+    """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
     device: str = "auto"
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
 from ..train.run import save_png
 from .contact_sheet import write_contact_sheet
-from .exr import FrameMetadata, write_frozen_exr
+from .exr import FrameMetadata, read_key, write_frozen_exr
+from .grain import Grain, draw, measure_plate
 from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen, suggest_t_star
 from .video import write_video
 
@@ -55,18 +57,75 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     scene = load_scene(shot)
     t_star = choose_t_star(shot, scene, run, params, report)
     width, height = output_size(scene, run, params)
-    frames = plan(scene, params, t_star, width, height)
+    whole = plan(scene, params, t_star, width, height)
+    frames = in_range(whole, params)
     folder = shot.take(params.take)
-    beyond = margin(shot, params, width, height, intrinsics(frames))
-    key = take_key(run, params, t_star, width, height, frames, beyond)
-    done = _prepare(folder, key, params.only_missing)
-    pixels = (width + 2 * beyond[0]) * (height + 2 * beyond[1])
-    need_disk(folder, (len(frames) - len(done)) * pixels * 20.0, "the take")
+    beyond = margin(shot, params, width, height, intrinsics(whole))
+    grain = plate_grain(shot, scene) if params.grain else None
+    # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
+    plate = (shot.info().width, round(shot.info().width * height / width))
+    look = Look(run, params.query, (width, height), beyond, grain, plate)
+    keys = {f.frame: look.key(f) for f in whole}
+    key = take_key(run, params, t_star, width, height, beyond)
+    done = _prepare(folder, keys, key, params)
+    left = sum(f.frame not in done for f in frames)
+    need_disk(folder, left * look.whole[0] * look.whole[1] * (26.0 if grain else 20.0), "the take")
     try:
-        _render_all(folder, frames, done, scene, run, params.query, (width, height), beyond, report)
-        return _finish(shot, scene, run, params, t_star, frames, (width, height), beyond, key, report)
+        _render_all(folder, frames, done, scene, look, keys, report)
+        there = done | {f.frame for f in frames}
+        return _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, report)
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
+
+
+@dataclass
+class Look:
+    """What every frame of a take has in common."""
+
+    run: LoadedRun
+    """The run that is frozen."""
+    query: str
+    """As in `FreezeParams`."""
+    size: tuple[int, int]
+    """Width and height of the frames in pixels, without overscan."""
+    beyond: tuple[int, int]
+    """Pixels beyond the frame on the left and right, and above and below: overscan."""
+    grain: Grain | None
+    """The plate's, None if it is not wanted."""
+    grain_size: tuple[int, int]
+    """Width and height in pixels at which a frame's grain is drawn, without overscan."""
+
+    @property
+    def whole(self) -> tuple[int, int]:
+        """Width and height of the frames in pixels, with overscan."""
+        return self.size[0] + 2 * self.beyond[0], self.size[1] + 2 * self.beyond[1]
+
+    @property
+    def whole_grain_size(self) -> tuple[int, int]:
+        """Width and height in pixels at which a frame's grain is drawn, with overscan."""
+        width, height = (n * w / s for n, w, s in zip(self.grain_size, self.whole, self.size, strict=True))
+        return round(width), round(height)
+
+    def key(self, output: OutputFrame) -> str:
+        """Identifies what a frame shows and from what, to tell stale frames from good ones."""
+        return content_key(
+            TAKE_VERSION,
+            self.run.folder / "checkpoint.safetensors",
+            self.query,
+            self.size,
+            None if self.grain is None else [self.grain.to_json(), self.grain_size],
+            output.t_star,
+            output.exposed_like,
+            output.viewmat.flatten().tolist(),
+            output.K.flatten().tolist(),
+            *([self.beyond] if any(self.beyond) else []),
+        )
+
+
+def plate_grain(shot: Shot, scene: Scene) -> Grain:
+    """Grain of the shot's undistorted frames, which frozen ones are mixed with."""
+    files = [shot.frames / frame_file(n, ".png") for n in scene.frames]
+    return measure_plate([path for path in files if path.is_file()])
 
 
 def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, report: Reporter) -> int:
@@ -101,25 +160,32 @@ def output_size(scene: Scene, run: LoadedRun, params: FreezeParams) -> tuple[int
 
 
 def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: int) -> list[OutputFrame]:
-    """The frames of a take: the clip's own poses, or a camera path in solve units."""
+    """All frames that a take can have: the clip's own poses, or a camera path in solve units."""
     if params.camera_path:
         viewmats, Ks, numbers = _path_cameras(scene, CameraPath.load(params.camera_path), width, height)
     else:
         viewmats, Ks, numbers = scene.viewmats, scene.camera_at(width, height), scene.frames
-    first = numbers[0] if params.first is None else params.first
-    last = numbers[-1] if params.last is None else params.last
     ramp = {int(k): float(v) for k, v in params.t_star_per_frame.items()}
     frames = []
     for i, n in enumerate(numbers):
-        if first <= n <= last:
-            at = ramp.get(n, float(t_star))
-            frames.append(OutputFrame(n, viewmats[i], Ks[i], at, at if params.camera_path else float(n)))
-    if not frames:
+        at = ramp.get(n, float(t_star))
+        frames.append(OutputFrame(n, viewmats[i], Ks[i], at, at if params.camera_path else float(n)))
+    return frames
+
+
+def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFrame]:
+    """Those of ascending frames that are asked for now: first, last and step. JobError if there is none."""
+    numbers = [f.frame for f in frames]
+    first = numbers[0] if params.first is None else params.first
+    last = numbers[-1] if params.last is None else params.last
+    asked = set(range(first, last + 1, max(1, params.step)))
+    chosen = [f for f in frames if f.frame in asked]
+    if not chosen:
         raise JobError(
             f"No frame lies between {first} and {last}.", f"The path has frames {numbers[0]} to {numbers[-1]}.",
             ExitCode.FREEZE,
         )  # fmt: skip
-    return frames
+    return chosen
 
 
 def intrinsics(frames: list[OutputFrame]) -> np.ndarray:
@@ -138,10 +204,10 @@ def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tu
 
 
 def take_key(
-    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, frames: list[OutputFrame],
-    beyond: tuple[int, int] = (0, 0),
-) -> str:  # fmt: skip
-    """Identifies what a take shows, to tell stale frames from good ones. The frame range is not part of it."""
+    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, beyond: tuple[int, int] = (0, 0)
+) -> str:
+    """Identifies what a take shows. The frame range is not part of it. Frames have keys of their own, see `Look.key`;
+    this one tells about frames that were rendered before they had."""
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
         TAKE_VERSION,
@@ -156,26 +222,39 @@ def take_key(
     )
 
 
-def _prepare(folder: Path, key: str, only_missing: bool) -> set[int]:
-    """Makes the take's folder; returns the frames in it that are already right. Stale frames are removed."""
+def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams) -> set[int]:
+    """Makes the take's folder; returns the frames in it that are already right. All others are removed.
+
+    A frame that is not asked for now stays if it is right: a part of the range does not undo the rest of the take.
+    """
     (folder / "preview").mkdir(parents=True, exist_ok=True)
     state = folder / "state.json"
-    same = state.is_file() and read_json(state).get("key") == key
-    if same and only_missing:
-        have = {int(p.stem) for p in folder.glob("*.exr") if _FRAME.fullmatch(p.stem)}
-        return {n for n in have if (folder / "preview" / frame_file(n, ".png")).is_file()}
+    # Frames without a key of their own are of before grain, too.
+    old_are_right = not params.grain and state.is_file() and read_json(state).get("key") == key
+    done = set()
+    for n in frames_in(folder.glob("*.exr")) if params.only_missing else ():
+        told = read_key(folder / frame_file(n, ".exr"))
+        right = n in keys and (told == keys[n] or (told == "" and old_are_right))
+        if right and (folder / "preview" / frame_file(n, ".png")).is_file():
+            done.add(n)
     stale = [p for p in [*folder.glob("*.exr"), *(folder / "preview").glob("*.png")] if _FRAME.fullmatch(p.stem)]
-    for old in [folder / "take.json", *stale]:
+    stale = [p for p in stale if int(p.stem) not in done]
+    for old in [folder / "take.json", *stale] if stale else ():
         old.unlink(missing_ok=True)
     write_json(state, {"version": 1, "key": key})
-    return set()
+    return done
+
+
+def frames_in(paths: Iterable[Path]) -> list[int]:
+    """Numbers of those files that are frames, ascending."""
+    return sorted(int(p.stem) for p in paths if _FRAME.fullmatch(p.stem))
 
 
 def _render_all(
-    folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, run: LoadedRun, query: str,
-    size: tuple[int, int], beyond: tuple[int, int], report: Reporter,
+    folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, look: Look, keys: dict[int, str],
+    report: Reporter,
 ) -> None:  # fmt: skip
-    whole = (size[0] + 2 * beyond[0], size[1] + 2 * beyond[1])
+    run = look.run
     frozen: FrozenGaussians | None = None
     at = float("nan")
     for n, output in enumerate(frames):
@@ -185,14 +264,14 @@ def _render_all(
             continue
         if frozen is None or output.t_star != at:
             frozen, at = (
-                freeze_at(run.model, scene.time_of_frame(output.t_star), span_of(scene, run), query),
+                freeze_at(run.model, scene.time_of_frame(output.t_star), span_of(scene, run), look.query),
                 output.t_star,
             )
         exposed_at = scene.time_of_frame(output.exposed_like)
         K = output.K.clone()
-        K[:2, 2] += torch.tensor(beyond, dtype=K.dtype)  # the same camera, with more pixels around
-        image = render_frozen(frozen, output.viewmat, K, *whole, run.model.exposure, exposed_at)
-        _write_frame(folder, output, image, scene, beyond)
+        K[:2, 2] += torch.tensor(look.beyond, dtype=K.dtype)  # the same camera, with more pixels around
+        image = render_frozen(frozen, output.viewmat, K, *look.whole, run.model.exposure, exposed_at)
+        _write_frame(folder, output, image, scene, look, keys[output.frame])
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
 
 
@@ -202,23 +281,28 @@ def span_of(scene: Scene, run: LoadedRun) -> float:
     return max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
 
 
-def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: Scene, beyond: tuple[int, int]) -> None:
+def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: Scene, look: Look, key: str) -> None:
     shown = image.color + (1.0 - image.alpha[..., None]) * 0.5
-    height, width = shown.shape[0] - 2 * beyond[1], shown.shape[1] - 2 * beyond[0]
+    (width, height), beyond = look.size, look.beyond
     # Previews, and so contact sheet and video, show the frame as it stands over the plate.
     shown = shown[beyond[1] : beyond[1] + height, beyond[0] : beyond[0] + width]
     save_png(folder / "preview" / frame_file(output.frame, ".png"), shown)
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ torch.from_numpy(scene.centre)
     depth = torch.where(image.depth < NO_DEPTH, image.depth / scene.scale, NO_DEPTH)
+    grain = None
+    if look.grain is not None:
+        rgba = np.concatenate([image.color.numpy(), image.alpha.numpy()[..., None]], axis=2)
+        grain = draw(look.grain, output.frame, rgba, look.whole_grain_size)
     write_frozen_exr(
         folder / frame_file(output.frame, ".exr"),
         scene_linear(image.color.numpy(), image.alpha.numpy()),
         depth.numpy(),
         image.support.numpy(),
         image.motion.numpy(),
-        FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy()),
-        beyond,
+        FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy(), key=key),
+        look.beyond,
+        grain,
     )
 
 
@@ -233,13 +317,13 @@ def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def _finish(
-    shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, t_star: int, frames: list[OutputFrame],
-    size: tuple[int, int], beyond: tuple[int, int], key: str, report: Reporter,
+    shot: Shot, scene: Scene, params: FreezeParams, t_star: int, frames: list[OutputFrame], look: Look, key: str,
+    report: Reporter,
 ) -> dict[str, Any]:  # fmt: skip
-    """Contact sheet, video, PLY and take.json; the frames are on disk."""
-    folder = shot.take(params.take)
-    report.progress("finishing the take", 0, 3, "contact sheet")
+    """Contact sheet, video, PLY and take.json of all frames that the take has by now; they are on disk."""
+    folder, run, size = shot.take(params.take), look.run, look.size
     numbers = [f.frame for f in frames]
+    report.progress("finishing the take", 0, 3, "contact sheet")
     previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
     sheet = _contact_sheet(
         shot, params, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}", t_star
@@ -252,7 +336,7 @@ def _finish(
     report.progress("finishing the take", 2, 3, "PLY")
     frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), params.query)
     _write_ply(folder / "frozen.ply", frozen, scene)
-    redistort = _redistort(shot, folder, size, beyond, intrinsics(frames), report)
+    redistort = _redistort(shot, folder, size, look.beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
         "key": key,
@@ -265,13 +349,14 @@ def _finish(
         "width": size[0],
         "height": size[1],
         "overscan": params.overscan,
-        "margin": list(beyond),
+        "margin": list(look.beyond),
         "redistort": str(redistort or ""),
         "first": numbers[0],
         "last": numbers[-1],
         "frames": len(numbers),
         "fps": shot.info().fps,
         "scale": scene.scale,
+        "grain": None if look.grain is None else look.grain.to_json(),
         "exr_dir": str(folder),
         "contact_sheet": str(sheet),
         "video": str(folder / "video.mp4"),

@@ -6,7 +6,15 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from torch_backend.freeze.exr import CHANNELS, HALF_MAX, FrameMetadata, read_frozen_exr, write_frozen_exr
+from torch_backend.freeze.exr import (
+    CHANNELS,
+    GRAIN_CHANNELS,
+    HALF_MAX,
+    FrameMetadata,
+    read_frozen_exr,
+    read_key,
+    write_frozen_exr,
+)
 
 VIEWMAT = np.array([[0, -1, 0, 0.25], [1, 0, 0, -2], [0, 0, 1, 3.5], [0, 0, 0, 1]], dtype=np.float32)
 K = np.array([[1000.5, 0, 31.5], [0, 999.25, 24.5], [0, 0, 1]], dtype=np.float32)
@@ -30,6 +38,32 @@ def test_round_trip_keeps_depth_exact_and_the_rest_to_half(tmp_path):
     for name in ("rgba", "support", "motion"):
         np.testing.assert_array_equal(getattr(frame, name), stored[name].astype(np.float16).astype(np.float32))
     assert [p.name for p in (tmp_path / "Größe 測試").iterdir()] == ["001012.exr"]
+
+
+def test_grain_comes_back_to_an_eighth_and_unbiased_and_may_be_absent(tmp_path):
+    stored = layers(120, 160)
+    grain = np.random.default_rng(3).normal(0.0, 0.02, (120, 160, 3)).astype(np.float32)
+    path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, grain=grain, **stored)
+    frame = read_frozen_exr(path)
+    np.testing.assert_allclose(frame.grain, grain, rtol=0.5**3, atol=1e-5)
+    assert frame.grain.std() == pytest.approx(grain.std(), rel=0.01)
+    np.testing.assert_array_equal(frame.depth, stored["depth"])
+    spec = oiio.ImageBuf(str(path)).spec()
+    kinds = dict(zip(spec.channelnames, map(str, spec.channelformats), strict=True))
+    assert {kinds[name] for name in GRAIN_CHANNELS} == {"half"}
+    assert read_frozen_exr(write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, **layers())).grain is None
+    with pytest.raises(ValueError, match="^grain should be"):
+        write_frozen_exr(tmp_path / "c.exr", metadata=METADATA, grain=grain[:5], **stored)
+    with pytest.raises(ValueError, match="^grain has NaN"):
+        write_frozen_exr(tmp_path / "c.exr", metadata=METADATA, grain=grain * np.nan, **stored)
+
+
+def test_the_key_is_read_from_the_header(tmp_path):
+    noted = dataclasses.replace(METADATA, key="0123abc")
+    assert read_key(write_frozen_exr(tmp_path / "a.exr", metadata=noted, **layers())) == "0123abc"
+    assert read_key(write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, **layers())) == ""
+    (tmp_path / "c.exr").write_bytes(b"torn")
+    assert read_key(tmp_path / "c.exr") is None
 
 
 def test_metadata_comes_back(tmp_path):

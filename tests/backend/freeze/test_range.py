@@ -1,0 +1,129 @@
+"""Parts of a take: range and step, which frames are stale, and the grain beside the picture."""
+
+import json
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from torch_backend.contract import CameraFrame, CameraPath, FreezeParams
+from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.exr import GRAIN_CHANNELS, read_frozen_exr, read_key
+from torch_backend.shot import write_json
+
+
+def times(folder):
+    return {int(p.stem): p.stat().st_mtime_ns for p in folder.glob("*.exr")}
+
+
+def test_a_range_with_a_step_then_the_rest_of_it(trained, quiet):
+    world, _ = trained
+    folder = world.shot.take("part")
+    ask = dict(take="part", t_star=104, only_missing=True)
+    facts = freeze_shot(world.shot, FreezeParams(**ask, first=102, last=108, step=3), quiet())
+    some = times(folder)
+    assert sorted(some) == [102, 105, 108]
+    assert (facts["first"], facts["last"], facts["frames"]) == (102, 108, 3)
+    facts = freeze_shot(world.shot, FreezeParams(**ask, first=104, last=106), quiet())
+    more = times(folder)
+    assert sorted(more) == [102, 104, 105, 106, 108], "frames outside of the range stay"
+    assert all(more[n] == some[n] for n in some), "and none of them is rendered again"
+    assert (facts["first"], facts["last"], facts["frames"]) == (102, 108, 5)
+    freeze_shot(world.shot, FreezeParams(**ask, first=104, last=104), quiet())
+    assert times(folder) == more
+    freeze_shot(world.shot, FreezeParams(**{**ask, "t_star": 110}, first=104, last=105), quiet())
+    assert sorted(times(folder)) == [104, 105], "at another instant none of the others is right"
+
+
+def test_only_frames_whose_instant_changed_are_stale(trained, quiet):
+    world, _ = trained
+    folder = world.shot.take("held")
+    ramp = {str(101 + n): 104.0 for n in range(16)}
+    freeze_shot(world.shot, FreezeParams(take="held", t_star_per_frame=ramp, only_missing=True), quiet())
+    before = times(folder)
+    released = ramp | {"115": 105.0, "116": 106.0}
+    freeze_shot(world.shot, FreezeParams(take="held", t_star_per_frame=released, only_missing=True), quiet())
+    after = times(folder)
+    assert {n for n in after if after[n] != before[n]} == {115, 116}
+    assert json.loads((folder / "take.json").read_text())["t_star_per_frame"] == released
+
+
+def test_only_frames_whose_camera_changed_are_stale(trained, quiet, tmp_path):
+    world, _ = trained
+
+    def path(shift: float) -> str:
+        frames = []
+        for n in (1, 2, 3):
+            viewmat = world.viewmats[7].clone()
+            viewmat[0, 3] += shift if n == 3 else 0.0
+            frames.append(CameraFrame(n, viewmat.flatten().tolist(), [60.0, 60.0, 32.0, 24.0], "blender"))
+        write_json(tmp_path / "path.json", CameraPath(64, 48, frames).to_json())
+        return str(tmp_path / "path.json")
+
+    folder = world.shot.take("move")
+    ask = dict(take="move", t_star=108, only_missing=True)
+    freeze_shot(world.shot, FreezeParams(**ask, camera_path=path(0.0)), quiet())
+    before = times(folder)
+    freeze_shot(world.shot, FreezeParams(**ask, camera_path=path(0.1)), quiet())
+    after = times(folder)
+    assert {n for n in after if after[n] != before[n]} == {3}
+
+
+def test_a_newer_run_makes_every_frame_stale(trained, quiet):
+    world, _ = trained
+    folder = world.shot.take("run")
+    ask = FreezeParams(take="run", t_star=104, first=101, last=103, only_missing=True)
+    freeze_shot(world.shot, ask, quiet())
+    before = times(folder)
+    (world.shot.run("main") / "checkpoint.safetensors").touch()
+    freeze_shot(world.shot, ask, quiet())
+    assert all(before[n] != t for n, t in times(folder).items())
+
+
+def test_a_take_of_before_frames_had_keys_stays_until_grain_is_wanted(trained, quiet):
+    world, _ = trained
+    folder = world.shot.take("old")
+    ask = dict(take="old", t_star=104, first=101, last=103, only_missing=True)
+    freeze_shot(world.shot, FreezeParams(**ask, grain=False), quiet())
+    for path in folder.glob("*.exr"):
+        image = oiio.ImageBuf(str(path))
+        image.read(0, 0, True)
+        image.specmod().erase_attribute("splannequin:key")
+        image.write(str(path))
+        assert read_key(path) == ""
+    before = times(folder)
+    freeze_shot(world.shot, FreezeParams(**ask, grain=False), quiet())
+    assert times(folder) == before
+    freeze_shot(world.shot, FreezeParams(**ask), quiet())
+    assert all(before[n] != t for n, t in times(folder).items())
+
+
+def test_a_damaged_frame_is_rendered_again(trained, quiet):
+    world, _ = trained
+    folder = world.shot.take("broken")
+    ask = FreezeParams(take="broken", t_star=104, first=101, last=102, only_missing=True)
+    freeze_shot(world.shot, ask, quiet())
+    (folder / "000102.exr").write_bytes(b"torn")
+    freeze_shot(world.shot, ask, quiet())
+    assert read_frozen_exr(folder / "000102.exr").metadata.frame == 102
+
+
+@pytest.mark.parametrize("grain", [True, False])
+def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quiet, grain):
+    world, _ = trained
+    folder = world.shot.take(f"grain{grain}")
+    ask = FreezeParams(take=folder.name, t_star=104, first=101, last=102, grain=grain)
+    facts = freeze_shot(world.shot, ask, quiet())
+    one, other = (read_frozen_exr(folder / f"{n:06d}.exr") for n in (101, 102))
+    plain = freeze_shot(world.shot, FreezeParams(take="plain", t_star=104, first=101, last=101, grain=False), quiet())
+    np.testing.assert_array_equal(one.rgba, read_frozen_exr(world.shot.take("plain") / "000101.exr").rgba)
+    assert plain["grain"] is None
+    names = oiio.ImageBuf(str(folder / "000101.exr")).spec().channelnames
+    assert set(GRAIN_CHANNELS) <= set(names) if grain else not set(GRAIN_CHANNELS) & set(names)
+    if not grain:
+        assert one.grain is None and facts["grain"] is None
+        return
+    assert len(facts["grain"]["deviation_8bit"]) == 3
+    assert one.grain.shape == one.rgba[..., :3].shape and other.grain.shape == one.grain.shape
+    if np.max(facts["grain"]["deviation_8bit"]) > 0:
+        assert one.grain.any() and not np.array_equal(one.grain, other.grain)
