@@ -271,8 +271,15 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
     operator = "splannequin.solve_camera"
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
-        """The lens."""
-        layout.prop(context.scene.splannequin, "camera_model")
+        """The lens, where cameras come from, and where they go."""
+        props = context.scene.splannequin
+        layout.prop(props, "camera_model")
+        layout.prop(props, "cameras_from")
+        if props.cameras_from == "FILE":
+            layout.prop(props, "cameras_path", text="")
+        elif props.cameras_from == "TRACKING":
+            layout.prop(props, "tracking_clip", text="")
+        layout.operator("splannequin.export_cameras")
 
     def _button(self, context: Any, layout: Any, view: View, running: str | None) -> None:
         watch = self._watch(context)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import bpy
 
-from . import cli, ops_clip, ops_jobs, ops_steps, panel, pictures, points, preferences, props, supervisor
+from . import cli, ops_clip, ops_jobs, ops_solves, ops_steps, panel, pictures, points, preferences, props, supervisor
 
-_CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *ops_clip.CLASSES, *panel.CLASSES)
+_CLASSES = (*ops_steps.CLASSES, *ops_jobs.CLASSES, *ops_clip.CLASSES, *ops_solves.CLASSES, *panel.CLASSES)
 
 
 def registered() -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, compat, compositor, jobs, markers, scene_setup, shots
+from . import backend, bake, cameras, compat, compositor, jobs, markers, scene_setup, shots, solves
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def params_of(scene: Any, step: str) -> Any:
         span = (props.first, props.last) if props.use_range else (None, None)
         return contract.ImportParams(os.path.abspath(bpy.path.abspath(props.clip)), *span)
     if step == "camera":
-        return contract.SolveParams(camera_model=props.camera_model)
+        return solves.params(scene, shot_folder(scene))
     if step == "train":
         return contract.TrainParams(run=props.run_name, preset=props.preset, device=backend.device())
     t_star = props.t_star if props.choose_t_star else None

@@ -20,7 +20,7 @@ from ..footage.sources import frame_words
 from ..shot import Shot, atomic_path, content_key, need_disk, write_json
 from . import foreign
 from .child import run_worker
-from .given import prepare, refuse_misfit, take_over
+from .given import doubts, prepare, refuse_misfit, take_over
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
 from .undistort import Undistorter
@@ -227,7 +227,7 @@ def _finish(
     (scratch / "model").rename(shot.solve / "colmap")
     write_json(shot.solve / "cameras.json", path.to_json())
     result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
-    warnings = _warnings(frames, path, result, "given" in answer)
+    warnings = _warnings(frames, path, result, "given" in answer) + doubts(answer)
     for message, hint in warnings:
         report.warning(message, hint)
     record = {

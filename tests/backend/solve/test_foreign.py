@@ -14,6 +14,7 @@ from torch_backend.shot import Shot
 from torch_backend.solve import SolveConfig, foreign, load_points, solve_shot
 from torch_backend.solve.colmap_files import read_model, write_model
 from torch_backend.solve.export import export_cameras
+from torch_backend.solve.given import doubts, refuse_misfit
 
 PLAIN = {"w": 640, "h": 480, "fl_x": 500.0, "fl_y": 510.0, "cx": 321.0, "cy": 239.0}
 
@@ -430,6 +431,20 @@ def test_an_export_never_hides_behind_another_model(solved, tmp_path):
     export_cameras(solved.shot, "colmap", tmp_path)
     with pytest.raises(JobError, match="has no cameras yet"):
         export_cameras(Shot.create(tmp_path / "new.splannequin"), "colmap", tmp_path / "out")
+
+
+def test_how_much_agrees_decides():
+    """The error in pixels cannot: with cameras held, what does not fit is left out of it."""
+    answer = {"triangulation_angle_deg": 5.0, "agreement": 0.6}
+    refuse_misfit(answer, 500)
+    assert doubts(answer) == [] and doubts({"triangulation_angle_deg": 5.0}) == []
+    assert "Only 40 %" in doubts({**answer, "agreement": 0.4})[0][0]
+    with pytest.raises(JobError, match="only 500 points of the scene, and 20 % of what was matched agree"):
+        refuse_misfit({**answer, "agreement": 0.2}, 500)
+    with pytest.raises(JobError, match="only 99 points"):
+        refuse_misfit(answer, 99)
+    with pytest.raises(JobError, match="moves too little"):
+        refuse_misfit({**answer, "triangulation_angle_deg": 1.0}, 500)
 
 
 def test_refused_cameras_leave_the_solve_that_is_there(solved, tools, tmp_path):
