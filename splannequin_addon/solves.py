@@ -7,6 +7,7 @@ a timer.
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import subprocess
@@ -160,16 +161,18 @@ def finish_export(process: subprocess.Popen[str], folder: Path) -> str:
     return f"Cameras written to {folder}"
 
 
+def look_after(process: subprocess.Popen[str], folder: Path, then: Callable[[str, bool], None]) -> float | None:
+    """A turn of the timer that follows an export: seconds to the next; None once it has ended and `then` was told."""
+    if process.poll() is None:
+        return _LOOK_SECONDS
+    try:
+        then(finish_export(process, folder), True)
+    except contract.JobError as error:
+        then(error.message, False)
+    return None
+
+
 def follow_export(process: subprocess.Popen[str], folder: Path, then: Callable[[str, bool], None]) -> None:
     """Calls `then(sentence, whether it went well)` from a timer once an export has ended."""
-
-    def look() -> float | None:
-        if process.poll() is None:
-            return _LOOK_SECONDS
-        try:
-            then(finish_export(process, folder), True)
-        except contract.JobError as error:
-            then(error.message, False)
-        return None
-
-    bpy.app.timers.register(look, first_interval=_LOOK_SECONDS, persistent=True)
+    turn = functools.partial(look_after, process, folder, then)
+    bpy.app.timers.register(turn, first_interval=_LOOK_SECONDS, persistent=True)

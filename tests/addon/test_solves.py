@@ -172,6 +172,16 @@ def test_the_export_button_says_what_is_wrong(scene, shot, tmp_path):
         bpy.ops.splannequin.export_cameras(directory=str(tmp_path / "out"), format="colmap_text")
 
 
+@pytest.mark.parametrize("well", [True, False])
+def test_an_export_in_a_window_is_followed_without_waiting(addon, shot, tmp_path, well):
+    solves, told = addon("solves"), []
+    process = solves.begin_export(shot if well else tmp_path, "colmap", tmp_path / "out")
+    assert solves.look_after(process, tmp_path / "out", lambda *said: told.append(said)) and not told
+    process.wait(60)
+    assert solves.look_after(process, tmp_path / "out", lambda *said: told.append(said)) is None
+    assert told[0][1] is well and (str(tmp_path / "out") if well else "is not a shot folder") in told[0][0]
+
+
 def test_export_and_given_cameras_from_the_command_line(addon, shot, tmp_path, capfd):
     main = addon("headless").main
     assert main(["export", str(shot), "--format", "nerfstudio", "--output", str(tmp_path / "out")]) == 0

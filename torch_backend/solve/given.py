@@ -75,7 +75,7 @@ def take_over(
         The worker's answer as after a solve; "given" says that it is none, and holds the kind of file.
 
     Raises:
-        JobError: the worker broke off.
+        JobError: the worker broke off, or not one point agrees with the cameras.
     """
     given, matched = taken.solve, taken.matched
     listed = frames["frames"]
@@ -118,6 +118,8 @@ def take_over(
             "reprojection_error_px": float(known.mean()),
             "triangulation_angle_deg": angle,
         }
+    if not answer["points"]:  # the worker left nothing to read
+        refuse_misfit(answer, 0)
     fx, fy, _, _, *bend = lenses[0].params
     return {
         **answer,

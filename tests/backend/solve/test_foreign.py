@@ -433,6 +433,15 @@ def test_an_export_never_hides_behind_another_model(solved, tmp_path):
         export_cameras(Shot.create(tmp_path / "new.splannequin"), "colmap", tmp_path / "out")
 
 
+def test_cameras_that_stand_still_are_refused(solved, tools, tmp_path):
+    """No point can be triangulated at all."""
+    shot = again(solved, tools, tmp_path)
+    file = transforms(tmp_path / "transforms.json", [np.eye(4)] * 21, **the_lens())
+    with pytest.raises(JobError, match="do not fit these frames: only 0 points"):
+        solve_shot(shot, SolveConfig(features=300), tools.recorder(), str(file))
+    assert not (shot.solve / "scratch").exists()
+
+
 def test_how_much_agrees_decides():
     """The error in pixels cannot: with cameras held, what does not fit is left out of it."""
     answer = {"triangulation_angle_deg": 5.0, "agreement": 0.6}
