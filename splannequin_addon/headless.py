@@ -23,7 +23,7 @@ import bpy
 
 from ..torch_backend import contract
 from ..torch_backend.contract import ExitCode
-from . import backend, bake, cameras, compositor, jobs, made, scene_setup, shots, steps, stmaps
+from . import backend, bake, cameras, compositor, jobs, made, scene_setup, shots, solves, steps, stmaps
 
 
 class Console:
@@ -119,7 +119,16 @@ def import_clip(args: argparse.Namespace, console: Console) -> int:
 
 def solve(args: argparse.Namespace, console: Console) -> int:
     """`solve SHOT`."""
-    return _one_step(args, console, "camera", contract.SolveParams(camera_model=args.camera_model))
+    given = str(Path(args.cameras).absolute()) if args.cameras else ""
+    return _one_step(args, console, "camera", contract.SolveParams(camera_model=args.camera_model, cameras=given))
+
+
+def export(args: argparse.Namespace, console: Console) -> int:
+    """`export SHOT --output DIR`: cameras and points for other programs."""
+    output = Path(args.output).absolute()
+    process = solves.begin_export(Path(args.shot).absolute(), args.format, output, args.text)
+    console.say(solves.finish_export(process, output))
+    return ExitCode.OK
 
 
 def train(args: argparse.Namespace, console: Console) -> int:
@@ -364,6 +373,15 @@ def parser() -> argparse.ArgumentParser:
     one = add("solve", solve, "Cameras of a shot.")
     one.add_argument("shot", help="shot folder")
     _add_solve_flags(one)
+    one.add_argument(
+        "--cameras", default="", metavar="PATH",
+        help="take these cameras instead: a COLMAP folder, a transforms.json or a camera path",
+    )  # fmt: skip
+    one = add("export", export, "Cameras and points of a solved shot for other programs.")
+    one.add_argument("shot", help="shot folder")
+    one.add_argument("--format", default="colmap", choices=("colmap", "nerfstudio"), help="what to write")
+    one.add_argument("--text", action="store_true", help="a COLMAP model as .txt instead of .bin")
+    one.add_argument("--output", required=True, metavar="DIR", help="folder to write into")
     one = add("train", train, "Train a run of a shot.")
     one.add_argument("shot", help="shot folder")
     _add_train_flags(one)

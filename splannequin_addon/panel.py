@@ -321,9 +321,16 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
             ops_align.draw(body)
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
-        """The lens."""
-        layout.prop(context.scene.splannequin, "camera_model")
-        layout.operator("splannequin.write_stmaps", icon=icons.of("splannequin.write_stmaps"))
+        """The lens, where cameras come from, and where they go."""
+        props = context.scene.splannequin
+        layout.prop(props, "camera_model")
+        layout.prop(props, "cameras_from")
+        if props.cameras_from == "FILE":
+            layout.prop(props, "cameras_path", text="")
+        elif props.cameras_from == "TRACKING":
+            layout.prop(props, "tracking_clip", text="")
+        for name in ("splannequin.export_cameras", "splannequin.write_stmaps"):
+            layout.operator(name, icon=icons.of(name))
 
     def _button(self, context: Any, layout: Any, view: View, running: str | None) -> None:
         watch = self._watch(context)

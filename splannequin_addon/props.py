@@ -79,6 +79,29 @@ class ShotSettings:
         ],
         options=set(),
     )
+    cameras_from: EnumProperty(
+        name="Cameras From",
+        description="Solve the camera here, or take cameras that another program found for the same clip",
+        items=[
+            ("SOLVE", "Solve", "Find the camera from the clip"),
+            ("FILE", "File", "A COLMAP folder, a nerfstudio transforms.json or a camera path"),
+            ("TRACKING", "Blender Tracking", "The solved camera of a movie clip of this file"),
+        ],
+        options=set(),
+    )
+    cameras_path: StringProperty(
+        name="Cameras",
+        description="Folder of a COLMAP model or one of its files, a transforms.json, or a camera path. "
+        "Pictures are matched to the clip's frames by the number in their names",
+        subtype="FILE_PATH",
+        options=compat.PATH_OPTIONS,
+    )
+    tracking_clip: PointerProperty(
+        name="Tracked Clip",
+        description="Movie clip whose camera is solved; it should show the same frames as the shot's clip",
+        type=bpy.types.MovieClip,
+        options=set(),
+    )
     preset: EnumProperty(
         name="Preset",
         description="How much to spend on training",

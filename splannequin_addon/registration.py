@@ -12,6 +12,7 @@ from . import (
     ops_jobs,
     ops_runs,
     ops_shots,
+    ops_solves,
     ops_steps,
     panel,
     pictures,
@@ -30,6 +31,7 @@ _CLASSES = (
     *ops_runs.CLASSES,
     *ops_align.CLASSES,
     *ops_shots.CLASSES,
+    *ops_solves.CLASSES,
     *stmaps.CLASSES,
     *panel.CLASSES,
 )

@@ -16,7 +16,21 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, compat, compositor, jobs, made, markers, scene_setup, shot_list, shots, training
+from . import (
+    backend,
+    bake,
+    cameras,
+    compat,
+    compositor,
+    jobs,
+    made,
+    markers,
+    scene_setup,
+    shot_list,
+    shots,
+    solves,
+    training,
+)
 
 
 @dataclass(frozen=True)
@@ -77,7 +91,7 @@ def params_of(scene: Any, step: str) -> Any:
         span = (props.first, props.last) if props.use_range else (None, None)
         return contract.ImportParams(os.path.abspath(bpy.path.abspath(props.clip)), *span)
     if step == "camera":
-        return contract.SolveParams(camera_model=props.camera_model)
+        return solves.params(scene, shot_folder(scene))
     if step == "train":
         folder = shot_folder(scene)
         state = shots.read(folder) if folder is not None else None

@@ -178,6 +178,24 @@ def status(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
+def export(args: argparse.Namespace, console: Console) -> int:
+    """`export SHOT --output DIR`: cameras and points for other programs; prints what was written."""
+    from .solve.export import export_cameras
+
+    try:
+        written = export_cameras(Shot.open(args.shot), args.format, Path(args.output).absolute(), args.text)
+    except contract.JobError as error:
+        print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
+        return error.exit_code
+    except OSError as error:
+        if isinstance(error, FileNotFoundError):
+            raise
+        _give_up(error, Path(args.output).absolute())
+    for path in written:
+        print(json.dumps({"written": str(path)}) if console.as_json else path, file=console.stream)
+    return ExitCode.OK
+
+
 def stmaps(args: argparse.Namespace, console: Console) -> int:
     """`stmaps SHOT`: ST maps of the lens into SHOT/solve."""
     from .solve.stmap import write_maps
@@ -287,6 +305,10 @@ def parser() -> argparse.ArgumentParser:
             _add_import_flags(one)
         elif name == "solve":
             one.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
+            one.add_argument(
+                "--cameras", default="", metavar="PATH",
+                help="take these cameras instead: a COLMAP folder, a transforms.json or a camera path",
+            )  # fmt: skip
         elif name == "train":
             _add_train_flags(one)
             text = "add N steps to a finished run, which keeps its settings (other flags are passed over)"
@@ -299,6 +321,11 @@ def parser() -> argparse.ArgumentParser:
     maps = commands.add_parser("stmaps", help="ST maps of the lens, both ways, into the shot's solve folder")
     maps.add_argument("shot", help="shot folder")
     maps.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")
+    out = commands.add_parser("export", help="cameras and points of a solved shot for other programs")
+    out.add_argument("shot", help="shot folder")
+    out.add_argument("--format", default="colmap", choices=("colmap", "nerfstudio"), help="what to write")
+    out.add_argument("--text", action="store_true", help="a COLMAP model as .txt instead of .bin")
+    out.add_argument("--output", required=True, metavar="DIR", help="folder to write into")
     state = commands.add_parser("status", help="jobs of a shot")
     state.add_argument("shot")
     commands.add_parser("doctor", help="what this environment can do, as JSON")
@@ -394,11 +421,13 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
         params = contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height)
         run_station(Shot.create(args.shot), "import", params, console)
     elif args.command == "solve":
-        run_station(Shot.open(args.shot), "solve", contract.SolveParams(camera_model=args.camera_model), console)
+        given = str(Path(args.cameras).absolute()) if args.cameras else ""
+        params = contract.SolveParams(camera_model=args.camera_model, cameras=given)
+        run_station(Shot.open(args.shot), "solve", params, console)
     elif args.command == "train":
         run_station(Shot.open(args.shot), "train", _train_params(args), console)
     elif args.command == "take":
         run_station(Shot.open(args.shot), "freeze", _freeze_params(args), console)
     else:
-        return {"status": status, "doctor": doctor, "stmaps": stmaps}[args.command](args, console)
+        return {"status": status, "doctor": doctor, "export": export, "stmaps": stmaps}[args.command](args, console)
     return ExitCode.OK

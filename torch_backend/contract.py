@@ -110,6 +110,9 @@ class SolveParams:
     """COLMAP camera model: SIMPLE_RADIAL or OPENCV (strong or tangential distortion)."""
     overlap: int = 15
     """Each solved frame is matched with this many following ones (and with quadratically spaced ones beyond)."""
+    cameras: str = ""
+    """Cameras to take instead of solving: a COLMAP model's folder, a nerfstudio transforms.json, or a CameraPath.
+    Pictures are matched to frames by number. Empty: solve."""
 
 
 @dataclass
@@ -295,7 +298,7 @@ class CameraFrame:
     K: list[float]
     """fx, fy, cx, cy in pixels of the path's width and height."""
     source: str = "registered"
-    """registered (by the mapper), localised (against the model), interpolated, or blender."""
+    """registered (by the mapper, or given), localised (against the model), interpolated, or blender."""
 
     def __post_init__(self) -> None:
         if len(self.viewmat) != 16 or len(self.K) != 4:

@@ -237,7 +237,8 @@ def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
 def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
     from .solve import SolveConfig, solve_shot
 
-    return solve_shot(shot, SolveConfig(camera_model=params.camera_model, overlap=params.overlap), report)
+    config = SolveConfig(camera_model=params.camera_model, overlap=params.overlap)
+    return solve_shot(shot, config, report, params.cameras)
 
 
 def _train(shot: Shot, params: contract.TrainParams, report: Reporter) -> Any:

@@ -1,6 +1,7 @@
 """The whole backend on a very small real clip, by its command line: files, figures, pixels; refusals in words."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -94,3 +95,24 @@ def test_hosts_are_known_by_their_files_alone():
     refused = run("train", "no.splannequin", "--method", "nerf")
     assert refused.returncode == ExitCode.USAGE
     assert "control_points" in refused.stderr
+
+
+def test_export_writes_and_refuses_in_words(world, tmp_path):
+    done = run("export", world.shot.root, "--format", "colmap", "--text", "--output", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    written = [tmp_path / "out" / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
+    assert done.stdout.split() == [str(path) for path in written]
+    assert "1 PINHOLE 64 48 60.0 60.0 32.0 24.0" in written[0].read_text()
+    refused = run("export", world.shot.root, "--output", tmp_path / "out")
+    assert refused.returncode == ExitCode.USAGE
+    assert refused.stderr.startswith("Error: ") and "holds another COLMAP model already" in refused.stderr
+
+
+def test_solve_refuses_cameras_that_are_not_there(world, tmp_path):
+    shot = tmp_path / "s.splannequin"
+    shutil.copytree(world.shot.root, shot)
+    listing = shot / "frames" / "frames.json"
+    listing.write_text(json.dumps({**json.loads(listing.read_text()), "key": "imported"}))
+    done = run("solve", shot, "--cameras", tmp_path / "gone")
+    assert done.returncode == ExitCode.SOLVE and "gone does not exist" in done.stdout
+    assert (shot / "solve" / "cameras.json").is_file()

@@ -18,7 +18,10 @@ from ..footage import load_frames
 from ..footage.images import read_png, write_png
 from ..footage.sources import frame_words
 from ..shot import Shot, atomic_path, content_key, need_disk, write_json
+from . import foreign
 from .child import run_worker
+from .given import doubts, prepare, refuse_misfit, take_over
+from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
 from .undistort import Undistorter
 
@@ -27,14 +30,7 @@ CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV")
 LEAST_REGISTERED = 8
 REFUSED_SHARE = 0.5
 GOOD_SHARE, GOOD_ERROR_PX = 0.95, 1.2
-LEAST_ANGLE_DEG = 2.0
-LEAST_POINTS = 100
-POINT_MAX_ERROR_PX = 2.0
-POINT_LEAST_TRACK = 3
-POINT_FARTHEST = 20.0
 _WRITERS = 2
-
-STILL_HINT = "A freeze needs a clip in which the camera moves sideways by a step or more."
 
 
 @dataclass
@@ -76,22 +72,27 @@ class SolveResult(TypedDict):
     """The same in words."""
 
 
-def solve_shot(shot: Shot, config: SolveConfig, report: Reporter) -> SolveResult:
+def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str = "") -> SolveResult:
     """Finds the camera of every frame of `shot` and writes the undistorted frames.
 
     Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
     contract.CameraPath in COLMAP's world ("solve units"), OpenCV axes, world-to-camera, pinhole of the undistorted
     frames. A shot already solved from the same frames with the same configuration is left alone.
 
+    With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
+    its world, frames without one interpolated.
+
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
     _check(config)
     frames = load_frames(shot)
-    key = content_key(SOLVE_VERSION, config, frames["key"])
+    source = [foreign.fingerprint(cameras)] if cameras else []
+    key = content_key(SOLVE_VERSION, config, frames["key"], *source)
     done = _finished(shot, frames, key)
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
         return done["result"]
+    taken = prepare(frames, cameras, report) if cameras else None  # before anything is thrown away
     for name in ("solve.json", "cameras.json"):
         (shot.solve / name).unlink(missing_ok=True)
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
@@ -101,7 +102,11 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter) -> SolveResult
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     try:
-        answer = _ask_worker(shot, frames, config, scratch, report)
+        if taken is None:
+            answer = _ask_worker(shot, frames, config, scratch, report)
+        else:
+            options = {"overlap": config.overlap, "features": config.features}
+            answer = take_over(shot, frames, taken, options, scratch, report)
         result = _finish(shot, frames, answer, scratch, config, key, report)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -186,11 +191,7 @@ def refuse_poor(answer: dict[str, Any], solved: int) -> None:
             "Choose a range without fast pans or blur, or a smaller step.",
             ExitCode.SOLVE,
         )
-    if angle < LEAST_ANGLE_DEG:
-        message = (
-            f"The camera moves too little for depth: half of the points are seen under {angle:.1f} degrees or less."
-        )
-        raise JobError(message, STILL_HINT, ExitCode.SOLVE)
+    refuse_narrow(angle)
     if answer["points"] < LEAST_POINTS:
         raise JobError(
             f"Only {answer['points']} points of the scene could be placed: the clip is too blurred or too bare.",
@@ -210,21 +211,23 @@ def _finish(
 ) -> SolveResult:
     """Checks the worker's answer and writes the solve's files, solve.json last."""
     solved = sum(f["solve"] for f in frames["frames"])
-    refuse_poor(answer, solved)
+    if "given" not in answer:
+        refuse_poor(answer, solved)
     poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
-    with np.load(scratch / "undistort.npz", allow_pickle=False) as data:
-        pinhole, where = data["pinhole"], data["where"]
-    path = _camera_path(frames, poses, pinhole)
+    maps = [scratch / f"undistort_{n}.npz" for n in range(1 + max(p.get("lens", 0) for p in poses.values()))]
+    path, lenses = _camera_path(frames, poses, [_pinhole(file) for file in maps])
     with np.load(scratch / "points.npz", allow_pickle=False) as data:
         points = filter_points({name: data[name] for name in data.files}, _centres(path))
-    _undistort_all(shot, frames, where, report)
+    if "given" in answer:
+        refuse_misfit(answer, len(points["xyz"]))
+    _undistort_all(shot, frames, lenses, maps, report)
     with atomic_path(shot.solve / "points.npz") as beside:
         np.savez(beside, **points)  # pyright: ignore[reportArgumentType]
     shutil.rmtree(shot.solve / "colmap", ignore_errors=True)
     (scratch / "model").rename(shot.solve / "colmap")
     write_json(shot.solve / "cameras.json", path.to_json())
-    result = _result(answer, path, solved, len(points["xyz"]), float(pinhole[0]))
-    warnings = _warnings(frames, path, result)
+    result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
+    warnings = _warnings(frames, path, result, "given" in answer) + doubts(answer)
     for message, hint in warnings:
         report.warning(message, hint)
     record = {
@@ -240,6 +243,8 @@ def _finish(
         "focal_px": answer["focal_px"],
         "triangulation_angle_deg": answer["triangulation_angle_deg"],
         "quality": result["quality"],
+        "cameras_from": answer.get("given", "solve"),
+        "agreement": answer.get("agreement"),
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,
     }
@@ -248,41 +253,49 @@ def _finish(
     return result
 
 
-def _camera_path(frames: dict[str, Any], poses: dict[str, Any], pinhole: NDArray) -> CameraPath:
-    """A camera for every frame: registered, localised, or interpolated in time between those."""
+def _pinhole(file: Path) -> NDArray[np.float64]:
+    with np.load(file, allow_pickle=False) as data:
+        return data["pinhole"]
+
+
+def _camera_path(
+    frames: dict[str, Any], poses: dict[str, Any], pinholes: list[NDArray[np.float64]]
+) -> tuple[CameraPath, list[int]]:
+    """A camera for every frame: registered, localised, or interpolated in time between those; and its lens's index.
+
+    `pinholes` are fx, fy, cx, cy of each lens. A frame between two lenses has the nearer frame's.
+    """
     listed = frames["frames"]
     names = [Path(f["file"]).name for f in listed]
     known = {i: np.array(poses[name]["pose"]) for i, name in enumerate(names) if name in poses}
     filled = fill_poses(np.array([f["seconds"] for f in listed]), known)
+    nearest = [min(known, key=lambda k: abs(k - i)) for i in range(len(names))]
+    lenses = [int(poses[names[k]].get("lens", 0)) for k in nearest]
     cameras = []
-    for frame, name, pose in zip(listed, names, filled, strict=True):
+    for frame, name, pose, lens in zip(listed, names, filled, lenses, strict=True):
         viewmat = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]]).ravel().tolist()
         source = poses[name]["source"] if name in poses else "interpolated"
-        cameras.append(CameraFrame(frame["frame"], viewmat, pinhole.tolist(), source))
-    return CameraPath(frames["width"], frames["height"], cameras)
+        cameras.append(CameraFrame(frame["frame"], viewmat, pinholes[lens].tolist(), source))
+    return CameraPath(frames["width"], frames["height"], cameras), lenses
 
 
 def _centres(path: CameraPath) -> NDArray[np.float64]:
     return np.array([camera_centre(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
 
 
-def filter_points(points: dict[str, NDArray], centres: NDArray) -> dict[str, NDArray]:
-    """The points to train from: error below 2 px, seen by 3 frames or more, before all cameras, no far outliers.
-
-    `points` holds xyz [P, 3], rgb, error, track and depth [P] (the least over its cameras); `centres` [C, 3] are the
-    cameras. Far means 20 times the median distance to the cameras' middle: points of distant windows are kept.
-    """
-    distance = np.linalg.norm(points["xyz"] - np.median(centres, axis=0), axis=1)
-    keep = (points["error"] < POINT_MAX_ERROR_PX) & (points["track"] >= POINT_LEAST_TRACK) & (points["depth"] > 0)
-    keep &= np.isfinite(points["xyz"]).all(axis=1)
-    if keep.any():
-        keep &= distance < POINT_FARTHEST * np.median(distance[keep])
-    return {name: points[name][keep] for name in ("xyz", "rgb", "error", "track")}
+def _undistort_all(shot: Shot, frames: dict[str, Any], lenses: list[int], maps: list[Path], report: Reporter) -> None:
+    """Writes the undistorted frames, lens by lens: a map takes 128 bytes per pixel."""
+    done = 0
+    for number, file in enumerate(maps):
+        rows = [frame for frame, lens in zip(frames["frames"], lenses, strict=True) if lens == number]
+        if rows:
+            _undistort(shot, rows, file, done, len(lenses), report)
+        done += len(rows)
 
 
-def _undistort_all(shot: Shot, frames: dict[str, Any], where: NDArray, report: Reporter) -> None:
-    listed = frames["frames"]
-    undistort = Undistorter(where)
+def _undistort(shot: Shot, listed: list[dict[str, Any]], file: Path, before: int, total: int, report: Reporter) -> None:
+    with np.load(file, allow_pickle=False) as data:
+        undistort = Undistorter(data["where"])
 
     def one(frame: dict[str, Any]) -> int:
         pixels = read_png(shot.frames / frame["file"])
@@ -292,9 +305,9 @@ def _undistort_all(shot: Shot, frames: dict[str, Any], where: NDArray, report: R
     with ThreadPoolExecutor(_WRITERS) as pool:
         waiting = [pool.submit(one, frame) for frame in listed]
         try:
-            for done, future in enumerate(waiting, start=1):
+            for done, future in enumerate(waiting, start=1 + before):
                 report.check_cancelled()
-                report.progress("solve: undistort", done, len(listed), f"frame {future.result()}")
+                report.progress("solve: undistort", done, total, f"frame {future.result()}")
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
@@ -313,28 +326,32 @@ def _result(answer: dict[str, Any], path: CameraPath, solved: int, points: int, 
         reprojection_error_px=error,
         points=points,
         focal_px=round(focal, 3),
-        quality=quality_words(registered, solved, error),
+        quality=quality_words(registered, solved, error, "given" in answer),
     )
 
 
-def quality_words(registered: int, solved: int, error_px: float) -> str:
-    """One sentence: Good, Fair or Poor, and the figures."""
+def quality_words(registered: int, solved: int, error_px: float, given: bool = False) -> str:
+    """One sentence: Good, Fair or Poor, and the figures; cameras that were `given` are said to be."""
     share = registered / max(1, solved)
     if share >= GOOD_SHARE and error_px <= GOOD_ERROR_PX:
         word = "Good"
     else:
         word = "Fair" if share >= 0.8 and error_px <= 1.5 * GOOD_ERROR_PX else "Poor"
+    if given:
+        return f"{word}: cameras given for {registered} of {solved} frames, {error_px:.2f} px."
     return f"{word}: {registered} of {solved} frames registered, {error_px:.2f} px."
 
 
-def _warnings(frames: dict[str, Any], path: CameraPath, result: SolveResult) -> list[tuple[str, str]]:
+def _warnings(
+    frames: dict[str, Any], path: CameraPath, result: SolveResult, given: bool = False
+) -> list[tuple[str, str]]:
     warnings = []
     lost = [
         camera.frame
         for camera, frame in zip(path.frames, frames["frames"], strict=True)
         if frame["solve"] and camera.source != "registered"
     ]
-    if lost:
+    if lost and not given:  # given cameras were told of when they were matched
         warnings.append(
             (
                 f"The mapper did not register {len(lost)} solved frames: {frame_words(lost)}.",
@@ -352,5 +369,6 @@ def _warnings(frames: dict[str, Any], path: CameraPath, result: SolveResult) -> 
             )
         )
     if result["reprojection_error_px"] > 1.5 * GOOD_ERROR_PX:
-        warnings.append(("The reprojection error is high: the picture will be soft.", "Try the OPENCV camera model."))
+        hint = "Are they of this clip and its lens?" if given else "Try the OPENCV camera model."
+        warnings.append(("The reprojection error is high: the picture will be soft.", hint))
     return warnings

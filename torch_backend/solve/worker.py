@@ -7,8 +7,12 @@ pycolmap.
 Standard input is held open by the parent: when it closes, the parent is gone and so is the worker. Standard output
 carries JSON lines: {"stage"} when one begins, with {"done", "total"} where COLMAP calls back; {"result": {...}} or
 {"failure": "reason"} at the end.
-Beside the request it writes: model/ (binary COLMAP model), points.npz, poses.json (cameras from world, 3x4) and
-undistort.npz (camera of the undistorted frames and where each of its pixels lies in the distorted ones).
+Beside the request it writes: model/ (binary COLMAP model), points.npz, poses.json (cameras from world, 3x4) and, for
+each lens, undistort_N.npz (camera of the undistorted frames and where each of its pixels lies in the distorted ones).
+
+A request with "known" cameras ({"lenses": [{"model", "width", "height", "params"}], "images": {name: {"lens",
+"pose"}}, "triangulate"}) is not solved: the lenses are undistorted and, if asked for, points are triangulated with the
+poses held.
 """
 
 from __future__ import annotations
@@ -33,6 +37,9 @@ TURNING_SHARE = 0.8
 LOCALISE_MAX_ERROR_PX = 4.0
 LOCALISE_LEAST_INLIERS = 24
 LOCALISE_LEAST_RATIO = 0.4
+WIDEST_ZOOM = 16.0
+TRIANGULATE_LEAST_DEG = 1.0
+"""Smallest angle under which a point is triangulated from known cameras."""
 
 
 class Request:
@@ -51,6 +58,7 @@ class Request:
         self.features: int = data["features"]
         self.neighbours: int = data["neighbours"]
         self.threads: int = data["threads"]
+        self.known: dict[str, Any] | None = data.get("known")
 
 
 def say(**message: Any) -> None:
@@ -64,6 +72,8 @@ def main(path: str) -> int:
     threading.Thread(target=_die_with_parent, daemon=True).start()
     request = Request(Path(path))
     pycolmap.set_random_seed(SEED)
+    if request.known is not None:
+        return take_over(request, request.known)
     extract(request, request.solved, None)
     match(request)
     flow, width = median_flow(request)
@@ -97,10 +107,101 @@ def main(path: str) -> int:
     return 0
 
 
+# --------------------------------------------------------------------------------------------------- known cameras
+
+
+def take_over(request: Request, known: dict[str, Any]) -> int:
+    """Undistorts the lenses of known cameras and triangulates points between them, if asked; 0."""
+    lenses = [
+        pycolmap.Camera(model=n["model"], width=n["width"], height=n["height"], params=n["params"])
+        for n in known["lenses"]
+    ]
+    for number, lens in enumerate(lenses):
+        say(stage="lens", done=number, total=len(lenses))
+        write_undistortion(request, lens, number)
+    if not known["triangulate"]:
+        say(result={})
+        return 0
+    poses = {name: (told["lens"], np.array(told["pose"], np.float64)) for name, told in known["images"].items()}
+    model = triangulate(request, lenses, poses)
+    if not model.num_points3D():
+        say(result={"points": 0})
+        return 0
+    write_points(request, model)
+    folder = request.scratch / "model"
+    folder.mkdir()
+    model.write_binary(folder)
+    say(
+        result={
+            "points": model.num_points3D(),
+            "reprojection_error_px": model.compute_mean_reprojection_error(),
+            "triangulation_angle_deg": triangulation_angle(model),
+            "agreement": agreement(request, model),
+        }
+    )
+    return 0
+
+
+def agreement(request: Request, model: pycolmap.Reconstruction) -> float:
+    """Share of the keypoints matched between frames that found a point: with cameras held, errors alone look good
+    whatever the cameras are, since what does not fit them is left out."""
+    matched: dict[int, list[NDArray[np.uint32]]] = {}
+    with closing_database(request) as database:
+        pairs, geometries = database.read_two_view_geometries()
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        if len(geometry.inlier_matches):
+            for image, side in zip(pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches.T, strict=True):
+                matched.setdefault(image, []).append(side)
+    total = sum(len(np.unique(np.concatenate(sides))) for sides in matched.values())
+    return sum(image.num_points3D for image in model.images.values()) / max(total, 1)
+
+
+def triangulate(
+    request: Request, lenses: list[pycolmap.Camera], poses: dict[str, tuple[int, NDArray[np.float64]]]
+) -> pycolmap.Reconstruction:
+    """Features and matches of the solved images, then points from known cameras, which are held.
+
+    `poses` gives each image's lens, as an index, and its world-to-camera pose, [3, 4]; all solved images are in it.
+    """
+    single = len(lenses) == 1
+    extract(request, request.solved, None, pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE)
+    known = pycolmap.Reconstruction()
+    with closing_database(request) as database:
+        images = {image.name: image for image in database.read_all_images()}
+        for name in request.solved:
+            lens, pose = poses[name]
+            stored = images[name]
+            if stored.camera_id not in known.cameras:
+                camera = pycolmap.Camera(
+                    model=lenses[lens].model, width=lenses[lens].width, height=lenses[lens].height,
+                    params=lenses[lens].params, camera_id=stored.camera_id,
+                )  # fmt: skip
+                # Pairs are verified without the lens, as in a solve of our own, unless it bends their epipolar lines.
+                camera.has_prior_focal_length = camera.model != pycolmap.CameraModelId.PINHOLE
+                database.update_camera(camera)
+                known.add_camera_with_trivial_rig(camera)
+            image = pycolmap.Image(name=name, camera_id=stored.camera_id, image_id=stored.image_id)
+            known.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    match(request)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.triangulation.min_angle = TRIANGULATE_LEAST_DEG
+    folder = request.scratch / "triangulated"
+    folder.mkdir()
+    say(stage="points")
+    return pycolmap.triangulate_points(known, request.database, request.images, folder, True, options)
+
+
 # --------------------------------------------------------------------------------------------------- COLMAP's stages
 
 
-def extract(request: Request, names: list[str], camera_id: int | None) -> None:
+def extract(
+    request: Request,
+    names: list[str],
+    camera_id: int | None,
+    mode: pycolmap.CameraMode = pycolmap.CameraMode.SINGLE,
+) -> None:
     """SIFT features of `names` into the database; one camera for all, an existing one if `camera_id` is given."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = request.camera_model
@@ -113,13 +214,13 @@ def extract(request: Request, names: list[str], camera_id: int | None) -> None:
     # Numbers given beforehand, in the clip's order: else the first thread to finish would choose them.
     with closing_database(request):
         pass  # makes the file
-    pycolmap.import_images(request.database, request.images, pycolmap.CameraMode.SINGLE, names, reader)
+    pycolmap.import_images(request.database, request.images, mode, names, reader)
     say(stage="features" if camera_id is None else "other features")
     pycolmap.extract_features(
         request.database,
         request.images,
         image_names=names,
-        camera_mode=pycolmap.CameraMode.SINGLE,
+        camera_mode=mode,
         reader_options=reader,
         extraction_options=options,
         device=pycolmap.Device.cpu,
@@ -311,6 +412,13 @@ def write_answers(request: Request, model: pycolmap.Reconstruction, poses: dict[
     folder = request.scratch / "model"
     folder.mkdir()
     model.write_binary(folder)
+    write_points(request, model)
+    (request.scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
+    write_undistortion(request, next(iter(model.cameras.values())), 0)
+
+
+def write_points(request: Request, model: pycolmap.Reconstruction) -> None:
+    """points.npz of a model: what the parent filters."""
     points = [model.points3D[i] for i in sorted(model.points3D)]
     np.savez(
         request.scratch / "points.npz",
@@ -320,10 +428,12 @@ def write_answers(request: Request, model: pycolmap.Reconstruction, poses: dict[
         track=np.array([min(p.track.length(), 65535) for p in points], np.uint16),
         depth=smallest_depths(model, points),
     )
-    (request.scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
-    camera = next(iter(model.cameras.values()))
+
+
+def write_undistortion(request: Request, camera: pycolmap.Camera, number: int) -> None:
+    """`undistortion` of a lens, as the parent reads it."""
     pinhole, where = undistortion(camera)
-    np.savez(request.scratch / "undistort.npz", pinhole=pinhole, where=where)
+    np.savez(request.scratch / f"undistort_{number}.npz", pinhole=pinhole, where=where)
 
 
 def smallest_depths(model: pycolmap.Reconstruction, points: list[pycolmap.Point3D]) -> NDArray[np.float32]:
@@ -365,10 +475,13 @@ def undistortion(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], NDArray[
         return bool(((at >= low) & (at <= high)).all())
 
     low, high = 0.5, 2.0
+    while not inside(high) and high < WIDEST_ZOOM:  # a fisheye
+        high *= 2.0
     for _ in range(40):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if inside(middle) else (middle, high)
-    zoom = high
+    # A pinhole stays as it is, to the last bit.
+    zoom = 1.0 if camera.is_undistorted() else high
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     where = distorted(grid.reshape(-1, 2), zoom).reshape(height, width, 2).astype(np.float32)
     return np.array([*(focal * zoom), cx, cy]), where

@@ -1,0 +1,337 @@
+"""COLMAP models on disk, read and written without COLMAP: cameras, images and points3D, as .bin or .txt.
+
+The format is COLMAP's own (https://colmap.github.io/format.html): world-to-camera poses as a quaternion wxyz and a
+translation, OpenCV axes, pixel centres at +0.5. The 2D keypoints of images are passed over. Everything read is checked:
+such a folder may come from anywhere.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..shot import atomic_path
+from .poses import quat_to_rotation, rotation_to_quat
+
+MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}
+"""COLMAP's number of a camera model -> its name and how many parameters it has."""
+PARTS = ("cameras", "images", "points3D")
+_MOST_POINTS = 50_000_000
+_PIXEL_BYTES = 24
+
+
+@dataclass
+class ColmapCamera:
+    """One camera, which images share."""
+
+    number: int
+    """COLMAP's id of it."""
+    model: str
+    """Name of the camera model."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    params: tuple[float, ...]
+    """In the model's own order."""
+
+
+@dataclass
+class ColmapImage:
+    """One image and its pose."""
+
+    number: int
+    """COLMAP's id of it."""
+    name: str
+    """File name, relative to the folder of images."""
+    camera: int
+    """Id of its camera."""
+    pose: NDArray[np.float64]
+    """[3, 4] world-to-camera, OpenCV axes."""
+
+
+@dataclass
+class ColmapPoints:
+    """The sparse points."""
+
+    xyz: NDArray[np.float64]
+    """[P, 3]."""
+    rgb: NDArray[np.uint8]
+    """[P, 3]."""
+    error: NDArray[np.float64]
+    """[P] mean reprojection error in pixels of the images; negative where COLMAP did not say."""
+    tracks: list[NDArray[np.int64]]
+    """P arrays of ids of the images that see the point; empty where the file does not tell."""
+
+
+@dataclass
+class ColmapModel:
+    """cameras, images and points3D of a folder."""
+
+    cameras: dict[int, ColmapCamera]
+    """By id."""
+    images: list[ColmapImage]
+    """In the file's order."""
+    points: ColmapPoints
+    """May be empty."""
+
+
+def model_files(folder: Path) -> list[Path]:
+    """The files of the model in a folder, .bin before .txt as COLMAP has it; empty if it holds none.
+
+    points3D may be missing: poses are worth reading without.
+    """
+    for suffix in (".bin", ".txt"):
+        found = [folder / (part + suffix) for part in PARTS]
+        if found[0].is_file() and found[1].is_file():
+            return [path for path in found if path.is_file()]
+    return []
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """The model in a folder.
+
+    Raises:
+        FileNotFoundError: the folder holds none.
+        ValueError: a file is broken, cut off, or of a camera model that is not known here; names the file.
+    """
+    files = model_files(folder)
+    if not files:
+        raise FileNotFoundError(f"{folder} holds no COLMAP model: cameras and images, as .bin or .txt")
+    binary = files[0].suffix == ".bin"
+    points = ColmapPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), [])
+    at = files[0]
+    try:
+        cameras = {c.number: c for c in (_cameras_bin(at) if binary else _cameras_txt(at))}
+        at = files[1]
+        images = list(_images_bin(at) if binary else _images_txt(at))
+        if len(files) > 2:
+            at = files[2]
+            points = _points_bin(at) if binary else _points_txt(at)
+    except (struct.error, IndexError, OverflowError, UnicodeDecodeError) as error:
+        raise ValueError(f"{at} is no file of a COLMAP model, or it is cut off: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{at} is no file of a COLMAP model: {error}") from error
+    for image in images:
+        if image.camera not in cameras:
+            raise ValueError(f"{files[1]}: image {image.name} has camera {image.camera}, which {files[0].name} lacks")
+    return ColmapModel(cameras, images, points)
+
+
+def write_model(folder: Path, model: ColmapModel, text: bool = False) -> list[Path]:
+    """Writes a model into a folder, made if it is not there: binary, or `text`. Returns the files.
+
+    Tracks are left out: without the keypoints that they count, COLMAP would refuse them.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    suffix = ".txt" if text else ".bin"
+    written = [folder / (part + suffix) for part in PARTS]
+    contents = (
+        (_cameras_as_text(model), _images_as_text(model), _points_as_text(model))
+        if text
+        else (_cameras_as_bytes(model), _images_as_bytes(model), _points_as_bytes(model))
+    )
+    for path, content in zip(written, contents, strict=True):
+        with atomic_path(path) as beside:
+            beside.write_bytes(content)
+    return written
+
+
+# ------------------------------------------------------------------------------------------------- reading
+
+
+class _Bytes:
+    """A file read from front to back; struct.error where it ends too early."""
+
+    def __init__(self, path: Path) -> None:
+        self.data = path.read_bytes()
+        self.at = 0
+
+    def take(self, layout: str) -> tuple:
+        values = struct.unpack_from("<" + layout, self.data, self.at)
+        self.at += struct.calcsize("<" + layout)
+        return values
+
+    def word(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        start, self.at = self.at, end + 1
+        return self.data[start:end].decode("utf-8")
+
+    def skip(self, count: int) -> None:
+        if count < 0 or self.at + count > len(self.data):
+            raise struct.error("it ends too early")
+        self.at += count
+
+
+def _camera(number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> ColmapCamera:
+    counts = {name: count for name, count in MODELS.values()}
+    if model in counts and len(params) != counts[model]:
+        raise ValueError(f"camera {number} is {model} with {len(params)} parameters instead of {counts[model]}")
+    if not (width > 0 and height > 0 and all(map(math.isfinite, params))):
+        raise ValueError(f"camera {number} has no size or its parameters are not finite")
+    return ColmapCamera(number, model, width, height, params)
+
+
+def _image(number: int, name: str, camera: int, quat: tuple[float, ...], shift: tuple[float, ...]) -> ColmapImage:
+    if not all(map(math.isfinite, (*quat, *shift))) or math.hypot(*quat) < 1e-9:
+        raise ValueError(f"the pose of image {name} is not finite")
+    rotation = quat_to_rotation(np.array(quat))
+    return ColmapImage(number, name, camera, np.concatenate([rotation, np.array(shift)[:, None]], axis=1))
+
+
+def _cameras_bin(path: Path) -> Iterator[ColmapCamera]:
+    file = _Bytes(path)
+    for _ in range(file.take("Q")[0]):
+        number, model, width, height = file.take("iiQQ")
+        if model not in MODELS:  # what follows cannot be found without its length
+            raise ValueError(f"camera {number} has the unknown model number {model}")
+        name, count = MODELS[model]
+        yield _camera(number, name, width, height, file.take(f"{count}d"))
+
+
+def _images_bin(path: Path) -> Iterator[ColmapImage]:
+    file = _Bytes(path)
+    for _ in range(file.take("Q")[0]):
+        number, *pose, camera = file.take("i7di")
+        name = file.word()
+        file.skip(file.take("Q")[0] * _PIXEL_BYTES)
+        yield _image(number, name, camera, tuple(pose[:4]), tuple(pose[4:]))
+
+
+def _points_bin(path: Path) -> ColmapPoints:
+    file = _Bytes(path)
+    count = file.take("Q")[0]
+    if count > _MOST_POINTS:
+        raise ValueError(f"it tells of {count} points")
+    rows, tracks = [], []
+    for _ in range(count):
+        *row, length = file.take("Q3d3BdQ")
+        start = file.at
+        file.skip(8 * length)
+        tracks.append(np.frombuffer(file.data, "<i4", 2 * length, start)[::2].astype(np.int64))
+        rows.append(row[1:])
+    return _points(rows, tracks)
+
+
+def _points(rows: list[list[float]], tracks: list[NDArray[np.int64]]) -> ColmapPoints:
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    return ColmapPoints(table[:, :3], np.clip(table[:, 3:6], 0, 255).astype(np.uint8), table[:, 6], tracks)
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines that say something. Empty ones stay: an image without keypoints has one."""
+    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.lstrip().startswith("#")]
+
+
+def _cameras_txt(path: Path) -> Iterator[ColmapCamera]:
+    for line in _lines(path):
+        if not line.strip():
+            continue
+        number, model, width, height, *params = line.split()
+        yield _camera(int(number), model, int(width), int(height), tuple(map(float, params)))
+
+
+def _images_txt(path: Path) -> Iterator[ColmapImage]:
+    lines = _lines(path)
+    at = 0
+    while at < len(lines):
+        if not lines[at].strip():
+            at += 1
+            continue
+        number, *pose, name = lines[at].split(maxsplit=9)
+        camera = int(pose.pop())
+        values = tuple(map(float, pose))
+        yield _image(int(number), name.strip(), camera, values[:4], values[4:])
+        at += 2  # the second line holds its keypoints
+
+
+def _points_txt(path: Path) -> ColmapPoints:
+    rows, tracks = [], []
+    for line in _lines(path):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) < 8:
+            raise ValueError(f"a point has {len(words)} values instead of 8 or more")
+        rows.append([float(w) for w in words[1:8]])
+        tracks.append(np.array([int(w) for w in words[8::2]], np.int64))
+    return _points(rows, tracks)
+
+
+# ------------------------------------------------------------------------------------------------- writing
+
+
+def _cameras_as_bytes(model: ColmapModel) -> bytes:
+    numbers = {name: number for number, (name, _) in MODELS.items()}
+    parts = [struct.pack("<Q", len(model.cameras))]
+    for c in model.cameras.values():
+        parts.append(struct.pack("<iiQQ", c.number, numbers[c.model], c.width, c.height))
+        parts.append(struct.pack(f"<{len(c.params)}d", *c.params))
+    return b"".join(parts)
+
+
+def _images_as_bytes(model: ColmapModel) -> bytes:
+    parts = [struct.pack("<Q", len(model.images))]
+    for image in model.images:
+        pose = [*rotation_to_quat(image.pose[:, :3]), *image.pose[:, 3]]
+        parts.append(struct.pack("<i7di", image.number, *pose, image.camera))
+        parts.append(image.name.encode("utf-8") + b"\0" + struct.pack("<Q", 0))
+    return b"".join(parts)
+
+
+def _points_as_bytes(model: ColmapModel) -> bytes:
+    points = model.points
+    parts = [struct.pack("<Q", len(points.xyz))]
+    rows = zip(points.xyz.tolist(), points.rgb.tolist(), points.error.tolist(), strict=True)
+    parts += [struct.pack("<Q3d3BdQ", n, *xyz, *rgb, error, 0) for n, (xyz, rgb, error) in enumerate(rows, start=1)]
+    return b"".join(parts)
+
+
+def _numbers(values: NDArray | tuple[float, ...]) -> str:
+    """As many digits as bring the same numbers back."""
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _cameras_as_text(model: ColmapModel) -> bytes:
+    rows = [f"{c.number} {c.model} {c.width} {c.height} {_numbers(c.params)}" for c in model.cameras.values()]
+    return _text("CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", rows)
+
+
+def _images_as_text(model: ColmapModel) -> bytes:
+    rows = []
+    for i in model.images:
+        pose = np.concatenate([rotation_to_quat(i.pose[:, :3]), i.pose[:, 3]])
+        rows += [f"{i.number} {_numbers(pose)} {i.camera} {i.name}", ""]
+    return _text("IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of POINTS2D[]", rows)
+
+
+def _points_as_text(model: ColmapModel) -> bytes:
+    points = model.points
+    rows = [
+        f"{n} {_numbers(xyz)} {' '.join(map(str, rgb.tolist()))} {float(error)!r}"
+        for n, (xyz, rgb, error) in enumerate(zip(points.xyz, points.rgb, points.error, strict=True), start=1)
+    ]
+    return _text("POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)", rows)
+
+
+def _text(head: str, rows: list[str]) -> bytes:
+    return ("\n".join([f"# {head}", *rows]) + "\n").encode("utf-8")

@@ -1,0 +1,112 @@
+"""The solve for other programs: a COLMAP model or a nerfstudio transforms.json of the undistorted frames.
+
+No pictures are copied: a COLMAP model names the plates as they are called in the shot's frames/, a transforms.json
+points there. World, axes and units are the solve's.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contract import CameraPath, ExitCode, JobError, frame_file
+from ..shot import Shot, write_atomic, write_json
+from .colmap_files import PARTS, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints, write_model
+
+FORMATS = ("colmap", "nerfstudio")
+_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False) -> list[Path]:
+    """Writes the cameras and points of a solved shot for other programs.
+
+    Args:
+        shot: a solved shot.
+        kind: of `FORMATS`. colmap: cameras, images and points3D, PINHOLE. nerfstudio: transforms.json and points.ply.
+        folder: where to; made if it is not there.
+        text: a COLMAP model as .txt instead of .bin.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ValueError: another format.
+        JobError: the shot is not solved, or the folder holds a model that would be read instead of this one.
+    """
+    if kind not in FORMATS:
+        raise ValueError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
+    if not (shot.solve / "cameras.json").is_file() or not (shot.solve / "points.npz").is_file():
+        raise JobError(f"{shot.root.name} has no cameras yet.", "Solve the camera first.", ExitCode.SOLVE)
+    path = CameraPath.load(shot.solve / "cameras.json")
+    with np.load(shot.solve / "points.npz", allow_pickle=False) as stored:
+        points = {name: stored[name] for name in ("xyz", "rgb", "error")}
+    if kind == "nerfstudio":
+        return _write_transforms(shot, path, points, folder)
+    other = [folder / (part + (".bin" if text else ".txt")) for part in PARTS]
+    there = next((file for file in other if file.is_file()), None)
+    if there is not None:
+        raise JobError(
+            f"{folder} holds another COLMAP model already ({there.name}).", "Choose another folder.", ExitCode.USAGE
+        )
+    return write_model(folder, _model(path, points), text)
+
+
+def _model(path: CameraPath, points: dict[str, NDArray]) -> ColmapModel:
+    lenses: dict[tuple[float, ...], int] = {}
+    images = []
+    for number, frame in enumerate(path.frames, start=1):
+        lens = lenses.setdefault(tuple(frame.K), len(lenses) + 1)
+        pose = np.reshape(np.array(frame.viewmat, np.float64), (4, 4))[:3]
+        images.append(ColmapImage(number, frame_file(frame.frame, ".png"), lens, pose))
+    cameras = {n: ColmapCamera(n, "PINHOLE", path.width, path.height, K) for K, n in lenses.items()}
+    xyz, error = points["xyz"].astype(np.float64), points["error"].astype(np.float64)
+    return ColmapModel(cameras, images, ColmapPoints(xyz, points["rgb"], error, [np.zeros(0, np.int64)] * len(xyz)))
+
+
+def _write_transforms(shot: Shot, path: CameraPath, points: dict[str, NDArray], folder: Path) -> list[Path]:
+    shared = path.frames[0].K
+    frames = []
+    for frame in path.frames:
+        to_world = np.linalg.inv(np.reshape(np.array(frame.viewmat, np.float64), (4, 4))) @ _TO_OPENGL
+        row: dict[str, Any] = {"file_path": _seen_from(folder, shot.frames / frame_file(frame.frame, ".png"))}
+        row["transform_matrix"] = to_world.tolist()
+        if shared != frame.K:
+            row |= _intrinsics(frame.K)
+        frames.append(row)
+    data = {
+        "camera_model": "PINHOLE",
+        "w": path.width,
+        "h": path.height,
+        **_intrinsics(shared),
+        "ply_file_path": "points.ply",
+        "frames": frames,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(folder / "points.ply", _ply(points["xyz"], points["rgb"]))
+    write_json(folder / "transforms.json", data)
+    return [folder / "transforms.json", folder / "points.ply"]
+
+
+def _intrinsics(K: list[float]) -> dict[str, float]:
+    return dict(zip(("fl_x", "fl_y", "cx", "cy"), K, strict=True))
+
+
+def _seen_from(folder: Path, file: Path) -> str:
+    """A file's path from a folder, with slashes; absolute where there is no way (another drive)."""
+    try:
+        return Path(os.path.relpath(file, folder.absolute())).as_posix()
+    except ValueError:
+        return file.as_posix()
+
+
+def _ply(xyz: NDArray, rgb: NDArray) -> bytes:
+    """Points with colours as binary PLY."""
+    rows = np.empty(len(xyz), np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
+    rows["xyz"], rows["rgb"] = xyz, rgb
+    names = [f"property float {n}" for n in "xyz"] + [f"property uchar {n}" for n in ("red", "green", "blue")]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}", *names, "end_header", ""]
+    return "\n".join(head).encode("ascii") + rows.tobytes()

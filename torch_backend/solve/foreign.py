@@ -1,0 +1,430 @@
+"""Cameras from elsewhere: a COLMAP model, a nerfstudio transforms.json, or a CameraPath, matched to a shot's frames.
+
+Whatever the file holds comes out as world-to-camera poses with OpenCV axes, and as lenses of four kinds with COLMAP's
+parameters: PINHOLE, OPENCV, FULL_OPENCV, OPENCV_FISHEYE. No pycolmap and no pictures: files in, plain values out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contract import CameraPath, ExitCode, JobError, read_json
+from ..footage.sources import frame_words
+from .colmap_files import ColmapModel, model_files, read_model
+from .poses import camera_centre
+
+LEAST_CAMERAS = 8
+LEAST_SHARE = 0.25
+"""Of the clip's frames: with fewer cameras than this, most of the path would be made up between them."""
+ASPECT_SLACK = 0.01
+"""Of the ratio of width to height: what rounding to whole pixels may change."""
+RIGID_SLACK = 1e-2
+"""How far the columns of a rotation may be from being perpendicular and of length 1."""
+MODEL_FOLDERS = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
+"""Where a COLMAP model is looked for below the folder that was named."""
+_ANGLE_POINTS = 2000
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How a camera takes the world to pixels."""
+
+    model: str
+    """PINHOLE, OPENCV, FULL_OPENCV or OPENCV_FISHEYE."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    params: tuple[float, ...]
+    """fx, fy, cx, cy in pixels, centres at +0.5, then the coefficients as COLMAP orders them."""
+
+    def scaled(self, width: int, height: int) -> Lens:
+        """The same lens for pictures of another size in pixels. Coefficients have no size."""
+        x, y = width / self.width, height / self.height
+        fx, fy, cx, cy, *bend = self.params
+        return Lens(self.model, width, height, (fx * x, fy * y, cx * x, cy * y, *bend))
+
+
+@dataclass
+class ForeignCamera:
+    """One camera of the file."""
+
+    name: str
+    """What the file calls its picture."""
+    pose: NDArray[np.float64]
+    """[3, 4] world-to-camera, OpenCV axes."""
+    lens: int
+    """Index into the solve's lenses."""
+    number: int | None = None
+    """Frame number, where the file gives one and not only a name."""
+
+
+@dataclass
+class ForeignSolve:
+    """What a file holds."""
+
+    path: Path
+    """The file, or the folder of the model."""
+    kind: str
+    """COLMAP model, transforms.json or camera path."""
+    lenses: list[Lens]
+    """In the size of the pictures that they were found from."""
+    cameras: list[ForeignCamera]
+    """In the file's order."""
+    points: dict[str, Any] | None = None
+    """xyz float64 [P, 3], rgb uint8 [P, 3], error float64 [P] px (negative: unknown), seen: P arrays of indices into
+    `cameras`, empty where unknown. None if the file holds no points."""
+
+
+@dataclass
+class Matched:
+    """The cameras of a solve that stand for frames of a clip."""
+
+    cameras: dict[int, ForeignCamera]
+    """By frame number."""
+    missing: list[int]
+    """Frame numbers without a camera."""
+    shift: int = 0
+    """What was added to the file's numbers."""
+
+
+# ------------------------------------------------------------------------------------------------- what there is
+
+
+def find(path: str | Path) -> tuple[str, list[Path]]:
+    """(kind, files) of what stands at a path: "colmap" or "json". JobError if there is nothing that can be read."""
+    path = Path(path)
+    if not path.exists():
+        raise _refusal(f"{path} does not exist.", "Name a COLMAP folder, a transforms.json or a camera path.")
+    if path.is_file():
+        if path.suffix.lower() == ".json":
+            return "json", [path]
+        path = path.parent  # one file of a model was chosen
+    for below in MODEL_FOLDERS:
+        files = model_files(path / below)
+        if files:
+            return "colmap", files
+    if (path / "transforms.json").is_file():
+        return "json", [path / "transforms.json"]
+    raise _refusal(
+        f"{path} holds no cameras: neither a COLMAP model (cameras and images, .bin or .txt, also in sparse/0) nor a "
+        "transforms.json.",
+        "Choose the folder of the model or the file.",
+    )
+
+
+def fingerprint(path: str | Path) -> str:
+    """Hash of what `find` finds: the same cameras need not be taken in twice. JobError as `find`."""
+    digest = hashlib.sha256()
+    for file in find(path)[1]:
+        digest.update(file.name.encode())
+        with open(file, "rb") as source:
+            while block := source.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def read(path: str | Path) -> ForeignSolve:
+    """Whatever stands at a path. JobError (SOLVE) in a sentence if it cannot be read or used."""
+    kind, files = find(path)
+    try:
+        if kind == "colmap":
+            return _from_colmap(files[0].parent)
+        data = read_json(files[0])
+        frames = data.get("frames")
+        if not isinstance(frames, list) or not frames or not isinstance(frames[0], dict):
+            raise ValueError(f"{files[0]} lists no frames")
+        return _from_path(files[0], data) if "viewmat" in frames[0] else _from_transforms(files[0], data)
+    except (ValueError, TypeError) as error:
+        raise _refusal(
+            f"These cameras cannot be used: {str(error).rstrip('.')}.", "Export them again, or solve here."
+        ) from error
+
+
+# ------------------------------------------------------------------------------------------------- the three kinds
+
+
+def _from_colmap(folder: Path) -> ForeignSolve:
+    model = read_model(folder)
+    numbers = {camera: n for n, camera in enumerate(model.cameras)}
+    lenses = [lens_from_colmap(c.model, c.width, c.height, c.params) for c in model.cameras.values()]
+    cameras = [ForeignCamera(i.name, i.pose, numbers[i.camera]) for i in model.images]
+    return ForeignSolve(folder, "COLMAP model", lenses, cameras, _colmap_points(model))
+
+
+def _colmap_points(model: ColmapModel) -> dict[str, Any] | None:
+    points = model.points
+    if not len(points.xyz):
+        return None
+    at = {image.number: n for n, image in enumerate(model.images)}
+    seen = [np.unique([at[i] for i in track.tolist() if i in at]).astype(np.int64) for track in points.tracks]
+    return {"xyz": points.xyz, "rgb": points.rgb, "error": points.error, "seen": seen}
+
+
+def lens_from_colmap(model: str, width: int, height: int, params: Sequence[float]) -> Lens:
+    """A COLMAP camera as one of the four kinds of lens. ValueError names a model that has no such form."""
+    p = tuple(map(float, params))
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
+        p = (p[0], *p)  # one focal length for both directions
+    bend = (*p[4:], 0.0, 0.0, 0.0, 0.0)[:4]
+    if model in ("SIMPLE_PINHOLE", "PINHOLE"):
+        return _lens("PINHOLE", width, height, p)
+    if model in ("SIMPLE_RADIAL", "RADIAL"):
+        return _lens("OPENCV", width, height, (*p[:4], *bend))
+    if model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
+        return _lens("OPENCV_FISHEYE", width, height, (*p[:4], *bend))
+    if model in ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"):
+        return _lens(model, width, height, p)
+    raise ValueError(f"the lens model {model} is not supported: pinhole, radial, OpenCV and OpenCV fisheye models are")
+
+
+def _lens(model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
+    if width < 1 or height < 1:
+        raise ValueError(f"a camera is of pictures of {width} x {height} pixels")
+    if not all(map(math.isfinite, params)) or params[0] <= 0 or params[1] <= 0:
+        raise ValueError("a focal length is not above 0, or a number of a lens is not finite")
+    if model != "OPENCV_FISHEYE" and not any(params[4:]):
+        return Lens("PINHOLE", width, height, params[:4])
+    return Lens(model, width, height, params)
+
+
+def _from_path(file: Path, data: dict[str, Any]) -> ForeignSolve:
+    path = CameraPath.from_json(data)
+    lenses: dict[Lens, int] = {}
+    cameras = []
+    for frame in path.frames:
+        lens = lenses.setdefault(_lens("PINHOLE", path.width, path.height, tuple(frame.K)), len(lenses))
+        pose = _rigid(np.reshape(frame.viewmat, (4, 4)), f"frame {frame.frame}")
+        cameras.append(ForeignCamera(f"frame {frame.frame}", pose, lens, frame.frame))
+    return ForeignSolve(file, "camera path", list(lenses), cameras)
+
+
+def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
+    """nerfstudio's format: camera-to-world, OpenGL axes; what a frame does not say of its lens stands at the top."""
+    lenses: dict[Lens, int] = {}
+    cameras = []
+    for n, frame in enumerate(data["frames"]):
+        name = frame.get("file_path")
+        matrix = np.array(frame.get("transform_matrix", []), np.float64)
+        if not isinstance(name, str) or matrix.shape not in ((4, 4), (3, 4)):
+            raise ValueError(f"frame {n} of {file} has no file_path or no transform_matrix of 4 x 4 numbers")
+        whole = np.eye(4)
+        whole[: len(matrix)] = matrix
+        turned = _rigid(whole, name) * [1.0, -1.0, -1.0, 1.0]  # OpenGL camera axes to OpenCV's
+        pose = np.concatenate([turned[:, :3].T, -(turned[:, :3].T @ turned[:, 3:])], axis=1)
+        lens = lenses.setdefault(_transforms_lens(file, {**data, **frame}), len(lenses))
+        cameras.append(ForeignCamera(name, pose, lens))
+    return ForeignSolve(file, "transforms.json", list(lenses), cameras)
+
+
+def _transforms_lens(file: Path, told: dict[str, Any]) -> Lens:
+    def number(name: str, otherwise: float | None = None) -> float:
+        value = told.get(name, otherwise)
+        if value is None or isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ValueError(f"{file} has no {name}, the lens cannot be told")
+        return float(value)
+
+    width, height = int(number("w")), int(number("h"))
+    if "fl_x" not in told and "camera_angle_x" in told:  # as instant-ngp writes it, radians
+        told = {**told, "fl_x": 0.5 * width / math.tan(0.5 * number("camera_angle_x"))}
+    fx = number("fl_x")
+    pinhole = (fx, number("fl_y", fx), number("cx", 0.5 * width), number("cy", 0.5 * height))
+    k1, k2, k3, k4, p1, p2 = (number(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = str(told.get("camera_model", "OPENCV"))
+    if model == "OPENCV_FISHEYE":
+        return _lens(model, width, height, (*pinhole, k1, k2, k3, k4))
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"):
+        raise ValueError(f"the camera_model {model} of {file} is not supported: OPENCV and OPENCV_FISHEYE are")
+    if k4:
+        raise ValueError(f"{file} has a k4 in a lens that is no fisheye, which is not supported")
+    if k3:
+        return _lens("FULL_OPENCV", width, height, (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    return _lens("OPENCV", width, height, (*pinhole, k1, k2, p1, p2))
+
+
+def _rigid(matrix: NDArray, name: str) -> NDArray[np.float64]:
+    """[3, 4] of a rigid [4, 4]: the rotation nearest to its own, which a file may have rounded."""
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"the camera of {name} is not finite")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_SLACK or np.linalg.det(rotation) < 0:
+        raise ValueError(f"the camera of {name} is no rotation and position: it is scaled, sheared or mirrored")
+    u, _, vt = np.linalg.svd(rotation)
+    return np.concatenate([u @ vt, matrix[:3, 3:]], axis=1)
+
+
+# ------------------------------------------------------------------------------------------------- to the clip
+
+
+def frame_numbers(names: Sequence[str]) -> list[int | None]:
+    """The frame number in each file name; None where it has no digits.
+
+    The last digits of the name before its ending (shot.0012.png, frame_00012.jpg); if those do not tell the names
+    apart (frame_0012_v2.png), the ones before them. ValueError if none do.
+    """
+    stems = [Path(name.replace("\\", "/")).stem for name in names]
+    if all(re.fullmatch(r"-?\d+", stem) for stem in stems):
+        plain = [int(stem) for stem in stems]
+        if len(set(plain)) == len(plain):
+            return list(plain)
+    runs = [re.findall(r"\d+", stem) for stem in stems]
+    first: list[int | None] | None = None
+    for place in range(1, max(map(len, runs), default=0) + 1):
+        numbers = [int(run[-place]) if len(run) >= place else None for run in runs]
+        told = [n for n in numbers if n is not None]
+        if told and len(set(told)) == len(told):
+            return numbers
+        first = first or numbers
+    if first is None:
+        return [None] * len(names)
+    told = [n for n in first if n is not None]
+    twice = next(n for n in told if told.count(n) > 1)
+    both = [name for name, n in zip(names, first, strict=True) if n == twice]
+    raise ValueError(f"{both[0]} and {both[1]} have the same frame number {twice}")
+
+
+def match(
+    solve: ForeignSolve, frames: Sequence[int], size: tuple[int, int], solved: Sequence[int] | None = None
+) -> Matched:
+    """Finds the camera of each frame by its number.
+
+    A file that holds as many pictures as the clip has frames, counted from 0 or 1, is taken in order.
+
+    Args:
+        solve: what was read.
+        frames: frame numbers of the clip, ascending.
+        size: width and height of the working frames in pixels.
+        solved: of `frames`, those that are trained on; None: all.
+
+    Raises:
+        JobError: too few of these have a camera, or the pictures had another shape.
+    """
+    numbers = [c.number for c in solve.cameras]
+    if None in numbers:
+        try:
+            numbers = frame_numbers([c.name for c in solve.cameras])
+        except ValueError as error:
+            raise _refusal(
+                f"The cameras cannot be told apart by frame: {error}.", "Use a solve of this one clip alone."
+            ) from error
+    table = {n: camera for n, camera in zip(numbers, solve.cameras, strict=True) if n is not None}
+    shift = 0
+    if table and solve.kind != "camera path" and len(table) == len(frames) and min(table) in (0, 1):
+        step = frames[0] - min(table)
+        if sorted(n + step for n in table) == list(frames):
+            shift = step
+    wanted = set(frames)
+    cameras = {n + shift: camera for n, camera in table.items() if n + shift in wanted}
+    missing = [n for n in frames if n not in cameras]
+    needed = list(frames if solved is None else solved)
+    found = sum(n in cameras for n in needed)
+    if found < min(LEAST_CAMERAS, len(needed)) or found < LEAST_SHARE * len(needed):
+        held = f"its pictures are numbered {min(table)} to {max(table)}" if table else "its pictures have no numbers"
+        raise _refusal(
+            f"Only {found} of the {len(needed)} frames needed, from {frames[0]} to {frames[-1]}, have a camera in "
+            f"{solve.path.name or solve.path}: {held}.",
+            "Pictures are matched by the frame number in their names: name them as the clip counts.",
+        )
+    for lens in (solve.lenses[n] for n in sorted({c.lens for c in cameras.values()})):
+        ratio = (lens.width / lens.height) / (size[0] / size[1])
+        if abs(ratio - 1.0) > ASPECT_SLACK:
+            raise _refusal(
+                f"The cameras are of pictures of {lens.width} x {lens.height} pixels, the shot's frames have another "
+                f"shape, {size[0]} x {size[1]}.",
+                "Use cameras of the same, uncropped clip.",
+            )
+    return Matched(cameras, missing, shift)
+
+
+def remarks(solve: ForeignSolve, matched: Matched) -> list[tuple[str, str]]:
+    """(sentence, hint) of what the artist should know about the matching."""
+    told = []
+    if matched.shift:
+        first = min(matched.cameras)
+        told.append(
+            (
+                f"The cameras' pictures are numbered from {first - matched.shift}, the clip's frames from {first}: "
+                "they were taken in order.",
+                "",
+            )
+        )
+    if matched.missing:
+        told.append(
+            (
+                f"{len(matched.missing)} frames have no camera in {solve.path.name}: {frame_words(matched.missing)}.",
+                "Their cameras are placed between their neighbours'.",
+            )
+        )
+    return told
+
+
+def own_points(solve: ForeignSolve, matched: Matched, size: tuple[int, int]) -> dict[str, NDArray] | None:
+    """The solve's own points as points.npz has them before filtering, and the angle under which they are seen.
+
+    Returns xyz float32 [P, 3], rgb uint8 [P, 3], error float32 [P] px of the working frames (0 where unknown), track
+    uint16 [P] (cameras of the clip that see it; where the file does not tell, those whose picture it lies in), depth
+    float32 [P] (the least over those), and angle float64 [] (median of the widest angle, degrees). None without any.
+    """
+    if solve.points is None:
+        return None
+    chosen = list(matched.cameras.values())
+    indices = {id(camera): n for n, camera in enumerate(solve.cameras)}
+    row_of = {indices[id(camera)]: n for n, camera in enumerate(chosen)}
+    xyz = solve.points["xyz"]
+    poses = np.array([camera.pose for camera in chosen])
+    lenses = [solve.lenses[c.lens] for c in chosen]
+    pictures = np.array([[*lens.params[:4], lens.width, lens.height] for lens in lenses])
+    told = any(len(seen) for seen in solve.points["seen"])
+    track, depth, sight = np.zeros(len(xyz)), np.full(len(xyz), -np.inf), []
+    for n, seen in enumerate(solve.points["seen"]):
+        at = poses[:, :, :3] @ xyz[n] + poses[:, :, 3]
+        if told:
+            rows = np.array([row_of[i] for i in seen.tolist() if i in row_of], np.int64)
+        else:
+            rows = _in_picture(at, pictures)
+        track[n] = len(rows)
+        depth[n] = at[rows, 2].min() if len(rows) else -np.inf
+        sight.append(rows)
+    scale = size[0] / solve.lenses[0].width
+    return {
+        "xyz": xyz.astype(np.float32),
+        "rgb": solve.points["rgb"],
+        "error": (np.maximum(np.nan_to_num(solve.points["error"], nan=0.0), 0.0) * scale).astype(np.float32),
+        "track": np.minimum(track, 65535).astype(np.uint16),
+        "depth": depth.astype(np.float32),
+        "angle": np.array(_angle(xyz, poses, sight)),
+    }
+
+
+def _in_picture(at: NDArray, pictures: NDArray) -> NDArray[np.int64]:
+    """Rows of the cameras whose picture, straightened, a point lies in: the point in camera axes [C, 3]; `pictures`
+    [C, 6] fx, fy, cx, cy, width, height."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = pictures[:, :2] * at[:, :2] / at[:, 2:] + pictures[:, 2:4]
+    return np.flatnonzero((at[:, 2] > 0) & ((pixels >= 0) & (pixels < pictures[:, 4:])).all(axis=1))
+
+
+def _angle(xyz: NDArray, poses: NDArray, sight: list[NDArray[np.int64]]) -> float:
+    centres = np.array([camera_centre(pose) for pose in poses])
+    angles = []
+    for n in range(0, len(xyz), max(1, len(xyz) // _ANGLE_POINTS)):
+        rays = centres[sight[n]] - xyz[n]
+        lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+        if len(rays) < 2 or not (lengths > 0).all():
+            continue
+        rays = rays / lengths
+        angles.append(math.degrees(math.acos(float(np.clip((rays @ rays.T).min(), -1.0, 1.0)))))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def _refusal(message: str, hint: str) -> JobError:
+    return JobError(message, hint, ExitCode.SOLVE)

@@ -1,0 +1,39 @@
+"""Which sparse points are worth training from, and when a solve tells too little of depth."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contract import ExitCode, JobError
+
+LEAST_ANGLE_DEG = 2.0
+LEAST_POINTS = 100
+POINT_MAX_ERROR_PX = 2.0
+POINT_LEAST_TRACK = 3
+POINT_FARTHEST = 20.0
+
+STILL_HINT = "A freeze needs a clip in which the camera moves sideways by a step or more."
+
+
+def filter_points(points: dict[str, NDArray], centres: NDArray) -> dict[str, NDArray]:
+    """The points to train from: error below 2 px, seen by 3 frames or more, before all cameras, no far outliers.
+
+    `points` holds xyz [P, 3], rgb, error, track and depth [P] (the least over its cameras); `centres` [C, 3] are the
+    cameras. Far means 20 times the median distance to the cameras' middle: points of distant windows are kept.
+    """
+    distance = np.linalg.norm(points["xyz"] - np.median(centres, axis=0), axis=1)
+    keep = (points["error"] < POINT_MAX_ERROR_PX) & (points["track"] >= POINT_LEAST_TRACK) & (points["depth"] > 0)
+    keep &= np.isfinite(points["xyz"]).all(axis=1)
+    if keep.any():
+        keep &= distance < POINT_FARTHEST * np.median(distance[keep])
+    return {name: points[name][keep] for name in ("xyz", "rgb", "error", "track")}
+
+
+def refuse_narrow(angle_deg: float) -> None:
+    """JobError if the points are seen under too small an angle (median, degrees) for depth."""
+    if angle_deg < LEAST_ANGLE_DEG:
+        message = (
+            f"The camera moves too little for depth: half of the points are seen under {angle_deg:.1f} degrees or less."
+        )
+        raise JobError(message, STILL_HINT, ExitCode.SOLVE)
