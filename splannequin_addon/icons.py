@@ -11,6 +11,7 @@ OF = {
     "splannequin.cancel_setup": "CANCEL",
     "splannequin.check_backend": "VIEWZOOM",
     "splannequin.combine_cg": "MESH_CUBE",
+    "splannequin.export_cameras": "EXPORT",
     "splannequin.freeze": "FREEZE",
     "splannequin.import_clip": "IMPORT",
     "splannequin.insert_freeze": "NODE_COMPOSITING",

@@ -11,6 +11,7 @@ from bpy.props import EnumProperty, StringProperty
 
 from ..torch_backend import contract
 from . import solves, steps, supervisor
+from .translations import tr
 
 FORMATS = [
     ("colmap", "COLMAP", "Cameras, images and points3D as .bin, of the plates in the shot's folder frames"),
@@ -26,8 +27,12 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
     bl_label = "Export Cameras"
     bl_options = {"REGISTER"}
 
-    directory: StringProperty(name="Folder", subtype="DIR_PATH", options={"SKIP_SAVE"})
-    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    directory: StringProperty(
+        name="Folder", description="Folder to write into", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
+    filter_folder: bpy.props.BoolProperty(
+        name="Folders", description="Show folders", default=True, options={"HIDDEN", "SKIP_SAVE"}
+    )
     format: EnumProperty(name="Format", description="What to write", items=FORMATS)
 
     @classmethod
@@ -36,7 +41,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
         folder = steps.shot_folder(context.scene)
         state = supervisor.watch_of(folder).state if folder else None
         if state is None or not state.solve:
-            cls.poll_message_set("Solve the camera first")
+            cls.poll_message_set(tr("Solve the camera first"))
             return False
         return True
 

@@ -28,15 +28,17 @@ def two(addon, scene, shot, other):
     return scene
 
 
-def test_settings_are_put_away_and_come_back(addon, scene, shot, other):
+def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     props, steps, shot_list = scene.splannequin, addon("steps"), addon("shot_list")
     assert not bpy.ops.splannequin.shot_add.poll(), "there is no first shot yet"
     props.shot_path, props.clip = str(shot), "//first.mov"
     own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
     scene.collection.objects.link(own)
+    tracked = bpy.data.movieclips.load(str(clip))
     values = {"run_name": "b", "preset": "final", "use_range": True, "first": 3, "last": 9, "t_star": 6}
     values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
     values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
+    values |= {"cameras_from": "FILE", "cameras_path": "//model", "tracking_clip": tracked}
     for name, value in values.items():
         setattr(props, name, value)
     assert set(shot_list.names()) == {*values, "clip", "shot_path"}, "a setting that is not tested here"
