@@ -205,6 +205,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         camera_path=args.camera_path,
         query=args.freeze_query,
         width=args.freeze_width,
+        grain=not args.no_grain,
         only_missing=True,
         device=args.device,
     )
@@ -317,6 +318,7 @@ def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--camera-path", default="", help="JSON camera path to render from (default: the clip's poses)")
     to.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"))
     to.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
+    to.add_argument("--no-grain", action="store_true", help="leave the plate's grain out of the files: a third smaller")
 
 
 def _add_device_flag(to: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""A cube put by hand among the frozen people: rendered through the compositor, checked pixel by pixel, kept as a picture.
+"""A cube put by hand among the frozen people: rendered through the compositor, checked by pixels, kept as a picture.
 
     SPLANNEQUIN_BACKEND_PYTHON=.venv/bin/python .venv-bpy-5.0/bin/python tests/addon/window/cube.py SHOT.splannequin
 
