@@ -250,6 +250,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         query=args.freeze_query,
         width=args.freeze_width,
         overscan=args.overscan,
+        grain=not args.no_grain,
         only_missing=True,
         device=args.device,
     )
@@ -380,6 +381,7 @@ def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
         "--overscan", type=contract.overscan, default=0.0, metavar="PERCENT",
         help="picture beyond the frame on every side, or `lens`: what the way back through the lens needs",
     )  # fmt: skip
+    to.add_argument("--no-grain", action="store_true", help="leave the plate's grain out of the files: a third smaller")
 
 
 def _add_device_flag(to: argparse.ArgumentParser) -> None:

@@ -99,7 +99,11 @@ def measure(frames: Sequence[NDArray]) -> Grain:
                     max(0.0, (np.median(chosen) / _median_ratio(softness) - step**2 / 12.0) / share)
                 )
     curve = _whole_curve(deviation)
-    return Grain(curve, softness, _agreement(residual, flat.all(axis=1))) if curve.any() else Grain.none()
+    return (
+        Grain(curve, softness, _agreement(residual, flat[:, 0] & flat[:, 1] & flat[:, 2]))
+        if curve.any()
+        else Grain.none()
+    )
 
 
 def draw(grain: Grain, frame: int, rgba: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
@@ -133,8 +137,8 @@ def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float3
     reach = len(kernel) // 2
     generator = np.random.default_rng(frame % 2**32)
     white = generator.standard_normal((height + 2 * reach, width + 2 * reach, 3), dtype=np.float32)
-    rows = sum(w * white[i : i + height] for i, w in enumerate(kernel))
-    soft = sum(w * rows[:, i : i + width] for i, w in enumerate(kernel))
+    rows = np.sum([w * white[i : i + height] for i, w in enumerate(kernel)], axis=0)
+    soft = np.sum([w * rows[:, i : i + width] for i, w in enumerate(kernel)], axis=0)
     values, axes = np.linalg.eigh(grain.correlation.astype(np.float64))
     root = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T
     return np.asarray(soft @ root.astype(np.float32), np.float32)
@@ -186,7 +190,8 @@ def _blocks(frame: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32], N
     blocks = values.reshape(rows, _BLOCK, columns, _BLOCK, 3).transpose(0, 2, 4, 1, 3).reshape(-1, 3, _BLOCK**2)
     basis = _basis().astype(np.float32)
     clipped = ((blocks < _CLIPPED) | (blocks > 1.0 - _CLIPPED)).mean(axis=2)
-    return blocks - (blocks @ basis) @ basis.T, blocks.mean(axis=2), clipped < 0.02
+    residual = np.asarray(blocks - (blocks @ basis) @ basis.T, np.float32)
+    return residual, blocks.mean(axis=2), clipped < 0.02
 
 
 @functools.lru_cache(maxsize=64)
