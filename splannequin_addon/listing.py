@@ -12,7 +12,7 @@ from typing import Any
 from . import shots
 
 _RUN_HEAD = ("Run", "dB", "Size", "Move", "Time")
-_RUN_WIDTHS = (0.27, 0.2, 0.18, 0.18, 0.17)  # a sidebar of Blender's own width shows all of it
+_RUN_WIDTHS = (0.24, 0.19, 0.18, 0.23, 0.16)  # a sidebar of Blender's own width shows all of it
 _TAKE_HEAD = ("Take", "t*", "Frames", "Run")
 _TAKE_WIDTHS = (0.3, 0.18, 0.24, 0.28)
 
