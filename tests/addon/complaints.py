@@ -172,6 +172,22 @@ ANSWERS = (
         f"{TEST}jobs.py::test_a_killed_child_leaves_a_status_that_says_so",
     ),
     Answer(
+        10,
+        "added steps have a file of their own until they are done",
+        "torch_backend/train/extend.py",
+        'EXTENSION_FILE = "extension.safetensors"',
+        'EXTENSION_FILE = "checkpoint.safetensors"',
+        "tests/backend/train/test_extend.py::test_the_finished_run_stays_until_the_last_added_step",
+    ),
+    Answer(
+        10,
+        "interrupted steps are gone on with",
+        "torch_backend/train/extend.py",
+        "    return last if begun_on == ",
+        "    return None if begun_on == ",
+        "tests/backend/train/test_extend.py::test_an_interrupted_extension_ends_exactly_where_an_unbroken_one_does",
+    ),
+    Answer(
         11,
         "the environment's path is short",
         f"{ADDON}environment.py",
