@@ -40,6 +40,9 @@ class GateConfig:
     """...or changes its colour by this (display-referred, 0 to 1)..."""
     opacity: float = 0.05
     """...or its opacity by this."""
+    noise: float = 4.0
+    """Nor does it stay open with less than this many times the change of the quarter that changes least: where cameras
+    are solved, everything seems to move a little, and what holds still tells how much."""
     max_share: float = 0.5
     """Most Gaussians that stay open; what moves most goes first."""
     neighbours: int = 8
@@ -89,7 +92,7 @@ def stays_open(model: Gaussians, rows: Tensor, change: Tensor, config: GateConfi
     nearest = KDTree(means).query(means, k=config.neighbours + 1)[1].reshape(len(rows), -1)
     nearest = torch.from_numpy(np.ascontiguousarray(nearest)).to(rows.device)
     smooth = change[nearest].median(1).values
-    stays = smooth > 1.0
+    stays = smooth > max(1.0, config.noise * float(change.quantile(0.25)))
     room = int(config.max_share * len(model))
     if int(stays.sum()) > room:
         kept = torch.where(stays, smooth, -torch.inf).topk(room).indices
