@@ -32,6 +32,9 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.parse
+import urllib.request
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
@@ -290,7 +293,10 @@ def _make(environment: Environment, python: str) -> None:
     pip += ["--no-deps"] if environment.complete else []
     index = os.environ.get("SPLANNEQUIN_TORCH_INDEX")
     if index and environment.requirements[0] == "backend.txt":
-        pip += ["--extra-index-url", index]
+        if _reachable(index):
+            pip += ["--extra-index-url", index]
+        else:  # pip would ask it in vain for every single package, minutes in all
+            say(f"{index} cannot be reached: torch comes from the usual index")
     for name in environment.requirements:
         pip += ["-r", str(REQUIREMENTS / name)]
     _step(environment, "installing packages", pip, condense_pip)
@@ -335,6 +341,17 @@ for package in importlib.metadata.distributions():
         shutil.rmtree(folder)
 """
 """pip writes a package's RECORD last: without one the package is not all there, and pip must not believe it is."""
+
+
+def _reachable(index: str) -> bool:
+    """True if a package index answers about torch within ten seconds; a folder (file:) does if it is there."""
+    try:
+        with urllib.request.urlopen(f"{index.rstrip('/')}/torch/", timeout=10.0):  # noqa: S310  (the user's own)
+            return True
+    except urllib.error.HTTPError:
+        return True  # it answers: pip tells what is wrong
+    except (OSError, ValueError):
+        return urllib.parse.urlsplit(index).scheme == "file"
 
 
 def _step(

@@ -151,3 +151,9 @@ def test_every_requirement_is_pinned_exactly():
     for path in splannequin.REQUIREMENTS.glob("*.txt"):
         for line in path.read_text().splitlines():
             assert not line.strip() or line.startswith(("#", "-c ")) or line.count("==") == 1, f"{path.name}: {line}"
+
+
+def test_an_index_that_does_not_answer_is_not_asked_for_every_package(tmp_path: Path):
+    assert splannequin._reachable(tmp_path.as_uri())
+    assert not splannequin._reachable("https://packages.invalid/whl/cpu")
+    assert not splannequin._reachable("http://127.0.0.1:9/simple")
