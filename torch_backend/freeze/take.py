@@ -269,7 +269,7 @@ def _render_all(
             )
         exposed_at = scene.time_of_frame(output.exposed_like)
         K = output.K.clone()
-        K[:2, 2] += torch.tensor(look.beyond, dtype=K.dtype)  # the same camera, with more pixels around
+        K[:2, 2] += torch.tensor(look.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
         image = render_frozen(frozen, output.viewmat, K, *look.whole, run.model.exposure, exposed_at)
         _write_frame(folder, output, image, scene, look, keys[output.frame])
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
