@@ -247,7 +247,7 @@ def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
     wanted = f"bpy.ops.{operator}("
     for _ in range(6):
         area, region = _place(window, kind)
-        shares = (0.8,) if operator.endswith(".cancel") else (0.33, 0.78, 0.83, 0.88)  # small ones stand at the right
+        shares = (0.8,) if operator.endswith(".cancel") else (0.33, 0.745, 0.85)  # small ones stand at the right
         rows = range(region.y + region.height - 8, region.y + 4, -9)
         for x, y in ((region.x + int(region.width * share), y) for share in shares for y in rows):
             _move(window, x + (y % 2), y)
