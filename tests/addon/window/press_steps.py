@@ -28,7 +28,8 @@ STEPS = (
     ("4-freeze", "splannequin.freeze"),
     ("5-bake", "splannequin.bake"),
 )
-WINDOW = (1600, 1000)
+WINDOW = tuple(int(n) for n in os.environ.get("SPLANNEQUIN_WINDOW", "1600x1000").split("x"))
+"""Pixels; another size is measured with SPLANNEQUIN_WINDOW=960x600, say."""
 PLAN = "SPLANNEQUIN_PRESS_PLAN"
 """Environment variable: JSON of what the script inside Blender shall do."""
 
