@@ -153,6 +153,7 @@ def remove(scene: Any) -> bool:
         if sources:
             tree.links.new(sources[0], target)
     images = [n.image for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image]
+    textures = [n.texture for n in group.nodes if n.bl_idname == "CompositorNodeTexture" and n.texture]
     tree.nodes.remove(node)
     if group.users == 0:  # another scene may show it
         bpy.data.node_groups.remove(group)
@@ -165,6 +166,9 @@ def remove(scene: Any) -> bool:
     for image in {i.name: i for i in images}.values():
         if image.users == 0:
             bpy.data.images.remove(image)
+    for texture in textures:
+        if texture.users == 0:
+            bpy.data.textures.remove(texture)
     return True
 
 
@@ -411,18 +415,9 @@ def _among(group: Any, enter: Any, frozen: Any, depth: Any) -> Any:
 
 def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     """Socket of how much of the frozen frame shows: Mix, left of Wipe, and where the mattes let it."""
-    ramp = group.nodes.new("CompositorNodeImage")
-    ramp.image = _ramp()
-    ramp.label = "From left to right"
-    wide = compat.new_fit_node(group, "Stretch")
-    group.links.new(ramp.outputs["Image"], wide.inputs[0])
-    # A scaled picture fades out over its last pixels: those of the ramp lie outside of the frame.
-    larger = group.nodes.new("CompositorNodeScale")
-    larger.inputs["X"].default_value = larger.inputs["Y"].default_value = _BEYOND
-    group.links.new(wide.outputs[0], larger.inputs[0])
     left = compat.new_math_node(group, "LESS_THAN")
     left.label = "Left of the wipe"
-    group.links.new(larger.outputs[0], left.inputs[0])
+    group.links.new(_across(group), left.inputs[0])
     group.links.new(enter.outputs["Wipe"], left.inputs[1])
     total = _product(group, enter.outputs["Mix"], left.outputs[0])
     for row, (name, layer) in enumerate((("Only Supported", "Support"), ("Only Moving", "Motion"))):
@@ -436,8 +431,29 @@ def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
         group.links.new(taken, kept.inputs[1])
         total = _product(group, total, kept.outputs[0])
         lacking.location, kept.location = (-2 * _GAP, 500.0 + 170.0 * row), (-_GAP, 500.0 + 170.0 * row)
-    ramp.location, wide.location, left.location = (-3 * _GAP, 330.0), (-2 * _GAP, 330.0), (-_GAP, 330.0)
+    left.location = (-_GAP, 330.0)
     return total
+
+
+def _across(group: Any) -> Any:
+    """Socket of a value that rises from 0 at the frame's left to 1 at its right."""
+    if compat.HAS_TEXTURE_NODE:
+        node = group.nodes.new("CompositorNodeTexture")
+        node.texture = _blend()
+        node.label = "From left to right"
+        node.location = (-2 * _GAP, 330.0)
+        return node.outputs["Value"]
+    ramp = group.nodes.new("CompositorNodeImage")
+    ramp.image = _ramp()
+    ramp.label = "From left to right"
+    wide = compat.new_fit_node(group, "Stretch")
+    group.links.new(ramp.outputs["Image"], wide.inputs[0])
+    # A scaled picture fades out over its last pixels: those of the ramp lie outside of the frame.
+    larger = group.nodes.new("CompositorNodeScale")
+    larger.inputs["X"].default_value = larger.inputs["Y"].default_value = _BEYOND
+    group.links.new(wide.outputs[0], larger.inputs[0])
+    ramp.location, wide.location = (-3 * _GAP, 330.0), (-2 * _GAP, 330.0)
+    return larger.outputs[0]
 
 
 def _product(group: Any, one: Any, other: Any) -> Any:
@@ -454,8 +470,17 @@ _BEYOND = 1.1
 """How much larger than the frame the ramp is shown."""
 
 
+def _blend() -> Any:
+    """A texture that rises from left to right. A scaled picture would do, but 4.3 leaves its lowest row unset."""
+    texture = next((t for t in bpy.data.textures if t.get(_TAG) and t.type == "BLEND"), None)
+    if texture is None:
+        texture = bpy.data.textures.new(_RAMP, "BLEND")
+        texture[_TAG] = True
+    return texture
+
+
 def _ramp() -> Any:
-    """A picture that rises from 0 at the frame's left to 1 at its right: nodes before 5.0 know no coordinates."""
+    """A picture that rises from 0 at the frame's left to 1 at its right: 5.0 has no node that does."""
     image = next((i for i in bpy.data.images if i.get(_TAG) and i.name.startswith(_RAMP)), None)
     if image is not None:
         return image

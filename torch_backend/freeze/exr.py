@@ -26,7 +26,7 @@ from ..shot import atomic_path
 
 CHANNELS = ("R", "G", "B", "A", "Z", "Support.V", "Motion.V")
 """Channel names in the order of the arrays: colour, depth, support matte, motion matte."""
-GRAIN_CHANNELS = ("Grain.R", "Grain.G", "Grain.B")
+GRAIN_CHANNELS = ("Grain.R", "Grain.G", "Grain.B", "Grain.A")
 """Channel names of the grain, which a frame may lack."""
 BLENDER_SOCKETS = ("Combined", "Alpha", "Depth", "Motion", "Support")
 """Outputs of Blender's compositor Image node for such a file, 4.2 to 5.2."""
@@ -158,7 +158,7 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
     beyond = (spec.full_x - spec.x, spec.full_y - spec.y)
     grain = None
     if all(name in names for name in GRAIN_CHANNELS):
-        grain = np.ascontiguousarray(pixels[..., [names.index(name) for name in GRAIN_CHANNELS]])
+        grain = np.ascontiguousarray(pixels[..., [names.index(name) for name in GRAIN_CHANNELS[:3]]])
     return FrozenFrame(np.ascontiguousarray(pixels[..., order[:4]]), depth, support, motion, metadata, beyond, grain)
 
 
@@ -175,14 +175,15 @@ def read_key(path: str | Path) -> str | None:
 
 
 def _coarse(grain: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Grain [H,W,3], checked, as half floats whose eight lowest bits are 0."""
+    """Grain [H,W,3], checked, as half floats whose eight lowest bits are 0, and an alpha of 0: [H,W,4]."""
     half = np.asarray(grain, dtype=np.float32).astype(np.float16)
     if half.shape != (*shape, 3):
         raise ValueError(f"grain should be {[*shape, 3]} like rgba, got shape {list(half.shape)}")
     if not np.isfinite(half).all():
         raise ValueError("grain has NaN or infinite values")
     # Rounded to the nearest: cut off, it would lose a tenth of its strength.
-    return ((half.view(np.uint16) + np.uint16(0x80)) & np.uint16(0xFF00)).view(np.float16).astype(np.float32)
+    half = ((half.view(np.uint16) + np.uint16(0x80)) & np.uint16(0xFF00)).view(np.float16)
+    return np.concatenate([half, np.zeros((*shape, 1), np.float16)], axis=2).astype(np.float32)
 
 
 def _stack(rgba: ArrayLike, depth: ArrayLike, support: ArrayLike, motion: ArrayLike) -> NDArray[np.float32]:
