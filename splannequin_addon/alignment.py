@@ -6,6 +6,8 @@ a turn, a shift or one factor for all axes. None of them can make a uniform scal
 
 from __future__ import annotations
 
+import random
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -114,13 +116,13 @@ def floor(points: NDArray, centres: NDArray, ups: NDArray) -> tuple[NDArray[np.f
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < LEAST_POINTS or not len(centres):
         return None
-    generator = np.random.default_rng(0)
+    chance = random.Random(0)  # noqa: S311  (numpy's would be imported here, which keeps Blender waiting)
     if len(points) > _ALL:
-        points = points[generator.permutation(len(points))[:_ALL]]
+        points = points[chance.sample(range(len(points)), _ALL)]
     centres, up = np.asarray(centres, dtype=np.float64), unit(np.asarray(ups, dtype=np.float64).mean(axis=0))
     away = points - np.median(centres, axis=0)
     near = NEAR * float(np.median(np.sqrt((away * away).sum(axis=1))))
-    corners = points[generator.integers(0, len(points), (_TRIES, 3))]
+    corners = points[np.reshape(chance.choices(range(len(points)), k=3 * _TRIES), (_TRIES, 3))]
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     facing = normals @ up
     normals *= np.where(facing < 0, -1.0, 1.0)[:, None]
@@ -128,7 +130,7 @@ def floor(points: NDArray, centres: NDArray, ups: NDArray) -> tuple[NDArray[np.f
     keep = np.abs(facing) > np.cos(np.radians(TILT_DEGREES))
     keep[keep] &= (centres @ normals[keep].T - heights[keep]).min(axis=0) > near
     normals, heights = normals[keep], heights[keep]
-    few = points[generator.permutation(len(points))[:_LOOKED_AT]]
+    few = points[chance.sample(range(len(points)), min(_LOOKED_AT, len(points)))]
     # A sample is judged with some leave: chance adds to either share.
     score = _judged(few, normals, heights, near, BIG / 2, 2 * BELOW)
     first = np.argsort(-score, kind="stable")[:_FINAL]

@@ -64,6 +64,8 @@ class Watch:
     """(sentence, hint) of what failed on Blender's side, by the step's name."""
     rendered: tuple[int, int] | None = None
     """(frames done, frames in all) of a render that runs."""
+    to_render: str = ""
+    """Name of the scene whose render begins with the next turn."""
     sampling: Sampling | None = None
     """An artist's camera that is being read, before its take is asked for."""
     pending: dict[str, jobs.Job] = field(default_factory=dict)
@@ -188,6 +190,9 @@ def _turn(watch: Watch, until: float) -> bool:
     for scene in steps.scenes_of(watch.shot):
         changed |= markers.follow(scene)
         made.tidy(scene)
+    if watch.to_render:
+        _render(watch)
+        return True
     _read_on(watch)
     for step, job in list(watch.jobs.items()):
         if job.ended or time.monotonic() > until:
@@ -267,9 +272,22 @@ def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
                 if watch.notes[step] or before != scene.splannequin.t_star:
                     undo_step(step)
                 if step == "bake":
-                    bpy.ops.splannequin.render("INVOKE_DEFAULT")
+                    watch.to_render = scene.name
         except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
             watch.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
+
+
+def _render(watch: Watch) -> None:
+    """Starts the render of a bake: a turn after the compositor was changed, since Blender takes its time for both."""
+    name, watch.to_render = watch.to_render, ""
+    window = next((w for w in bpy.context.window_manager.windows if w.scene.name == name), None)
+    if window is None:
+        return
+    try:
+        with bpy.context.temp_override(window=window, scene=window.scene):
+            bpy.ops.splannequin.render("INVOKE_DEFAULT")
+    except RuntimeError as error:
+        watch.failures["bake"] = (str(error).strip(), "")
 
 
 def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
