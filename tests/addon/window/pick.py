@@ -8,12 +8,7 @@ mouse, two of three points picked, the question for the distance.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,49 +16,6 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import press_steps as press
-
-PLAN = "SPLANNEQUIN_PICK_PLAN"
-
-
-def main() -> int:
-    """The host's side: a display, Blender on it, photographs when asked for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--blender", required=True)
-    parser.add_argument("--shot", required=True, help="solved shot folder")
-    parser.add_argument("--output", default="docs/images")
-    parser.add_argument("--display", default=":96")
-    parser.add_argument("--limit", type=float, default=200.0)
-    args = parser.parse_args()
-    output = Path(args.output).absolute()
-    output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="splannequin-pick-") as work:
-        environ = {**os.environ, "DISPLAY": args.display}
-        environ[PLAN] = json.dumps({"shot": str(Path(args.shot).absolute()), "work": work})
-        with press.screen(args.display):
-            blender = subprocess.Popen(press.command(args.blender, __file__), env=environ)
-            press._serve(blender, Path(work), output, environ, args.limit)
-        told = Path(work) / "told.json"
-        if not told.is_file():
-            print("Error: Blender ended without telling how it went.", file=sys.stderr)
-            return 1
-        results = json.loads(told.read_text())
-        print(json.dumps(results, indent=1))
-        return 1 if "error" in results else 0
-
-
-# ------------------------------------------------------------------------------------------------- inside Blender
-
-
-def inside() -> None:
-    """Starts the script as a timer that walks through `_play`."""
-    import bpy
-
-    plan, told = json.loads(os.environ[PLAN]), {"blender": bpy.app.version_string}
-    press.act(_play(plan, told), Path(plan["work"]), told)
-
-
-def _module(name: str) -> Any:
-    return next(m for n, m in sys.modules.items() if n.endswith(f".splannequin_addon.{name}"))
 
 
 class _Artist:
@@ -143,7 +95,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
         return scene.splannequin.made[0].points.matrix_world @ picks[n]
 
     def free() -> bool:
-        return _module("ops_align").picking() is None
+        return press.addon_module("ops_align").picking() is None
 
     stood = cloud.matrix_world.copy()
     artist.invoke("align_origin")
@@ -164,7 +116,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
         yield from artist.press("LEFTMOUSE", *artist.at(world(n)))
         if n == 2:
             yield from artist.press("BACK_SPACE", *artist.at(world(n)))
-            told["backspace"] = len(_module("ops_align").picking().picked) == 1
+            told["backspace"] = len(press.addon_module("ops_align").picking().picked) == 1
             yield from artist.press("LEFTMOUSE", *artist.at(world(n)))
             yield from press._shoot(work, "10-two-of-three")
     told["floor"] = free() and max(abs(world(n).z) for n in (1, 2, 3)) < 1e-4
@@ -190,7 +142,6 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 if __name__ == "__main__":
-    if PLAN in os.environ and "bpy" in sys.modules:
-        inside()
-    else:
-        sys.exit(main())
+    status = press.on_a_shot(__file__, __doc__ or "", _play, "solved shot folder", ":96")
+    if "bpy" not in sys.modules:
+        sys.exit(status)

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 STEPS = (
@@ -53,6 +53,58 @@ def main() -> int:
         results = json.loads(told.read_text())
         print(json.dumps(results, indent=1))
         return 0 if results["ended"] == [name for name, _ in STEPS] else 1
+
+
+def on_a_shot(
+    script: str,
+    text: str,
+    play: Callable[[dict, dict], Iterator[float]],
+    needs: str,
+    display: str,
+    good: Callable[[dict], bool] = lambda results: "error" not in results,
+) -> int:
+    """Both sides of a script that plays on one shot: the host's, or, within Blender, the start of `play(plan, told)`.
+
+    Args:
+        script: file of the script, which Blender runs.
+        text: what it does, for --help.
+        play: the artist; `plan` has the shot's folder and a work folder, what `told` holds is printed.
+        needs: what the shot needs, for --help.
+        display: X display to open.
+        good: whether what was told is a success.
+
+    Returns:
+        Exit status.
+    """
+    if PLAN in os.environ and "bpy" in sys.modules:
+        import bpy
+
+        plan = json.loads(os.environ[PLAN])
+        told = {"blender": bpy.app.version_string}
+        act(play(plan, told), Path(plan["work"]), told)
+        return 0
+    parser = argparse.ArgumentParser(description=text.partition("\n")[0])
+    parser.add_argument("--blender", required=True, help="Blender with the extension installed")
+    parser.add_argument("--shot", required=True, help=needs)
+    parser.add_argument("--output", default="docs/images", help="folder for the pictures")
+    parser.add_argument("--display", default=display, help="X display to open")
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds until Blender is ended")
+    args = parser.parse_args()
+    output = Path(args.output).absolute()
+    output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="splannequin-window-") as work:
+        plan = {"shot": str(Path(args.shot).absolute()), "work": work}
+        environ = {**os.environ, "DISPLAY": args.display, PLAN: json.dumps(plan)}
+        with screen(args.display):
+            blender = subprocess.Popen(command(args.blender, script), env=environ)
+            _serve(blender, Path(work), output, environ, args.limit)
+        told_file = Path(work) / "told.json"
+        if not told_file.is_file():
+            print("Error: Blender ended without telling how it went.", file=sys.stderr)
+            return 1
+        results = json.loads(told_file.read_text())
+    print(json.dumps(results, indent=1))
+    return 0 if good(results) else 1
 
 
 @contextlib.contextmanager
@@ -337,7 +389,12 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
 
 
 def _supervisor():
-    found = [m for n, m in sys.modules.items() if n.endswith(".splannequin.splannequin_addon.supervisor")]
+    return addon_module("supervisor")
+
+
+def addon_module(name: str):
+    """A module of the installed extension. RuntimeError if it is not enabled."""
+    found = [m for n, m in sys.modules.items() if n.endswith(f".splannequin.splannequin_addon.{name}")]
     if not found:
         raise RuntimeError("the extension is not enabled in this Blender")
     return found[0]

@@ -9,12 +9,7 @@ a free view with a cube among the people, the guesses.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,45 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import press_steps as press
 
-PLAN = "SPLANNEQUIN_SCRUB_PLAN"
 SWEEP_SECONDS = 10.0
-
-
-def main() -> int:
-    """The host's side: a display, Blender on it, photographs when asked for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--blender", required=True)
-    parser.add_argument("--shot", required=True, help="shot folder with a trained run `main`")
-    parser.add_argument("--output", default="docs/images")
-    parser.add_argument("--display", default=":98")
-    parser.add_argument("--limit", type=float, default=300.0)
-    args = parser.parse_args()
-    output = Path(args.output).absolute()
-    output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="splannequin-scrub-") as work:
-        environ = {**os.environ, "DISPLAY": args.display}
-        environ[PLAN] = json.dumps({"shot": str(Path(args.shot).absolute()), "work": work})
-        with press.screen(args.display):
-            blender = subprocess.Popen(press.command(args.blender, __file__), env=environ)
-            press._serve(blender, Path(work), output, environ, args.limit)
-        told = Path(work) / "told.json"
-        if not told.is_file():
-            print("Error: Blender ended without telling how it went.", file=sys.stderr)
-            return 1
-        results = json.loads(told.read_text())
-        print(json.dumps(results, indent=1))
-        return 1 if "error" in results else 0
-
-
-# ------------------------------------------------------------------------------------------------- inside Blender
-
-
-def inside() -> None:
-    """Starts the script as a timer that walks through `_play`."""
-    import bpy
-
-    plan, told = json.loads(os.environ[PLAN]), {"blender": bpy.app.version_string}
-    press.act(_play(plan, told), Path(plan["work"]), told)
 
 
 def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
@@ -72,7 +29,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     yield from press._arrange()
     scene = bpy.context.scene
     scene.splannequin.shot_path = plan["shot"]
-    viewport = _module("viewport")
+    viewport = press.addon_module("viewport")
     stalls = _time(viewport, told)
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.splannequin.load_camera()
@@ -156,13 +113,6 @@ def _free_view(scene: Any, work: Path) -> Iterator[float]:
     yield from press._shoot(work, "8-scrub-free")
 
 
-def _module(name: str) -> Any:
-    found = [m for n, m in sys.modules.items() if n.endswith(f".splannequin.splannequin_addon.{name}")]
-    if not found:
-        raise RuntimeError("the extension is not enabled in this Blender")
-    return found[0]
-
-
 def _time(viewport: Any, told: dict[str, Any]) -> dict[str, list[float]]:
     """Has everything of ours that runs on Blender's main thread timed: seconds by name, filled as it goes."""
     import bpy
@@ -180,7 +130,7 @@ def _time(viewport: Any, told: dict[str, Any]) -> dict[str, list[float]]:
         return call
 
     viewport._draw, viewport._tick = timed("draw", viewport._draw), timed("live tick", viewport._tick)
-    supervisor = _module("supervisor")
+    supervisor = press.addon_module("supervisor")
     bpy.app.timers.unregister(supervisor.tick)
     supervisor.tick = timed("tick", supervisor.tick)
     bpy.app.timers.register(supervisor.tick, persistent=True)
@@ -188,7 +138,6 @@ def _time(viewport: Any, told: dict[str, Any]) -> dict[str, list[float]]:
 
 
 if __name__ == "__main__":
-    if PLAN in os.environ and "bpy" in sys.modules:
-        inside()
-    else:
-        sys.exit(main())
+    status = press.on_a_shot(__file__, __doc__ or "", _play, "shot folder with a trained run `main`", ":98")
+    if "bpy" not in sys.modules:
+        sys.exit(status)

@@ -8,12 +8,7 @@ what it found and one undo took it back. Pictures: the search in English, the pa
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,45 +16,6 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import press_steps as press
-
-PLAN = "SPLANNEQUIN_SEARCH_PLAN"
-
-
-def main() -> int:
-    """The host's side: a display, Blender on it, photographs when asked for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--blender", required=True)
-    parser.add_argument("--shot", required=True, help="shot folder with a take")
-    parser.add_argument("--output", default="docs/images")
-    parser.add_argument("--display", default=":97")
-    parser.add_argument("--limit", type=float, default=200.0)
-    args = parser.parse_args()
-    output = Path(args.output).absolute()
-    output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="splannequin-search-") as work:
-        plan = {"shot": str(Path(args.shot).absolute()), "work": work}
-        environ = {**os.environ, "DISPLAY": args.display, PLAN: json.dumps(plan)}
-        with press.screen(args.display):
-            blender = subprocess.Popen(press.command(args.blender, __file__), env=environ)
-            press._serve(blender, Path(work), output, environ, args.limit)
-        told = Path(work) / "told.json"
-        if not told.is_file():
-            print("Error: Blender ended without telling how it went.", file=sys.stderr)
-            return 1
-        results = json.loads(told.read_text())
-        print(json.dumps(results, indent=1))
-        return 0 if results.get("loaded") and results.get("undone") and results.get("german") else 1
-
-
-# ------------------------------------------------------------------------------------------------- inside Blender
-
-
-def inside() -> None:
-    """Starts the script as a timer that walks through `_play`."""
-    import bpy
-
-    plan, told = json.loads(os.environ[PLAN]), {"blender": bpy.app.version_string}
-    press.act(_play(plan, told), Path(plan["work"]), told)
 
 
 def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
@@ -125,7 +81,13 @@ def _press(key: str, times: int) -> Iterator[float]:
 
 
 if __name__ == "__main__":
-    if PLAN in os.environ and "bpy" in sys.modules:
-        inside()
-    else:
-        sys.exit(main())
+    status = press.on_a_shot(
+        __file__,
+        __doc__ or "",
+        _play,
+        "shot folder with a take",
+        ":97",
+        good=lambda told: bool(told.get("loaded") and told.get("undone") and told.get("german")),
+    )
+    if "bpy" not in sys.modules:
+        sys.exit(status)
