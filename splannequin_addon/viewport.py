@@ -116,21 +116,23 @@ def reason(scene: Any) -> str:
     return f"Shown: frame {shown.pop()}. " + suggested if len(shown) == 1 and at not in shown else suggested
 
 
-def redraw() -> None:
-    """Draws every 3D view again."""
+def redraw(kinds: tuple[str, ...] = ("WINDOW", "UI")) -> None:
+    """Draws these regions of every 3D view again; without a graphics card each one's drawing is dear."""
     manager = bpy.context.window_manager
     for window in manager.windows if manager else ():
         for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+            for region in area.regions if area.type == "VIEW_3D" else ():
+                if region.type in kinds:
+                    region.tag_redraw()
 
 
 _last: tuple[int, tuple[Any, ...]] = (-1, ())
+_last_told: tuple[str, ...] = ()
 
 
 def _tick() -> float | None:
     """Draws again when a frame has arrived, when t* changed, or when a view rests; ends with the session."""
-    global _told, _last
+    global _told, _last, _last_told
     if _session is None:
         return None
     if _session.failure is not None:
@@ -149,8 +151,17 @@ def _tick() -> float | None:
     resting = [v for v, moved in _moved.items() if 0 < now - moved - _REST_SECONDS < 2 * TICK_SECONDS]
     if state != _last or resting:
         _last = state
-        redraw()
+        redraw(("WINDOW",))
+    told = tuple(reason(s) for s in scenes)
+    if told != _last_told and not _moving(now):
+        _last_told = told
+        redraw(("UI",))
     return TICK_SECONDS
+
+
+def _moving(now: float) -> bool:
+    """True while a view changes: the sidebar's sentence can wait until it rests."""
+    return any(now - moved < _REST_SECONDS for moved in _moved.values())
 
 
 def view_of(
