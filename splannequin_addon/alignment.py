@@ -6,7 +6,7 @@ a turn, a shift or one factor for all axes. None of them can make a uniform scal
 
 from __future__ import annotations
 
-import random
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ NEAR = 0.01
 """A point this near is on a plane, in median distances from the cameras."""
 _TRIES, _LOOKED_AT, _FINAL, _ALL = 5000, 400, 12, 3000
 """Triples drawn; points that each is judged by at first; those judged by all points; most points used."""
+_AT_ONCE = 128
+"""Planes judged together."""
 
 
 def unit(vectors: NDArray) -> NDArray[np.float64]:
@@ -34,6 +36,12 @@ def unit(vectors: NDArray) -> NDArray[np.float64]:
     vectors = np.asarray(vectors, dtype=np.float64)
     length = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
     return vectors / np.where(length > 0, length, 1.0)
+
+
+def middle(values: NDArray) -> NDArray[np.float64]:
+    """The median along the first axis. numpy's own takes 20 ms the first time, for its masked arrays."""
+    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=0)
+    return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
 
 
 def turn(one: NDArray, other: NDArray) -> NDArray[np.float64]:
@@ -116,21 +124,20 @@ def floor(points: NDArray, centres: NDArray, ups: NDArray) -> tuple[NDArray[np.f
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < LEAST_POINTS or not len(centres):
         return None
-    chance = random.Random(0)  # noqa: S311  (numpy's would be imported here, which keeps Blender waiting)
-    if len(points) > _ALL:
-        points = points[chance.sample(range(len(points)), _ALL)]
+    points = points[_shuffled(len(points))[:_ALL]]
     centres, up = np.asarray(centres, dtype=np.float64), unit(np.asarray(ups, dtype=np.float64).mean(axis=0))
-    away = points - np.median(centres, axis=0)
-    near = NEAR * float(np.median(np.sqrt((away * away).sum(axis=1))))
-    corners = points[np.reshape(chance.choices(range(len(points)), k=3 * _TRIES), (_TRIES, 3))]
+    away = points - middle(centres)
+    near = NEAR * float(middle(np.sqrt((away * away).sum(axis=1))))
+    corners = points[np.reshape(_scattered(3 * _TRIES) % np.uint64(len(points)), (_TRIES, 3)).astype(np.intp)]
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     facing = normals @ up
     normals *= np.where(facing < 0, -1.0, 1.0)[:, None]
     heights = (normals * corners[:, 0]).sum(axis=1)
     keep = np.abs(facing) > np.cos(np.radians(TILT_DEGREES))
-    keep[keep] &= (centres @ normals[keep].T - heights[keep]).min(axis=0) > near
     normals, heights = normals[keep], heights[keep]
-    few = points[chance.sample(range(len(points)), min(_LOOKED_AT, len(points)))]
+    keep = np.concatenate([h.min(axis=0) for h in _heights(centres, normals, heights)]) > near
+    normals, heights = normals[keep], heights[keep]
+    few = points[:_LOOKED_AT]
     # A sample is judged with some leave: chance adds to either share.
     score = _judged(few, normals, heights, near, BIG / 2, 2 * BELOW)
     first = np.argsort(-score, kind="stable")[:_FINAL]
@@ -177,10 +184,38 @@ def _length(vector: NDArray) -> float:
 
 def _judged(points: NDArray, normals: NDArray, heights: NDArray, near: float, big: float, below: float) -> NDArray:
     """Share of the points on each of K planes, [K]; 0 for a plane that is too small or has too much under it."""
-    above = points @ normals.T - heights
-    on = (np.abs(above) < near).mean(axis=0)
-    under = (above < -2.0 * near).mean(axis=0)
-    return np.where((on >= big) & (under <= below), on, 0.0)
+    shares = []
+    for above in _heights(points, normals, heights):
+        on = np.count_nonzero(np.abs(above) < near, axis=0) / len(points)
+        under = np.count_nonzero(above < -2.0 * near, axis=0) / len(points)
+        shares.append(np.where((on >= big) & (under <= below), on, 0.0))
+    return np.concatenate(shares)
+
+
+def _heights(points: NDArray, normals: NDArray, heights: NDArray) -> Iterator[NDArray[np.float64]]:
+    """How far each point [P, 3] is over each of K planes, as [P, k] for some planes after others.
+
+    All at once would be megabytes that the machine has to give first, which takes longer than to fill them.
+    """
+    for first in range(0, max(1, len(normals)), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        yield points @ normals[some].T - heights[some]
+
+
+def _scattered(count: int) -> NDArray[np.uint64]:
+    """Numbers over all 64 bits, [count], always the same: the integers mixed as SplitMix64 does.
+
+    numpy.random and Python's own would do, but the one is imported and the other looped over while Blender waits.
+    """
+    mixed = np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return mixed ^ (mixed >> np.uint64(31))
+
+
+def _shuffled(count: int) -> NDArray[np.intp]:
+    """The numbers below `count` in an order that says nothing, always the same, [count]."""
+    return np.argsort(_scattered(count), kind="stable")
 
 
 def _refined(points: NDArray, normal: NDArray, height: float, near: float) -> tuple[NDArray[np.float64], float]:

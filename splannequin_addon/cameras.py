@@ -178,7 +178,7 @@ def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarra
     ahead = ahead / np.linalg.norm(ahead)
     rotation = np.stack([np.cross(ahead, up), ahead, up])  # scene x, y, z in solve coordinates
     seen = (points if len(points) else matrices[:, :3, 3]) @ rotation.T
-    centre = np.median(seen, axis=0)
+    centre = alignment.middle(seen)
     centre[2] = np.percentile(seen[:, 2], 2.0) if floor is None else floor[1]
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = rotation, -centre
@@ -370,5 +370,5 @@ def _clip(path: contract.CameraPath, xyz: np.ndarray) -> tuple[float, float]:
     """Clip distances that show every point from everywhere on the path."""
     if not len(xyz):
         return 0.01, 1000.0
-    reach = float(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1).max()) + _extent(path)
+    reach = float(np.linalg.norm(xyz - alignment.middle(xyz), axis=1).max()) + _extent(path)
     return max(reach * 1e-4, 1e-3), max(reach * 4.0, 100.0) if math.isfinite(reach) else 1000.0
