@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,21 @@ def insert(scene: Any, shot: Path, take: str) -> list[str]:
     Raises:
         contract.JobError: the take has no frames.
     """
+    frozen, plate = _sources(scene, shot, take)
+    changes = compositor.insert(scene, frozen, plate)
+    lacking = missing_frames(shot, take, frames_of(scene))
+    if lacking:
+        changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
+    return changes
+
+
+def read_ahead(scene: Any, shot: Path, take: str) -> Iterator[None]:
+    """Has Blender read what `insert` will need, a picture a turn. JobError as `insert`."""
+    return compositor.read_ahead(*_sources(scene, shot, take))
+
+
+def _sources(scene: Any, shot: Path, take: str) -> tuple[compositor.Take, Path | None]:
+    """A take, and the first picture of its plate if there is one. JobError if the take has no frames."""
     try:
         frozen = compositor.take_of(shot / "takes" / take, cameras.depth_scale(scene, shot))
     except FileNotFoundError as error:
@@ -28,11 +43,7 @@ def insert(scene: Any, shot: Path, take: str) -> list[str]:
             f"The take {take!r} of {shot.name} holds no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
         ) from error
     plate = compositor.frame_path(shot / "frames", frozen.first, ".png")
-    changes = compositor.insert(scene, frozen, plate if plate.is_file() else None)
-    lacking = missing_frames(shot, take, frames_of(scene))
-    if lacking:
-        changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
-    return changes
+    return frozen, plate if plate.is_file() else None
 
 
 def shown(scene: Any, shot: Path) -> str:

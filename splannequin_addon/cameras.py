@@ -179,7 +179,7 @@ def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarra
     rotation = np.stack([np.cross(ahead, up), ahead, up])  # scene x, y, z in solve coordinates
     seen = (points if len(points) else matrices[:, :3, 3]) @ rotation.T
     centre = alignment.middle(seen)
-    centre[2] = np.percentile(seen[:, 2], 2.0) if floor is None else floor[1]
+    centre[2] = np.sort(seen[:, 2])[len(seen) // 50] if floor is None else floor[1]
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = rotation, -centre
     return result

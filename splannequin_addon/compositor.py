@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -221,12 +222,49 @@ def frame_path(folder: Path, frame: int, suffix: str = ".exr") -> Path:
     return folder / contract.frame_file(frame, suffix)
 
 
+_ahead: set[str] = set()
+"""Files that `read_ahead` has just had read: the next `load_sequence` takes them as they are."""
+
+
+def read_ahead(take: Take, plate: Path | None = None) -> Iterator[None]:
+    """Has Blender read what `insert` needs, one picture a turn: it does so while its window stands still."""
+    wanted = [(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")]
+    if plate is not None:
+        wanted.append((plate, _plate_name(plate), "srgb"))
+    for path, name, encoding in wanted:
+        _read(path, name, encoding, take)
+        yield
+
+
+def forget_ahead() -> None:
+    """Drops what is known of pictures read ahead: another file has others."""
+    _ahead.clear()
+
+
+def _read(path: Path, name: str, encoding: str, take: Take) -> None:
+    """Has a picture of a sequence read: a node does it for the frame that it shows."""
+    _ahead.discard(os.path.abspath(path))
+    image = load_sequence(path, name, encoding)
+    reader = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
+    try:
+        show_sequence(reader.nodes.new("CompositorNodeImage"), image, take.first, take.last)
+    finally:
+        bpy.data.node_groups.remove(reader)
+    _ahead.add(os.path.abspath(path))
+
+
+def _plate_name(plate: Path) -> str:
+    return f"Plate {plate.parent.parent.stem}"
+
+
 def load_sequence(path: Path, name: str, encoding: str) -> Any:
     """An image sequence as a data-block, reused by path; `encoding` is "linear" or "srgb"."""
     wanted = os.path.abspath(path)
     for image in bpy.data.images:
         if image.get(_TAG) and os.path.abspath(bpy.path.abspath(image.filepath)) == wanted:
-            image.reload()
+            if wanted not in _ahead:
+                image.reload()
+            _ahead.discard(wanted)
             return image
     image = bpy.data.images.load(wanted)
     image.name = name
@@ -544,7 +582,7 @@ def _show_plate(scene: Any, tree: Any, node: Any, plate: Path, take: Take) -> No
     image_node = tree.nodes.new("CompositorNodeImage")
     image_node[_TAG] = True
     image_node.name = image_node.label = "Plate"
-    image = load_sequence(plate, f"Plate {plate.parent.parent.stem}", "srgb")
+    image = load_sequence(plate, _plate_name(plate), "srgb")
     show_sequence(image_node, image, take.first, take.last)
     stream = image_node.outputs["Image"]
     # The tree is ours: in a row, left to right.

@@ -147,11 +147,13 @@ class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
                 )
                 return {"FINISHED"}
             return super().execute(context)
+        if not bpy.app.background:
+            supervisor.bring_in(scene, folder, take)
+            return {"FINISHED"}
         outcome = _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take))
         if outcome == {"FINISHED"}:
-            supervisor.undo_step("bake")
             try:
-                bpy.ops.splannequin.render("EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT")
+                bpy.ops.splannequin.render("EXEC_DEFAULT")
             except RuntimeError as error:
                 self.report({"ERROR"}, str(error).strip())
                 return {"CANCELLED"}

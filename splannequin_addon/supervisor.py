@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, bake, jobs, made, markers, pictures, shots, steps, viewport
+from . import backend, bake, compositor, jobs, made, markers, pictures, shots, steps, viewport
 from .translations import tr
 
 TICK_SECONDS = 0.25
@@ -64,6 +64,8 @@ class Watch:
     """(sentence, hint) of what failed on Blender's side, by the step's name."""
     rendered: tuple[int, int] | None = None
     """(frames done, frames in all) of a render that runs."""
+    ahead: tuple[Iterator[None], str] | None = None
+    """What Blender still has to read, a picture a turn, before a take comes into the compositor, and its name."""
     to_render: str = ""
     """Name of the scene whose render begins with the next turn."""
     sampling: Sampling | None = None
@@ -75,7 +77,7 @@ class Watch:
 
     def running(self) -> str | None:
         """Name of the step at work, if any."""
-        if self.rendered is not None:
+        if self.rendered is not None or self.ahead is not None or self.to_render:
             return "bake"
         if self.sampling is not None:
             return self.sampling.step
@@ -181,7 +183,8 @@ def tick() -> float:
             changed = True
     if changed:
         redraw()
-    return TICK_SECONDS if all(w.sampling is None for w in _watches.values()) else 2 * SAMPLING_SECONDS
+    waits = any(w.sampling is not None or w.ahead is not None or w.to_render for w in _watches.values())
+    return 2 * SAMPLING_SECONDS if waits else TICK_SECONDS
 
 
 def _turn(watch: Watch, until: float) -> bool:
@@ -192,6 +195,9 @@ def _turn(watch: Watch, until: float) -> bool:
         made.tidy(scene)
     if watch.to_render:
         _render(watch)
+        return True
+    if watch.ahead is not None:
+        _read_ahead(watch, *watch.ahead)
         return True
     _read_on(watch)
     for step, job in list(watch.jobs.items()):
@@ -207,7 +213,10 @@ def _turn(watch: Watch, until: float) -> bool:
             continue
         if job.ended:
             refresh(watch)
-            if steps.scenes_of(watch.shot) or job.state != "done":
+            there = steps.scenes_of(watch.shot)
+            if there and step == "bake" and job.state == "done":
+                bring_in(there[0], watch.shot, str(job.params["take"]))
+            elif there or job.state != "done":
                 _apply(watch, step, job)
             else:
                 watch.pending[step] = job
@@ -255,32 +264,68 @@ def undo_step(step: str) -> None:
 
 
 def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
-    """Lets a job that ended well change the scenes that work on its shot: in a window, as one undo step each."""
-    if job.state != "done":
-        return
+    """Lets a job that ended well change the scenes that work on its shot."""
+    if job.state == "done":
+        _change(watch, step, lambda scene: steps.finish(scene, step, job))
+
+
+def _window_of(scene: Any) -> Any | None:
+    return next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
+
+
+def _change(watch: Watch, step: str, change: Callable[[Any], list[str]]) -> None:
+    """Changes the scenes that work on a shot: as one undo step each in a window. Notes what was changed or why not."""
     for scene in steps.scenes_of(watch.shot):
-        window = next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
+        window = _window_of(scene)
         try:
             if window is None:
-                watch.notes[step] = steps.finish(scene, step, job)
+                watch.notes[step] = change(scene)
                 continue
             with bpy.context.temp_override(window=window, scene=scene):
                 before = scene.splannequin.t_star
-                watch.notes[step] = steps.finish(scene, step, job)
+                watch.notes[step] = change(scene)
                 if step == "camera":
                     look_through_camera(window)
                 if watch.notes[step] or before != scene.splannequin.t_star:
                     undo_step(step)
-                if step == "bake":
-                    watch.to_render = scene.name
         except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
             watch.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
+
+
+def bring_in(scene: Any, shot: Path, take: str) -> None:
+    """Has a take put into the compositor and rendered by the timer, in turns: Blender stands still in each."""
+    watch = watch_of(shot)
+    watch.notes.pop("bake", None)
+    watch.failures.pop("bake", None)
+    try:
+        watch.ahead = bake.read_ahead(scene, shot, take), take
+    except (contract.JobError, OSError):
+        watch.ahead = iter(()), take  # inserting it fails alike, and says so
+
+
+def _read_ahead(watch: Watch, turns: Iterator[None], take: str) -> None:
+    """Has one more picture read; after the last the take comes into the compositor."""
+    try:
+        next(turns)
+        return
+    except (StopIteration, OSError, RuntimeError, ValueError):
+        watch.ahead = None
+    _change(watch, "bake", lambda scene: _put_in(watch, scene, take))
+
+
+def _put_in(watch: Watch, scene: Any, take: str) -> list[str]:
+    """Puts a take into a scene's compositor; the render of a scene that is seen begins with the next turn."""
+    changes = steps.insert_freeze(scene, watch.shot, take)
+    if _window_of(scene) is not None:
+        changes += bake.choose_output(scene, watch.shot, take)  # here, for it belongs to the same undo step
+        watch.to_render = scene.name
+    return changes
 
 
 def _render(watch: Watch) -> None:
     """Starts the render of a bake: a turn after the compositor was changed, since Blender takes its time for both."""
     name, watch.to_render = watch.to_render, ""
-    window = next((w for w in bpy.context.window_manager.windows if w.scene.name == name), None)
+    window = _window_of(bpy.data.scenes.get(name))
     if window is None:
         return
     try:
@@ -304,6 +349,7 @@ def _on_load(*_: Any) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
     viewport.end()
     markers.forget()
+    compositor.forget_ahead()
     for scene in bpy.data.scenes:
         folder = steps.shot_folder(scene)
         if folder is not None:
@@ -311,7 +357,8 @@ def _on_load(*_: Any) -> None:
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     for watch in _watches.values():
-        watch.rendered = watch.sampling = None
+        watch.rendered = watch.sampling = watch.ahead = None
+        watch.to_render = ""
         watch.pending.clear()
 
 
