@@ -8,7 +8,7 @@ together, and depth is brought to scene units through it.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -154,14 +154,17 @@ def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[in
     return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size), "blender")
 
 
-def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarray:
+def scene_from_solve(
+    path: contract.CameraPath, points: np.ndarray, floor: tuple[Sequence[float], float] | None = None
+) -> np.ndarray:
     """A first guess of the solve-to-scene transform: floor at z = 0, cameras upright, shot around the origin.
 
-    Without a floor among the points the cameras' mean up is taken for up, and what is lowest for the floor.
+    Without a floor the cameras' mean up is taken for up, and what is lowest for the floor.
 
     Args:
         path: the solved cameras, solve units.
         points: sparse points, [P, 3], solve units.
+        floor: (normal, height) of the points x of the floor: normal . x = height; None if it is not known.
 
     Returns:
         [4, 4] float64, rotation and translation, no scale.
@@ -170,8 +173,7 @@ def scene_from_solve(path: contract.CameraPath, points: np.ndarray) -> np.ndarra
     up = matrices[:, :3, 1].mean(axis=0)
     forward = -matrices[:, :3, 2].mean(axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
-    floor = alignment.floor(points, matrices[:, :3, 3], matrices[:, :3, 1])
-    up = up if floor is None else floor[0]
+    up = up if floor is None else np.array(floor[0], dtype=np.float64)
     ahead = forward - up * float(forward @ up)
     if np.linalg.norm(ahead) < 1e-6:  # looking straight up or down
         ahead = np.cross(up, np.roll(up, 1))
@@ -214,7 +216,7 @@ def build(scene: Any, shot: Path) -> Any:
     if root is None:
         root = entry.root = bpy.data.objects.new(f"{name} root", None)
         root.empty_display_type = "ARROWS"
-        root.matrix_world = Matrix(scene_from_solve(path, xyz).tolist())
+        root.matrix_world = Matrix(scene_from_solve(path, xyz, _floor(shot)).tolist())
         root.empty_display_size = _extent(path)
         collection.objects.link(root)
     camera_data = bpy.data.cameras.new(f"{name} camera")
@@ -335,6 +337,12 @@ def _show_plate(data: Any, shot: Path, name: str) -> None:
     background.display_depth = "BACK"
     background.alpha = 1.0
     data.show_background_images = True
+
+
+def _floor(shot: Path) -> tuple[Sequence[float], float] | None:
+    """The floor that the solve found (torch_backend/solve/floor.py); None if it found none, or did not look."""
+    found = contract.read_json(shot / "solve" / "solve.json").get("floor")
+    return (found["normal"], float(found["height"])) if found else None
 
 
 def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:

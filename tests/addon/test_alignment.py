@@ -1,5 +1,7 @@
 """Floor, origin and scale: the maths against float64 truth, and the buttons on a scene."""
 
+import json
+
 import bpy
 import numpy as np
 import pytest
@@ -67,60 +69,31 @@ def test_what_cannot_be_aligned_is_said(maths, contract):
             maths.scaled(np.eye(3)[:2], distance)
 
 
-def room(seed: int, floor_share: float = 0.15, count: int = 3000, pitch: float = 25.0):
-    """Points, centres and ups of a room: floor z = 0, a table with more points than it, walls, people, outliers."""
-    rng = np.random.default_rng(seed)
-    on_floor = int(floor_share * count)
-    ground = np.concatenate([rng.uniform(-3, 3, (on_floor, 2)), rng.normal(0, 0.01, (on_floor, 1))], axis=1)
-    table = np.concatenate([rng.uniform(-1, 1, (count // 4, 2)), rng.normal(0.8, 0.005, (count // 4, 1))], axis=1)
-    wall = np.stack([rng.uniform(-3, 3, count // 3), np.full(count // 3, 3.0), rng.uniform(0.1, 2.5, count // 3)], 1)
-    outliers = rng.uniform(-4, 4, (count // 33, 3))
-    people = rng.normal((0, 0, 1.0), (0.6, 0.6, 0.25), (count - on_floor - count // 4 - count // 3 - count // 33, 3))
-    centres = np.array([0, -3, 1.6]) + np.stack([np.linspace(-0.5, 0.5, 20), *rng.normal(0, 0.03, (2, 20))], 1)
-    tilt = np.radians(pitch)  # looking down on the table: the camera's up leans forward
-    ups = np.array([0, np.sin(tilt), np.cos(tilt)]) + rng.normal(0, 0.03, (20, 3))
-    return np.concatenate([ground, table, wall, outliers, people]), centres, ups
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_floor_is_found_under_a_table_among_outliers(maths, seed):
-    points, centres, ups = room(seed)
-    rotation, shift, size = turned(seed + 10), np.array([2.0, -7.0, 0.5]), 0.3
-    found = maths.floor(size * points @ rotation.T + shift, size * centres @ rotation.T + shift, ups @ rotation.T)
-    assert found is not None
-    normal, height = found
-    assert np.degrees(np.arccos(min(1.0, normal @ rotation[:, 2]))) < 0.5
-    assert height == pytest.approx(shift @ rotation[:, 2], abs=0.02 * size)
-    again = maths.floor(size * points @ rotation.T + shift, size * centres @ rotation.T + shift, ups @ rotation.T)
-    assert np.array_equal(again[0], normal) and again[1] == height, "the same points, the same floor"
-
-
-def test_no_floor_is_made_up(maths):
-    points, centres, ups = room(0)
-    assert maths.floor(points[:49], centres, ups) is None
-    rng = np.random.default_rng(1)
-    assert maths.floor(rng.normal((0, 3, 0), 1, (2000, 3)), centres, ups) is None, "a cloud has none"
-    walls = points[np.abs(points[:, 1] - 3) < 1e-6]
-    assert maths.floor(walls, centres, ups) is None, "a wall is none"
-
-
 def test_the_first_guess_stands_on_the_floor(addon, contract):
     cameras = addon("cameras")
-    points, centres, ups = room(3)
-    frames = []
-    for n, (centre, up) in enumerate(zip(centres, ups, strict=True)):
-        down = -up / np.linalg.norm(up)
-        right = np.array([1.0, 0, 0]) - down[0] * down
-        right /= np.linalg.norm(right)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = [right, down, np.cross(right, down)]
-        viewmat[:3, 3] = -viewmat[:3, :3] @ centre
-        frames.append(contract.CameraFrame(n, viewmat.ravel().tolist(), [500, 500, 320, 240]))
-    placed = cameras.scene_from_solve(contract.CameraPath(640, 480, frames), points)
-    np.testing.assert_allclose(placed[:3, :3] @ [0, 0, 1], [0, 0, 1], atol=0.01)
-    ground = points[:450] @ placed[:3, :3].T + placed[:3, 3]
-    assert abs(np.median(ground[:, 2])) < 0.01 and ground[:, 2].std() < 0.03
-    assert ((centres @ placed[:3, :3].T + placed[:3, 3])[:, 2] > 1.0).all()
+    tilt = np.radians(25.0)  # looking down on a table: the camera's up leans forward
+    right, down = np.array([1.0, 0, 0]), -np.array([0, np.sin(tilt), np.cos(tilt)])
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [right, down, np.cross(right, down)]
+    viewmat[:3, 3] = -viewmat[:3, :3] @ [0, -3, 1.6]
+    path = contract.CameraPath(640, 480, [contract.CameraFrame(1, viewmat.ravel().tolist(), [500, 500, 320, 240])])
+    points = np.random.default_rng(0).uniform((-1, -1, 0.2), (1, 1, 2), (100, 3))
+    placed = cameras.scene_from_solve(path, points, ([0.0, 0.0, 1.0], 0.2))
+    np.testing.assert_allclose(placed[:3, :3] @ [0, 0, 1], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose((placed @ [0.3, 0.7, 0.2, 1])[2], 0.0, atol=1e-12)
+    leaning = cameras.scene_from_solve(path, points)
+    np.testing.assert_allclose(leaning[:3, :3] @ -down, [0, 0, 1], atol=1e-12)
+
+
+def test_a_solve_stands_on_the_floor_that_it_found(addon, scene, shot):
+    file = shot / "solve" / "solve.json"
+    normal = np.array([0.1, -0.9, 0.3]) / np.linalg.norm([0.1, -0.9, 0.3])
+    file.write_text(json.dumps({**json.loads(file.read_text()), "floor": {"normal": normal.tolist(), "height": 0.7}}))
+    cameras = addon("cameras")
+    cameras.build(scene, shot)
+    root = np.array(cameras.find(scene, shot, "EMPTY").matrix_world)
+    np.testing.assert_allclose(root[:3, :3] @ normal, [0, 0, 1], atol=1e-6)
+    assert (root @ [*(0.7 * normal), 1.0])[2] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_nearest_point_under_the_mouse(maths):

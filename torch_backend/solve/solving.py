@@ -20,6 +20,7 @@ from ..footage.sources import frame_words
 from ..shot import Shot, atomic_path, content_key, need_disk, write_json
 from . import foreign
 from .child import run_worker
+from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
@@ -245,6 +246,7 @@ def _finish(
         "quality": result["quality"],
         "cameras_from": answer.get("given", "solve"),
         "agreement": answer.get("agreement"),
+        "floor": floor_of(path, points["xyz"]),
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,
     }

@@ -14,6 +14,7 @@ from torch_backend.footage.images import read_png
 from torch_backend.shot import Shot
 from torch_backend.solve import SolveConfig, load_points, solve_shot
 from torch_backend.solve.child import run_worker
+from torch_backend.solve.floor import floor_of
 from torch_backend.solve.poses import camera_centre
 from torch_backend.solve.solving import filter_points, quality_words, refuse_poor
 
@@ -99,6 +100,8 @@ def test_solve_json_says_how_good_it_is(solved):
     assert record["points"] == len(load_points(solved.shot)["xyz"])
     assert record["warnings"] == []
     assert solved.result == record["result"]
+    path = CameraPath.load(solved.shot.solve / "cameras.json")
+    assert record["floor"] == floor_of(path, load_points(solved.shot)["xyz"])
 
 
 def test_the_model_is_kept_and_the_scratch_is_not(solved):

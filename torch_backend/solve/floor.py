@@ -1,0 +1,103 @@
+"""The floor among the points of a solve: what Blender stands the shot on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contract import CameraPath
+from .poses import camera_centre
+
+TILT_DEGREES = 40.0
+"""Most that the floor may lean against the cameras' mean up: people hold cameras level, but look down."""
+LEAST_POINTS = 50
+"""Fewer points say nothing about a floor."""
+BIG = 0.08
+"""Least share of the points on the floor."""
+BELOW = 0.05
+"""Most of the points under it: outliers. A table has the floor under it."""
+NEAR = 0.01
+"""A point this near is on a plane, in median distances from the cameras."""
+_TRIES, _LOOKED_AT, _FINAL, _ALL = 5000, 400, 12, 3000
+"""Triples drawn; points that each is judged by at first; those judged by all points; most points used."""
+
+
+def floor_of(path: CameraPath, points: NDArray) -> dict[str, Any] | None:
+    """`find_floor` of solved cameras and points [P, 3] as solve.json has it: normal, height; None if there is none."""
+    viewmats = np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4)
+    found = find_floor(points, np.stack([camera_centre(v) for v in viewmats]), -viewmats[:, 1, :3])
+    return None if found is None else {"normal": found[0].tolist(), "height": found[1]}
+
+
+def find_floor(points: NDArray, centres: NDArray, ups: NDArray) -> tuple[NDArray[np.float64], float] | None:
+    """The floor under a solve: the plane with most points among those that have next to nothing under them.
+
+    The same points give the same floor, always.
+
+    Args:
+        points: sparse points, [P, 3], solve units; outliers are expected.
+        centres: where the camera was, [F, 3], solve units. All of it is above the floor.
+        ups: its upward directions, [F, 3]; the floor faces their mean within `TILT_DEGREES`.
+
+    Returns:
+        (normal [3] of length 1, upwards; height h): the points x with normal . x = h. None if there is none.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < LEAST_POINTS or not len(centres):
+        return None
+    chance = np.random.default_rng(0)
+    points = chance.permutation(points)[:_ALL]
+    centres, up = np.asarray(centres, dtype=np.float64), _unit(np.asarray(ups, dtype=np.float64).mean(axis=0))
+    away = points - np.median(centres, axis=0)
+    near = NEAR * float(np.median(np.linalg.norm(away, axis=1)))
+    corners = points[chance.integers(len(points), size=(_TRIES, 3))]
+    normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    facing = normals @ up
+    normals *= np.where(facing < 0, -1.0, 1.0)[:, None]
+    heights = (normals * corners[:, 0]).sum(axis=1)
+    keep = np.abs(facing) > np.cos(np.radians(TILT_DEGREES))
+    keep[keep] &= (centres @ normals[keep].T - heights[keep]).min(axis=0) > near
+    normals, heights = normals[keep], heights[keep]
+    few = points[:_LOOKED_AT]
+    # A sample is judged with some leave: chance adds to either share.
+    score = _judged(few, normals, heights, near, BIG / 2, 2 * BELOW)
+    first = np.argsort(-score, kind="stable")[:_FINAL]
+    first = first[score[first] > 0]
+    best: tuple[float, NDArray[np.float64], float] | None = None
+    for index in first:
+        normal, height = _refined(points, normals[index], float(heights[index]), near)
+        share = float(_judged(points, normal[None], np.array([height]), near, BIG, BELOW)[0])
+        leans = float(normal @ up) < np.cos(np.radians(TILT_DEGREES))
+        if share > 0 and not leans and (best is None or share > best[0]):
+            best = (share, normal, height)
+    return None if best is None else best[1:]
+
+
+def _judged(points: NDArray, normals: NDArray, heights: NDArray, near: float, big: float, below: float) -> NDArray:
+    """Share of the points on each of K planes, [K]; 0 for a plane that is too small or has too much under it."""
+    above = points @ normals.T - heights
+    on = (np.abs(above) < near).mean(axis=0)
+    under = (above < -2.0 * near).mean(axis=0)
+    return np.where((on >= big) & (under <= below), on, 0.0)
+
+
+def _refined(points: NDArray, normal: NDArray, height: float, near: float) -> tuple[NDArray[np.float64], float]:
+    """A plane fitted to the points that are near it, three times over: the direction in which they spread least."""
+    for _ in range(3):
+        on = points[np.abs(points @ normal - height) < near]
+        if len(on) < 3:
+            break
+        middle = on.mean(axis=0)
+        least = np.linalg.eigh((on - middle).T @ (on - middle))[1][:, 0]
+        normal = least if least @ normal >= 0 else -least
+        height = float(middle @ normal)
+    return normal, height
+
+
+def _unit(vectors: NDArray) -> NDArray[np.float64]:
+    """Vectors [..., 3] at length 1; those of length 0 stay 0."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)
