@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib
 import subprocess
 import sys
 import threading
@@ -203,3 +204,8 @@ def last_line(log: Path) -> str:
     except OSError:
         return ""
     return lines[-1].strip()[:200] if lines else ""
+
+
+def import_beside(name: str) -> None:
+    """Imports a module that the main thread will need, so that it does not wait for the disk then."""
+    threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()

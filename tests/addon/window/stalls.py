@@ -1,0 +1,130 @@
+"""Times what holds Blender's main thread because of us: loading the camera, and a bake with its render.
+
+    python tests/addon/window/stalls.py --blender BLENDER --shot SHOT.splannequin
+
+BLENDER has the extension installed, as for press_steps.py; the shot has a trained run and a take, and is copied.
+Prints, in milliseconds, the turns of our timer over 10 ms with the longest calls in them, and Blender's own start of a
+render in the same scene before anything of ours is in it.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import press_steps as press
+
+TOLD_MS = 10.0
+FRAMES = 6
+
+
+def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+    import bpy
+
+    shot = Path(plan["work"]) / "stalls.splannequin"
+    shutil.copytree(plan["shot"], shot)
+    yield from press._arrange()
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end, scene.render.resolution_percentage = 1, 1, 10
+    told["blender_render_start"] = []
+    for n in range(3):
+        scene.render.filepath = str(shot.parent / "own" / str(n)) + "/"
+        told["blender_render_start"].append(_timed(lambda: bpy.ops.render.render("INVOKE_DEFAULT", animation=True)))
+        yield from _rendered()
+    scene.render.filepath, scene.render.resolution_percentage = "/tmp/", 100  # noqa: S108  (what a new file has)
+    scene.splannequin.shot_path = str(shot)
+    scene.splannequin.take_name = sorted(p.name for p in (shot / "takes").iterdir())[0]
+    (shot / "takes" / scene.splannequin.take_name / "000003.exr").unlink()  # so that there is something to freeze
+    yield 1.0
+    calls: list[tuple[str, float]] = []
+    told["turns"] = []
+    _watch_calls(calls)
+    _watch_turns(calls, told["turns"])
+    told["load_camera"] = []
+    for _ in range(2):
+        calls.clear()
+        with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+            spent = _timed(bpy.ops.splannequin.load_camera)
+        told["load_camera"].append({"ms": spent, "in": _longest(calls)})
+        yield 1.0
+    scene.frame_start, scene.frame_end = 1, FRAMES
+    yield from press._click("splannequin.bake")
+    watch = press._supervisor().watch_of(shot)
+    yield 1.0
+    while watch.running() is not None:
+        yield 0.2
+    if watch.failures:
+        raise RuntimeError(str(watch.failures))
+    told["rendered"] = len(list((shot / "bake").rglob("*.png")))
+
+
+def _rendered() -> Iterator[float]:
+    import bpy
+
+    yield 0.5
+    while bpy.app.is_job_running("RENDER"):
+        yield 0.2
+    yield 0.5
+
+
+def _timed(call: Callable[[], Any]) -> float:
+    """Milliseconds."""
+    began = time.perf_counter()
+    call()
+    return round(1000 * (time.perf_counter() - began), 1)
+
+
+def _watch_calls(calls: list[tuple[str, float]]) -> None:
+    """Has the functions behind the steps timed: (name, milliseconds), as they end."""
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **named: Any) -> Any:
+            began = time.perf_counter()
+            try:
+                return function(*args, **named)
+            finally:
+                calls.append((name, round(1000 * (time.perf_counter() - began), 1)))
+
+        return call
+
+    for part in ("steps", "bake", "cameras", "compat", "compositor", "guesses", "made", "scene_setup", "supervisor"):
+        module = press.addon_module(part)
+        for name, function in list(vars(module).items()):
+            if isinstance(function, types.FunctionType) and function.__module__ == module.__name__ and name != "tick":
+                setattr(module, name, timed(f"{part}.{name}", function))
+
+
+def _longest(calls: list[tuple[str, float]]) -> list[str]:
+    return [f"{name} {ms}" for name, ms in sorted(calls, key=lambda call: -call[1])[:5]]
+
+
+def _watch_turns(calls: list[tuple[str, float]], turns: list[dict[str, Any]]) -> None:
+    """Has the timer's turns timed, with the calls in them."""
+    import bpy
+
+    tick = press._supervisor().tick
+    bpy.app.timers.unregister(tick)
+
+    def timed() -> float:
+        calls.clear()
+        began = time.perf_counter()
+        pause = tick()
+        spent = 1000 * (time.perf_counter() - began)
+        if spent > TOLD_MS:
+            turns.append({"ms": round(spent, 1), "in": _longest(calls)})
+        return pause
+
+    bpy.app.timers.register(timed, persistent=True)
+
+
+if __name__ == "__main__":
+    status = press.on_a_shot(__file__, __doc__ or "", _play, "shot folder with a trained run `main` and a take", ":94")
+    if "bpy" not in sys.modules:
+        sys.exit(status)
