@@ -31,7 +31,8 @@ def insert(scene: Any, shot: Path, take: str) -> list[str]:
 
 def read_ahead(scene: Any, shot: Path, take: str) -> Iterator[None]:
     """Has Blender read what `insert` will need, a picture a turn. JobError as `insert`."""
-    return compositor.read_ahead(*_sources(scene, shot, take))
+    frozen, plate = _sources(scene, shot, take)
+    return compositor.read_ahead(frozen, plate if compositor.shows_plate(scene) else None)
 
 
 def _sources(scene: Any, shot: Path, take: str) -> tuple[compositor.Take, Path | None]:

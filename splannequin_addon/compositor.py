@@ -80,9 +80,18 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
     _fill_group(scene, node.node_tree, take)
     if node.inputs[_GRAIN].default_value and _GRAIN not in node.node_tree.nodes:
         changes.append("The take has no grain to add: freeze it again.")
-    if plate is not None and json.loads(node.node_tree[_BEFORE])["made_tree"]:
+    if plate is not None and shows_plate(scene):
         _show_plate(scene, tree, node, plate, take)
     return changes
+
+
+def shows_plate(scene: Any) -> bool:
+    """True if the plate is the stream of the scene's tree: one that was made here, or that `insert` would make."""
+    tree = compat.compositor_tree(scene)
+    if tree is None or not len(tree.nodes):
+        return True
+    node = group_node(tree)
+    return node is not None and bool(json.loads(node.node_tree[_BEFORE])["made_tree"])
 
 
 def may_combine_cg(scene: Any) -> Any:

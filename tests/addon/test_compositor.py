@@ -111,6 +111,30 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
     assert not bpy.data.node_groups and not [i for i in bpy.data.images if i.source == "SEQUENCE"]
 
 
+def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, shot):
+    bake = addon("bake")
+    images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
+    assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 1, "the artist's tree shows no plate of ours"
+    assert set(bpy.data.node_groups.keys()) == groups
+    bake.insert(scene, shot, "freeze")
+    assert len(bpy.data.images) == len(images) + 1 + (not addon("compat").HAS_TEXTURE_NODE)
+    bake.remove(scene)
+    assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
+
+
+def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, shot, tmp_path, pictures):
+    bake, plate = addon("bake"), shot / "frames" / "000005.png"
+    for value in (40, 200):
+        pictures.write(plate, np.full((12, 16, 3), value, np.uint8))
+        assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 2
+        bake.insert(scene, shot, "freeze")
+        node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+        node.inputs["Mix"].default_value = 0.0
+        render(addon, scene, tmp_path / str(value))
+        found = pictures.read(tmp_path / str(value) / "000005.png")
+        assert np.abs(found * 255 - value).max() < 0.6
+
+
 def test_compositor_that_was_off_is_said_and_put_back(addon, scene, artists_tree, take):
     compat = addon("compat")
     switches = {name: False for name in compat.compositor_switches(scene)}
