@@ -64,8 +64,9 @@ class Watch:
     """(sentence, hint) of what failed on Blender's side, by the step's name."""
     rendered: tuple[int, int] | None = None
     """(frames done, frames in all) of a render that runs."""
-    ahead: tuple[Iterator[None], str] | None = None
-    """What Blender still has to read, a picture a turn, before a take comes into the compositor, and its name."""
+    ahead: tuple[Iterator[None], str, str] | None = None
+    """What Blender still has to read, a picture a turn, before a take comes into the compositor; the take's name; the
+    only scene's name, or empty for all that work on the shot."""
     to_render: str = ""
     """Name of the scene whose render begins with the next turn."""
     sampling: Sampling | None = None
@@ -215,7 +216,7 @@ def _turn(watch: Watch, until: float) -> bool:
             refresh(watch)
             there = steps.scenes_of(watch.shot)
             if there and step == "bake" and job.state == "done":
-                bring_in(there[0], watch.shot, str(job.params["take"]))
+                bring_in(there[0], watch.shot, str(job.params["take"]), alone=False)
             elif there or job.state != "done":
                 _apply(watch, step, job)
             else:
@@ -273,9 +274,10 @@ def _window_of(scene: Any) -> Any | None:
     return next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
 
 
-def _change(watch: Watch, step: str, change: Callable[[Any], list[str]]) -> None:
-    """Changes the scenes that work on a shot: as one undo step each in a window. Notes what was changed or why not."""
-    for scene in steps.scenes_of(watch.shot):
+def _change(watch: Watch, step: str, change: Callable[[Any], list[str]], only: str = "") -> None:
+    """Changes the scenes that work on a shot, or the one of them that is named `only`: as one undo step each in a
+    window. Notes what was changed or why not."""
+    for scene in [s for s in steps.scenes_of(watch.shot) if only in ("", s.name)]:
         window = _window_of(scene)
         try:
             if window is None:
@@ -292,25 +294,32 @@ def _change(watch: Watch, step: str, change: Callable[[Any], list[str]]) -> None
             watch.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
 
 
-def bring_in(scene: Any, shot: Path, take: str) -> None:
-    """Has a take put into the compositor and rendered by the timer, in turns: Blender stands still in each."""
-    watch = watch_of(shot)
+def bring_in(scene: Any, shot: Path, take: str, alone: bool = True) -> None:
+    """Has a take put into the compositor and rendered by the timer, in turns: Blender stands still in each.
+
+    Args:
+        scene: the scene; with `alone` no other one that works on the shot is changed.
+        shot: shot folder.
+        take: name of a take.
+        alone: see `scene`.
+    """
+    watch, only = watch_of(shot), scene.name if alone else ""
     watch.notes.pop("bake", None)
     watch.failures.pop("bake", None)
     try:
-        watch.ahead = bake.read_ahead(scene, shot, take), take
+        watch.ahead = bake.read_ahead(scene, shot, take), take, only
     except (contract.JobError, OSError):
-        watch.ahead = iter(()), take  # inserting it fails alike, and says so
+        watch.ahead = iter(()), take, only  # inserting it fails alike, and says so
 
 
-def _read_ahead(watch: Watch, turns: Iterator[None], take: str) -> None:
+def _read_ahead(watch: Watch, turns: Iterator[None], take: str, only: str) -> None:
     """Has one more picture read; after the last the take comes into the compositor."""
     try:
         next(turns)
         return
     except (StopIteration, OSError, RuntimeError, ValueError):
         watch.ahead = None
-    _change(watch, "bake", lambda scene: _put_in(watch, scene, take))
+    _change(watch, "bake", lambda scene: _put_in(watch, scene, take), only)
 
 
 def _put_in(watch: Watch, scene: Any, take: str) -> list[str]:

@@ -37,22 +37,25 @@ PLAN = "SPLANNEQUIN_PRESS_PLAN"
 def main() -> int:
     """The host's side: a display, Blender on it, photographs when asked for. Exit status 0 if all five steps ended."""
     args = _arguments()
+    plan = {"clip": str(Path(args.clip).absolute()), "last": args.last, "t_star": args.t_star}
+    results = _host(__file__, plan | {"stop_train": args.cancel_once}, args)
+    return 0 if results.get("ended") == [name for name, _ in STEPS] else 1
+
+
+def _host(script: str, plan: dict, args: argparse.Namespace) -> dict:
+    """Runs a script in Blender on a display, takes the pictures it asks for; returns and prints what it told."""
     output = Path(args.output).absolute()
     output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="splannequin-window-") as work:
-        plan = {"clip": str(Path(args.clip).absolute()), "last": args.last, "work": work, "t_star": args.t_star}
-        plan |= {"stop_train": args.cancel_once}
-        environ = {**os.environ, "DISPLAY": args.display, PLAN: json.dumps(plan)}
+        environ = {**os.environ, "DISPLAY": args.display, PLAN: json.dumps({**plan, "work": work})}
         with screen(args.display):
-            blender = subprocess.Popen(command(args.blender, __file__), env=environ)
+            blender = subprocess.Popen(command(args.blender, script), env=environ)
             _serve(blender, Path(work), output, environ, args.limit)
         told = Path(work) / "told.json"
-        if not told.is_file():
-            print("Error: Blender ended without telling how the steps went.", file=sys.stderr)
-            return 1
-        results = json.loads(told.read_text())
-        print(json.dumps(results, indent=1))
-        return 0 if results["ended"] == [name for name, _ in STEPS] else 1
+        lacking = {"error": "Blender ended without telling how it went."}
+        results = json.loads(told.read_text()) if told.is_file() else lacking
+    print(json.dumps(results, indent=1))
+    return results
 
 
 def on_a_shot(
@@ -61,7 +64,7 @@ def on_a_shot(
     play: Callable[[dict, dict], Iterator[float]],
     needs: str,
     display: str,
-    good: Callable[[dict], bool] = lambda results: "error" not in results,
+    good: Callable[[dict], bool] = lambda results: True,
 ) -> int:
     """Both sides of a script that plays on one shot: the host's, or, within Blender, the start of `play(plan, told)`.
 
@@ -71,7 +74,7 @@ def on_a_shot(
         play: the artist; `plan` has the shot's folder and a work folder, what `told` holds is printed.
         needs: what the shot needs, for --help.
         display: X display to open.
-        good: whether what was told is a success.
+        good: whether what was told is a success, if nothing failed.
 
     Returns:
         Exit status.
@@ -90,21 +93,8 @@ def on_a_shot(
     parser.add_argument("--display", default=display, help="X display to open")
     parser.add_argument("--limit", type=float, default=300.0, help="seconds until Blender is ended")
     args = parser.parse_args()
-    output = Path(args.output).absolute()
-    output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="splannequin-window-") as work:
-        plan = {"shot": str(Path(args.shot).absolute()), "work": work}
-        environ = {**os.environ, "DISPLAY": args.display, PLAN: json.dumps(plan)}
-        with screen(args.display):
-            blender = subprocess.Popen(command(args.blender, script), env=environ)
-            _serve(blender, Path(work), output, environ, args.limit)
-        told_file = Path(work) / "told.json"
-        if not told_file.is_file():
-            print("Error: Blender ended without telling how it went.", file=sys.stderr)
-            return 1
-        results = json.loads(told_file.read_text())
-    print(json.dumps(results, indent=1))
-    return 0 if good(results) else 1
+    results = _host(script, {"shot": str(Path(args.shot).absolute())}, args)
+    return 0 if "error" not in results and good(results) else 1
 
 
 @contextlib.contextmanager
