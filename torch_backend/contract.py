@@ -15,6 +15,8 @@ import enum
 import functools
 import json
 import math
+import os
+import stat
 import struct
 import typing
 from collections.abc import Mapping
@@ -32,6 +34,8 @@ CANCEL_FILE = "cancel"
 
 HEARTBEAT_SECONDS = 2.0
 """How often a living job rewrites status.json. A reader believes a job dead after ten of these and no process."""
+LONGEST_JSON = 1 << 28
+"""Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
 
 
 class ExitCode(enum.IntEnum):
@@ -437,8 +441,8 @@ def _read_exactly(stream: BinaryIO, count: int) -> bytes | None:
 def process_start(pid: int) -> float:
     """Start time of a process in clock ticks since boot, where the system tells (Linux); else 0."""
     try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-        return float(stat.rpartition(")")[2].split()[19])
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        return float(fields.rpartition(")")[2].split()[19])
     except (OSError, ValueError, IndexError):
         return 0.0
 
@@ -452,12 +456,32 @@ def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VER
         )
 
 
+def open_regular(path: str | Path) -> BinaryIO:
+    """Opens a regular file (or a link to one) for reading, without ever waiting for it.
+
+    A shot folder may come from anywhere: a pipe would hold up Blender's main thread, a device would fill its memory.
+    FileNotFoundError or another OSError of the system's; ValueError names a path that holds something else.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+    handle = os.open(path, flags)
+    try:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise ValueError(f"{path} is not a file: remove it")
+        return open(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
 def read_json(path: str | Path) -> dict[str, Any]:
     """A JSON object from a file. FileNotFoundError, or ValueError naming the file and what is wrong in it."""
-    text = Path(path).read_text(encoding="utf-8")
+    with open_regular(path) as source:
+        text = source.read(LONGEST_JSON + 1)
+    if len(text) > LONGEST_JSON:
+        raise ValueError(f"{path} is longer than {LONGEST_JSON >> 20} MB: nothing of ours is")
     try:
         data = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:  # ValueError: no JSON, no UTF-8, or a number of too many digits
         raise ValueError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(data, dict):
         raise ValueError(f"{path} should hold a JSON object, found {type(data).__name__}")

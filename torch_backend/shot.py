@@ -147,6 +147,39 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
 
 
+@contextlib.contextmanager
+def replacing_folder(path: str | Path) -> Iterator[Path]:
+    """Yields an empty folder beside `path`, which takes its place if the block ends well, whole or not at all.
+
+    Until then, and if the block fails, `path` stays as it was. What a killed process left is swept by the next one:
+    a folder that had been moved aside is put back if nothing took its place.
+    """
+    path = Path(path)
+    fresh, aside = path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
+    restore_folder(path)
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    try:
+        yield fresh
+        if path.exists():
+            _replace(path, aside)
+        _replace(fresh, path)
+    except BaseException:
+        restore_folder(path)
+        raise
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def restore_folder(path: Path) -> None:
+    """Puts back the folder that `replacing_folder` had moved aside when it was killed; removes it if it was replaced."""
+    aside = path.with_name(f".{path.name}.old")
+    if aside.is_dir() and not path.exists():
+        _replace(aside, path)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
 def _replace(source: Path, target: Path) -> None:
     """Renames over `target`; on Windows a reader may hold it open for a moment, so that is tried for two seconds."""
     for attempt in range(40):
