@@ -98,7 +98,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
     requests = {
-        "import": contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height),
+        "import": _import_params(args),
         "solve": contract.SolveParams(camera_model=args.camera_model),
         "train": _train_params(args),
         "freeze": _freeze_params(args),
@@ -221,6 +221,12 @@ def stmaps(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
+def _import_params(args: argparse.Namespace) -> contract.ImportParams:
+    return contract.ImportParams(
+        _source(args.clip), args.first, args.last, args.step, args.working_height, args.fps, args.layer
+    )
+
+
 def _train_params(args: argparse.Namespace) -> contract.TrainParams:
     return contract.TrainParams(
         run=args.run,
@@ -338,6 +344,8 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--last", type=int, help="last frame number, inclusive")
     to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
     to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
+    to.add_argument("--fps", type=float, default=0.0, help="rate of an image sequence (0: as its files say, else 24)")
+    to.add_argument("--layer", default="", metavar="NAME", help="EXR layer or part to take (default: the picture)")
     if not any(a.dest == "camera_model" for a in to._actions):
         to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
 
@@ -420,8 +428,7 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
 
         return run_live(args.shot, args.run, args.device)
     if args.command == "import":
-        params = contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height)
-        run_station(Shot.create(args.shot), "import", params, console)
+        run_station(Shot.create(args.shot), "import", _import_params(args), console)
     elif args.command == "solve":
         given = str(Path(args.cameras).absolute()) if args.cameras else ""
         params = contract.SolveParams(camera_model=args.camera_model, cameras=given)

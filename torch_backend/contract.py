@@ -34,6 +34,8 @@ CANCEL_FILE = "cancel"
 
 HEARTBEAT_SECONDS = 2.0
 """How often a living job rewrites status.json. A reader believes a job dead after ten of these and no process."""
+LAST_FRAME = 1_048_574
+"""Blender's last frame number: no scene reaches further."""
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
 
@@ -104,6 +106,10 @@ class ImportParams:
     """Every how many frames are solved and trained on; 0 chooses. All frames are delivered whatever it is."""
     working_height: int = 0
     """Height in pixels of the working frames; 0: the source's, at most 720."""
+    fps: float = 0.0
+    """Frames per second of an image sequence; 0: what its files say, else 24. A video has its own."""
+    layer: str = ""
+    """Layer or part of an image sequence to take, by its name or the end of it; empty: the picture itself."""
 
 
 @dataclass
