@@ -139,9 +139,7 @@ def test_a_file_that_breaks_off_says_how_much_of_it_there_is(broken_off, suffix)
     source, got = decoded(broken_off(suffix, 0.75))
     assert 12 <= len(got) < 24
     assert [f.number for f in got] == list(range(1, len(got) + 1))
-    assert [w[0] for w in source.warnings] == [
-        f"broken.{suffix} breaks off after frame {len(got)}: it announces 24."
-    ]
+    assert [w[0] for w in source.warnings] == [f"broken.{suffix} breaks off after frame {len(got)}: it announces 24."]
     asked, got = decoded(broken_off(suffix, 0.75), 2, 10)  # before it breaks off: nothing to say
     assert ([f.number for f in got], asked.warnings) == (list(range(2, 11)), [])
 
