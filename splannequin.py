@@ -85,7 +85,7 @@ def python_version(executable: str) -> tuple[int, int] | None:
     """(major, minor) of the Python at `executable`; None if it does not run (a pyenv shim without a version, say)."""
     try:
         found = subprocess.run(
-            [executable, "-c", "import sys; print('%d %d' % sys.version_info[:2])"],
+            [executable, "-I", "-c", "import sys; print('%d %d' % sys.version_info[:2])"],
             capture_output=True,
             text=True,
             timeout=30,
@@ -109,17 +109,16 @@ def find_python(accept: Callable[[tuple[int, int]], bool], names: Sequence[str])
     for name in names:
         for folder in os.get_exec_path():
             found = shutil.which(name, path=folder)
-            if found:
+            if found and os.path.isabs(found):  # Windows offers the folder that we stand in first
                 candidates.append(found)
         wanted = name.replace("python", "")
         if wanted:
             pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
             candidates += [str(p) for p in sorted(pyenv.glob(f"{wanted}.*/bin/{name}"), reverse=True)]
             launcher = shutil.which("py") if WINDOWS else None
-            if launcher:
-                located = subprocess.run(
-                    [launcher, f"-{wanted}", "-c", "import sys; print(sys.executable)"], capture_output=True, text=True
-                )
+            if launcher and os.path.isabs(launcher):
+                command = [launcher, f"-{wanted}", "-I", "-c", "import sys; print(sys.executable)"]
+                located = subprocess.run(command, capture_output=True, text=True)
                 if located.returncode == 0:
                     candidates.append(located.stdout.strip())
     for candidate in dict.fromkeys(candidates):
@@ -149,7 +148,10 @@ def hand_over_to_newer_python() -> int:
 if __name__ == "__main__" and sys.version_info[:2] < NEEDED_PYTHON:
     sys.exit(hand_over_to_newer_python())
 
-from torch_backend.contract import ExitCode, read_json  # noqa: E402  (needs 3.11)
+if str(ROOT) not in sys.path:  # -P and PYTHONSAFEPATH leave even a script's own folder out
+    sys.path.insert(0, str(ROOT))
+
+from torch_backend.contract import ExitCode, program, python_child, read_json  # noqa: E402  (needs 3.11)
 from torch_backend.shot import is_disk_full, locked, write_json  # noqa: E402
 
 
@@ -250,9 +252,10 @@ def bench_environment() -> Environment:
 
 
 def child_environ(**extra: str) -> dict[str, str]:
-    """Environment variables for a child: this checkout on its path, nothing of another Python."""
+    """Environment variables for a child: this checkout on its path, nothing of another Python or of where it stands."""
     environ = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP")}
-    environ.update(PYTHONPATH=str(ROOT), PYTHONUTF8="1", PYTHONUNBUFFERED="1", PYTHONNOUSERSITE="1", **extra)
+    environ.update(PYTHONPATH=str(ROOT), PYTHONSAFEPATH="1", PYTHONNOUSERSITE="1")
+    environ.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", **extra)
     return environ
 
 
@@ -283,12 +286,13 @@ def _make(environment: Environment, python: str) -> None:
     environment.state.mkdir(parents=True, exist_ok=True)
     environment.log.write_bytes(b"")
     if not usable:
-        _step(environment, "making the virtual environment", [python, "-m", "venv", str(environment.folder)])
+        _step(environment, "making the virtual environment", [python, "-P", "-m", "venv", str(environment.folder)])
     elif environment.begun.exists():
-        _step(environment, "checking what an interrupted set-up left", [environment.python, "-c", DROP_UNFINISHED])
+        command = [environment.python, "-P", "-c", DROP_UNFINISHED]
+        _step(environment, "checking what an interrupted set-up left", command)
     before = environment.installed()
     environment.begun.touch()
-    pip = [environment.python, "-m", "pip", "install", "--no-input", "--progress-bar", "off"]
+    pip = [environment.python, "-P", "-m", "pip", "install", "--no-input", "--progress-bar", "off"]
     pip += ["--disable-pip-version-check", "--only-binary=:all:"]
     pip += ["--no-deps"] if environment.complete else []
     index = os.environ.get("SPLANNEQUIN_TORCH_INDEX")
@@ -300,7 +304,7 @@ def _make(environment: Environment, python: str) -> None:
     for name in environment.requirements:
         pip += ["-r", str(REQUIREMENTS / name)]
     _step(environment, "installing packages", pip, condense_pip)
-    _step(environment, "importing what was installed", [environment.python, "-c", environment.probe])
+    _step(environment, "importing what was installed", [environment.python, "-P", "-c", environment.probe])
     venv = (environment.folder / "pyvenv.cfg").read_text(encoding="utf-8")
     write_json(environment.stamp, {"files": {**before, **environment.hashes()}, "venv": venv})
     environment.begun.unlink()
@@ -311,7 +315,8 @@ def _has_pip(environment: Environment) -> bool:
     version = python_version(environment.python)
     if version is None or version < NEEDED_PYTHON:
         return False
-    return subprocess.run([environment.python, "-m", "pip", "--version"], capture_output=True).returncode == 0
+    command = python_child(environment.python, "pip", "--version")
+    return subprocess.run(**command, env=child_environ(), capture_output=True).returncode == 0
 
 
 def _make_room(environment: Environment) -> None:
@@ -456,12 +461,13 @@ class Blender:
 
     def running(self, script: Path, *arguments: str) -> list[str]:
         """The command line that runs `script` with `arguments`."""
-        return [*self.command, str(script), *(() if self.is_wheel else ("--",)), *arguments]
+        safe, apart = (("-P",), ()) if self.is_wheel else ((), ("--",))
+        return [*self.command, *safe, str(script), *apart, *arguments]
 
 
 def find_blender() -> tuple[str, str] | None:
     """(path, version) of a `blender` on the PATH that is new enough."""
-    path = shutil.which("blender")
+    path = program("blender")
     if path is None:
         return None
     try:
@@ -530,7 +536,11 @@ def say(text: str) -> None:
 
 
 def start_child(command: Sequence[str], environ: dict[str, str], **streams: Any) -> subprocess.Popen[Any]:
-    """Starts a child in a process group of its own, so that Ctrl-C reaches it once, from here."""
+    """Starts a child in a process group of its own, so that Ctrl-C reaches it once, from here.
+
+    It stands beside its program, as in `contract.python_child`, unless `cwd` says where.
+    """
+    streams.setdefault("cwd", os.path.dirname(os.path.abspath(command[0])))
     try:
         if WINDOWS:
             group = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
@@ -558,13 +568,20 @@ def stop_child(child: subprocess.Popen[Any]) -> None:
         child.wait()
 
 
+HERE = Path()
+"""Where the user stands, for children that are given paths as they were typed."""
+
+
 def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = False, **environ: str) -> int:
     """Runs a child with our output; returns its exit code. On Ctrl-C it is cancelled and KeyboardInterrupt goes on.
 
+    `cwd`: where it stands, if not beside its program.
     `tied`: its standard input stays open as long as this process lives, however that ends; the child watches it.
     """
-    streams = {"stdin": subprocess.PIPE} if tied else {}
-    child = start_child(command, child_environ(**environ), cwd=cwd, **streams)
+    streams: dict[str, Any] = {"stdin": subprocess.PIPE} if tied else {}
+    if cwd is not None:
+        streams["cwd"] = cwd
+    child = start_child(command, child_environ(**environ), **streams)
     try:
         while True:
             # A wait without limit cannot be interrupted on Windows.
@@ -647,7 +664,8 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     setting_up += took
 
     say(f"Freezing {clip} into {output}")
-    code = run_child([backend.python, "-P", "-m", "torch_backend", "freeze", clip, "--output", str(output), *options])
+    command = [backend.python, "-P", "-m", "torch_backend", "freeze", clip, "--output", str(output), *options]
+    code = run_child(command, cwd=HERE)
     if code:
         return code
     summary = read_summary(output)
@@ -720,17 +738,17 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
     set_up(backend, sys.executable)
     legs: list[Leg] = []
     if not pytest_args and not series:
-        legs.append(Leg("ruff", [backend.python, "-m", "ruff", "check", str(ROOT)]))
+        legs.append(Leg("ruff", [backend.python, "-P", "-m", "ruff", "check", str(ROOT)]))
         project = ["--project", str(ROOT), "--pythonpath", backend.python]
-        legs.append(Leg("pyright", [backend.python, "-m", "pyright", *project]))
+        legs.append(Leg("pyright", [backend.python, "-P", "-m", "pyright", *project]))
     if backend_paths:
-        command = [backend.python, "-m", "pytest", "--ignore=tests/addon", *backend_paths, *rest]
+        command = [backend.python, "-P", "-m", "pytest", "--ignore=tests/addon", *backend_paths, *rest]
         legs.append(Leg("backend", command, output / "junit-backend.xml"))
     if addon_paths:
         blender = set_up_wheel(series, True)[0] if series else get_blender(testing=True)[0]
         if not blender.is_wheel:
             raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
-        command = [*blender.command, "-m", "pytest", *addon_paths, *rest]
+        command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
         legs.append(Leg(f"add-on in {blender.label}", command, output / "junit-addon.xml"))
     output.mkdir(parents=True, exist_ok=True)
     for leg in legs:
@@ -754,7 +772,7 @@ def bench(arguments: Sequence[str], output: Path) -> int:
             )
         renderer, setting_up = ["--bpy", blender.command[0]], setting_up + took
     command = [backend.python, "-P", "-m", "benchmarks.bench", "--results", str(output), "--tied", *renderer]
-    code = run_child([*command, *arguments], tied=True)
+    code = run_child([*command, *arguments], cwd=HERE, tied=True)
     summary: dict[str, Any] = {"command": "bench", "exit_code": code}
     summary.update(wall_seconds=round(time.monotonic() - started, 2), setup_seconds=round(setting_up, 2))
     if code == 0:
@@ -905,7 +923,7 @@ def memory_gb() -> float | None:
 
 def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
     """NVIDIA cards and whether driver and card fit the pinned Warp and torch."""
-    tool = shutil.which("nvidia-smi")
+    tool = program("nvidia-smi")
     query = "--query-gpu=name,driver_version,compute_cap"
     try:
         command = [tool or "nvidia-smi", query, "--format=csv,noheader"]
@@ -942,9 +960,8 @@ def gpu_finding(name: str, driver: str, compute: str) -> Finding:
 
 def backend_facts(backend: Environment) -> dict[str, Any]:
     """What the backend says about its own environment."""
-    ran = subprocess.run(
-        [backend.python, "-P", "-m", "torch_backend", "doctor"], capture_output=True, text=True, env=child_environ()
-    )
+    command = python_child(backend.python, "torch_backend", "doctor")
+    ran = subprocess.run(**command, capture_output=True, text=True, env=child_environ())
     try:
         return json.loads(ran.stdout[ran.stdout.index("{") :])
     except ValueError:
@@ -1041,7 +1058,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     module = {"freeze": ["torch_backend", "freeze"], "bench": ["benchmarks.bench"]}.get(words[0] if words else "")
     if module and {"-h", "--help"} & set(words) and backend_environment().ready():
-        return run_child([backend_environment().python, "-P", "-m", *module, "--help"])
+        return run_child([backend_environment().python, "-P", "-m", *module, "--help"], cwd=HERE)
     args, rest = parser().parse_known_args(words)
     if rest and args.command in ("doctor", "setup"):
         parser().error(f"unrecognized arguments: {' '.join(rest)}")

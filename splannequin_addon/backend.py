@@ -120,10 +120,10 @@ class Doctor:
 def begin_doctor() -> Doctor:
     """Asks the backend what it can do, without waiting. JobError if there is none, or it cannot be started."""
     root = package_root()
-    command = [python(), "-m", "torch_backend", "doctor"]
+    command = contract.python_child(python(), "torch_backend", "doctor")
     try:
         child = subprocess.Popen(
-            command, cwd=root, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            **command, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
     except OSError as error:

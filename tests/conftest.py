@@ -1,6 +1,10 @@
 """Loaded by the backend's tests and, inside a bpy wheel, by the add-on's: standard library and pytest only."""
 
 import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
 
 if importlib.util.find_spec("hypothesis"):
     from hypothesis import settings
@@ -8,3 +12,30 @@ if importlib.util.find_spec("hypothesis"):
     # No test depends on how fast the machine is, and every run tries the same examples.
     settings.register_profile("splannequin", deadline=None, derandomize=True, max_examples=50)
     settings.load_profile("splannequin")
+
+HOSTILE = ("torch_backend", "benchmarks", "pycolmap", "numpy", "torch", "json", "venv", "pip", "ensurepip", "site")
+CUSTOM = ("sitecustomize", "usercustomize")
+
+
+@pytest.fixture
+def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """hostile(folder, ...) puts modules into folders and stands in the first; returns the file that they write when
+    they are imported."""
+    marker = tmp_path / "a module of a shot was imported"
+
+    def plant(*folders: Path) -> Path:
+        monkeypatch.delenv("PYTHONSAFEPATH", raising=False)  # of who runs the tests; a user has none
+        monkeypatch.setenv("PYTHONPATH", "")
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            source = f"open({str(marker)!r}, 'a').write(__name__ + ' ' + __file__ + chr(10))\n"
+            for name in (*HOSTILE, *CUSTOM):
+                (folder / f"{name}.py").write_text(source, encoding="utf-8")
+            (folder / "torch_backend.py").unlink()
+            (folder / "torch_backend").mkdir(exist_ok=True)
+            for name in ("__init__", "__main__"):
+                (folder / "torch_backend" / f"{name}.py").write_text(source, encoding="utf-8")
+        monkeypatch.chdir(folders[0])
+        return marker
+
+    return plant

@@ -16,6 +16,7 @@ import functools
 import json
 import math
 import os
+import shutil
 import stat
 import struct
 import typing
@@ -433,6 +434,30 @@ def _read_exactly(stream: BinaryIO, count: int) -> bytes | None:
         parts.append(part)
         missing -= len(part)
     return b"".join(parts)
+
+
+# ------------------------------------------------------------------------------------------------- processes
+
+
+def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]:
+    """`args` and `cwd` of the `Popen` that runs a module of ours; paths in `words` should be absolute.
+
+    Python takes modules from the folder that it stands in, and a shot folder may come from anywhere: -P says no. The
+    child stands beside its interpreter, where nobody puts files for it: a loader of libraries still looks there
+    (Windows always, Linux with an empty entry in LD_LIBRARY_PATH). It is neither the shot's folder nor the extension's:
+    Windows keeps the folder that a process stands in from being moved or removed.
+    """
+    python = os.path.abspath(python)
+    return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
+
+
+def program(name: str) -> str | None:
+    """Absolute path of a program on the PATH; None if there is none, or if the folder we stand in has one to offer.
+
+    `shutil.which` looks into that folder first on Windows, and it may be one that came with a .blend or a clip.
+    """
+    found = shutil.which(name)
+    return found if found and os.path.isabs(found) else None
 
 
 # ------------------------------------------------------------------------------------------------- reading

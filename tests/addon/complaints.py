@@ -310,8 +310,8 @@ def _try(folder: Path, answer: Answer, backend: str, bpy: str) -> str:
 
 def _run(folder: Path, answer: Answer, backend: str, bpy: str) -> int:
     python = bpy if answer.test.startswith("tests/addon") else backend
-    environ = {**os.environ, "SPLANNEQUIN_BACKEND_PYTHON": backend}
-    command = [python, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", answer.test]
+    environ = {**os.environ, "SPLANNEQUIN_BACKEND_PYTHON": backend, "PYTHONPATH": str(folder)}
+    command = [python, "-P", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", answer.test]
     try:
         return subprocess.run(command, cwd=folder, env=environ, capture_output=True, timeout=180).returncode
     except subprocess.TimeoutExpired:

@@ -1,6 +1,7 @@
 """The whole backend on a very small real clip, by its command line: files, figures, pixels; refusals in words."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_backend.contract import ExitCode
+from torch_backend.contract import ExitCode, python_child
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png, resize
 from torch_backend.freeze.exr import read_frozen_exr
@@ -22,8 +23,9 @@ KEYS = {
 
 
 def run(*arguments):
-    command = [sys.executable, "-m", "torch_backend", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    command = python_child(sys.executable, "torch_backend", *map(str, arguments))
+    environ = {**os.environ, "PYTHONPATH": str(CLIP.parents[1])}
+    return subprocess.run(**command, env=environ, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 from torch_backend.contract import CameraPath, Cancelled, ExitCode, JobError, read_json
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png
-from torch_backend.shot import Shot
+from torch_backend.shot import Shot, write_json
 from torch_backend.solve import SolveConfig, load_points, solve_shot
 from torch_backend.solve.child import run_worker
 from torch_backend.solve.floor import floor_of
@@ -286,3 +286,17 @@ import sys, torch_backend.solve.worker
 assert "pycolmap" in sys.modules and "OpenImageIO" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_worker_takes_no_module_from_where_the_request_lies(hostile, tmp_path, tools):
+    scratch = tmp_path / "scratch"
+    marker = hostile(scratch)
+    request = {"images": str(tmp_path / "none"), "solved": [], "others": [], "camera_model": "SIMPLE_RADIAL"}
+    request |= {"overlap": 1, "features": 128, "neighbours": 1, "threads": 1}
+    write_json(scratch / "request.json", request)
+    try:
+        told = run_worker(scratch / "request.json", scratch / "log.txt", tools.recorder())
+    except JobError as error:
+        told = error.message
+    assert "COLMAP" in str(told) or "failure" in told, "the worker itself answered"
+    assert not marker.exists(), marker.read_text()
