@@ -26,6 +26,8 @@ _START_SECONDS = 30.0
 _LOG_LINES = 6
 _KILL_SECONDS = 20.0
 """A job that has not ended this long after it was asked to is ended by force on a second request."""
+_SILENT_SECONDS = 10 * contract.HEARTBEAT_SECONDS
+"""A job of an older backend is believed dead after this long without a sign of life."""
 
 
 @dataclass
@@ -155,24 +157,35 @@ def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
 
 
 def is_alive(job: Job, status: contract.Status | None) -> bool:
-    """True if the job's process still works on it, or may be about to."""
+    """True if the job's process still works on it, or may be about to. One of another computer is never judged dead.
+
+    A process that is only stopped, as by a computer that slept, is alive whatever its last sign of life.
+    """
     if job.process is not None:
         return job.process.poll() is None
     if status is None or not status.pid:
         return time.time() - _made(job.folder) < _START_SECONDS
-    if status.process_started and sys.platform == "linux":
-        return contract.process_start(status.pid) == status.process_started
-    return time.time() - status.heartbeat < 10 * contract.HEARTBEAT_SECONDS
+    if status.host and status.host != contract.host_name():
+        return True
+    if status.host or (status.process_started and sys.platform == "linux"):
+        return contract.runs_still(status.pid, status.process_started)
+    return time.time() - status.heartbeat < _SILENT_SECONDS  # from an older backend, that did not say where it ran
 
 
 def cancel(job: Job) -> None:
-    """Asks the job to stop with a checkpoint; asked again after `_KILL_SECONDS`, ends it by force."""
+    """Asks the job to stop with a checkpoint; asked again after `_KILL_SECONDS`, ends it by force.
+
+    JobError if it should be ended by force and cannot be told from other processes beyond doubt: those stay.
+    """
     flag = job.folder / contract.CANCEL_FILE
-    if flag.exists() and time.time() - flag.stat().st_mtime > _KILL_SECONDS and is_alive(job, job.status):
-        _kill(job)
-        return
-    if not flag.exists():
-        flag.touch()
+    try:
+        os.close(os.open(flag, os.O_WRONLY | os.O_CREAT | os.O_EXCL))  # whatever lies there, also a link, is left alone
+    except FileNotFoundError:
+        return  # the shot was moved or deleted, which ends the job too
+    except FileExistsError:
+        since = flag.lstat().st_mtime
+        if time.time() - since > _KILL_SECONDS and is_alive(job, job.status):
+            _kill(job)
 
 
 def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
@@ -263,7 +276,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 def _read_status(folder: Path) -> contract.Status | None:
     try:
         data = contract.read_json(folder / contract.STATUS_FILE)
-        contract.check_version(data, "job status")
+        contract.check_version(data, "job status", contract.STATUS_VERSION)
         return contract.from_dict(contract.Status, data)
     except OSError:
         return None
@@ -333,14 +346,32 @@ def _made(folder: Path) -> float:
 
 
 def _kill(job: Job) -> None:
-    """Ends the job's process group. Only a process whose start time is the one in the status, or our own child."""
-    pid = job.process.pid if job.process else (job.status.pid if job.status else 0)
-    if not pid:
-        return
+    """Ends the job's process and its children: our own child, or what is the job's beyond doubt. JobError if not."""
+    if job.process is not None:
+        pid = job.process.pid  # ours until it is waited for: the system gives its number to no other
+    else:
+        status = job.status
+        if status is None or status.host not in ("", contract.host_name()):
+            where = status.host.partition(" (")[0] if status else "another computer"
+            raise _not_ours(f"This step runs on {where}: only there it can be ended.")
+        pid = status.pid
+        if not contract.runs_job(pid, status.process_started, job.folder):
+            raise _not_ours("The process of this step cannot be told from others for sure, so none was ended.")
     if sys.platform == "win32":
-        subprocess.run(["taskkill", "/F", "/T", "/PID", str(pid)], capture_output=True, check=False)
+        program = os.path.join(os.environ.get("SYSTEMROOT", r"C:\Windows"), "System32", "taskkill.exe")
+        subprocess.run([program, "/F", "/T", "/PID", str(pid)], capture_output=True, check=False)
         return
     try:
-        os.killpg(pid, signal.SIGKILL)
+        if os.getpgid(pid) == pid:
+            os.killpg(pid, signal.SIGKILL)
+        else:
+            os.kill(pid, signal.SIGKILL)  # in somebody else's group
     except ProcessLookupError:
         return  # it ended by itself in the meantime
+
+
+def _not_ours(message: str) -> contract.JobError:
+    return contract.JobError(
+        message, "It was asked to stop and does so with its next step, or end it where it was started.",
+        contract.ExitCode.USAGE,
+    )  # fmt: skip

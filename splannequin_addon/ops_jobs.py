@@ -9,6 +9,7 @@ from bpy.props import StringProperty
 
 from ..torch_backend import contract
 from . import jobs, steps, supervisor
+from .translations import tr
 
 
 class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
@@ -31,7 +32,11 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         if job is None or job.ended:
             self.report({"WARNING"}, "Nothing is running")
             return {"CANCELLED"}
-        jobs.cancel(job)
+        try:
+            jobs.cancel(job)
+        except (contract.JobError, OSError) as error:
+            self.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
+            return {"CANCELLED"}
         return {"FINISHED"}
 
 

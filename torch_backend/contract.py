@@ -10,15 +10,21 @@ row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame number
 
 from __future__ import annotations
 
+import calendar
+import contextlib
 import dataclasses
 import enum
 import functools
+import hashlib
 import json
 import math
 import os
 import shutil
+import socket
 import stat
 import struct
+import subprocess
+import sys
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -26,15 +32,19 @@ from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 CONTRACT_VERSION = 1
+STATUS_VERSION = 2
+"""Of status.json: 2 has the host."""
 
 REQUEST_FILE = "request.json"
 STATUS_FILE = "status.json"
 EVENTS_FILE = "events.jsonl"
 LOG_FILE = "log.txt"
 CANCEL_FILE = "cancel"
+JOB_COMMAND = "-m torch_backend run-job"
+"""How the process of a job was called, but for its Python and the job's folder."""
 
 HEARTBEAT_SECONDS = 2.0
-"""How often a living job rewrites status.json. A reader believes a job dead after ten of these and no process."""
+"""How often a living job rewrites status.json."""
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
 
@@ -265,7 +275,7 @@ class Status:
     started: float
     """Start of the job, seconds since the epoch."""
     process_started: float
-    """Start time of the process as the system gives it, so that a reused pid is not believed; 0 if unknown."""
+    """`Process.started` of the child, so that a reused pid is not believed; 0 if unknown."""
     heartbeat: float
     """Last sign of life, seconds since the epoch."""
     stage: str = ""
@@ -280,8 +290,10 @@ class Status:
     """Seconds left in this stage, if it can be told."""
     exit_code: int | None = None
     """Exit code once it has ended."""
-    version: int = CONTRACT_VERSION
-    """Version of this contract."""
+    host: str = ""
+    """Computer that the job runs on, as `host_name` says; empty in files from before version 2."""
+    version: int = STATUS_VERSION
+    """Version of this file."""
 
     @property
     def ended(self) -> bool:
@@ -460,16 +472,151 @@ def program(name: str) -> str | None:
     return found if found and os.path.isabs(found) else None
 
 
-# ------------------------------------------------------------------------------------------------- reading
+@functools.cache
+def host_name() -> str:
+    """This computer as files name it: its name, and in brackets what tells it from another one of the same name.
+
+    On Linux that is a hash of the machine's id and, in a container, of its process ids' namespace; on Windows of the
+    machine's GUID; elsewhere there is none.
+    """
+    marks = []
+    if sys.platform == "win32":
+        import winreg
+
+        with contextlib.suppress(OSError):
+            with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, r"SOFTWARE\Microsoft\Cryptography") as known:
+                marks.append(str(winreg.QueryValueEx(known, "MachineGuid")[0]))
+    else:
+        with contextlib.suppress(OSError):
+            marks.append(Path("/etc/machine-id").read_text(encoding="ascii", errors="replace").strip())
+        with contextlib.suppress(OSError):
+            marks.append(os.readlink("/proc/self/ns/pid"))
+    mark = hashlib.sha256("\n".join(marks).encode()).hexdigest()[:8]
+    return f"{socket.gethostname()} ({mark})" if any(marks) else socket.gethostname()
+
+
+@dataclass(frozen=True)
+class Process:
+    """What the system says of a living process."""
+
+    started: float
+    """When it started, in the system's own unit: only to be compared with another answer. 0 if it does not tell."""
+    command: str
+    """Its command line, arguments separated by spaces; empty if the system does not tell."""
+
+
+def process(pid: int) -> Process | None:
+    """A living process of this computer; None if there is none of that id. Standard library, on all three systems."""
+    if not (isinstance(pid, int) and 0 < pid < 1 << 31):
+        return None
+    if sys.platform == "win32":
+        return _process_of_windows(pid)
+    try:
+        os.kill(pid, 0)  # asks only: no signal is sent
+    except ProcessLookupError:
+        return None
+    except OSError:
+        pass  # somebody else's, but there
+    return _process_of_proc(pid) if Path("/proc/self/stat").exists() else process_of_ps(pid)
 
 
 def process_start(pid: int) -> float:
-    """Start time of a process in clock ticks since boot, where the system tells (Linux); else 0."""
+    """`Process.started` of a process; 0 if there is none or the system does not tell."""
+    found = process(pid)
+    return found.started if found is not None else 0.0
+
+
+def runs_still(pid: int, started: float) -> bool:
+    """True if a process of this computer lives that has this id and start; one that is only stopped does.
+
+    Where the system tells no start, a process of this id is taken for it: a job is not declared dead on a guess.
+    """
+    found = process(pid)
+    return found is not None and (not found.started or not started or found.started == started)
+
+
+def _process_of_proc(pid: int) -> Process | None:
+    """From /proc. Start in clock ticks since boot."""
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-        return float(fields.rpartition(")")[2].split()[19])
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        fields = text.rpartition(")")[2].split()
+        if fields[0] in ("Z", "X"):
+            return None  # it has ended: only its exit code is kept for its parent
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        return Process(float(fields[19]), " ".join(os.fsdecode(word) for word in words).rstrip(" "))
     except (OSError, ValueError, IndexError):
-        return 0.0
+        return Process(0.0, "")  # hidden from us, or ending just now
+
+
+def process_of_ps(pid: int) -> Process | None:
+    """From `ps`, on systems without /proc (macOS). Start in seconds since the epoch, whole ones."""
+    command = ["/bin/ps", "-ww", "-o", "stat=,lstart=,command=", "-p", str(pid)]
+    environ = {"LC_ALL": "C", "TZ": "UTC0", "PATH": "/usr/bin:/bin"}
+    try:
+        # close_fds=False: macOS then spawns it without copying the parent, which may be a heavy Blender.
+        told = subprocess.run(command, capture_output=True, env=environ, close_fds=False, timeout=5.0, check=False)
+        state, _, month, day, clock, year, line = os.fsdecode(told.stdout).strip("\n").split(None, 6)
+        if state.startswith("Z"):
+            return None
+        hours, minutes, seconds = map(int, clock.split(":"))
+        when = (int(year), _MONTHS.index(month) + 1, int(day), hours, minutes, seconds)
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return Process(0.0, "")
+    return Process(float(calendar.timegm((*when, 0, 0, 0))), line)
+
+
+_MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
+
+
+def _process_of_windows(pid: int) -> Process | None:
+    """From the Windows API. Start in units of 100 ns since 1601; the command line since Windows 8.1."""
+    if sys.platform != "win32":
+        return None
+    import ctypes
+    from ctypes import wintypes
+
+    class UnicodeString(ctypes.Structure):
+        _fields_ = [("length", wintypes.USHORT), ("room", wintypes.USHORT), ("text", ctypes.c_void_p)]
+
+    kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+    kernel.OpenProcess.restype = wintypes.HANDLE
+    opened = kernel.OpenProcess(wintypes.DWORD(0x1000), False, wintypes.DWORD(pid))  # PROCESS_QUERY_LIMITED_INFORMATION
+    if not opened:
+        return None if ctypes.get_last_error() == 87 else Process(0.0, "")  # ERROR_INVALID_PARAMETER: no such process
+    handle = wintypes.HANDLE(opened)
+    try:
+        code, times = wintypes.DWORD(), [wintypes.FILETIME() for _ in range(4)]
+        if kernel.GetExitCodeProcess(handle, ctypes.byref(code)) and code.value != 259:  # STILL_ACTIVE
+            return None
+        told = kernel.GetProcessTimes(handle, *(ctypes.byref(time) for time in times))
+        started = times[0].dwHighDateTime << 32 | times[0].dwLowDateTime if told else 0
+        room, needed = ctypes.create_string_buffer(1 << 17), wintypes.ULONG()
+        query = ctypes.WinDLL("ntdll").NtQueryInformationProcess  # 60: ProcessCommandLineInformation
+        if query(handle, 60, room, wintypes.ULONG(len(room)), ctypes.byref(needed)):
+            return Process(float(started), "")
+        line = UnicodeString.from_buffer(room)
+        text = ctypes.string_at(line.text, line.length).decode("utf-16-le", "replace") if line.text else ""
+        return Process(float(started), text.replace('"', ""))
+    finally:
+        kernel.CloseHandle(handle)
+
+
+def runs_job(pid: int, started: float, folder: Path) -> bool:
+    """True if a process is the job of a folder beyond doubt: its start, and a command line that runs that job.
+
+    A file's word for a process is not enough to end it: whoever wrote the file could have anything ended.
+    """
+    found = process(pid) if pid > 1 else None
+    if found is None or not started or found.started != started:
+        return False
+    _, ours, told = found.command.rpartition(f" {JOB_COMMAND} ")
+    try:
+        return bool(ours) and os.path.isabs(told) and os.path.samefile(told, folder)
+    except (OSError, ValueError):
+        return False
+
+
+# ------------------------------------------------------------------------------------------------- reading
 
 
 def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VERSION) -> None:

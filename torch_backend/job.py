@@ -43,7 +43,8 @@ class JobReporter:
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
         now = time.time()
-        self.status = Status(kind, "running", os.getpid(), now, contract.process_start(os.getpid()), now)
+        pid, host = os.getpid(), contract.host_name()
+        self.status = Status(kind, "running", pid, now, contract.process_start(pid), now, host=host)
         self._events = open(folder / contract.EVENTS_FILE, "a", encoding="utf-8")  # noqa: SIM115 - lives as long as the job
         self._stop = threading.Event()
         self._write_status()

@@ -248,6 +248,9 @@ MESSAGES: dict[str, str] = {
     "Last line of its log: {}": "Letzte Zeile des Protokolls: {}",
     "It was killed, perhaps for want of memory: close other programs or choose a smaller preset, then start again.": "Es wurde beendet, vielleicht weil der Speicher nicht reichte: andere Programme schließen oder eine kleinere Vorgabe wählen, dann neu starten.",
     "Start it again: finished work is kept. Its whole log is {}": "Noch einmal starten: Fertiges bleibt. Das ganze Protokoll ist {}",
+    "This step runs on {}: only there it can be ended.": "Dieser Schritt läuft auf {}: nur dort lässt er sich beenden.",
+    "The process of this step cannot be told from others for sure, so none was ended.": "Der Prozess dieses Schritts ist nicht sicher von anderen zu unterscheiden, darum wurde keiner beendet.",
+    "It was asked to stop and does so with its next step, or end it where it was started.": "Er wurde gebeten aufzuhören und tut das beim nächsten Schritt; sonst dort beenden, wo er gestartet wurde.",
     # ------------------------------------------------------------------------------------------ preferences
     "In use: {}": "In Gebrauch: {}",
     "Folder (empty: {})": "Ordner (leer: {})",
