@@ -14,6 +14,7 @@ import json
 import os
 import re
 import shutil
+import stat
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -25,6 +26,8 @@ from .contract import ExitCode, JobError, check_version, from_dict, read_json
 
 SHOT_VERSION = 1
 SHOT_SUFFIX = ".splannequin"
+_JUNCTION = 0xA0000003
+"""Reparse tag of a mount point, Windows' link between folders (stat.IO_REPARSE_TAG_MOUNT_POINT, there alone)."""
 _NAME = re.compile(r"^[\w][\w .-]{0,63}$")
 
 
@@ -107,6 +110,26 @@ class Shot:
         """Folder of a take; ValueError if the name could leave it."""
         return self.root / "takes" / checked_name(name, "take")
 
+    def own(self, folder: Path) -> Path:
+        """`folder` of this shot, for those who remove or overwrite files in it.
+
+        JobError if it is no folder, or if it or a folder on the way to it is a link: what lies behind is not ours.
+        """
+        there = self.root
+        for part in folder.relative_to(self.root).parts:
+            there = there / part
+            if is_link(there):
+                raise JobError(
+                    f"{there} is a link to {os.path.realpath(there)}: what lies there is not this shot's to replace.",
+                    "Remove the link, or put a folder of that name in its place, then start again.",
+                    ExitCode.USAGE,
+                )
+            if os.path.lexists(there) and not there.is_dir():
+                raise JobError(
+                    f"{there} is not a folder.", "Move it away: the shot keeps its files there.", ExitCode.USAGE
+                )
+        return folder
+
     def info(self) -> ShotInfo:
         """shot.json as it is now."""
         data = read_json(self.info_path)
@@ -122,6 +145,15 @@ class Shot:
         info = dataclasses.replace(self.info(), **changes)
         self.save(info)
         return info
+
+
+def is_link(path: Path) -> bool:
+    """True for a symbolic link, and on Windows for a junction, whether or not it leads anywhere."""
+    try:
+        found = os.lstat(path)
+    except OSError:
+        return False
+    return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == _JUNCTION
 
 
 def checked_name(name: str, what: str) -> str:
@@ -241,8 +273,8 @@ def content_key(*parts: Any) -> str:
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, Path):
-            stat = part.stat()
-            part = [part.name, stat.st_size, stat.st_mtime_ns]
+            found = part.stat()
+            part = [part.name, found.st_size, found.st_mtime_ns]
         elif dataclasses.is_dataclass(part) and not isinstance(part, type):
             part = dataclasses.asdict(part)
         digest.update(json.dumps(part, sort_keys=True, default=str).encode("utf-8"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..contract import Reporter, frame_file, read_json
-from ..shot import Shot, content_key, need_disk, write_json
+from ..shot import Shot, content_key, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import resize, working_size, write_png
 from .sources import Source, SourceFrame, footage_error, frame_words, open_source
@@ -23,6 +25,10 @@ LEAST_FRAMES = 8
 MANY_FRAMES = 1500
 EXPOSURE_DRIFT_STOPS = 1.0
 CLIPPED_SHARE = 0.01
+_PARTIAL = "raw.partial"
+"""What a killed import of an earlier version left."""
+_BESIDE = re.compile(r"\..+\.\d+\.tmp\.(png|json)")
+"""What a killed process leaves of a file that it was writing, see `shot.atomic_path`."""
 _WRITERS = 2
 _DISK_CHECK_FRAMES = 16
 
@@ -59,7 +65,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
 
     Frames are frames/raw/NNNNNN.png, 8-bit sRGB, or 16-bit where the source is deeper; `seconds` in frames.json count
     from the first frame of the range. A finished import of the same source and configuration is left alone. Another
-    one replaces it, and the solve made from it is removed.
+    one takes its place once it is whole, and the solve made from it is removed; files that are not ours stay.
 
     Returns {frames, solved_frames, first, last, step, width, height, fps, colour, source}.
     Raises JobError (FOOTAGE, DISK) in one sentence, and Cancelled; either leaves no half import behind.
@@ -68,21 +74,22 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     opened = open_source(source, config.fps)
     _check_range(opened, config)
     key = content_key(FRAMES_VERSION, opened.info.key, config)
+    restore_folder(shot.frames)
+    for folder in (shot.frames / "raw", shot.solve):
+        shot.own(folder)
     done = _finished(shot, key)
     if done is not None:
         report.progress("import", 1, 1, "already imported")
         return _result(shot, done)
-    partial = shot.frames / "raw.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        extracted = _extract(shot, opened, config, partial, report)
+    with replacing_folder(shot.frames) as fresh:
+        extracted = _extract(shot, opened, config, fresh / "raw", report)
         _refuse_unusable(extracted.measures)
         for message, hint in opened.warnings + _remarks(extracted):
             report.warning(message, hint)
         record = _record(opened, config, extracted, key)
-        _publish(shot, partial, record, source)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        write_json(fresh / FRAMES_FILE, record)
+        _keep_strangers(shot.frames, fresh, record)
+    _publish(shot, record, source)
     return _result(shot, record)
 
 
@@ -284,15 +291,43 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
     }
 
 
-def _publish(shot: Shot, partial: Path, record: dict[str, Any], source: str) -> None:
-    """Puts the new frames in the place of the old. frames.json goes first and comes back last: it says "whole"."""
-    (shot.frames / FRAMES_FILE).unlink(missing_ok=True)
-    for stale in shot.frames.glob("*.png"):
-        stale.unlink()
+def _keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:
+    """Takes over what lies in the frames folder and is not ours, under its own name or, where we need that, another.
+
+    Ours are the listing, the frames that it names, and their undistorted copies beside raw/.
+    """
+    ours, needed = _listed(old / FRAMES_FILE), _names(record)
+    for found in sorted(p for p in old.rglob("*") if p.is_symlink() or not p.is_dir()):
+        name = found.relative_to(old)
+        if name in ours or name.parts[0] == _PARTIAL or _BESIDE.fullmatch(name.name):
+            continue
+        while name in needed or os.path.lexists(fresh / name):
+            name = name.with_name(f"{name.stem}.kept{name.suffix}")
+        target = fresh / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(found, target, follow_symlinks=False)
+        except (OSError, NotImplementedError):  # no hard links there: a network share, a memory card
+            shutil.copy2(found, target, follow_symlinks=False)
+
+
+def _listed(listing: Path) -> set[Path]:
+    """Our files in a folder with this frames.json; the listing alone if it cannot be read: no other is known to be."""
+    try:
+        return _names(read_json(listing))
+    except (OSError, ValueError, KeyError, TypeError):
+        return {Path(FRAMES_FILE)}
+
+
+def _names(record: dict[str, Any]) -> set[Path]:
+    """Files of an import, relative to the frames folder, and the undistorted ones that a solve writes beside raw/."""
+    files = [Path(str(row["file"])) for row in record["frames"]]
+    return {Path(FRAMES_FILE), *files, *(Path(file.name) for file in files)}
+
+
+def _publish(shot: Shot, record: dict[str, Any], source: str) -> None:
+    """Removes the solve of the frames that were replaced, and tells shot.json of the new ones."""
     shutil.rmtree(shot.solve, ignore_errors=True)
-    shutil.rmtree(shot.frames / "raw", ignore_errors=True)
-    partial.rename(shot.frames / "raw")
-    write_json(shot.frames / FRAMES_FILE, record)
     frames = record["frames"]
     shot.update(
         source=str(source),

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Protocol
 
 from numpy.typing import NDArray
 
 from ..contract import ExitCode, JobError
+
+LONGEST_PIXEL = 4
+"""Anamorphic pixels are at most about 2 times as wide as high."""
 
 
 @dataclass
@@ -79,6 +84,21 @@ def frame_words(numbers: Sequence[int]) -> str:
     return ("frame " if len(numbers) == 1 else "frames ") + ", ".join(listed[:8]) + more
 
 
+def believable_aspect(aspect: Fraction, warnings: list[tuple[str, str]]) -> Fraction:
+    """Width of a pixel over its height; 1, with a warning, if no camera or lens has such pixels."""
+    if 1 / LONGEST_PIXEL <= aspect <= LONGEST_PIXEL:
+        return aspect
+    warnings.append((f"The footage claims pixels {float(aspect):g} times as wide as high: taken as square.", ""))
+    return Fraction(1)
+
+
+def square_size(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
+    """Size of a picture once its pixels, `aspect` times as wide as high, are square; neither side shrinks."""
+    if aspect >= 1:
+        return max(1, round(width * aspect)), height
+    return width, max(1, round(height / aspect))
+
+
 def open_source(source: str, fps: float = 0.0) -> Source:
     """Opens a video file, a folder or file or pattern of a numbered sequence. `fps` overrides a sequence's rate.
 
@@ -92,9 +112,18 @@ def open_source(source: str, fps: float = 0.0) -> Source:
             "No footage was given.", "Choose a video file, a picture of a numbered sequence, or a folder."
         )
     path = Path(source)
-    is_pattern = not path.exists() and any(mark in path.name for mark in ("#", "%", "@", "*"))
-    if is_pattern or path.is_dir() or path.suffix.lower() in PICTURES:
+    try:
+        is_pattern = not path.exists() and any(mark in path.name for mark in ("#", "%", "@", "*"))
+        if path.is_dir():
+            os.listdir(path)
+    except (OSError, ValueError) as error:  # no permission, too long a name, a zero byte in it
+        reason = getattr(error, "strerror", None) or error
+        raise footage_error(f"The footage {source!r} cannot be opened: {reason}.", "Check the path.") from error
+    special = path.exists() and not path.is_file() and not path.is_dir()
+    if is_pattern or path.is_dir() or (path.suffix.lower() in PICTURES and not special):
         return SequenceSource(find_sequence(path), fps)
+    if special:
+        raise footage_error(f"{source} is neither a file nor a folder.", "Choose a video file or an image sequence.")
     if not path.is_file():
         raise footage_error(
             f"The footage {source} does not exist.", "Check the path; a clip on a server must be mounted."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from av.video.reformatter import Colorspace, Interpolation
 from numpy.typing import NDArray
 
 from .images import resize
-from .sources import SourceFrame, SourceInfo, footage_error, frame_words
+from .sources import SourceFrame, SourceInfo, believable_aspect, footage_error, frame_words, square_size
 
 NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
 """FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
@@ -25,7 +26,10 @@ BT709, BT601_BT470, BT601_SMPTE = 1, 5, 6
 
 
 class VideoSource:
-    """A video file. Frame numbers count from 1 in presentation order; an undecodable one keeps its number."""
+    """A video file. Frame numbers count from 1 in presentation order; an undecodable one keeps its number.
+
+    A file that ends before what it announces, and a picture that changes its size midway, are told by name.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -34,14 +38,16 @@ class VideoSource:
             stream = _best_stream(container, path)
             frame = _first_frame(container, stream, path)
             self._quarter_turns = round(_rotation(frame) / 90.0) % 4
-            self._aspect = _pixel_aspect(stream)
+            self._aspect = believable_aspect(_pixel_aspect(stream), self.warnings)
             self._deep = max(c.bits for c in frame.format.components) > 8
-            width, height = self._square_size(frame.width, frame.height)
+            width, height = square_size(frame.width, frame.height, self._aspect)
             if self._quarter_turns % 2:
                 width, height = height, width
             rate = stream.average_rate or stream.guessed_rate or Fraction(24)
             count = stream.frames or _count_from_duration(container, stream, rate)
             self._warn_about(frame)
+            self._size = frame.width, frame.height
+            self._promise = _promise(container, stream, rate)
         stat = path.stat()
         self.info = SourceInfo(
             width=width,
@@ -56,21 +62,30 @@ class VideoSource:
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
         """See `Source.frames`."""
-        number, lost = 0, []
+        begin = 1 if first is None else first
+        number, got, lost, seen = 0, 0, [], _Seen()
         with self._open() as container:
             stream = _best_stream(container, self.path)
             stream.thread_type = "AUTO"
-            for frame in _decoded(container, stream):
+            for frame in _decoded(container, stream, seen.damaged):
                 number += 1
+                if last is not None and number > last:
+                    break
                 if isinstance(frame, FFmpegError):
                     lost.append(number)
                     continue
-                if last is not None and number > last:
+                if (frame.width, frame.height) != self._size:
+                    self._stop_at_change(number, got, frame)
                     break
-                if first is None or number >= first:
-                    seconds = frame.time if frame.time is not None else (number - 1) / self.info.fps
-                    yield SourceFrame(number, float(seconds), self._upright(frame), bool(frame.is_corrupt))
-        lost = [n for n in lost if (first is None or n >= first) and (last is None or n <= last)]
+                seconds = float(frame.time) if frame.time is not None else (number - 1) / self.info.fps
+                seen.add(number, seconds)
+                if number >= begin:
+                    got += 1
+                    corrupt = bool(frame.is_corrupt) or frame.pts in seen.damaged
+                    yield SourceFrame(number, seconds, self._upright(frame), corrupt)
+            else:
+                self._check_promise(seen, begin, last)
+        lost = [n for n in lost if begin <= n < seen.number]
         if lost:
             words = frame_words(lost).capitalize()
             self.warnings.append(
@@ -80,6 +95,36 @@ class VideoSource:
                 )
             )
 
+    def _stop_at_change(self, number: int, got: int, frame: av.VideoFrame) -> None:
+        """A stream may change its size midway; the shot has one, and ends there."""
+        sizes = f"{frame.width}x{frame.height} pixels instead of {self._size[0]}x{self._size[1]}"
+        if got < 1:
+            raise footage_error(
+                f"The clip changes its size before the range begins: from frame {number} on it is {sizes}.",
+                "Choose a range before that frame, or export the clip in one size.",
+            )
+        self.warnings.append(
+            (
+                f"From frame {number} on the clip is {sizes}: the shot ends before it.",
+                "Export the clip in one size if the rest is wanted.",
+            )
+        )
+
+    def _check_promise(self, seen: _Seen, begin: int, last: int | None) -> None:
+        """Says so if the file ended before what it announces; JobError if less than half of what was asked came."""
+        count, end = self._promise
+        # Both: a clip that was trimmed without encoding it again holds frames that are never shown.
+        short = count - seen.number > 1 and end - seen.seconds > 1.5 / self.info.fps + seen.gap
+        wanted = count if last is None else min(last, count)
+        if not short or seen.number >= wanted:
+            return
+        message = f"{self.path.name} breaks off after frame {seen.number}: it announces {count}."
+        hint = "It is damaged or was not copied whole: copy or export it again."
+        if 2 * (seen.number - begin + 1) < wanted - begin + 1:
+            remedy = f" To use what is there, set the last frame to {seen.number}." if seen.number > 7 else ""
+            raise footage_error(message, hint + remedy)
+        self.warnings.append((message, hint))
+
     def _open(self) -> Any:
         try:
             # Only plain files: a playlist in disguise must not make the decoder fetch anything.
@@ -87,20 +132,13 @@ class VideoSource:
         except FFmpegError as error:
             raise _no_video(self.path) from error
 
-    def _square_size(self, width: int, height: int) -> tuple[int, int]:
-        if self._aspect >= 1:
-            return max(1, round(width * self._aspect)), height
-        return width, max(1, round(height / self._aspect))
-
     def _upright(self, frame: av.VideoFrame) -> NDArray:
         kind = "rgb48le" if self._deep else "rgb24"
         rgb = frame.reformat(format=kind, src_colorspace=_matrix(frame), interpolation=Interpolation.BICUBIC)
         pixels = rgb.to_ndarray()
-        width, height = self._square_size(frame.width, frame.height)
+        width, height = square_size(frame.width, frame.height, self._aspect)
         pixels = resize(pixels, width, height)
-        pixels = np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
-        # A stream may change its size midway; the shot has one.
-        return resize(pixels, self.info.width, self.info.height)
+        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
 
     def _warn_about(self, frame: av.VideoFrame) -> None:
         transfer = HDR_TRANSFERS.get(int(frame.color_trc))
@@ -117,6 +155,25 @@ class VideoSource:
             )
 
 
+@dataclass
+class _Seen:
+    """What was decoded of the file so far."""
+
+    number: int = 0
+    """Of the last frame that could be decoded; 0: none yet."""
+    seconds: float = 0.0
+    """Its time."""
+    gap: float = 0.0
+    """Longest time between two frames, beyond the second: rates may vary."""
+    damaged: set[int | None] = field(default_factory=set)
+    """Time stamps of packets that the container knows to be incomplete."""
+
+    def add(self, number: int, seconds: float) -> None:
+        if self.number:
+            self.gap = max(self.gap, seconds - self.seconds)
+        self.number, self.seconds = number, seconds
+
+
 def _no_video(path: Path) -> Exception:
     return footage_error(
         f"{path.name} is not a video that can be read.",
@@ -129,6 +186,12 @@ def _best_stream(container: Any, path: Path) -> Any:
     streams = [s for s in container.streams.video if not (s.disposition & s.disposition.attached_pic)]
     if names & NOT_VIDEO or not streams:
         raise _no_video(path)
+    streams = [s for s in streams if s.codec_context is not None]
+    if not streams:
+        raise footage_error(
+            f"{path.name} is encoded in a way that cannot be decoded here, or its header is damaged.",
+            "Export it as H.264 or ProRes, or as an image sequence.",
+        )
     return max(streams, key=lambda s: (s.codec_context.width or 0) * (s.codec_context.height or 0))
 
 
@@ -139,21 +202,49 @@ def _first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:
     raise _no_video(path)
 
 
-def _decoded(container: Any, stream: Any) -> Iterator[Any]:
-    """Frames, and in the place of a packet that cannot be decoded its error. Ends where the file breaks off."""
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets)
-        except StopIteration:
-            return
-        except FFmpegError as error:
-            yield error
-            return
+def _decoded(container: Any, stream: Any, damaged: set[int | None] | None = None) -> Iterator[Any]:
+    """Frames, and in the place of a packet that cannot be decoded its error. Ends where the file breaks off.
+
+    `damaged` receives the time stamps of packets that are decoded although they are not whole.
+    """
+    for packet in _packets(container, stream):
+        if isinstance(packet, FFmpegError):
+            yield packet
+            continue
+        if damaged is not None and packet.is_corrupt and packet.pts is not None:
+            damaged.add(packet.pts)
         try:
             yield from packet.decode()
         except FFmpegError as error:
             yield error
+
+
+def _packets(container: Any, stream: Any) -> Iterator[Any]:
+    """Packets, the last of them empty: it asks the decoder for what it still holds. An error ends the file early.
+
+    The packet in the middle of which a file ends is left out: it would be half a picture, and its error would cost
+    those that the decoder has not given out yet.
+    """
+    packets = container.demux(stream)
+    packet: Any
+    held: Any = None
+    while True:
+        try:
+            packet = next(packets, None)
+        except FFmpegError as error:
+            packet = error
+        empty = isinstance(packet, av.Packet) and not packet.size
+        if empty and packet.dts is not None:  # a repeat of the frame before, in an AVI: to a decoder it means the end
+            continue
+        at_end = packet is None or empty or isinstance(packet, FFmpegError)
+        if held is not None and not (at_end and held.is_corrupt):
+            yield held
+        held = None
+        if at_end:
+            if packet is not None:
+                yield packet
+            return
+        held = packet
 
 
 def _rotation(frame: Any) -> float:
@@ -176,6 +267,32 @@ def _matrix(frame: av.VideoFrame) -> Colorspace:
     if tagged in (9, 10):
         return Colorspace(9)
     return Colorspace.ITU709 if max(frame.width, frame.height) >= 1280 else Colorspace.ITU601
+
+
+def _promise(container: Any, stream: Any, rate: Fraction) -> tuple[int, float]:
+    """Frames that the file announces, and when the last of them ends, in seconds on the stream's clock.
+
+    (0, 0) where it announces nothing for this stream: with sound, the container's length may be the sound's.
+    """
+    start = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
+    if stream.duration and stream.time_base:
+        end = start + float(stream.duration * stream.time_base)
+    elif stream.metadata.get("DURATION"):  # Matroska: the end, not the length
+        end = _clock(stream.metadata["DURATION"])
+    elif container.duration and len(container.streams) == 1:
+        end = start + container.duration / av.time_base
+    else:
+        return 0, 0.0
+    return stream.frames or round((end - start) * rate), end
+
+
+def _clock(text: str) -> float:
+    """Seconds of "00:00:01.958000000"; 0 if it is something else."""
+    try:
+        hours, minutes, seconds = (float(part) for part in text.split(":"))
+    except ValueError:
+        return 0.0
+    return 3600.0 * hours + 60.0 * minutes + seconds
 
 
 def _count_from_duration(container: Any, stream: Any, rate: Fraction) -> int:

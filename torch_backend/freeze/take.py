@@ -59,7 +59,9 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     width, height = output_size(scene, run, params)
     whole = plan(scene, params, t_star, width, height)
     frames = in_range(whole, params)
-    folder = shot.take(params.take)
+    folder = shot.own(shot.take(params.take))
+    for inner in ("preview", TAKE_REDISTORT.parent):
+        shot.own(folder / inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
     grain = plate_grain(shot, scene) if params.grain else None
     # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
@@ -227,8 +229,14 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams)
 
     A frame that is not asked for now stays if it is right: a part of the range does not undo the rest of the take.
     """
-    (folder / "preview").mkdir(parents=True, exist_ok=True)
     state = folder / "state.json"
+    if not state.is_file() and frames_in([*folder.glob("*.exr"), *(folder / "preview").glob("*.png")]):
+        raise JobError(
+            f"{folder} holds numbered pictures that were not made here.",
+            "Name another take, or move them away.",
+            ExitCode.FREEZE,
+        )
+    (folder / "preview").mkdir(parents=True, exist_ok=True)
     # Frames without a key of their own are of before grain, too.
     old_are_right = not params.grain and state.is_file() and read_json(state).get("key") == key
     done = set()

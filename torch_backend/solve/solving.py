@@ -86,6 +86,8 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
     _check(config)
+    for folder in (shot.frames, shot.solve / "colmap"):  # where files of before are replaced
+        shot.own(folder)
     frames = load_frames(shot)
     source = [foreign.fingerprint(cameras)] if cameras else []
     key = content_key(SOLVE_VERSION, config, frames["key"], *source)

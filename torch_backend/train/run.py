@@ -58,7 +58,8 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if params.extend:
         return extend_run(shot, params, report)
     config, device = config_from_params(params), _prepared_device(params)
-    folder = shot.run(params.run)
+    folder = shot.own(shot.run(params.run))
+    shot.own(folder / "previews")
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
@@ -101,7 +102,8 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     """
     if params.extend < 0:
         raise ValueError(f"extend is {params.extend}: it is a number of steps to add")
-    folder, again = shot.run(params.run), "Train it without --extend first."
+    folder, again = shot.own(shot.run(params.run)), "Train it without --extend first."
+    shot.own(folder / "previews")
     checkpoint, beside = folder / "checkpoint.safetensors", folder / EXTENSION_FILE
     facts = read_meta(checkpoint) if checkpoint.is_file() else {}
     if not facts:

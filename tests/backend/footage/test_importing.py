@@ -74,6 +74,47 @@ def test_another_import_replaces_frames_and_the_solve_made_from_them(shot, clip,
     assert not shot.solve.exists()
 
 
+def test_files_of_the_artist_in_the_frames_folder_outlive_an_import(shot, clip, recorder):
+    import_footage(shot, clip, FootageConfig(first=1, last=12), recorder())
+    theirs = {"notes.png": b"a", "000016.png": b"b", "raw/000017.png": b"c", "ours/000002.png": b"d"}
+    for name, content in theirs.items():
+        (shot.frames / name).parent.mkdir(exist_ok=True)
+        (shot.frames / name).write_bytes(content)
+    import_footage(shot, clip, FootageConfig(first=6, last=15), recorder())
+    expected = ["frames.json", *(f"raw/{n:06d}.png" for n in range(6, 16))]
+    assert files(shot.frames) == sorted([*expected, *theirs])
+    import_footage(shot, clip, FootageConfig(), recorder())
+    kept = {"notes.png": b"a", "000016.kept.png": b"b", "raw/000017.kept.png": b"c", "ours/000002.png": b"d"}
+    expected = ["frames.json", *(f"raw/{n:06d}.png" for n in range(1, 21))]
+    assert files(shot.frames) == sorted([*expected, *kept])
+    assert all((shot.frames / name).read_bytes() == content for name, content in kept.items())
+
+
+@pytest.mark.parametrize("linked", ["frames", "frames/raw", "solve"])
+def test_nothing_is_removed_through_a_link(shot, clip, tmp_path, recorder, linked):
+    import_footage(shot, clip, FootageConfig(), recorder())
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "000001.png").write_bytes(b"mine")
+    shutil.rmtree(shot.root / linked, ignore_errors=True)
+    (shot.root / linked).symlink_to(theirs, target_is_directory=True)
+    with pytest.raises(JobError, match="is a link to .*theirs") as error:
+        import_footage(shot, clip, FootageConfig(first=2), recorder())
+    assert (error.value.exit_code, bool(error.value.hint)) == (ExitCode.USAGE, True)
+    assert files(theirs) == ["000001.png"]
+
+
+def test_a_killed_import_leaves_what_was_there(shot, clip, recorder):
+    """At the worst moment: the old frames were moved aside, the new ones not yet put in their place."""
+    import_footage(shot, clip, FootageConfig(), recorder())
+    before = files(shot.frames)
+    shot.frames.rename(shot.root / ".frames.old")
+    report = recorder()
+    import_footage(shot, clip, FootageConfig(), report)
+    assert report.steps == [("import", 1, 1)]
+    assert files(shot.frames) == before
+
+
 def test_a_lost_frame_is_imported_again(shot, clip, recorder):
     import_footage(shot, clip, FootageConfig(), recorder())
     (shot.frames / "raw/000007.png").unlink()

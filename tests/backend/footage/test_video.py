@@ -1,5 +1,6 @@
 """Videos: real files written by the tests, decoded to the pixels and times that went in."""
 
+import os
 from fractions import Fraction
 
 import av
@@ -117,12 +118,61 @@ def test_damaged_packets_are_skipped_with_a_warning_and_keep_their_numbers(tmp_p
     assert source.warnings[0][0] == "Frame 6 cannot be decoded: left out of the shot."
 
 
-def test_a_file_that_breaks_off_gives_what_it_has(tmp_path, pan, write_video):
-    write_video(tmp_path / "a.mkv", pan(24), codec="ffv1", pix_fmt="yuv444p")
-    whole = (tmp_path / "a.mkv").read_bytes()
-    (tmp_path / "b.mkv").write_bytes(whole[: len(whole) * 2 // 3])
-    _, got = decoded(tmp_path / "b.mkv")
-    assert 8 <= len(got) < 24
+@pytest.fixture
+def broken_off(tmp_path, pan, write_video):
+    """broken_off(suffix, share): the first part of a clip of 24 frames, whose header stands at its beginning."""
+
+    def make(suffix, share):
+        whole = tmp_path / f"whole.{suffix}"
+        options = {"codec": "mjpeg", "pix_fmt": "yuvj444p"} if suffix == "mov" else {}
+        write_video(whole, pan(24), faststart=True, **options)
+        content = whole.read_bytes()
+        broken = tmp_path / f"broken.{suffix}"
+        broken.write_bytes(content[: int(len(content) * share)])
+        return broken
+
+    return make
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
+def test_a_file_that_breaks_off_says_how_much_of_it_there_is(broken_off, suffix):
+    source, got = decoded(broken_off(suffix, 0.75))
+    assert 12 <= len(got) < 24
+    assert [f.number for f in got] == list(range(1, len(got) + 1))
+    assert [w[0] for w in source.warnings] == [
+        f"broken.{suffix} breaks off after frame {len(got)}: it announces 24."
+    ]
+    asked, got = decoded(broken_off(suffix, 0.75), 2, 10)  # before it breaks off: nothing to say
+    assert ([f.number for f in got], asked.warnings) == (list(range(2, 11)), [])
+
+
+@pytest.mark.parametrize(("suffix", "share"), [("mp4", 0.6), ("mov", 0.45), ("mkv", 0.45)])
+def test_less_than_half_of_a_file_is_refused(broken_off, suffix, share):
+    with pytest.raises(JobError, match=r"breaks off after frame \d+: it announces 24\.") as error:
+        decoded(broken_off(suffix, share))
+    assert error.value.exit_code == ExitCode.FOOTAGE
+
+
+def test_a_clip_that_changes_its_size_ends_there_and_says_so(tmp_path, pan, write_video):
+    """Motion JPEG, whose pictures carry their own size."""
+    write_video(tmp_path / "a.mkv", pan(12), codec="mjpeg", pix_fmt="yuvj444p")
+    write_video(tmp_path / "b.mkv", pan(12, height=64, width=48), codec="mjpeg", pix_fmt="yuvj444p")
+    with av.open(str(tmp_path / "both.mkv"), "w") as target:
+        stream = None
+        for part in ("a.mkv", "b.mkv"):
+            with av.open(str(tmp_path / part)) as source:
+                stream = stream or target.add_stream_from_template(source.streams.video[0])
+                for packet in (p for p in source.demux(video=0) if p.size):
+                    packet.pts = packet.dts = packet.pts + (500 if part == "b.mkv" else 0)
+                    packet.stream = stream
+                    target.mux(packet)
+    source, got = decoded(tmp_path / "both.mkv")
+    assert [f.number for f in got] == list(range(1, 13))
+    assert [w[0] for w in source.warnings] == [
+        "From frame 13 on the clip is 48x64 pixels instead of 64x48: the shot ends before it."
+    ]
+    with pytest.raises(JobError, match="changes its size before the range begins: from frame 13 on it is 48x64"):
+        decoded(tmp_path / "both.mkv", 14, 24)
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "noise.mp4", "empty.mov", "list.m3u8"])
@@ -139,6 +189,39 @@ def test_what_is_no_video_is_refused_in_one_sentence(tmp_path, name):
     assert error.value.message == f"{name} is not a video that can be read."
     assert error.value.exit_code == ExitCode.FOOTAGE
     assert error.value.hint
+
+
+@pytest.mark.parametrize("name", ["clip.mp4", "shot.0001.exr", "clip"])
+def test_a_pipe_is_refused_without_waiting_for_it(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(JobError, match="is neither a file nor a folder") as error:
+        open_source(str(tmp_path / name))
+    assert error.value.exit_code == ExitCode.FOOTAGE
+
+
+def test_a_name_that_no_system_takes_is_refused_in_a_sentence(tmp_path):
+    with pytest.raises(JobError, match="cannot be opened") as error:
+        open_source(str(tmp_path / ("a" * 300 + ".mp4")))
+    assert error.value.exit_code == ExitCode.FOOTAGE
+
+
+def test_damaged_headers_get_a_sentence(tmp_path, pan, write_video):
+    write_video(tmp_path / "a.mp4", pan(12))
+    content = (tmp_path / "a.mp4").read_bytes()
+    (tmp_path / "codec.mp4").write_bytes(content.replace(b"avc1", b"zzzz"))
+    (tmp_path / "moov.mp4").write_bytes(content[: content.index(b"moov") - 4])
+    with pytest.raises(JobError, match=r"codec\.mp4 is encoded in a way that cannot be decoded here") as error:
+        open_source(str(tmp_path / "codec.mp4"))
+    assert error.value.exit_code == ExitCode.FOOTAGE
+    with pytest.raises(JobError, match=r"moov\.mp4 is not a video that can be read"):
+        open_source(str(tmp_path / "moov.mp4"))
+
+
+def test_pixels_that_no_lens_makes_are_taken_as_square(tmp_path, pan, write_video):
+    write_video(tmp_path / "a.mp4", pan(8), aspect=Fraction(5, 1))
+    source, got = decoded(tmp_path / "a.mp4")
+    assert got[0].pixels.shape == (48, 64, 3)
+    assert source.warnings[0][0] == "The footage claims pixels 5 times as wide as high: taken as square."
 
 
 def test_sound_alone_is_no_video(tmp_path):

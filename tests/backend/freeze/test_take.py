@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.contract import NO_DEPTH, CameraFrame, CameraPath, Cancelled, FreezeParams, JobError
+from torch_backend.contract import NO_DEPTH, CameraFrame, CameraPath, Cancelled, FreezeParams, JobError, TrainParams
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.gaussians.ply import read_ply
 from torch_backend.shot import write_json
-from torch_backend.train import load_run
+from torch_backend.train import load_run, train_shot
 
 
 @pytest.fixture(scope="module")
@@ -158,3 +158,25 @@ def test_t_star_snaps_to_a_trained_frame_and_says_so(trained, quiet):
     report = quiet()
     assert freeze_shot(world.shot, FreezeParams(take="snap", t_star=109), report)["t_star_frame"] in (108, 110)
     assert any(e[0] == "warning" and "109" in e[1] for e in report.events)
+
+
+def test_pictures_of_the_artist_outlive_a_take_and_a_run_of_that_name(trained, quiet, tmp_path):
+    world, _ = trained
+    (tmp_path / "preview").mkdir()
+    mine = [tmp_path / "000105.exr", tmp_path / "preview" / "000105.png"]
+    for picture in mine:
+        picture.write_bytes(b"mine")
+    for link in (world.shot.take("linked"), world.shot.run("linked"), world.shot.take("inner") / "preview"):
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(tmp_path, target_is_directory=True)
+    for name in ("linked", "inner"):
+        with pytest.raises(JobError, match="is a link to"):
+            freeze_shot(world.shot, FreezeParams(take=name, t_star=105), quiet())
+    with pytest.raises(JobError, match="is a link to"):
+        train_shot(world.shot, TrainParams(run="linked"), quiet())
+    world.shot.take("theirs").mkdir()
+    mine.append(world.shot.take("theirs") / "000101.exr")
+    mine[-1].write_bytes(b"mine")
+    with pytest.raises(JobError, match="theirs holds numbered pictures that were not made here"):
+        freeze_shot(world.shot, FreezeParams(take="theirs", t_star=105), quiet())
+    assert [picture.read_bytes() for picture in mine] == [b"mine"] * 3
