@@ -24,6 +24,8 @@ GROUP_NAME = "Splannequin Freeze"
 _TAG = "splannequin"
 _BEFORE = "splannequin_before"
 _CG = "cg"
+_LAYERS = ("Combined", "Depth", "Support", "Motion")
+"""Of a frozen frame; `_GRAIN` is in some."""
 _FROZEN, _DEPTH = "Frozen", "Depth in scene units"
 """Nodes inside the group."""
 _GAP = 200.0
@@ -57,8 +59,14 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
 
     Returns:
         What was changed, one sentence each.
+
+    Raises:
+        ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is as it was.
     """
     changes: list[str] = []
+    frozen, stream = _frozen_image(take), None
+    if plate is not None and shows_plate(scene):
+        stream = load_sequence(plate, _plate_name(plate), "srgb")
     enabled = compat.compositor_enabled(scene)
     before = {**compat.compositor_switches(scene), "made_tree": False}
     tree = compat.compositor_tree(scene)
@@ -77,12 +85,27 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
     else:
         _set_defaults(node, _give_sockets(node.node_tree))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
-    _fill_group(scene, node.node_tree, take)
+    _fill_group(scene, node.node_tree, take, frozen)
     if node.inputs[_GRAIN].default_value and _GRAIN not in node.node_tree.nodes:
         changes.append("The take has no grain to add: freeze it again.")
-    if plate is not None and shows_plate(scene):
-        _show_plate(scene, tree, node, plate, take)
+    if stream is not None:
+        _show_plate(scene, tree, node, stream, take)
     return changes
+
+
+def _frozen_image(take: Take) -> Any:
+    """The take's frames as a data-block. ValueError if they lack a layer."""
+    image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
+    group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
+    try:
+        node = group.nodes.new("CompositorNodeImage")
+        show_sequence(node, image, take.first, take.last)
+        missing = [n for n in _LAYERS if n not in node.outputs]
+    finally:
+        bpy.data.node_groups.remove(group)
+    if missing:
+        raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+    return image
 
 
 def shows_plate(scene: Any) -> bool:
@@ -275,6 +298,7 @@ def load_sequence(path: Path, name: str, encoding: str) -> Any:
                 image.reload()
             _ahead.discard(wanted)
             return image
+    compat.colour_space(encoding)  # before anything is made: a configuration may have none
     image = bpy.data.images.load(wanted)
     image.name = name
     image.source = "SEQUENCE"
@@ -391,14 +415,13 @@ def _insert_node(tree: Any, before: dict[str, bool]) -> Any:
     return node
 
 
-def _fill_group(scene: Any, group: Any, take: Take) -> None:
+def _fill_group(scene: Any, group: Any, take: Take, image: Any) -> None:
     """(Re)builds the inside of the group; its sockets, and so the links around it, stay."""
     old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image} - {_RAMP}
     group.nodes.clear()
     enter = group.nodes.new("NodeGroupInput")
     leave = group.nodes.new("NodeGroupOutput")
     frozen = group.nodes.new("CompositorNodeImage")
-    image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
     frozen.name = frozen.label = _FROZEN
     show_sequence(frozen, image, take.first, take.last)
     mix, factor, first, second, mixed = compat.new_mix_node(group)
@@ -554,11 +577,7 @@ def show_sequence(user: Any, image: Any, first: int, last: int) -> None:
 
 def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
     """The frozen layers' sockets: without overscan, and led through Scale nodes if the render size is not theirs."""
-    names = ("Combined", "Depth", "Support", "Motion")
-    missing = [n for n in names if n not in frozen.outputs]
-    if missing:
-        raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
-    names += (_GRAIN,) if _GRAIN in frozen.outputs else ()
+    names = _LAYERS + ((_GRAIN,) if _GRAIN in frozen.outputs else ())
     sockets = {n: frozen.outputs[n] for n in names}
     for row, name in enumerate(names if any(take.margin) else ()):
         node = compat.new_crop_node(group, take.margin, take.size)
@@ -584,14 +603,13 @@ def render_size(scene: Any) -> tuple[int, int]:
     return render.resolution_x * share // 100, render.resolution_y * share // 100
 
 
-def _show_plate(scene: Any, tree: Any, node: Any, plate: Path, take: Take) -> None:
+def _show_plate(scene: Any, tree: Any, node: Any, image: Any, take: Take) -> None:
     """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
     for old in [n for n in tree.nodes if n.get(_TAG) and n.get(_TAG) != _CG]:
         tree.nodes.remove(old)
     image_node = tree.nodes.new("CompositorNodeImage")
     image_node[_TAG] = True
     image_node.name = image_node.label = "Plate"
-    image = load_sequence(plate, _plate_name(plate), "srgb")
     show_sequence(image_node, image, take.first, take.last)
     stream = image_node.outputs["Image"]
     # The tree is ours: in a row, left to right.

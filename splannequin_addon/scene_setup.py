@@ -16,7 +16,9 @@ _TOGETHER = (
     {"fps", "fps_base"},
     {"frame_start", "frame_end"},
 )
-_VIEW = {"view_transform": "Standard", "look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False}
+_NEUTRAL = ("Standard", "Un-tone-mapped")
+"""Views that show colours as they are: Blender's own, that of the ACES configurations."""
+_VIEW = {"look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False}
 
 
 def untouched(scene: Any) -> bool:
@@ -76,25 +78,33 @@ def keep_plate_colours(scene: Any) -> list[str]:
     Blender's default view (AgX) is made for renders and would change every plate. Dithering is noise on the last bit.
     JobError if the colour configuration has no such view.
     """
-    view = scene.view_settings
     changes = []
-    different = [name for name, value in _VIEW.items() if getattr(view, name) != value]
-    if different:
-        was = view.view_transform
-        for name, value in _VIEW.items():
-            try:
-                _set(scene, "view", {name: value})
-            except TypeError as error:  # what an enumeration says to a value it lacks
-                raise contract.JobError(
-                    f"This Blender's colour configuration has no {name.replace('_', ' ')} {value!r}.",
-                    "Use Blender's own configuration, or switch Keep Plate Colours off.",
-                    contract.ExitCode.BAKE,
-                ) from error
-        changes.append(f"View transform set from {was} to Standard, so that the plate keeps its colours.")
+    if not keeps_plate_colours(scene):
+        was, neutral = scene.view_settings.view_transform, _neutral(scene.view_settings)
+        _set(scene, "view", {"view_transform": neutral, **_VIEW})
+        changes.append(f"View transform set from {was} to {neutral}, so that the plate keeps its colours.")
     if scene.render.dither_intensity:
         _set(scene, "render", {"dither_intensity": 0.0})
         changes.append("Dither set to 0, so that pixels stay exact.")
     return changes
+
+
+def _neutral(view: Any) -> str:
+    """Name of the view that shows colours as they are. JobError if there is none for the display that is chosen."""
+    was = view.view_transform
+    for name in (was, *_NEUTRAL):
+        try:
+            view.view_transform = name
+        except TypeError:  # what an enumeration says to a value it lacks; which ones it has, it does not tell
+            continue
+        view.view_transform = was
+        if name in _NEUTRAL:
+            return name
+    raise contract.JobError(
+        f"This Blender's colour configuration has no view that leaves colours alone ({', '.join(_NEUTRAL)}).",
+        "Use Blender's own configuration, or switch Keep Plate Colours off.",
+        contract.ExitCode.BAKE,
+    )
 
 
 def render_cg(scene: Any) -> list[str]:
@@ -111,7 +121,8 @@ def render_cg(scene: Any) -> list[str]:
 
 def keeps_plate_colours(scene: Any) -> bool:
     """True if pictures leave the scene with the colours they came in with."""
-    return all(getattr(scene.view_settings, name) == value for name, value in _VIEW.items())
+    view = scene.view_settings
+    return view.view_transform in _NEUTRAL and all(getattr(view, name) == value for name, value in _VIEW.items())
 
 
 def restore(scene: Any) -> bool:

@@ -22,6 +22,7 @@ from . import (
     cameras,
     compat,
     compositor,
+    intact,
     jobs,
     made,
     markers,
@@ -300,22 +301,26 @@ def imported(scene: Any, shot: Path) -> list[str]:
 
 def load_camera(scene: Any, shot: Path) -> list[str]:
     """Brings the solve into the scene. FileNotFoundError if there is none."""
-    changes = _fit(scene, shots.read(shot), force_k=True)
-    camera = cameras.build(scene, shot)
+    state = shots.read(shot)
+    with intact.scene_of(scene):
+        camera = cameras.build(scene, shot)
+        changes = _fit(scene, state, force_k=True)
     return [f"{camera.name} is the scene's camera, with the plate behind it.", *changes]
 
 
 def insert_freeze(scene: Any, shot: Path, take: str) -> list[str]:
     """Puts a take into the scene's compositor, and keeps the plate's colours if the artist consents."""
-    changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
-    return bake.insert(scene, shot, take) + changes
+    with intact.scene_of(scene):
+        changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
+        return bake.insert(scene, shot, take) + changes
 
 
 def combine_cg(scene: Any, shot: Path) -> list[str]:
     """Has the scene's own objects stand among the frozen. JobError if the freeze is not in the compositor."""
     compositor.may_combine_cg(scene)
-    changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
-    return compositor.combine_cg(scene) + changes
+    with intact.scene_of(scene):
+        changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
+        return compositor.combine_cg(scene) + changes
 
 
 def remove_all(scene: Any, shot: Path) -> list[str]:
