@@ -205,7 +205,7 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
 
 
 def restore_folder(path: Path) -> None:
-    """Puts back the folder that `replacing_folder` had moved aside when it was killed; removes it if it was replaced."""
+    """Puts back the folder that a killed `replacing_folder` had moved aside; removes it if it was replaced."""
     aside = path.with_name(f".{path.name}.old")
     if aside.is_dir() and not path.exists():
         _replace(aside, path)
