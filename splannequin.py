@@ -57,8 +57,6 @@ BACKEND_DISK_GB = 4.0
 BPY_DISK_GB = 2.0
 HEARTBEAT_SECONDS = 15.0
 """A set-up that has printed nothing for this long says that it is still at work."""
-GRACE_SECONDS = 30.0
-"""How long a cancelled child may take for its checkpoint before it is terminated."""
 
 BLENDER_LIBRARIES = {
     "libX11.so.6": "libx11-6",
@@ -142,7 +140,10 @@ def hand_over_to_newer_python() -> int:
             file=sys.stderr,
         )
         return 9
-    return subprocess.call([newer, str(Path(__file__).resolve()), *sys.argv[1:]])
+    command = [newer, str(Path(__file__).resolve()), *sys.argv[1:]]
+    if WINDOWS:  # a program that takes another's place there is a second one, which nobody waits for
+        return subprocess.call(command)
+    os.execv(newer, command)  # noqa: S606  (no shell is wanted)
 
 
 if __name__ == "__main__" and sys.version_info[:2] < NEEDED_PYTHON:
@@ -151,7 +152,7 @@ if __name__ == "__main__" and sys.version_info[:2] < NEEDED_PYTHON:
 if str(ROOT) not in sys.path:  # -P and PYTHONSAFEPATH leave even a script's own folder out
     sys.path.insert(0, str(ROOT))
 
-from torch_backend.contract import ExitCode, program, python_child, read_json  # noqa: E402  (needs 3.11)
+from torch_backend.contract import GRACE_SECONDS, ExitCode, program, python_child, read_json  # noqa: E402  (needs 3.11)
 from torch_backend.shot import is_disk_full, locked, write_json  # noqa: E402
 
 
@@ -286,13 +287,13 @@ def _make(environment: Environment, python: str) -> None:
     environment.state.mkdir(parents=True, exist_ok=True)
     environment.log.write_bytes(b"")
     if not usable:
-        _step(environment, "making the virtual environment", [python, "-P", "-m", "venv", str(environment.folder)])
+        _step(environment, "making the virtual environment", tied_command(python, "venv", str(environment.folder)))
     elif environment.begun.exists():
         command = [environment.python, "-P", "-c", DROP_UNFINISHED]
         _step(environment, "checking what an interrupted set-up left", command)
     before = environment.installed()
     environment.begun.touch()
-    pip = [environment.python, "-P", "-m", "pip", "install", "--no-input", "--progress-bar", "off"]
+    pip = tied_command(environment.python, "pip", "install", "--no-input", "--progress-bar", "off")
     pip += ["--disable-pip-version-check", "--only-binary=:all:"]
     pip += ["--no-deps"] if environment.complete else []
     index = os.environ.get("SPLANNEQUIN_TORCH_INDEX")
@@ -365,7 +366,9 @@ def _step(
     """Runs one step of a set-up, its output to the log and what `condense` makes of each line to the screen."""
     started = time.monotonic()
     lines: queue.Queue[str | None] = queue.Queue()
-    child = start_child(command, child_environ(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    child = start_child(
+        command, child_environ(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
 
     def read() -> None:
         assert child.stdout is not None  # PIPE, above
@@ -399,6 +402,8 @@ def _step(
     except KeyboardInterrupt:
         stop_child(child)
         raise
+    finally:
+        _close(child)
     if code:
         _refuse(environment, step, "\n".join(tail))
     if condense is None:
@@ -568,6 +573,19 @@ def stop_child(child: subprocess.Popen[Any]) -> None:
         child.wait()
 
 
+def tied_command(python: str, module: str, *words: str) -> list[str]:
+    """`python -m module words` for a child that ends when we do, however that comes about: its standard input must be a
+    pipe (`run_child(tied=True)`), which closes with us."""
+    return [python, "-P", "-m", "torch_backend.tied", module, *words]
+
+
+def _close(child: subprocess.Popen[Any]) -> None:
+    """Closes our end of an ended child's standard input."""
+    if child.stdin is not None:
+        with contextlib.suppress(OSError):
+            child.stdin.close()
+
+
 HERE = Path()
 """Where the user stands, for children that are given paths as they were typed."""
 
@@ -591,6 +609,8 @@ def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = Fals
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
         raise KeyboardInterrupt("the child has said so") from None
+    finally:
+        _close(child)
 
 
 def _documented(code: int) -> int:
@@ -610,8 +630,9 @@ BLENDERS_OWN = re.compile(
 
 
 def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
-    """`run_child` for Blender: all that it prints goes to `log`, what the add-on says also to the screen."""
-    child = start_child(command, child_environ(**environ), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    """`run_child(tied=True)` for Blender: all that it prints goes to `log`, what the add-on says also to the screen."""
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    child = start_child(command, child_environ(**environ), **streams)
     try:
         with open(log, "w", encoding="utf-8") as stream:
             for raw in child.stdout or ():
@@ -626,6 +647,8 @@ def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
         raise KeyboardInterrupt("the child has said so") from None
+    finally:
+        _close(child)
 
 
 # ------------------------------------------------------------------------------------------------------ summary
@@ -664,8 +687,8 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     setting_up += took
 
     say(f"Freezing {clip} into {output}")
-    command = [backend.python, "-P", "-m", "torch_backend", "freeze", clip, "--output", str(output), *options]
-    code = run_child(command, cwd=HERE)
+    command = tied_command(backend.python, "torch_backend", "freeze", clip, "--output", str(output), *options)
+    code = run_child(command, cwd=HERE, tied=True)
     if code:
         return code
     summary = read_summary(output)
@@ -674,7 +697,7 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     # The bake rewrites summary.json with what it adds; the wall time and the set-up are ours to add after it.
     say(f"Compositing in {blender.label}")
     baking = time.monotonic()
-    take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output)]
+    take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output), "--tied"]
     bake = blender.running(ROOT / "splannequin_addon" / "run_in_bpy.py", "bake", *take)
     code = run_blender(bake, output / "blender.log", SPLANNEQUIN_BACKEND_PYTHON=backend.python)
     if code:
