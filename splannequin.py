@@ -71,10 +71,9 @@ BLENDER_LIBRARIES = {
 }
 """What Blender opens on Linux and a bare server lacks: file, Debian package."""
 
-WARP_DRIVER = 580
-"""Oldest NVIDIA driver branch for the CUDA 13 builds of Warp and torch pinned here."""
-WARP_COMPUTE = 7.5
-"""Oldest CUDA compute capability of the same."""
+TORCH_INDEX = "SPLANNEQUIN_TORCH_INDEX"
+CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
+"""Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
 
 # ------------------------------------------------------------------------------------------------- interpreters
 
@@ -152,7 +151,8 @@ if __name__ == "__main__" and sys.version_info[:2] < NEEDED_PYTHON:
 if str(ROOT) not in sys.path:  # -P and PYTHONSAFEPATH leave even a script's own folder out
     sys.path.insert(0, str(ROOT))
 
-from torch_backend.contract import GRACE_SECONDS, ExitCode, program, python_child, read_json  # noqa: E402  (needs 3.11)
+from torch_backend.cards import Card, nvidia_cards, why_unfit, why_unused  # noqa: E402  (needs 3.11)
+from torch_backend.contract import GRACE_SECONDS, ExitCode, program, python_child, read_json  # noqa: E402
 from torch_backend.shot import is_disk_full, locked, write_json  # noqa: E402
 
 
@@ -296,8 +296,8 @@ def _make(environment: Environment, python: str) -> None:
     pip = tied_command(environment.python, "pip", "install", "--no-input", "--progress-bar", "off")
     pip += ["--disable-pip-version-check", "--only-binary=:all:"]
     pip += ["--no-deps"] if environment.complete else []
-    index = os.environ.get("SPLANNEQUIN_TORCH_INDEX")
-    if index and environment.requirements[0] == "backend.txt":
+    index = torch_index() if environment.requirements[0] == "backend.txt" else ""
+    if index:
         if _reachable(index):
             pip += ["--extra-index-url", index]
         else:  # pip would ask it in vain for every single package, minutes in all
@@ -347,6 +347,16 @@ for package in importlib.metadata.distributions():
         shutil.rmtree(folder)
 """
 """pip writes a package's RECORD last: without one the package is not all there, and pip must not believe it is."""
+
+
+def torch_index(windows: bool = WINDOWS) -> str:
+    """Package index, beside pip's own, that torch comes from; empty for none.
+
+    What the variable says; without it, on Windows, the one with CUDA where there is a card for it.
+    """
+    if TORCH_INDEX in os.environ:
+        return os.environ[TORCH_INDEX]
+    return CUDA_INDEX if windows and any(card.fits for card in nvidia_cards()[0]) else ""
 
 
 def _reachable(index: str) -> bool:
@@ -945,40 +955,26 @@ def memory_gb() -> float | None:
 
 
 def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
-    """NVIDIA cards and whether driver and card fit the pinned Warp and torch."""
-    tool = program("nvidia-smi")
-    query = "--query-gpu=name,driver_version,compute_cap"
-    try:
-        command = [tool or "nvidia-smi", query, "--format=csv,noheader"]
-        rows = subprocess.run(command, capture_output=True, text=True, timeout=30).stdout if tool else ""
-    except (OSError, subprocess.TimeoutExpired):
-        rows = ""
-    cards = [row for row in rows.splitlines() if row.count(",") >= 2]
-    if not cards:
+    """NVIDIA cards: whether driver and card fit the pinned Warp and torch, and whether the backend uses them."""
+    cards, trouble = nvidia_cards()
+    if trouble:
+        advice = "restart the machine; if it stays, install the driver anew"
+        yield Finding("gpu", "note", f"the NVIDIA driver does not answer: {trouble}: {advice}")
+    elif not cards:
         yield Finding("gpu", "note", "no NVIDIA card or driver: the CPU is used, nothing is missing")
-    for card in cards:
-        yield gpu_finding(*(field.strip() for field in card.rsplit(",", 2)))
-    if cards and facts and facts.get("torch_device") != "cuda":
-        yield Finding(
-            "torch on gpu",
-            "note",
-            "torch sees no card: its CPU build is installed; set SPLANNEQUIN_TORCH_INDEX to "
-            "https://download.pytorch.org/whl/cu130, remove .venv and run setup again",
-        )
+    yield from map(gpu_finding, cards)
+    if any(card.fits for card in cards) and facts.get("trains_on") == "cpu":
+        unseen = None if facts.get("torch_device") == "cuda" else why_unused(facts.get("torch_cuda"))
+        told = " ".join(unseen) if unseen else facts.get("cuda_refusal") or "CUDA_VISIBLE_DEVICES hides the card"
+        yield Finding("torch on gpu", "note", told)
 
 
-def gpu_finding(name: str, driver: str, compute: str) -> Finding:
-    """One card against what Warp needs: `driver` as "580.65.06", `compute` as "9.0"."""
-    try:
-        new_driver, new_card = int(driver.split(".")[0]) >= WARP_DRIVER, float(compute) >= WARP_COMPUTE
-    except ValueError:
-        return Finding("gpu", "note", f"{name}: driver {driver}, compute {compute}: not understood, the CPU is used")
-    text = f"{name}, driver {driver}, compute capability {compute}"
-    if not new_card:
-        return Finding("gpu", "note", f"{text}: Warp needs {WARP_COMPUTE} or newer, the CPU is used")
-    if not new_driver:
-        return Finding("gpu", "note", f"{text}: Warp needs driver R{WARP_DRIVER} or newer, update it to use the card")
-    return Finding("gpu", "ok", text)
+def gpu_finding(card: Card) -> Finding:
+    """One card against what Warp and torch need."""
+    unfit = why_unfit(card)
+    if unfit is not None:
+        return Finding("gpu", "note", " ".join(unfit).strip())
+    return Finding("gpu", "ok", f"{card.name}, driver {card.driver}, compute capability {card.compute or 'unknown'}")
 
 
 def backend_facts(backend: Environment) -> dict[str, Any]:
