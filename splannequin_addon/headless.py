@@ -89,6 +89,8 @@ def main(argv: Sequence[str]) -> int:
             before[number] = signal.signal(number, _interrupt)
     try:
         args = parser().parse_args(list(argv))
+        if getattr(args, "tied", False):
+            contract.end_with_starter()
         return int(args.run(args, Console(args.json)))
     except SystemExit as stop:
         return int(stop.code or 0)
@@ -409,6 +411,7 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--last", type=int, help="last frame to bake, inclusive")
     one.add_argument("--step", type=int, default=0, help="bake every n-th frame (0: the scene's step)")
     one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
+    one.add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # to the launcher, by the standard input
     one = add("stmaps", write_stmaps, "ST maps of the lens, both ways, into SHOT/solve.")
     one.add_argument("shot", help="shot folder")
     one.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")

@@ -1,6 +1,7 @@
 """Loaded by the backend's tests and, inside a bpy wheel, by the add-on's: standard library and pytest only."""
 
 import importlib.util
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -39,3 +40,41 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Pa
         return marker
 
     return plant
+
+
+NVIDIA_SMI = '''#!/bin/sh
+# Stands in for NVIDIA's own tool on a machine without a card: prints what that prints.
+case "$*" in
+*compute_cap*) {old} cat <<'END'
+{with_compute}
+END
+exit {code};;
+*) cat <<'END'
+{without_compute}
+END
+exit {code};;
+esac
+'''
+
+
+@pytest.fixture
+def nvidia_smi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """nvidia_smi(row, ...) puts a stand-in of NVIDIA's tool on the PATH that lists "name, driver, compute capability";
+    code: its exit code, old: it does not know the last column."""
+
+    def put(*rows: str, code: int = 0, old: bool = False) -> None:
+        folder = tmp_path / f"bin {len(list(tmp_path.iterdir()))}"
+        folder.mkdir()
+        refusal = "echo 'Field \"compute_cap\" is not a valid field to query.'; exit 2;" if old else ""
+        source = NVIDIA_SMI.format(
+            old=refusal,
+            with_compute="\n".join(rows),
+            without_compute="\n".join(row.rpartition(",")[0] for row in rows) if old else "\n".join(rows),
+            code=code,
+        )
+        (folder / "nvidia-smi").write_text(source, encoding="utf-8")
+        (folder / "nvidia-smi").chmod(0o755)
+        monkeypatch.setenv("PATH", os.pathsep.join([str(folder), os.environ["PATH"]]))
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+
+    return put

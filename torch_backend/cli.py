@@ -162,6 +162,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     facts["torch_device"] = "cuda" if torch.cuda.is_available() else "cpu"
     facts["cuda_device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     facts["trains_on"] = choose_device("auto").type
+    facts["torch_cuda"] = torch.version.cuda
     facts["cuda_refusal"] = cuda_refusal()
     facts["cores"] = os.cpu_count()
     facts["h264"] = "libx264" in av.codecs_available

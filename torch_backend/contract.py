@@ -10,6 +10,7 @@ row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame number
 
 from __future__ import annotations
 
+import _thread
 import calendar
 import contextlib
 import dataclasses
@@ -20,11 +21,14 @@ import json
 import math
 import os
 import shutil
+import signal
 import socket
 import stat
 import struct
 import subprocess
 import sys
+import threading
+import time
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -45,6 +49,8 @@ JOB_COMMAND = "-m torch_backend run-job"
 
 HEARTBEAT_SECONDS = 2.0
 """How often a living job rewrites status.json."""
+GRACE_SECONDS = 30.0
+"""How long a cancelled process may take for its checkpoint before it is ended by force."""
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
 
@@ -461,6 +467,34 @@ def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]
     """
     python = os.path.abspath(python)
     return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
+
+
+def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
+    """Stops this process, as Ctrl-C does, once its standard input closes: its starter holds that open, however it ends.
+
+    A checkpoint may take `grace_seconds`; then the process ends at once, with the group that it leads (POSIX).
+    """
+    starter = os.dup(0)
+    # Nobody else has it: on Windows a child of ours that inherits a pipe hangs at its start while we read from that.
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    watch = functools.partial(_stop_when_alone, starter, grace_seconds)
+    threading.Thread(target=watch, name="end with starter", daemon=True).start()
+
+
+def _stop_when_alone(starter: int, grace_seconds: float) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(starter, 1):
+            pass
+    if sys.platform == "win32":
+        _thread.interrupt_main()
+    else:  # a signal of its own also ends a wait of the main thread
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    time.sleep(grace_seconds)
+    if sys.platform != "win32" and os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(ExitCode.CANCELLED)
 
 
 def program(name: str) -> str | None:

@@ -2,6 +2,8 @@
 
 import json
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import bpy
@@ -148,3 +150,20 @@ def test_ctrl_c_while_frames_render_ends_the_bake_with_130(run, shot, tmp_path, 
     assert code == 130 and "Cancelled" in err
     assert [p.name for p in (tmp_path / "out" / "composited").iterdir()] == ["000005.png"]
     assert (bpy.context.scene.frame_start, bpy.context.scene.frame_end) == (5, 7)
+
+
+@pytest.mark.skipif(not getattr(bpy.app, "module", False), reason="a Blender is no Python that runs a script")
+@pytest.mark.parametrize(("starter", "code", "baked"), [("gone", 130, False), ("there", 0, True)])
+def test_a_bake_ends_with_the_launcher_that_started_it(shot, tmp_path, root, starter, code, baked):
+    script = root / "splannequin_addon" / "run_in_bpy.py"
+    words = ["bake", "--shot", str(shot), "--take", "freeze", "--output", str(tmp_path / "out"), "--tied"]
+    bake = subprocess.Popen([sys.executable, "-P", str(script), *words], stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert bake.stdin and bake.stderr
+    if starter == "gone":
+        bake.stdin.close()
+    said = bake.stderr.read().decode()
+    assert bake.wait(120) == code, said
+    assert ("Cancelled" in said) == (not baked)
+    assert (tmp_path / "out" / "shot.blend").is_file() == baked
+    bake.stdin.close()
+    bake.stderr.close()

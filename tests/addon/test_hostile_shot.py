@@ -1,4 +1,4 @@
-"""A shot that came with Python modules in its folders: no button runs them. Real backends, in and around such a shot."""
+"""A shot that came with Python modules in its folders: no button runs them. Real backends in and around it."""
 
 import os
 import sys

@@ -22,7 +22,7 @@ from ..shot import Shot, content_key, write_atomic, write_json
 from . import adam
 from .checkpoint import load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
-from .device import choose_device
+from .device import choose_device, unused_card
 from .extend import EXTENSION_FILE, pending
 from .model import DynamicModel
 from .needs import modelled
@@ -57,7 +57,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     """
     if params.extend:
         return extend_run(shot, params, report)
-    config, device = config_from_params(params), _prepared_device(params)
+    config, device = config_from_params(params), _prepared_device(params, report)
     folder = shot.own(shot.run(params.run))
     shot.own(folder / "previews")
     scene = load_scene(shot)
@@ -114,7 +114,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if facts["solve"] != solve_key(shot):
         message = f"The run {params.run!r} was trained on other cameras than the shot has now: it cannot be extended."
         raise JobError(message, "Remove the run or name another one, then train.", ExitCode.TRAIN)
-    config, device, scene = config_from_json(facts["config"]), _prepared_device(params), load_scene(shot)
+    config, device, scene = config_from_json(facts["config"]), _prepared_device(params, report), load_scene(shot)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     images = place_images(load_images(scene, train + test, *training_size(scene, config.width), report), device)
     held_out = images[len(train) :]
@@ -142,8 +142,11 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     return summary
 
 
-def _prepared_device(params: TrainParams) -> torch.device:
+def _prepared_device(params: TrainParams, report: Reporter) -> torch.device:
     device = choose_device(params.device)
+    unused = unused_card() if params.device == "auto" and device.type == "cpu" else None
+    if unused is not None:
+        report.warning(f"Training uses the processor, not the graphics card: {unused[0]}", unused[1])
     torch.set_num_threads(default_threads())
     if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
         for module in (raster_cpu, ssim, adam, planes):
