@@ -224,7 +224,7 @@ def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     From its header: Blender says 0 x 0 of a multilayer file. ValueError without one, or for margins that are not the
     same on opposite sides: Blender centres the pixels, wherever the frame lies in them.
     """
-    with open(path, "rb") as source:
+    with contract.open_regular(path) as source:
         header = source.read(16384)
     if header[:4] != b"\x76\x2f\x31\x01":
         raise ValueError(f"{path} is no OpenEXR file: render the take again")
@@ -246,7 +246,8 @@ def frame_numbers(folder: Path, suffix: str = ".exr") -> list[int]:
     """Numbers of the frames in a folder, ascending; empty if there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(int(p.stem) for p in folder.iterdir() if p.suffix == suffix and p.stem.lstrip("-").isdigit())
+    found = (contract.frame_number(p.stem) for p in folder.iterdir() if p.suffix == suffix)
+    return sorted(number for number in found if number is not None)
 
 
 def frame_path(folder: Path, frame: int, suffix: str = ".exr") -> Path:

@@ -240,7 +240,7 @@ def status(args: argparse.Namespace, console: Console) -> int:
             print(json.dumps({"job": job.folder.name, **dataclasses.asdict(told)}))
         else:
             share = f"{told.stage} {100 * told.fraction:.0f}%" if told.stage else ""
-            print(f"{job.folder.name}  {told.state:<9} {share}  {told.message}".rstrip())
+            print(contract.printable(f"{job.folder.name}  {told.state:<9} {share}  {told.message}").rstrip())
     return ExitCode.OK
 
 

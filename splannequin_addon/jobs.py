@@ -5,6 +5,7 @@ No bpy here: the job folder is all the state there is, so that any Blender that 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -26,6 +27,10 @@ _START_SECONDS = 30.0
 _LOG_LINES = 6
 _KILL_SECONDS = 20.0
 """A job that has not ended this long after it was asked to is ended by force on a second request."""
+_LONGEST_SECONDS = 1e7
+"""What is said to take longer is not told."""
+_LONGEST_REQUEST = 1 << 24
+"""Bytes of a request that are read; one with a t* for each of 100,000 frames takes a fifth."""
 _SILENT_SECONDS = 10 * contract.HEARTBEAT_SECONDS
 """A job of an older backend is believed dead after this long without a sign of life."""
 
@@ -219,12 +224,15 @@ def raise_if_failed(job: Job) -> None:
 
 
 def open_job(folder: Path) -> Job | None:
-    """A job from its folder; None if its request cannot be read."""
+    """A job from its folder; None if its request cannot be read, or is none."""
     try:
-        request = contract.from_dict(contract.JobRequest, contract.read_json(folder / contract.REQUEST_FILE))
+        data = contract.read_json(folder / contract.REQUEST_FILE, _LONGEST_REQUEST)
+        contract.check_version(data, "job request")
+        request: contract.JobRequest = contract.from_dict(contract.JobRequest, data)
+        params = dataclasses.asdict(request.typed_params())
     except (OSError, ValueError):
         return None
-    return Job(folder, request.kind, request.params)
+    return Job(folder, request.kind, params)
 
 
 def latest(shot: Path) -> dict[str, Job]:
@@ -249,21 +257,22 @@ def latest(shot: Path) -> dict[str, Job]:
 def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
     """Last lines of the job's log; empty if it has none."""
     try:
-        with open(folder / contract.LOG_FILE, "rb") as log:
+        with contract.open_regular(folder / contract.LOG_FILE) as log:
             log.seek(0, os.SEEK_END)
             log.seek(max(log.tell() - 8192, 0))
-            text = log.read().decode("utf-8", "replace")
-    except OSError:
+            text = log.read(8192).decode("utf-8", "replace")
+    except (OSError, ValueError):
         return []
-    return [line for line in text.splitlines() if line.strip()][-lines:]
+    return [contract.printable(line) for line in text.splitlines() if line.strip()][-lines:]
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Writes a JSON object beside `path`, fsyncs, renames over it: a reader never sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    beside.unlink(missing_ok=True)  # a link that another hand left there would be followed
     try:
-        with open(beside, "w", encoding="utf-8", newline="\n") as out:
+        with open(beside, "x", encoding="utf-8", newline="\n") as out:
             out.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
             out.flush()
             os.fsync(out.fileno())
@@ -274,47 +283,93 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def _read_status(folder: Path) -> contract.Status | None:
+    """The status as it stands; None before there is one. ValueError if it is none of ours."""
     try:
-        data = contract.read_json(folder / contract.STATUS_FILE)
-        contract.check_version(data, "job status", contract.STATUS_VERSION)
-        return contract.from_dict(contract.Status, data)
+        data = contract.read_json(folder / contract.STATUS_FILE, contract.SHORT_JSON)
     except OSError:
         return None
+    contract.check_version(data, "job status", contract.STATUS_VERSION)
+    status: contract.Status = contract.from_dict(contract.Status, data)
+    for name in ("stage", "message", "hint", "host"):
+        setattr(status, name, contract.printable(getattr(status, name)))
+    status.fraction = min(max(status.fraction, 0.0), 1.0)
+    if status.eta_seconds is not None and not 0.0 <= status.eta_seconds < _LONGEST_SECONDS:
+        status.eta_seconds = None
+    return status
 
 
 def _read_events(job: Job, until: float) -> tuple[list[contract.Event], bool]:
-    """New whole lines of events.jsonl, and whether they were all read."""
+    """New whole lines of events.jsonl, and whether they were all read. A line that is no event is passed over."""
     events: list[contract.Event] = []
     try:
-        source = open(job.folder / contract.EVENTS_FILE, "rb")  # noqa: SIM115  (closed below; may not be there yet)
+        with contextlib.closing(contract.read_lines(job.folder / contract.EVENTS_FILE, job.read_to)) as lines:
+            for line, job.read_to in lines:
+                event = _event(line)
+                if event is not None:
+                    _take_in(job, event)
+                    events.append(event)
+                if time.monotonic() > until:
+                    return events, False
     except OSError:
-        return events, True
-    with source:
-        source.seek(job.read_to)
-        for line in source:
-            if not line.endswith(b"\n"):
-                return events, True  # half written: the rest comes with the next poll
-            job.read_to += len(line)
-            event = contract.from_dict(contract.Event, json.loads(line))
-            _take_in(job, event)
-            events.append(event)
-            if time.monotonic() > until:
-                return events, False
+        pass  # not there yet
     return events, True
+
+
+def _event(line: bytes) -> contract.Event | None:
+    try:
+        event: contract.Event = contract.from_dict(contract.Event, json.loads(line))
+        if event.type in _EVENT_DATA:
+            contract.from_dict(_EVENT_DATA[event.type], event.data)
+    except (ValueError, TypeError, RecursionError):
+        return None
+    return event
+
+
+@dataclass
+class _Words:
+    message: str
+    hint: str = ""
+    exit_code: int = 1
+
+
+@dataclass
+class _Figures:
+    values: dict[str, Any]
+    stage: str = ""
+
+
+@dataclass
+class _Picture:
+    label: str
+    path: str
+
+
+@dataclass
+class _End:
+    state: str
+    result: Any = None
+
+
+_EVENT_DATA: dict[str, type] = {
+    "warning": _Words, "error": _Words, "metric": _Figures, "image": _Picture, "done": _End,
+}  # fmt: skip
+"""What an event has to hold to be believed; those of other types are only handed on."""
 
 
 def _take_in(job: Job, event: contract.Event) -> None:
     if event.type == "warning":
-        job.warnings.append((event.data["message"], event.data["hint"]))
+        words = _Words(**event.data)
+        job.warnings.append((contract.printable(words.message), contract.printable(words.hint)))
     elif event.type == "metric":
         values = event.data["values"]
         job.metrics.update(values)
-        if values.get("heldout_psnr_db") is not None and "seconds" in values:
-            job.history.append((float(values["seconds"]), float(values["heldout_psnr_db"])))
+        point = contract.measured(values)
+        if point is not None:
+            job.history.append(point)
     elif event.type == "image":
         job.images[event.data["label"]] = event.data["path"]
     elif event.type == "done":
-        job.result = event.data["result"]
+        job.result = event.data.get("result")
 
 
 def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:

@@ -404,11 +404,13 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
 
     def _runs(self, context: Any, state: shots.ShotState) -> None:
         """All runs of the shot, to compare and pick."""
-        if not state.runs and not state.unfinished:
+        if not state.listed("run"):
             return
         body = sub_panel(self.layout, "runs", "Runs")  # type: ignore[attr-defined]
         if body is not None:
             listing.draw(body, "run", state, context.scene.splannequin.run_name)
+            for told in state.damaged["run"].values():
+                wrap(body, context, told, "ERROR")
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The run's name."""
@@ -440,11 +442,13 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         """The step's body, and the takes to compare."""
         super().draw(context)
         watch = self._watch(context)
-        if watch is None or watch.state is None or not watch.state.takes:
+        if watch is None or watch.state is None or not watch.state.listed("take"):
             return
         body = sub_panel(self.layout, "takes", "Takes")  # type: ignore[attr-defined]
         if body is not None:
             listing.draw(body, "take", watch.state, context.scene.splannequin.take_name)
+            for told in watch.state.damaged["take"].values():
+                wrap(body, context, told, "ERROR")
 
     def _live(self, context: Any, layout: Any) -> None:
         """Scrubbing: on or off, what is shown, suggestions and why."""

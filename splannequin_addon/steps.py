@@ -268,8 +268,9 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
 def step_of(job: jobs.Job) -> str:
     """Name of the step that a job found in a shot folder belongs to: Freeze and Bake ask for the same kind."""
     try:
-        told = (job.folder / _STEP_FILE).read_text(encoding="utf-8")
-    except OSError:
+        with contract.open_regular(job.folder / _STEP_FILE) as file:
+            told = file.read(100).decode("utf-8", "replace")
+    except (OSError, ValueError):
         told = ""  # started from the backend's command line
     names = [s.name for s in STEPS.values() if s.kind == job.kind]
     return told if told in names else names[0]

@@ -43,9 +43,9 @@ class Console:
         elif event.type == "metric" and event.data["values"].get("modelled"):
             self._line(modelled_table(event.data["values"]["modelled"]))
         elif event.type == "warning":
-            self._line(f"  note: {event.data['message']} {event.data['hint']}".rstrip())
+            self._line(contract.printable(f"  note: {event.data['message']} {event.data['hint']}".rstrip()))
         elif event.type == "error":
-            self._line(f"Error: {event.data['message']} {event.data['hint']}".rstrip())
+            self._line(contract.printable(f"Error: {event.data['message']} {event.data['hint']}".rstrip()))
         elif event.type == "done" and event.data["state"] == "cancelled":
             self._line("Cancelled. Start the same command again to go on: finished work is kept.")
 
@@ -174,8 +174,12 @@ def status(args: argparse.Namespace, console: Console) -> int:
     """`status SHOT`: its jobs, newest last, one line each."""
     shot = Shot.open(args.shot)
     for path in sorted(shot.jobs.glob(f"*/{contract.STATUS_FILE}")):
-        job = contract.from_dict(contract.Status, contract.read_json(path))
-        print(f"{path.parent.name}  {job.state:<9} {job.stage} {100 * job.fraction:.0f}%  {job.message}".rstrip())
+        try:
+            job: contract.Status = contract.from_dict(contract.Status, contract.read_json(path, contract.SHORT_JSON))
+            told = f"{job.state:<9} {job.stage} {100 * job.fraction:.0f}%  {job.message}"
+        except (OSError, ValueError) as error:
+            told = f"damaged   {error}"
+        print(contract.printable(f"{path.parent.name}  {told}").rstrip())
     return ExitCode.OK
 
 

@@ -20,6 +20,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import socket
@@ -30,7 +31,7 @@ import sys
 import threading
 import time
 import typing
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -53,6 +54,10 @@ GRACE_SECONDS = 30.0
 """How long a cancelled process may take for its checkpoint before it is ended by force."""
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
+SHORT_JSON = 1 << 20
+"""Bytes of a file that Blender reads between two turns of its timer: a status, a run's figures."""
+LONGEST_LINE = 1 << 20
+"""Bytes of a line of events.jsonl or metrics.jsonl that are read."""
 
 
 class ExitCode(enum.IntEnum):
@@ -658,7 +663,8 @@ def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VER
     version = data.get("version", 1)
     if not isinstance(version, int) or version > newest:
         raise ValueError(
-            f"{what} has version {version}, this Splannequin reads up to {newest}: update the add-on and its backend"
+            f"{what} has version {_short(version)}, this Splannequin reads up to {newest}: "
+            "update the add-on and its backend"
         )
 
 
@@ -679,19 +685,100 @@ def open_regular(path: str | Path) -> BinaryIO:
         raise
 
 
-def read_json(path: str | Path) -> dict[str, Any]:
-    """A JSON object from a file. FileNotFoundError, or ValueError naming the file and what is wrong in it."""
+def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
+    """A JSON object from a file of at most `longest` bytes.
+
+    FileNotFoundError, or ValueError naming the file and what is wrong in it.
+    """
     with open_regular(path) as source:
-        text = source.read(LONGEST_JSON + 1)
-    if len(text) > LONGEST_JSON:
-        raise ValueError(f"{path} is longer than {LONGEST_JSON >> 20} MB: nothing of ours is")
+        text = source.read(longest + 1)
+    if len(text) > longest:
+        raise ValueError(f"{path} is longer than {longest >> 20} MB: nothing of ours is")
     try:
-        data = json.loads(text)
+        data = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:  # ValueError: no JSON, no UTF-8, or a number of too many digits
         raise ValueError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(data, dict):
         raise ValueError(f"{path} should hold a JSON object, found {type(data).__name__}")
     return data
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def read_lines(
+    path: str | Path, start: int = 0, longest: int = LONGEST_LINE
+) -> Generator[tuple[bytes, int], None, None]:
+    """Whole lines of a file that grows, from a byte on: (line, where the next one begins).
+
+    One longer than `longest` bytes is passed over: (b"", where it goes on). OSError or ValueError as `open_regular`.
+    """
+    with open_regular(path) as source:
+        source.seek(start)
+        inside = False  # of a line that is too long
+        while line := source.readline(longest):
+            start += len(line)
+            whole = line.endswith(b"\n")
+            if not whole and len(line) < longest:
+                return  # half written: it is read with the next call
+            yield (line if whole and not inside else b""), start
+            inside = not whole
+
+
+def measured(row: Mapping[str, Any]) -> tuple[float, float] | None:
+    """(seconds of training, dB on frames kept out) of a measurement; None if it is none, or holds no plain numbers."""
+    seconds, quality = row.get("seconds"), row.get("heldout_psnr_db")
+    if any(isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e9 for v in (seconds, quality)):
+        return None
+    return float(seconds), float(quality)  # pyright: ignore[reportArgumentType]
+
+
+def printable(text: str, longest: int = 2000) -> str:
+    """Text from a file as it may be shown or printed: no escape codes or other control characters, and not endless."""
+    return "".join(c if c.isprintable() else " " for c in text[:longest])
+
+
+def checked_name(name: str, what: str) -> str:
+    """`name` if it is safe as a folder name on every system; ValueError otherwise."""
+    if not _NAME.fullmatch(name) or name.endswith((".", " ")):
+        raise ValueError(f"{what} name {name!r} should be 1 to 64 letters, digits, spaces, '.', '_' or '-'")
+    if name.partition(".")[0].rstrip().upper() in _DEVICES:
+        raise ValueError(f"{what} name {name!r} is the name of a device on Windows: choose another one")
+    return name
+
+
+_NAME = re.compile(r"\w[\w .-]{0,63}")
+_DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in "0123456789¹²³")}
+
+
+def frame_number(stem: str) -> int | None:
+    """Number of a frame's file by its name without suffix; None if it is no such file."""
+    return int(stem) if _NUMBER.fullmatch(stem) else None
+
+
+_NUMBER = re.compile(r"-?[0-9]{1,9}")
+
+
+def is_link(path: Path) -> bool:
+    """True for a symbolic link, and on Windows for a junction, whether or not it leads anywhere."""
+    try:
+        found = os.lstat(path)
+    except OSError:
+        return False
+    return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == _JUNCTION
+
+
+def remove_link(path: Path) -> None:
+    """Removes a link, never what it leads to."""
+    if sys.platform == "win32" and path.is_dir():
+        os.rmdir(path)  # how Windows removes a link to a folder
+    else:
+        os.unlink(path)
+
+
+_JUNCTION = 0xA0000003
+"""stat.IO_REPARSE_TAG_MOUNT_POINT, which only Windows has: its link between folders."""
 
 
 def from_dict(cls: type, data: Mapping[str, Any]) -> Any:
@@ -700,11 +787,21 @@ def from_dict(cls: type, data: Mapping[str, Any]) -> Any:
     unknown = set(data) - set(hints)
     if unknown:
         raise ValueError(f"{cls.__name__} has no field {sorted(unknown)[0]!r}: it has {', '.join(hints)}")
+    missing = _needed(cls) - set(data)
+    if missing:
+        raise ValueError(f"{cls.__name__} has no {min(missing)}")
     values = {name: _checked(cls.__name__, name, hints[name], value) for name, value in data.items()}
     try:
         return cls(**values)
-    except TypeError as error:
+    except (TypeError, OverflowError) as error:
         raise ValueError(f"{cls.__name__}: {error}") from error
+
+
+@functools.cache
+def _needed(cls: type) -> set[str]:
+    """Fields that have no default."""
+    none = dataclasses.MISSING
+    return {f.name for f in dataclasses.fields(cls) if f.default is none and f.default_factory is none}
 
 
 @functools.cache
@@ -720,11 +817,28 @@ def _checked(owner: str, name: str, hint: Any, value: Any) -> Any:
         base = typing.get_origin(option) or option
         if base is Any or (base is type(None) and value is None):
             return value
-        if base is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if base is float and number and abs(value) < _LARGEST_FLOAT:
             return float(value)
-        if isinstance(base, type) and isinstance(value, base) and not (base is int and isinstance(value, bool)):
+        if base is int:
+            if number and isinstance(value, int) and abs(value) < _LARGEST_INT:
+                return value
+        elif base is not float and isinstance(base, type) and isinstance(value, base):
             return value
-    raise ValueError(f"{owner}.{name} cannot be {value!r}")
+    raise ValueError(f"{owner}.{name} cannot be {_short(value)}")
+
+
+_LARGEST_FLOAT, _LARGEST_INT = 1e300, 1 << 53
+"""What JSON cannot hold without loss, or is no number (NaN, infinity), comes from no file of ours."""
+
+
+def _short(value: Any) -> str:
+    """A value as a sentence names it."""
+    if isinstance(value, (list, dict)):
+        return f"a {'list' if isinstance(value, list) else 'JSON object'}"
+    if isinstance(value, int) and abs(value) >= _LARGEST_INT:
+        return "a number that large"
+    return repr(value if not isinstance(value, str) else printable(value, 80))
 
 
 # ------------------------------------------------------------------------------------------------- frozen frames

@@ -227,3 +227,27 @@ def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root,
     assert shots.read(shot).runs["main"]["iterations"] == 360
     assert addon("headless").main(["train", str(shot), "--run", "none", "--extend", "10"]) == 5
     assert "no trained run 'none'" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("link", ["takes/mine", "trash", "takes"])
+def test_removing_a_take_deletes_nothing_behind_a_link(addon, shot, new_take, tmp_path, link):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "holiday.png").write_bytes(b"mine")
+    new_take(tmp_path / "elsewhere", "mine")
+    path = shot / link
+    if link == "takes":
+        path.rename(shot / "was")
+        path.symlink_to(tmp_path / "elsewhere" / "takes", target_is_directory=True)
+    else:
+        path.symlink_to(mine, target_is_directory=True)
+    take = shot / "takes" / ("freeze" if link == "trash" else "mine")
+    remove = addon("listing").remove
+    if link == "takes":
+        with pytest.raises(OSError, match="takes is a link to another folder"):
+            remove(shot, take, wait=True)
+        assert len(list((tmp_path / "elsewhere" / "takes" / "mine").iterdir())) == 4
+    else:
+        remove(shot, take, wait=True)
+        assert not os.path.lexists(take) and not os.path.lexists(shot / "trash")
+    assert [p.name for p in mine.iterdir()] == ["holiday.png"]
