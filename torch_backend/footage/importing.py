@@ -47,6 +47,8 @@ class FootageConfig:
     """Height in pixels of the working frames; 0: the source's, at most 720. Frames are never enlarged."""
     fps: float = 0.0
     """Rate of an image sequence, frames per second; 0: what its files say, else 24. Videos have their own clock."""
+    layer: str = ""
+    """Layer of the pictures of a sequence, by its name or the last part of it; empty: the picture itself."""
 
 
 @dataclass
@@ -71,9 +73,10 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     Raises JobError (FOOTAGE, DISK) in one sentence, and Cancelled; either leaves no half import behind.
     """
     _check(config)
-    opened = open_source(source, config.fps)
+    opened = open_source(source, config.fps, config.layer)
     _check_range(opened, config)
-    key = content_key(FRAMES_VERSION, opened.info.key, config)
+    asked = {name: value for name, value in asdict(config).items() if name != "layer" or value}
+    key = content_key(FRAMES_VERSION, opened.info.key, asked)
     restore_folder(shot.frames)
     for folder in (shot.frames / "raw", shot.solve):
         shot.own(folder)
@@ -283,6 +286,7 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "height": extracted.height,
         "fps": info.fps,
         "colour": info.colour,
+        "reading": info.reading,
         "bits": 16 if info.deep else 8,
         "step": step,
         "config": asdict(config),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
@@ -50,9 +50,11 @@ class SourceInfo:
     deep: bool
     """True if working frames keep 16 bits."""
     colour: str
-    """srgb, or linear for scene-linear pictures."""
+    """srgb, or linear for pictures that hold light: scene-linear, log, HDR."""
     key: list
     """What tells this footage from another: names, sizes, modification times."""
+    reading: dict[str, Any] = field(default_factory=dict)
+    """How it is read, and what of that was assumed: the record in frames.json says so."""
 
 
 class Source(Protocol):
@@ -99,8 +101,10 @@ def square_size(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
     return width, max(1, round(height / aspect))
 
 
-def open_source(source: str, fps: float = 0.0) -> Source:
-    """Opens a video file, a folder or file or pattern of a numbered sequence. `fps` overrides a sequence's rate.
+def open_source(source: str, fps: float = 0.0, layer: str = "") -> Source:
+    """Opens a video file, a folder or file or pattern of a numbered sequence.
+
+    `fps` overrides a sequence's rate, `layer` names the layer of its pictures to take.
 
     JobError in one sentence for what is missing, empty, or no footage at all.
     """
@@ -121,7 +125,7 @@ def open_source(source: str, fps: float = 0.0) -> Source:
         raise footage_error(f"The footage {source!r} cannot be opened: {reason}.", "Check the path.") from error
     special = path.exists() and not path.is_file() and not path.is_dir()
     if is_pattern or path.is_dir() or (path.suffix.lower() in PICTURES and not special):
-        return SequenceSource(find_sequence(path), fps)
+        return SequenceSource(find_sequence(path), fps, layer)
     if special:
         raise footage_error(f"{source} is neither a file nor a folder.", "Choose a video file or an image sequence.")
     if not path.is_file():
