@@ -212,6 +212,7 @@ def build(scene: Any, shot: Path) -> Any:
         _place(scene, shot, camera, cloud, scene_from_solve(path, xyz, floor), _extent(path))
         camera.data.clip_start, camera.data.clip_end = (v * depth_scale(scene, shot) for v in _clip(path, xyz))
         guesses.mark(scene, shot, unsolved)
+        made.keep_camera(scene)
         scene.camera = camera
     return camera
 
@@ -292,8 +293,11 @@ def remove(scene: Any, shot: Path) -> bool:
     """
     if made.of(scene, shot) is None:
         return False
+    was, ours = scene.camera is not None, scene.camera == made.part(scene, shot, "camera")
     _clear(scene, shot)
     made.drop(scene, shot)
+    if was and ours:
+        made.give_camera_back(scene)
     return True
 
 

@@ -134,14 +134,52 @@ def new_over_node(tree: Any) -> tuple[Any, Any, Any]:
 
 
 def new_fit_node(tree: Any, how: str = "Fit") -> Any:
-    """A Scale node that brings inputs[0] to the render size: "Fit" keeps its shape, "Stretch" does not."""
+    """A Scale node that brings inputs[0] to the render size, and leaves what has that size as it is, bit by bit.
+
+    Args:
+        tree: where it is made.
+        how: "Fit" shows all and leaves bars, "Crop" fills the frame and cuts off what is over; both keep the shape.
+            "Stretch" does not.
+    """
     node = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Render Size"
         node.inputs["Frame Type"].default_value = how
+        if how == "Crop":  # else the outermost pixels fade out
+            node.inputs["Extension X"].default_value = node.inputs["Extension Y"].default_value = "Extend"
     else:
         node.space = "RENDER_SIZE"
         node.frame_method = how.upper()
+    return node
+
+
+def new_quotient(tree: Any, picture: Any, value: Any) -> Any:
+    """Socket of a picture whose four channels are divided by a value; 0 where that is 0. Until 4.5."""
+    node = tree.nodes.new("CompositorNodeMixRGB")
+    node.blend_type = "DIVIDE"
+    parts, whole = tree.nodes.new("CompositorNodeSeparateColor"), tree.nodes.new("CompositorNodeSetAlpha")
+    alpha = new_math_node(tree, "DIVIDE")
+    whole.mode = "REPLACE_ALPHA"
+    for source, target in (
+        (picture, node.inputs[1]), (value, node.inputs[2]), (picture, parts.inputs[0]),
+        (parts.outputs["Alpha"], alpha.inputs[0]), (value, alpha.inputs[1]),
+        (node.outputs[0], whole.inputs["Image"]), (alpha.outputs[0], whole.inputs["Alpha"]),
+    ):  # fmt: skip
+        tree.links.new(source, target)
+    return whole.outputs[0]
+
+
+def new_nearest_node(tree: Any) -> Any:
+    """A node whose output is the least of inputs[0] at a pixel and its eight neighbours."""
+    node = tree.nodes.new("CompositorNodeDilateErode")
+    if "Size" in node.inputs:  # 4.5 on
+        node.inputs["Size"].default_value = -1
+    else:
+        node.distance = -1
+    if "Type" in node.inputs:  # 5.0 on
+        node.inputs["Type"].default_value = "Steps"
+    else:
+        node.mode = "STEP"
     return node
 
 

@@ -290,7 +290,7 @@ def _bake(
     scene: Any, fresh: bool, shot: Path, take: str, output: Path, console: Console, span: range | None = None
 ) -> dict[str, Any]:
     """Compositor, render of `span` (None: the scene's range), shot.blend; returns what the summary tells of it."""
-    changes = bake.fit_take(scene, shot, take) if fresh or scene_setup.fitted(scene) else []
+    changes = bake.fit_take(scene, shot, take, fresh) if fresh or scene_setup.fitted(scene) else []
     if span is not None:
         scene.frame_start, scene.frame_end, scene.frame_step = span.start, span.stop - 1, span.step
     changes += steps.insert_freeze(scene, shot, take)

@@ -70,8 +70,28 @@ def part(scene: Any, shot: Path, name: str) -> Any | None:
     return item if item is not None and scene.objects.get(item.name) == item else None
 
 
+def keep_camera(scene: Any) -> None:
+    """Remembers the scene's camera, before a shot's takes its place."""
+    camera = scene.camera
+    if camera is not None and camera not in [entry.camera for entry in scene.splannequin.made]:
+        scene.splannequin.camera_before = camera
+
+
+def give_camera_back(scene: Any) -> None:
+    """Where the scene's camera went with a shot: another shot's takes its place, or the one before all of them."""
+    held = scene.splannequin
+    if scene.camera is None:
+        others = [entry.camera for entry in held.made] + [held.camera_before]
+        scene.camera = next((c for c in others if c is not None and scene.objects.get(c.name) == c), None)
+    if not len(held.made):
+        held.camera_before = None
+
+
 def tidy(scene: Any) -> None:
     """Lets go of what the artist deleted: the pointer would keep it in the file, out of sight."""
+    before = scene.splannequin.camera_before
+    if before is not None and not before.users_scene:
+        scene.splannequin.camera_before = None
     for entry in scene.splannequin.made:
         for name in PARTS:
             item = getattr(entry, name)

@@ -188,6 +188,12 @@ class ShotSettings:
 class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
     """Settings of a shot of the scene that is not the chosen one."""
 
+    scene_settings: StringProperty(
+        name="Scene Settings",
+        description="Size, rate and range of the scene while this shot was chosen",
+        options={"HIDDEN"},
+    )
+
 
 class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
     """The chosen shot of the scene, and what is the scene's own."""
@@ -217,6 +223,12 @@ class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
     )
     loaded_shot: IntProperty(
         name="Loaded", description="Shot of the list whose settings are the scene's", default=0, options={"HIDDEN"}
+    )
+    camera_before: PointerProperty(
+        name="Camera Before",
+        description="Camera of the scene before a shot's was put in its place",
+        type=bpy.types.Object,
+        options={"HIDDEN"},
     )
     made: CollectionProperty(
         name="Made", description="What was put into this scene, by shot", type=made.SPLANNEQUIN_PG_made, options=set()

@@ -361,11 +361,13 @@ def run(
 
 
 def _fit(scene: Any, state: shots.ShotState, force_k: bool = False) -> list[str]:
-    if not (scene.splannequin.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
+    props = scene.splannequin
+    if not (props.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
         return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]
     size, k = state.size, None
     if force_k:
         path = contract.CameraPath.load(state.folder / "solve" / "cameras.json")
         size = (path.width, path.height)
         k = (path.frames[0].K[0], path.frames[0].K[1], path.frames[0].K[2], path.frames[0].K[3])
-    return scene_setup.fit_clip(scene, size, float(state.info.get("fps", 0.0)), state.frame_range, k)
+    fps = float(state.info.get("fps", 0.0))
+    return scene_setup.fit_clip(scene, size, fps, state.frame_range, k, props.set_up_scene)

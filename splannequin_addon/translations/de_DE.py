@@ -177,6 +177,10 @@ MESSAGES: dict[str, str] = {
     "Name of the frozen frames; a new name keeps the old": "Name der eingefrorenen Bilder; ein neuer Name lässt die alten bestehen",
     "Fit Scene to Clip": "Szene an Clip anpassen",
     "Set resolution, frame rate and frame range of the scene to the clip's. Off: only a new scene is set up, one you have worked in is left alone": "Auflösung, Bildrate und Bildbereich der Szene auf die des Clips setzen. Aus: nur eine neue Szene wird eingerichtet, eine bearbeitete bleibt, wie sie ist",
+    "Camera Before": "Kamera zuvor",
+    "Camera of the scene before a shot's was put in its place": "Kamera der Szene, bevor die eines Shots an ihre Stelle kam",
+    "Scene Settings": "Szeneneinstellungen",
+    "Size, rate and range of the scene while this shot was chosen": "Größe, Bildrate und Bildbereich der Szene, während dieser Shot gewählt war",
     "Keep Plate Colours": "Farben der Plate erhalten",
     "Set the view transform to Standard and dither to 0, so that pictures leave with the colours they came in with. Blender's default view changes them": "Die Anzeigetransformation auf Standard und Dither auf 0 setzen, damit Bilder mit den Farben hinausgehen, mit denen sie kamen. Blenders Voreinstellung verändert sie",
     # ------------------------------------------------------------------------------------------ messages

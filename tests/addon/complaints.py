@@ -95,8 +95,8 @@ ANSWERS = (
         4,
         "the nearer of CG and frozen shows",
         COMPOSITOR,
-        'nearer = compat.new_math_node(group, "LESS_THAN")',
-        'nearer = compat.new_math_node(group, "GREATER_THAN")',
+        "    group.links.new(cg, ratio.inputs[0])\n    group.links.new(frozen, ratio.inputs[1])\n",
+        "    group.links.new(frozen, ratio.inputs[0])\n    group.links.new(cg, ratio.inputs[1])\n",
         f"{TEST}compositor.py::test_cg_stands_in_front_and_behind_by_depth",
     ),
     Answer(
