@@ -24,6 +24,7 @@ from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
+from .replacing import Staged, replacing_solve, settle_solve
 from .undistort import Undistorter
 
 SOLVE_VERSION = 1
@@ -78,7 +79,8 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 
     Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
     contract.CameraPath in COLMAP's world ("solve units"), OpenCV axes, world-to-camera, pinhole of the undistorted
-    frames. A shot already solved from the same frames with the same configuration is left alone.
+    frames. They take the place of a solve of before when all of them are written; until then, and if this one fails,
+    that one stays. A shot already solved from the same frames with the same configuration is left alone.
 
     With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
     its world, frames without one interpolated.
@@ -86,6 +88,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
     _check(config)
+    settle_solve(shot)
     frames = load_frames(shot)
     source = [foreign.fingerprint(cameras)] if cameras else []
     key = content_key(SOLVE_VERSION, config, frames["key"], *source)
@@ -93,9 +96,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
         return done["result"]
-    taken = prepare(frames, cameras, report) if cameras else None  # before anything is thrown away
-    for name in ("solve.json", "cameras.json"):
-        (shot.solve / name).unlink(missing_ok=True)
+    taken = prepare(frames, cameras, report) if cameras else None
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
     size = sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
     need_disk(shot.root, 1.2 * size + (len(frames["frames"]) << 20), "The camera solve")
@@ -108,9 +109,11 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
         else:
             options = {"overlap": config.overlap, "features": config.features}
             answer = take_over(shot, frames, taken, options, scratch, report)
-        result = _finish(shot, frames, answer, scratch, config, key, report)
+        with replacing_solve(shot) as staged:
+            result = _finish(shot, frames, answer, scratch, staged, key, report)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    report.metric("solve", dict(result))
     return result
 
 
@@ -206,11 +209,11 @@ def _finish(
     frames: dict[str, Any],
     answer: dict[str, Any],
     scratch: Path,
-    config: SolveConfig,
+    staged: Staged,
     key: str,
     report: Reporter,
 ) -> SolveResult:
-    """Checks the worker's answer and writes the solve's files, solve.json last."""
+    """Checks the worker's answer and writes the solve's files to where they wait until they are whole."""
     solved = sum(f["solve"] for f in frames["frames"])
     if "given" not in answer:
         refuse_poor(answer, solved)
@@ -221,12 +224,11 @@ def _finish(
         points = filter_points({name: data[name] for name in data.files}, _centres(path))
     if "given" in answer:
         refuse_misfit(answer, len(points["xyz"]))
-    _undistort_all(shot, frames, lenses, maps, report)
-    with atomic_path(shot.solve / "points.npz") as beside:
+    _undistort_all(shot, frames, lenses, maps, staged.frames, report)
+    with atomic_path(staged.solve / "points.npz") as beside:
         np.savez(beside, **points)  # pyright: ignore[reportArgumentType]
-    shutil.rmtree(shot.solve / "colmap", ignore_errors=True)
-    (scratch / "model").rename(shot.solve / "colmap")
-    write_json(shot.solve / "cameras.json", path.to_json())
+    (scratch / "model").rename(staged.solve / "colmap")
+    write_json(staged.solve / "cameras.json", path.to_json())
     result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
     warnings = _warnings(frames, path, result, "given" in answer) + doubts(answer)
     for message, hint in warnings:
@@ -250,8 +252,7 @@ def _finish(
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,
     }
-    write_json(shot.solve / "solve.json", record)
-    report.metric("solve", dict(result))
+    write_json(staged.solve / "solve.json", record)
     return result
 
 
@@ -285,23 +286,29 @@ def _centres(path: CameraPath) -> NDArray[np.float64]:
     return np.array([camera_centre(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
 
 
-def _undistort_all(shot: Shot, frames: dict[str, Any], lenses: list[int], maps: list[Path], report: Reporter) -> None:
-    """Writes the undistorted frames, lens by lens: a map takes 128 bytes per pixel."""
+def _undistort_all(
+    shot: Shot, frames: dict[str, Any], lenses: list[int], maps: list[Path], into: Path, report: Reporter
+) -> None:
+    """Writes the undistorted frames to a folder, lens by lens: a map takes 128 bytes per pixel."""
     done = 0
     for number, file in enumerate(maps):
         rows = [frame for frame, lens in zip(frames["frames"], lenses, strict=True) if lens == number]
         if rows:
-            _undistort(shot, rows, file, done, len(lenses), report)
+            _undistort(shot, rows, file, into, (done, len(lenses)), report)
         done += len(rows)
 
 
-def _undistort(shot: Shot, listed: list[dict[str, Any]], file: Path, before: int, total: int, report: Reporter) -> None:
+def _undistort(
+    shot: Shot, listed: list[dict[str, Any]], file: Path, into: Path, counts: tuple[int, int], report: Reporter
+) -> None:
+    """Frames of one lens; `counts` are the frames done before these, and all there are."""
+    before, total = counts
     with np.load(file, allow_pickle=False) as data:
         undistort = Undistorter(data["where"])
 
     def one(frame: dict[str, Any]) -> int:
         pixels = read_png(shot.frames / frame["file"])
-        write_png(shot.frames / frame_file(frame["frame"], ".png"), undistort(pixels))
+        write_png(into / frame_file(frame["frame"], ".png"), undistort(pixels))
         return frame["frame"]
 
     with ThreadPoolExecutor(_WRITERS) as pool:
