@@ -13,7 +13,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
+from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, open_regular, read_json
 from ..footage import load_frames
 from ..footage.images import read_png, write_png
 from ..footage.sources import frame_words
@@ -33,6 +33,7 @@ LEAST_REGISTERED = 8
 REFUSED_SHARE = 0.5
 GOOD_SHARE, GOOD_ERROR_PX = 0.95, 1.2
 _WRITERS = 2
+_LOG_END_BYTES = 16_384
 
 
 @dataclass
@@ -111,6 +112,9 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
             answer = take_over(shot, frames, taken, options, scratch, report)
         with replacing_solve(shot) as staged:
             result = _finish(shot, frames, answer, scratch, staged, key, report)
+    except JobError as error:
+        error.add_note(_log_end(shot.solve / "colmap.log"))
+        raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     report.metric("solve", dict(result))
@@ -124,6 +128,17 @@ def load_points(shot: Shot) -> dict[str, NDArray]:
         raise FileNotFoundError(f"{path} does not exist: solve the shot first")
     with np.load(path, allow_pickle=False) as data:
         return {name: data[name] for name in ("xyz", "rgb", "error", "track")}
+
+
+def _log_end(log: Path) -> str:
+    """What COLMAP said last, for the job's own log."""
+    try:
+        with open_regular(log) as handle:
+            handle.seek(max(0, os.fstat(handle.fileno()).st_size - _LOG_END_BYTES))
+            end = handle.read().decode("utf-8", errors="replace")
+    except (OSError, ValueError):
+        return ""
+    return f"The end of {log}:\n{end}"
 
 
 def _check(config: SolveConfig) -> None:
@@ -184,15 +199,17 @@ def _failure(answer: dict[str, Any]) -> JobError:
     )
 
 
-def refuse_poor(answer: dict[str, Any], solved: int) -> None:
-    """JobError for a model that nothing could be trained on."""
+def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
+    """JobError for a model that nothing could be trained on; `frames` is frames.json, whose solved frames it is of."""
+    solved = [f["frame"] for f in frames["frames"] if f["solve"]]
     registered, angle = answer["registered"], answer["triangulation_angle_deg"]
-    if registered < min(LEAST_REGISTERED, solved) or registered < REFUSED_SHARE * solved:
-        sizes = [size for size in answer["model_sizes"] if size >= LEAST_REGISTERED]
-        parts = f" (it falls into {len(sizes)} parts that do not connect)" if len(sizes) > 1 else ""
+    if registered < min(LEAST_REGISTERED, len(solved)) or registered < REFUSED_SHARE * len(solved):
+        parts = [_spans(solved, part) for part in answer["parts"] if len(part) >= LEAST_REGISTERED]
+        apart = f"; {len(parts)} parts of the clip do not connect" if len(parts) > 1 else ""
+        worked = f": {_span_words(parts[0])}" if parts else ""
         raise JobError(
-            f"Cameras were found for only {registered} of {solved} frames{parts}.",
-            "Choose a range without fast pans or blur, or a smaller step.",
+            f"Cameras were found for only {registered} of {len(solved)} frames{worked}{apart}.",
+            _range_hint(parts, solved, frames["step"]),
             ExitCode.SOLVE,
         )
     refuse_narrow(angle)
@@ -202,6 +219,34 @@ def refuse_poor(answer: dict[str, Any], solved: int) -> None:
             "Choose a sharper range, or film with more light and texture in view.",
             ExitCode.SOLVE,
         )
+
+
+def _spans(solved: list[int], names: list[str]) -> list[tuple[int, int, int]]:
+    """(first, last, how many) of each unbroken row of `solved` frames whose pictures are among `names`."""
+    placed = {int(Path(name).stem) for name in names}
+    spans: list[tuple[int, int, int]] = []
+    before = False
+    for frame in solved:
+        if frame in placed:
+            first, count = (spans[-1][0], spans[-1][2]) if before else (frame, 0)
+            spans[-1 if before else len(spans) :] = [(first, frame, count + 1)]
+        before = frame in placed
+    return spans
+
+
+def _span_words(spans: list[tuple[int, int, int]]) -> str:
+    """'12 to 41, 60 to 74', the longest four of them, in the clip's order."""
+    longest = sorted(sorted(spans, key=lambda span: span[2], reverse=True)[:4])
+    return ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last, _ in longest)
+
+
+def _range_hint(parts: list[list[tuple[int, int, int]]], solved: list[int], step: int) -> str:
+    """What can help: a range that worked, and a smaller step only where there is one."""
+    best = max((span for part in parts for span in part), key=lambda span: span[2], default=(0, 0, 0))
+    smaller = " A smaller step shows more of each to the next." if step > 1 else ""
+    if best[2] < LEAST_REGISTERED or best[2] == len(solved):
+        return f"Choose a range without fast pans or blur.{smaller}"
+    return f"Frames {best[0]} to {best[1]} worked: import that range, or one without fast pans or blur.{smaller}"
 
 
 def _finish(
@@ -216,7 +261,7 @@ def _finish(
     """Checks the worker's answer and writes the solve's files to where they wait until they are whole."""
     solved = sum(f["solve"] for f in frames["frames"])
     if "given" not in answer:
-        refuse_poor(answer, solved)
+        refuse_poor(answer, frames)
     poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
     maps = [scratch / f"undistort_{n}.npz" for n in range(1 + max(p.get("lens", 0) for p in poses.values()))]
     path, lenses = _camera_path(frames, poses, [_pinhole(file) for file in maps])
