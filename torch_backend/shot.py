@@ -65,10 +65,13 @@ class Shot:
     @classmethod
     def open(cls, root: str | Path) -> Shot:
         """An existing shot. FileNotFoundError if there is none, ValueError if it is from a newer version."""
+        from .solve.replacing import settle_solve
+
         shot = cls(root)
         if not shot.info_path.is_file():
             raise FileNotFoundError(f"{shot.root} is not a shot folder: it has no shot.json")
         shot.info()
+        settle_solve(shot)
         return shot
 
     @classmethod
@@ -152,7 +155,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield beside
         with open(beside, "rb+") as handle:
             os.fsync(handle.fileno())
-        _replace(beside, path)
+        replace_file(beside, path)
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
@@ -173,8 +176,8 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     try:
         yield fresh
         if os.path.lexists(path):
-            _replace(path, aside)
-        _replace(fresh, path)
+            replace_file(path, aside)
+        replace_file(fresh, path)
     except BaseException:
         restore_folder(path)
         raise
@@ -187,7 +190,7 @@ def restore_folder(path: Path) -> None:
     """Puts back the folder that `replacing_folder` moved aside and was killed; if it was replaced, removes it."""
     aside = path.with_name(f".{path.name}.old")
     if aside.is_dir() and not os.path.lexists(path):
-        _replace(aside, path)
+        replace_file(aside, path)
     _discard(aside)
 
 
@@ -199,7 +202,7 @@ def _discard(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _replace(source: Path, target: Path) -> None:
+def replace_file(source: Path, target: Path) -> None:
     """Renames over `target`; on Windows a reader may hold it open for a moment, so that is tried for two seconds."""
     for attempt in range(40):
         try:
