@@ -15,6 +15,8 @@ from ..contract import ExitCode, JobError, check_version
 from ..shot import atomic_path
 
 CHECKPOINT_VERSION = 1
+CHECKPOINT_FILE = "checkpoint.safetensors"
+"""Of a run, in its folder."""
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:

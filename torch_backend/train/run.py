@@ -20,7 +20,8 @@ from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, write_atomic, write_json
 from . import adam
-from .checkpoint import load_checkpoint, read_meta
+from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
+from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .device import choose_device
 from .extend import EXTENSION_FILE, pending
@@ -53,26 +54,35 @@ class LoadedRun:
 def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
     """Trains one run; resumes its checkpoint if asked to and the settings are the same; or extends a finished one.
 
+    A run of other settings, or one that is to begin anew, stays as it is until this one is done (see `anew`).
     Returns the run's figures, also written to runs/<name>/summary.json. JobError in words if it cannot be done.
     """
     if params.extend:
         return extend_run(shot, params, report)
     config, device = config_from_params(params), _prepared_device(params)
-    folder = shot.run(params.run)
+    run = shot.run(params.run)
+    settle(run)
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     key = content_key(config_to_json(config), solve_key(shot), train, test)
-    done = finished(folder, key)
+    done = finished(run, key)
     if done is not None and params.resume:
+        forget(run, key)
         report.progress("training", 1, 1, "already trained")
         return done
+    folder = place_for(run, key, params.resume)
+    if folder != run and params.resume:
+        report.warning(
+            "The run's settings or cameras changed: it is trained anew.",
+            "The run that is there stays until the new one is done.",
+        )
     images = place_images(load_images(scene, train + test, width, height, report), device)
     identity = {"key": key, "solve": solve_key(shot)}
     trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
-    checkpoint = folder / "checkpoint.safetensors"
+    checkpoint = folder / CHECKPOINT_FILE
     resumed = _resume(trainer, checkpoint, params.resume, report)
-    for name in ("summary.json", EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
+    for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
         (folder / name).unlink(missing_ok=True)
     write_json(folder / "config.json", {"version": 1, **identity, "config": config_to_json(config)})
     metrics = Metrics(folder, report, trainer.iteration if resumed else -1)
@@ -83,7 +93,9 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
 
     trainer.run(checkpoint, evaluate)
     summary = summarise(trainer, params.run, test, held_out, key)
-    write_json(folder / "summary.json", summary)
+    write_json(folder / SUMMARY_FILE, summary)
+    if folder != run:
+        take_place(run, folder)
     report.metric("train", summary)
     if config.method == "auto" and summary["moving_share"] > _TOO_MUCH_MOTION:
         report.warning(
@@ -102,11 +114,12 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if params.extend < 0:
         raise ValueError(f"extend is {params.extend}: it is a number of steps to add")
     folder, again = shot.run(params.run), "Train it without --extend first."
-    checkpoint, beside = folder / "checkpoint.safetensors", folder / EXTENSION_FILE
+    settle(folder)
+    checkpoint, beside = folder / CHECKPOINT_FILE, folder / EXTENSION_FILE
     facts = read_meta(checkpoint) if checkpoint.is_file() else {}
     if not facts:
         raise JobError(f"{shot.root.name} has no trained run {params.run!r} to extend.", again, ExitCode.TRAIN)
-    before = read_json(folder / "summary.json") if (folder / "summary.json").is_file() else {}
+    before = read_json(folder / SUMMARY_FILE) if (folder / SUMMARY_FILE).is_file() else {}
     if before.get("key") != facts["key"]:
         raise JobError(f"The run {params.run!r} is not finished: it cannot be extended yet.", again, ExitCode.TRAIN)
     if facts["solve"] != solve_key(shot):
@@ -134,7 +147,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     trainer.run(beside, lambda t: metrics.add(t, test, held_out))
     summary = summarise(trainer, params.run, test, held_out, facts["key"])
     trainer.save(checkpoint)
-    write_json(folder / "summary.json", summary)
+    write_json(folder / SUMMARY_FILE, summary)
     beside.unlink(missing_ok=True)
     report.metric("train", summary)
     return summary
@@ -165,8 +178,8 @@ def training_size(scene: Scene, wanted: int) -> tuple[int, int]:
 
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
     """The summary of a run that was finished with the same settings on the same solve, extended or not; or None."""
-    path = folder / "summary.json"
-    checkpoint = folder / "checkpoint.safetensors"
+    path = folder / SUMMARY_FILE
+    checkpoint = folder / CHECKPOINT_FILE
     if not path.is_file() or not checkpoint.is_file():
         return None
     summary, facts = read_json(path), read_meta(checkpoint)
@@ -183,7 +196,6 @@ def _resume(trainer: Trainer, checkpoint: Path, wanted: bool, report: Reporter) 
     if not (wanted and checkpoint.is_file()):
         return False
     if read_meta(checkpoint).get("key") != trainer.identity["key"]:
-        report.warning("The run's settings or cameras changed: it is trained anew.")
         return False
     trainer.restore(checkpoint)
     report.progress("training", trainer.iteration, trainer.config.iterations, f"resumed at step {trainer.iteration}")
@@ -278,7 +290,7 @@ def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, ke
 def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> LoadedRun:
     """A run as it stands in its checkpoint, on `device`. JobError if there is none."""
     folder = shot.run(name)
-    checkpoint = folder / "checkpoint.safetensors"
+    checkpoint = folder / CHECKPOINT_FILE
     if not checkpoint.is_file():
         message = f"{shot.root.name} has no trained run named {name!r}."
         raise JobError(message, "Run the training step first.", ExitCode.FREEZE)
