@@ -62,9 +62,17 @@ def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) 
 
 
 def restore_optimizer(named: dict[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Inverse of `optimizer_state`."""
+    """Inverse of `optimizer_state`: moments lie where their parameter does, in its type and order, counts beside them.
+
+    Gaussians may be cloned and dropped, moments with them, before the optimiser makes another step.
+    """
     for name, parameter in named.items():
         keys = ("step", "exp_avg", "exp_avg_sq")
         stored = {key: tensors.get(f"adam.{key}.{name}") for key in keys}
-        if all(value is not None for value in stored.values()):
-            optimizer.state[parameter] = {key: value.clone() for key, value in stored.items() if value is not None}
+        state = {}
+        for key, value in stored.items():
+            if value is not None:
+                like = torch.zeros((), device=parameter.device) if key == "step" else parameter.detach()
+                state[key] = torch.empty_like(like).copy_(value)
+        if len(state) == len(keys):
+            optimizer.state[parameter] = state
