@@ -507,6 +507,8 @@ BACKEND: dict[str, str] = {
     "Expect ghosts where people walked; a range in which they hold still does better.": "Wo Menschen gehen, sind Geister zu erwarten; ein Bereich, in dem sie stillhalten, wird besser.",
     "The run's settings or cameras changed: it is trained anew.": "Einstellungen oder Kameras des Laufs haben sich geändert: er wird neu trainiert.",
     "The run that is there stays until the new one is done.": "Der vorhandene Lauf bleibt, bis der neue fertig ist.",
+    "The run was trained while it was frozen: the take shows what it was before.": "Der Lauf wurde trainiert, während er eingefroren wurde: der Take zeigt, was er davor war.",
+    "Freeze it again.": "Noch einmal einfrieren.",
     "Frame {} was not trained on: time stands still at frame {}, the nearest that was.": "Auf Bild {} wurde nicht trainiert: die Zeit steht bei Bild {}, dem nächsten, auf das trainiert wurde.",
     "t* is frame {}, the shot has frames {} to {}.": "t* ist Bild {}, der Shot hat die Bilder {} bis {}.",
     "Choose a frame of the shot.": "Ein Bild des Shots wählen.",

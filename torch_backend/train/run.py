@@ -29,6 +29,8 @@ from .model import DynamicModel
 from .needs import modelled
 from .trainer import Trainer, restore_model
 
+_ATTEMPTS = 5
+"""A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
 _TOO_MUCH_MOTION = 0.25
 """Share of open Gaussians above which the artist is told (holding still left 0.03 to 0.21 open: docs/benchmarks.md)."""
 
@@ -49,6 +51,13 @@ class LoadedRun:
     """Height of them."""
     train_frames: list[int]
     """Frame numbers it was trained on."""
+    stamp: list[Any]
+    """Name, bytes and time (ns) of the checkpoint that the model is from: what is made of it is known by them."""
+
+    @property
+    def stale(self) -> bool:
+        """True if the run has been trained since it was loaded."""
+        return _stamp(self.folder / CHECKPOINT_FILE)[1:] != self.stamp
 
 
 def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
@@ -294,10 +303,27 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
     if not checkpoint.is_file():
         message = f"{shot.root.name} has no trained run named {name!r}."
         raise JobError(message, "Run the training step first.", ExitCode.FREEZE)
-    tensors, meta = load_checkpoint(checkpoint)
+    for _ in range(_ATTEMPTS):
+        inode, *stamp = _stamp(checkpoint)
+        tensors, meta = load_checkpoint(checkpoint)
+        if [inode, *stamp] == _stamp(checkpoint):  # else it was replaced meanwhile: which one was read cannot be told
+            break
+    else:
+        message = f"The run {name!r} is written again and again while it is read."
+        raise JobError(message, "Wait for its training to end.", ExitCode.FREEZE)
     config = config_from_json(meta["config"])
     if meta["solve"] != solve_key(shot):
         message = f"The run {name!r} was trained on other cameras than the shot has now."
         raise JobError(message, "Train it again.", ExitCode.FREEZE)
     model = restore_model(tensors, meta, config, device)
-    return LoadedRun(folder, config, model, int(meta["width"]), int(meta["height"]), list(meta["train_frames"]))
+    size = int(meta["width"]), int(meta["height"])
+    return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp)
+
+
+def _stamp(checkpoint: Path) -> list[Any]:
+    """[inode, name, bytes, time in ns] of a file, all None if it is gone. A replaced file has another inode."""
+    try:
+        told = checkpoint.stat()
+    except FileNotFoundError:
+        return [None] * 4
+    return [told.st_ino, checkpoint.name, told.st_size, told.st_mtime_ns]

@@ -208,7 +208,8 @@ def test_wrong_calls_are_named():
 
 def test_restored_moments_lie_where_their_parameter_does():
     """A checkpoint is read to the CPU; torch's `meta` device stands for a card here."""
-    stored = {"adam.step.a": torch.tensor(7.0), "adam.exp_avg.a": torch.ones(5, 3), "adam.exp_avg_sq.a": torch.ones(5, 3)}
+    stored = {f"adam.{name}.a": torch.ones(5, 3) for name in ("exp_avg", "exp_avg_sq")}
+    stored["adam.step.a"] = torch.tensor(7.0)
     for device, dtype in (("meta", torch.float32), ("cpu", torch.float64)):
         a = torch.zeros(3, 5, device=device, dtype=dtype).T.requires_grad_()
         optimizer = torch.optim.Adam([a])
