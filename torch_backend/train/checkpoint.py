@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +23,19 @@ CHECKPOINT_FILE = "checkpoint.safetensors"
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-    """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then."""
+    """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then.
+
+    OSError if it cannot be written (errno ENOSPC when the disk is full).
+    """
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"version": CHECKPOINT_VERSION, **meta}, allow_nan=False)
     with atomic_path(path) as beside:
-        save_file(contiguous, str(beside), metadata={"splannequin": text})
+        try:
+            save_file(contiguous, str(beside), metadata={"splannequin": text})
+        except SafetensorError as error:  # it hands the system's reason on in words: "... (os error 28)"
+            code = int(told[1]) if (told := re.search(r"os error (\d+)", str(error))) else errno.EIO
+            windows = (code,) if os.name == "nt" else ()
+            raise OSError(code, f"checkpoint not written: {error}", str(path), *windows) from error
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -18,7 +18,7 @@ from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
-from ..shot import Shot, content_key, write_atomic, write_json
+from ..shot import Shot, content_key, need_disk, write_atomic, write_json
 from . import adam
 from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
@@ -31,6 +31,8 @@ from .trainer import Trainer, restore_model
 
 _ATTEMPTS = 5
 """A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
+_FIELD_BYTES = 8e6
+"""Of a field with its moments, and of a run's small things (a preview's HexPlane: 4.4 MB)."""
 _TOO_MUCH_MOTION = 0.25
 """Share of open Gaussians above which the artist is told (holding still left 0.03 to 0.21 open: docs/benchmarks.md)."""
 
@@ -81,6 +83,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         report.progress("training", 1, 1, "already trained")
         return done
     folder = place_for(run, key, params.resume)
+    need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     if folder != run and params.resume:
         report.warning(
             "The run's settings or cameras changed: it is trained anew.",
@@ -138,6 +141,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     images = place_images(load_images(scene, train + test, *training_size(scene, config.width), report), device)
     held_out = images[len(train) :]
+    need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     identity = {"key": facts["key"], "solve": facts["solve"]}
     trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
     begun = pending(folder, facts) if params.resume else None
@@ -183,6 +187,12 @@ def training_size(scene: Scene, wanted: int) -> tuple[int, int]:
     """(width, height) of the training images: the working frames' shape, never larger than they are."""
     width = min(wanted, scene.width)
     return width, max(16, round(scene.height * width / scene.width))
+
+
+def checkpoint_bytes(config: TrainConfig) -> float:
+    """Bytes that a run's checkpoints may need on disk, at most: one is written while the one before is still there."""
+    numbers = 11 + 3 * (config.sh_degree + 1) ** 2  # of a Gaussian; with two moments each, and what saw it
+    return 2.0 * (config.densify.budget * (3 * 4 * numbers + 40) + _FIELD_BYTES)
 
 
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
