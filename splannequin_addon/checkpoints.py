@@ -14,6 +14,8 @@ from ..torch_backend import contract
 CHECKPOINT = "checkpoint.safetensors"
 EXTENSION = "extension.safetensors"
 """Of steps that are added to a finished run and are not done."""
+NEXT = "next"
+"""Folder in a run's: of trainings that will take the run's place when they are done."""
 _LONGEST = 1 << 22
 
 
@@ -44,6 +46,20 @@ def paused(run: Path) -> dict[str, Any] | None:
 @dataclass
 class _Count:
     steps: int
+
+
+def anew(run: Path) -> dict[str, Any] | None:
+    """Of a run that is trained anew, paused or at work: as `paused`, of the training that was saved last."""
+    saved = sorted((run / NEXT).glob(f"*/{CHECKPOINT}"), key=_saved)
+    told = paused(saved[-1].parent) if saved else None
+    return None if told is None else {**told, "folder": saved[-1].parent}
+
+
+def _saved(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def extension(run: Path) -> dict[str, int] | None:

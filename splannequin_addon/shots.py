@@ -31,10 +31,11 @@ class ShotState:
     solve: dict[str, Any] = field(default_factory=dict)
     """solve.json; empty before the solve."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Trained runs: name -> summary.json, with `history`, `preview`, `extension` (see `checkpoints.extension`) and
+    """Trained runs: name -> summary.json, with `history`, `preview`, `extension`, `anew` (see `checkpoints`) and
     `other_cameras` added."""
     unfinished: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells."""
+    """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells, with
+    `history`, `preview`, `anew` and `other_cameras` added."""
     takes: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Frozen takes: name -> take.json, with `frame_count` added."""
     damaged: dict[str, dict[str, str]] = field(default_factory=lambda: {"run": {}, "take": {}})
@@ -86,6 +87,10 @@ def read(folder: Path) -> ShotState:
         if told is not None:
             state.unfinished[name] = told
     for name, run in [*state.runs.items(), *state.unfinished.items()]:
+        run["anew"] = checkpoints.anew(folder / "runs" / name)
+        if run["anew"] is not None:
+            run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
+            run["anew"]["history"] = _history(run["anew"]["folder"] / "metrics.jsonl")
         run["other_cameras"] = checkpoints.other_cameras(folder, folder / "runs" / name)
         run["history"] = _history(folder / "runs" / name / "metrics.jsonl")
         run["preview"] = max((folder / "runs" / name / "previews").glob("*.png"), default=None)
@@ -99,7 +104,8 @@ def stamp(folder: Path) -> tuple[float, ...]:
     """Changes when something in the shot did: cheap to ask for on every tick."""
     parts = ("shot.json", "frames/frames.json", "solve/solve.json", "runs", "takes", "jobs")
     deep = [p for name in ("runs", "takes") if (folder / name).is_dir() for p in (folder / name).iterdir()]
-    return tuple(_mtime(p) for p in [*(folder / part for part in parts), *deep])
+    anew = [p for run in deep if (run / checkpoints.NEXT).is_dir() for p in (run / checkpoints.NEXT).iterdir()]
+    return tuple(_mtime(p) for p in [*(folder / part for part in parts), *deep, *anew])
 
 
 def plate_range(folder: Path) -> tuple[int, int] | None:
