@@ -23,7 +23,7 @@ import bpy
 
 from ..torch_backend import contract
 from ..torch_backend.contract import ExitCode
-from . import backend, bake, cameras, compositor, jobs, made, scene_setup, shots, solves, steps, stmaps
+from . import backend, bake, cameras, compositor, jobs, scene_setup, shots, solves, steps, stmaps
 
 
 class Console:
@@ -258,7 +258,7 @@ def _one_step(args: argparse.Namespace, console: Console, step: str, params: Any
     scene = bpy.context.scene
     scene.splannequin.shot_path = str(Path(args.shot).absolute())
     job = steps.begin(scene, step, params)
-    result = jobs.wait(job, console)
+    result = steps.wait(job, console)
     if console.as_json:
         print(json.dumps({"result": result}))
     return ExitCode.OK
@@ -318,9 +318,7 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
         files.save_version = 0
         scene = bpy.context.scene
         compositor.relative_images()
-        made.relative_folders(scene)
         scene.render.filepath = compositor.blend_path(frames / bake.DIGITS)
-        scene.splannequin.shot_path = compositor.blend_path(Path(bpy.path.abspath(scene.splannequin.shot_path)))
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
     except RuntimeError as error:
         raise contract.JobError(

@@ -81,12 +81,6 @@ def tidy(scene: Any) -> None:
             entry.collection = None
 
 
-def relative_folders(scene: Any) -> None:
-    """Makes the folders relative to the .blend, once it has a place."""
-    for entry in scene.splannequin.made:
-        entry.folder = compositor.blend_path(Path(bpy.path.abspath(entry.folder)))
-
-
 def adopt(scene: Any, shot: Path) -> None:
     """Takes over what 0.2.0 made, which marked objects instead: the one of each kind that kept its name."""
     name = name_of(shot)

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, jobs, markers, steps, supervisor, viewport
+from . import backend, bake, cameras, markers, steps, supervisor, viewport
 from .translations import tr
 
 
@@ -33,7 +33,7 @@ class _StepOperator:
             supervisor.follow(self.step, job)
             if not bpy.app.background:
                 return {"FINISHED"}
-            jobs.wait(job)
+            steps.wait(job)
             notes = self.after(scene, job)
         except contract.Cancelled:
             self.report({"WARNING"}, "Cancelled: finished work is kept")  # type: ignore[attr-defined]

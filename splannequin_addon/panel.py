@@ -24,6 +24,7 @@ from . import (
     markers,
     ops_align,
     pictures,
+    places,
     scene_setup,
     shots,
     steps,
@@ -151,6 +152,8 @@ class _StepPanel:
 
     def _view(self, context: Any) -> View:
         watch = self._watch(context)
+        if watch is not None and places.missing(context.scene, watch.state):
+            return View(False, self.step == "footage", [], "" if self.step == "footage" else "Locate the shot first.")
         return VIEWS[self.step](context.scene, watch.state if watch else None)
 
     def _next_done(self, context: Any) -> bool:
@@ -179,6 +182,7 @@ class _StepPanel:
         """The step's body."""
         layout = self.layout  # type: ignore[attr-defined]
         watch, view = self._watch(context), self._view(context)
+        self.draw_trouble(context, layout)
         for line in view.state:
             wrap(layout, context, line)
         running = watch.running() if watch else None
@@ -190,12 +194,15 @@ class _StepPanel:
         else:
             self._button(context, layout, view, running)
             self._outcome(context, layout, watch)
-            if running is None and not (view.done and self._next_done(context)):
+            if running is None and view.advice and not (view.done and self._next_done(context)):
                 wrap(layout, context, view.advice, "INFO")
         body = sub_panel(layout, f"{self.step}_more", "Advanced")
         if body is not None:
             body.enabled = running is None
             self.draw_advanced(context, body)
+
+    def draw_trouble(self, context: Any, layout: Any) -> None:
+        """What keeps the step from being done at all, with the button that helps."""
 
     def draw_settings(self, context: Any, layout: Any) -> None:
         """The settings that an artist needs."""
@@ -291,10 +298,25 @@ class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
         span.enabled = props.use_range
         span.prop(props, "first", text="")
         span.prop(props, "last", text="")
+
+    def draw_trouble(self, context: Any, layout: Any) -> None:
+        """No backend, no shot folder: what to do about it."""
         if not supervisor.backend_found():
             box = layout.box()
             box.alert = True
             wrap(box, context, "The backend is not set up: choose its Python in the add-on's preferences.", "ERROR")
+        watch = self._watch(context)
+        if watch is not None and places.missing(context.scene, watch.state):
+            box = layout.box()
+            box.alert = True
+            name = watch.shot.name
+            wrap(box, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
+            box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
+
+    def _label(self, context: Any, view: View) -> str:
+        watch = self._watch(context)
+        gone = watch is not None and places.missing(context.scene, watch.state)
+        return "Import Anew" if gone else super()._label(context, view)
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """Shot folder, consent to set the scene up."""

@@ -25,6 +25,8 @@ class ShotState:
     """shot.json; empty if there is no shot."""
     frames: int = 0
     """Imported frames, 0 before the import."""
+    beside: str = ""
+    """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
     solve: dict[str, Any] = field(default_factory=dict)
     """solve.json; empty before the solve."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -64,7 +66,8 @@ def read(folder: Path) -> ShotState:
     contract.check_version(state.info, str(folder / "shot.json"))
     listing = folder / "frames" / "frames.json"
     if listing.is_file():
-        state.frames = len(contract.read_json(listing)["frames"])
+        told = contract.read_json(listing)
+        state.frames, state.beside = len(told["frames"]), str(told.get("beside", ""))
     if (folder / "solve" / "cameras.json").is_file():
         state.solve = contract.read_json(folder / "solve" / "solve.json")
     state.runs = _named(folder / "runs", "summary.json")

@@ -6,6 +6,7 @@ the jobs of a shot that is opened are found again in its folder.
 
 from __future__ import annotations
 
+import contextlib
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterator
@@ -17,7 +18,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, bake, compositor, jobs, live, made, markers, pictures, shots, steps, viewport
+from . import backend, bake, compositor, jobs, live, made, markers, pictures, places, shots, steps, viewport
 from .translations import tr
 
 TICK_SECONDS = 0.25
@@ -95,7 +96,8 @@ def watch_of(shot: Path) -> Watch:
     watch = _watches.get(shot)
     if watch is None:
         watch = _watches[shot] = Watch(shot)
-        watch.jobs = {steps.step_of(job): job for job in jobs.latest(shot).values()}
+        with contextlib.suppress(OSError):  # a path that can be none: `refresh` says so
+            watch.jobs = {steps.step_of(job): job for job in jobs.latest(shot).values()}
     if watch.state is None:
         refresh(watch)
     return watch
@@ -165,7 +167,8 @@ def refresh(watch: Watch) -> bool:
         watch.state = shots.read(watch.shot)
     except (OSError, ValueError, KeyError) as error:
         watch.state = shots.ShotState(watch.shot)
-        watch.failures["footage"] = (f"The shot folder cannot be read: {error}", "")
+        why = getattr(error, "strerror", None) or error
+        watch.failures["footage"] = (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one.")
     return True
 
 
@@ -194,6 +197,7 @@ def _turn(watch: Watch, until: float) -> bool:
     for scene in steps.scenes_of(watch.shot):
         changed |= markers.follow(scene)
         made.tidy(scene)
+        places.see(scene, watch.state)
     if watch.to_render:
         _render(watch)
         return True
@@ -213,6 +217,7 @@ def _turn(watch: Watch, until: float) -> bool:
             del watch.jobs[step]
             continue
         if job.ended:
+            steps.give_up(job)
             refresh(watch)
             there = steps.scenes_of(watch.shot)
             if there and step == "bake" and job.state == "done":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -80,6 +81,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
         for message, hint in opened.warnings + _remarks(extracted):
             report.warning(message, hint)
         record = _record(opened, config, extracted, key)
+        record["beside"] = _beside(shot, source)
         _publish(shot, partial, record, source)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -304,6 +306,14 @@ def _publish(shot: Shot, partial: Path, record: dict[str, Any], source: str) -> 
         height=record["height"],
         colour=record["colour"],
     )
+
+
+def _beside(shot: Shot, source: str) -> str:
+    """Where the footage lies seen from the shot folder, with slashes: it holds where both were moved together."""
+    try:
+        return Path(os.path.relpath(source, shot.root)).as_posix()
+    except ValueError:  # another drive on Windows
+        return ""
 
 
 def _result(shot: Shot, record: dict[str, Any]) -> dict[str, Any]:
