@@ -28,6 +28,9 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     root: PointerProperty(name="Root", description="Where the solve stands in the scene", type=bpy.types.Object)
     camera: PointerProperty(name="Camera", description="The solved camera", type=bpy.types.Object)
     points: PointerProperty(name="Points", description="The sparse points", type=bpy.types.Object)
+    plate: PointerProperty(
+        name="Plate", description="The camera that shows the clip until it is solved", type=bpy.types.Object
+    )
     collection: PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
     marks: StringProperty(name="Marks", description="Markers that were put on the timeline, as JSON", options=set())
 
@@ -64,7 +67,7 @@ def drop(scene: Any, shot: Path) -> None:
 
 
 def part(scene: Any, shot: Path, name: str) -> Any | None:
-    """One of `PARTS` if the scene still has it."""
+    """One of `PARTS`, or the plate, if the scene still has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
     return item if item is not None and scene.objects.get(item.name) == item else None
@@ -73,7 +76,7 @@ def part(scene: Any, shot: Path, name: str) -> Any | None:
 def tidy(scene: Any) -> None:
     """Lets go of what the artist deleted: the pointer would keep it in the file, out of sight."""
     for entry in scene.splannequin.made:
-        for name in PARTS:
+        for name in (*PARTS, "plate"):
             item = getattr(entry, name)
             if item is not None and not item.users_scene:
                 setattr(entry, name, None)

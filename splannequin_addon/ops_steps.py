@@ -310,6 +310,8 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Off without a trained run, and where there is no view."""
+        if viewport.session() is not None:
+            return True  # it can be stopped, whatever became of the run
         if bpy.app.background:
             cls.poll_message_set(tr("There is no 3D view"))
             return False

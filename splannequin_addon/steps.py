@@ -27,6 +27,7 @@ from . import (
     made,
     markers,
     places,
+    plate,
     scene_setup,
     shot_list,
     shots,
@@ -91,7 +92,7 @@ def params_of(scene: Any, step: str) -> Any:
         if not props.clip:
             raise contract.JobError("No clip is chosen.", "Choose a video or image sequence.", contract.ExitCode.USAGE)
         span = (props.first, props.last) if props.use_range else (None, None)
-        return contract.ImportParams(places.absolute(props.clip), *span)
+        return contract.ImportParams(places.absolute(props.clip), *span, step=props.solve_step, fps=props.fps)
     if step == "camera":
         return solves.params(scene, shot_folder(scene))
     if step == "train":
@@ -324,7 +325,10 @@ def imported(scene: Any, shot: Path) -> list[str]:
     first, last = state.frame_range
     if not first <= props.t_star <= last:
         props.t_star = (first + last) // 2
-    return _fit(scene, state)
+    changes, camera = _fit(scene, state), plate.show(scene, shot)
+    if camera is not None:
+        changes.append(f"{camera.name} shows the clip until the camera is solved.")
+    return changes
 
 
 def load_camera(scene: Any, shot: Path) -> list[str]:
@@ -333,6 +337,7 @@ def load_camera(scene: Any, shot: Path) -> list[str]:
     places.see(scene, state)
     changes = _fit(scene, state, force_k=True)
     camera = cameras.build(scene, shot)
+    plate.remove(scene, shot)
     return [f"{camera.name} is the scene's camera, with the plate behind it.", *changes]
 
 
@@ -361,6 +366,7 @@ def remove_all(scene: Any, shot: Path) -> list[str]:
     others = [f for f in others if f == baked or made.of(scene, f) is not None]
     if baked not in others and bake.remove(scene):
         done.append("The freeze left the compositor.")
+    plate.remove(scene, shot)
     if cameras.remove(scene, shot):
         done.append("Camera and points were removed.")
     if others:
