@@ -255,7 +255,7 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
         job = jobs.new_job(folder, STEPS[step].kind, params)
         (job.folder / _STEP_FILE).write_text(step, encoding="utf-8")
     except OSError as error:
-        raise _unwritable(folder, error) from error
+        raise unwritable(folder, error, "Choose another shot folder.") from error
     try:
         backend.start(job)
     except contract.JobError:
@@ -278,13 +278,10 @@ def _needed(scene: Any, step: str) -> Path:
     return folder
 
 
-def _unwritable(folder: Path, error: OSError) -> contract.JobError:
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return contract.JobError(
-        f"Cannot write to {folder}: {error.strerror or error}.",
-        "Choose another shot folder.",
-        contract.ExitCode.DISK if full else contract.ExitCode.USAGE,
-    )
+def unwritable(folder: Path, error: OSError, hint: str) -> contract.JobError:
+    """What is said of a folder that cannot be written, with the exit code that the backend's command line gives it."""
+    code = contract.ExitCode.DISK if error.errno in (errno.ENOSPC, errno.EDQUOT) else contract.ExitCode.USAGE
+    return contract.JobError(f"Cannot write to {folder}: {error.strerror or error}.", hint, code)
 
 
 def give_up(job: jobs.Job) -> None:

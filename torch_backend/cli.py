@@ -108,7 +108,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
     requests = {
-        "import": contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height),
+        "import": _import_params(args),
         "solve": contract.SolveParams(camera_model=args.camera_model),
         "train": _train_params(args),
         "freeze": _freeze_params(args),
@@ -266,6 +266,11 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
     )
 
 
+def _import_params(args: argparse.Namespace) -> contract.ImportParams:
+    span = (args.first, args.last)
+    return contract.ImportParams(_source(args.clip), *span, args.step, args.working_height, args.fps)
+
+
 def _source(clip: str) -> str:
     return clip if not clip or "://" in clip else str(Path(clip).absolute())
 
@@ -348,6 +353,7 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--last", type=int, help="last frame number, inclusive")
     to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
     to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
+    to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
     if not any(a.dest == "camera_model" for a in to._actions):
         to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
 
@@ -433,8 +439,7 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
 
         return run_live(args.shot, args.run, args.device)
     if args.command == "import":
-        params = contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height)
-        run_station(_begun(args.shot), "import", params, console)
+        run_station(_begun(args.shot), "import", _import_params(args), console)
     elif args.command == "solve":
         given = str(Path(args.cameras).absolute()) if args.cameras else ""
         params = contract.SolveParams(camera_model=args.camera_model, cameras=given)

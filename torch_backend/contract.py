@@ -161,6 +161,18 @@ class TrainParams:
 
 PRESET_STEPS = {"preview": 3000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
+PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
+"""Width in pixels of each preset's training images, never above the working frames'."""
+HOSTS = ("control_points", "hexplane", "mlp")
+"""Hosts of the deformation, as their files in deformation/ name themselves."""
+METHODS = ("auto", *HOSTS, "static")
+"""What `TrainParams.method` may be."""
+HOST_CONFIGS = ("default", "reference")
+"""What `TrainParams.host_config` may be."""
+SUPERVISIONS = ("support", "paper", "none")
+"""What `TrainParams.supervision` may be."""
+DETECTORS = ("weight", "grad_norm", "grad_signed")
+"""What `TrainParams.detector` may be."""
 
 
 @dataclass
