@@ -77,12 +77,18 @@ def python() -> str:
     )
 
 
+def trouble() -> contract.JobError | None:
+    """Why there is no Python for the backend; None if there is."""
+    try:
+        python()
+    except contract.JobError as error:
+        return error
+    return None
+
+
 def available() -> bool:
     """True if a Python for the backend was found."""
-    try:
-        return bool(python())
-    except contract.JobError:
-        return False
+    return trouble() is None
 
 
 @dataclass

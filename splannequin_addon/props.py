@@ -5,7 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 from ..torch_backend import contract
 from . import compat, made
@@ -65,11 +73,34 @@ class ShotSettings:
         subtype="DIR_PATH",
         options=compat.PATH_OPTIONS,
     )
+    shot_seen: StringProperty(
+        name="Shot Seen",
+        description="Shot folder that was there when this file was last at work: it can be missed",
+        subtype="DIR_PATH",
+        options=compat.PATH_OPTIONS | {"HIDDEN"},
+    )
     use_range: BoolProperty(
         name="Only a Range", description="Import a part of the clip instead of all of it", default=False, options=set()
     )
     first: IntProperty(name="First", description="First frame number of the clip to import", default=1, options=set())
     last: IntProperty(name="Last", description="Last frame number to import, inclusive", default=250, options=set())
+    solve_step: IntProperty(
+        name="Solve Every",
+        description="Every how many frames the camera is solved and trained on, all are delivered; 0: chosen by the "
+        "clip's length. Smaller where a solve loses its way, 1: every frame",
+        default=0,
+        min=0,
+        soft_max=10,
+        options=set(),
+    )
+    fps: FloatProperty(
+        name="Frame Rate",
+        description="Frames per second of an image sequence; 0: what its files say, else 24. A video has its own",
+        default=0.0,
+        min=0.0,
+        soft_max=120.0,
+        options=set(),
+    )
     camera_model: EnumProperty(
         name="Lens",
         description="How the lens bends straight lines",

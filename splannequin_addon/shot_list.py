@@ -31,7 +31,11 @@ def folder_of(one: Any) -> Path | None:
         return Path(os.path.abspath(bpy.path.abspath(one.shot_path)))
     if not one.clip:
         return None
-    clip = Path(os.path.abspath(bpy.path.abspath(one.clip)))
+    return beside(Path(os.path.abspath(bpy.path.abspath(one.clip))))
+
+
+def beside(clip: Path) -> Path:
+    """The shot folder of a clip for which none was chosen."""
     return clip.with_name(clip.stem + shots.SHOT_SUFFIX)
 
 

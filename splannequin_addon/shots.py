@@ -28,6 +28,8 @@ class ShotState:
     """shot.json; empty if there is no shot."""
     frames: int = 0
     """Imported frames, 0 before the import."""
+    beside: str = ""
+    """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
     solve: dict[str, Any] = field(default_factory=dict)
     """solve.json; empty before the solve."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -75,7 +77,8 @@ def read(folder: Path) -> ShotState:
     state.info = _typed(_Info, folder / "shot.json")
     listing = folder / "frames" / "frames.json"
     if listing.is_file():
-        state.frames = len(_typed(_Listing, listing, contract.LONGEST_JSON)["frames"])
+        told = _typed(_Listing, listing, contract.LONGEST_JSON)
+        state.frames, state.beside = len(told["frames"]), told["beside"]
     if (folder / "solve" / "cameras.json").is_file():
         state.solve = _typed(_Solve, folder / "solve" / "solve.json")
     state.runs = _named(_Run, folder / "runs", "summary.json", state.damaged["run"])
@@ -162,6 +165,7 @@ class _Listing:
     """Of frames.json."""
 
     frames: list[Any]
+    beside: str = ""
 
 
 @dataclass

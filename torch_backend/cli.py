@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 from . import contract
 from .contract import DEVICES, Event, ExitCode
@@ -83,8 +83,18 @@ def run_station(shot: Shot, kind: str, params: Any, console: Console) -> Any:
         _give_up(error, shot.root)
     code, result = run_job(folder, console)
     if code != ExitCode.OK:
+        if kind == "import":
+            contract.discard_unborn(shot.root)
         raise SystemExit(code)
     return result
+
+
+def _begun(folder: str) -> Shot:
+    """The shot of an import, made if it is not there. Ends the command, in one sentence, if it cannot be."""
+    try:
+        return Shot.create(folder)
+    except OSError as error:
+        _give_up(error, Path(folder).absolute(), "Choose another shot folder.")
 
 
 def freeze_clip(args: argparse.Namespace, console: Console) -> int:
@@ -98,7 +108,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
     requests = {
-        "import": contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height),
+        "import": _import_params(args),
         "solve": contract.SolveParams(camera_model=args.camera_model),
         "train": _train_params(args),
         "freeze": _freeze_params(args),
@@ -261,15 +271,20 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
     )
 
 
+def _import_params(args: argparse.Namespace) -> contract.ImportParams:
+    span = (args.first, args.last)
+    return contract.ImportParams(_source(args.clip), *span, args.step, args.working_height, args.fps)
+
+
 def _source(clip: str) -> str:
     return clip if not clip or "://" in clip else str(Path(clip).absolute())
 
 
-def _give_up(error: OSError, where: Path) -> Any:
-    """Ends the command on an output folder that cannot be written, in one sentence."""
+def _give_up(error: OSError, where: Path, hint: str = "Choose another --output folder.") -> NoReturn:
+    """Ends the command on a folder that cannot be written, in one sentence."""
     full = is_disk_full(error)
     message = disk_error(where) if full else f"Cannot write to {where}: {error.strerror or error}."
-    print(f"Error: {getattr(message, 'message', message)} Choose another --output folder.", file=sys.stderr)
+    print(f"Error: {getattr(message, 'message', message)} {hint}", file=sys.stderr)
     raise SystemExit(ExitCode.DISK if full else ExitCode.USAGE)
 
 
@@ -343,6 +358,7 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--last", type=int, help="last frame number, inclusive")
     to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
     to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
+    to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
     if not any(a.dest == "camera_model" for a in to._actions):
         to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
 
@@ -411,6 +427,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, FileNotFoundError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return ExitCode.USAGE
+    except OSError as error:
+        print(f"Error: {error.strerror or error}: {error.filename or ''}", file=sys.stderr)
+        return ExitCode.DISK
 
 
 def _dispatch(args: argparse.Namespace, console: Console) -> int:
@@ -425,8 +444,7 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
 
         return run_live(args.shot, args.run, args.device)
     if args.command == "import":
-        params = contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height)
-        run_station(Shot.create(args.shot), "import", params, console)
+        run_station(_begun(args.shot), "import", _import_params(args), console)
     elif args.command == "solve":
         given = str(Path(args.cameras).absolute()) if args.cameras else ""
         params = contract.SolveParams(camera_model=args.camera_model, cameras=given)

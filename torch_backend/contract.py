@@ -126,6 +126,8 @@ class ImportParams:
     """Every how many frames are solved and trained on; 0 chooses. All frames are delivered whatever it is."""
     working_height: int = 0
     """Height in pixels of the working frames; 0: the source's, at most 720."""
+    fps: float = 0.0
+    """Frames per second of a sequence; 0: the footage's own, 24 for a sequence that says none."""
 
 
 @dataclass
@@ -179,6 +181,18 @@ class TrainParams:
 
 PRESET_STEPS = {"preview": 3000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
+PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
+"""Width in pixels of each preset's training images, never above the working frames'."""
+HOSTS = ("control_points", "hexplane", "mlp")
+"""Hosts of the deformation, as their files in deformation/ name themselves."""
+METHODS = ("auto", *HOSTS, "static")
+"""What `TrainParams.method` may be."""
+HOST_CONFIGS = ("default", "reference")
+"""What `TrainParams.host_config` may be."""
+SUPERVISIONS = ("support", "paper", "none")
+"""What `TrainParams.supervision` may be."""
+DETECTORS = ("weight", "grad_norm", "grad_signed")
+"""What `TrainParams.detector` may be."""
 
 
 @dataclass
@@ -881,3 +895,43 @@ def summarise(
 def frame_file(frame: int, suffix: str) -> str:
     """File name of a frame: its number in the clip, six digits (a minus sign for negative ones) and a suffix."""
     return f"{frame:06d}{suffix}"
+
+
+# ------------------------------------------------------------------------------------------------- unborn shots
+
+_UNBORN = {"shot.json", "jobs", "frames"}
+"""What an import that did not end well may leave in a shot folder."""
+
+
+def discard_unborn(shot: Path) -> bool:
+    """Takes away what a failed import left of a shot that it was to begin. True if it did; what cannot go stays.
+
+    A shot that has a frame, or anything else that took work, is left alone, and so are files that are not ours. Kept is
+    also the log of a job that ended without a sentence of its own.
+    """
+    try:
+        names = {p.name for p in shot.iterdir()}
+        frames = [p for p in (shot / "frames").rglob("*") if not p.is_dir()] if "frames" in names else []
+        jobs = list((shot / "jobs").iterdir()) if "jobs" in names else []
+        if "shot.json" not in names or frames or names & {"solve", "runs", "takes"} or (shot / "jobs").is_symlink():
+            return False
+        if not all("-import-" in job.name and not job.is_symlink() and _said_why(job) for job in jobs):
+            return False
+        for name in _UNBORN & names - {"shot.json"}:
+            shutil.rmtree(shot / name, ignore_errors=True)  # a link is left alone
+        (shot / "shot.json").unlink()
+        with contextlib.suppress(OSError):  # it holds something of the artist's
+            shot.rmdir()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _said_why(job: Path) -> bool:
+    """True if a job ended in a sentence, or was cancelled, or never wrote a word: nobody needs its log."""
+    status = from_dict(Status, read_json(job / STATUS_FILE)) if (job / STATUS_FILE).is_file() else None
+    log = job / LOG_FILE
+    if status is not None and not status.ended:
+        return False
+    named = status is not None and (status.state == "cancelled" or status.exit_code != ExitCode.INTERNAL)
+    return named or not log.is_file() or not log.stat().st_size

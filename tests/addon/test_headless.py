@@ -1,5 +1,7 @@
 """The command line of the Blender side, in this process: exit codes, what it leaves, and a baked file that renders."""
 
+import argparse
+import importlib
 import json
 import signal
 import subprocess
@@ -167,3 +169,53 @@ def test_a_bake_ends_with_the_launcher_that_started_it(shot, tmp_path, root, sta
     assert (tmp_path / "out" / "shot.blend").is_file() == baked
     bake.stdin.close()
     bake.stderr.close()
+
+
+def options(parser: argparse.ArgumentParser, command: str) -> dict[str, tuple]:
+    """Option -> (default, choices) of a command of a command line."""
+    chosen = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[command]
+    return {o: (a.default, a.choices and tuple(a.choices)) for a in chosen._actions for o in a.option_strings}
+
+
+@pytest.mark.parametrize("command", ["import", "solve", "train", "freeze"])
+def test_every_option_of_the_backends_command_line_is_here_too(addon, package, contract, command):
+    backend = importlib.import_module(f"{package.__name__}.torch_backend.cli")
+    ours, theirs = options(addon("headless").parser(), command), options(backend.parser(), command)
+    if command == "import":
+        theirs.pop("--camera-model", None)  # it is no option of an import
+    elif command != "solve":
+        assert theirs.pop("--device")[1] == ours.pop("--device")[1] == contract.DEVICES
+    for option, told in theirs.items():
+        assert option in ours, option
+        assert told == ours[option] or not told[1], option
+    assert backend.host_names() == contract.HOSTS
+
+
+def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tmp_path):
+    headless = addon("headless")
+    monkeypatch.setattr(addon("backend"), "device", lambda: "cpu")  # as the preferences say
+
+    def asked(*words):
+        return headless.parser().parse_args([str(w) for w in words])
+
+    train = headless._train_params(asked("train", tmp_path, "--method", "mlp", "--host", "mlp", "--host-config",
+                                         "reference", "--detector", "weight"))  # fmt: skip
+    assert (train.method, train.host, train.host_config, train.detector) == ("mlp", "mlp", "reference", "weight")
+    assert (
+        train.device == "cpu" and headless._train_params(asked("train", tmp_path, "--device", "cuda")).device == "cuda"
+    )
+    frozen = headless._freeze_params(asked("freeze", "a.mp4", "--no-grain", "--camera-path", tmp_path / "p.json"))
+    assert (frozen.grain, frozen.camera_path, frozen.device) == (False, str(tmp_path / "p.json"), "cpu")
+    assert frozen.only_missing, "frames that are finished are not rendered again"
+    assert headless._import_params(asked("import", tmp_path, "a.0001.png", "--fps", 25)).fps == 25.0
+
+
+def test_an_output_that_cannot_be_is_one_sentence(run, shot, clip, tmp_path):
+    (tmp_path / "file").touch()
+    for words in (("bake", "--shot", shot), ("freeze", clip)):
+        code, _, said = run(*words, "--output", tmp_path / "file" / "out")
+        assert code == 2 and said.startswith("Error: Cannot write to") and said.strip().count("\n") == 0
+        assert "Choose another --output folder." in said
+    for name in ("s" * 300, "file/s"):
+        code, _, said = run("status", tmp_path / name)
+        assert code in (2, 8) and said.startswith("Error: ") and said.strip().count("\n") == 0

@@ -39,6 +39,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
     values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
     values |= {"cameras_from": "FILE", "cameras_path": "//model", "tracking_clip": tracked}
+    values |= {"shot_seen": "//first.splannequin", "solve_step": 2, "fps": 25.0}
     for name, value in values.items():
         setattr(props, name, value)
     assert set(shot_list.names()) == {*values, "clip", "shot_path"}, "a setting that is not tested here"

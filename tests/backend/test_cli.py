@@ -118,3 +118,26 @@ def test_solve_refuses_cameras_that_are_not_there(world, tmp_path):
     done = run("solve", shot, "--cameras", tmp_path / "gone")
     assert done.returncode == ExitCode.SOLVE and "gone does not exist" in done.stdout
     assert (shot / "solve" / "cameras.json").is_file()
+
+
+def test_a_failed_import_leaves_no_empty_shot(tmp_path):
+    wrong = tmp_path / "text.mp4"
+    wrong.write_text("no video")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    for folder in ("s.splannequin", "mine"):
+        done = run("import", tmp_path / folder, wrong)
+        assert done.returncode == ExitCode.FOOTAGE and "text.mp4" in done.stdout
+    assert run("freeze", wrong, "--output", tmp_path / "out").returncode == ExitCode.FOOTAGE
+    assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+
+
+def test_a_shot_folder_that_cannot_be_is_one_sentence(tmp_path):
+    (tmp_path / "file").touch()
+    for where in ("file/s.splannequin", "s" * 300):
+        done = run("import", tmp_path / where, CLIP)
+        assert done.returncode == ExitCode.USAGE and "Traceback" not in done.stderr
+        assert done.stderr.startswith("Error: Cannot write to") and done.stderr.count("\n") == 1
+        done = run("train", tmp_path / where)
+        assert done.returncode != 0 and done.stderr.startswith("Error: ") and done.stderr.count("\n") == 1
