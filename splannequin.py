@@ -57,8 +57,6 @@ BACKEND_DISK_GB = 4.0
 BPY_DISK_GB = 2.0
 HEARTBEAT_SECONDS = 15.0
 """A set-up that has printed nothing for this long says that it is still at work."""
-GRACE_SECONDS = 30.0
-"""How long a cancelled child may take for its checkpoint before it is terminated."""
 
 BLENDER_LIBRARIES = {
     "libX11.so.6": "libx11-6",
@@ -73,10 +71,9 @@ BLENDER_LIBRARIES = {
 }
 """What Blender opens on Linux and a bare server lacks: file, Debian package."""
 
-WARP_DRIVER = 580
-"""Oldest NVIDIA driver branch for the CUDA 13 builds of Warp and torch pinned here."""
-WARP_COMPUTE = 7.5
-"""Oldest CUDA compute capability of the same."""
+TORCH_INDEX = "SPLANNEQUIN_TORCH_INDEX"
+CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
+"""Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
 
 # ------------------------------------------------------------------------------------------------- interpreters
 
@@ -85,7 +82,7 @@ def python_version(executable: str) -> tuple[int, int] | None:
     """(major, minor) of the Python at `executable`; None if it does not run (a pyenv shim without a version, say)."""
     try:
         found = subprocess.run(
-            [executable, "-c", "import sys; print('%d %d' % sys.version_info[:2])"],
+            [executable, "-I", "-c", "import sys; print('%d %d' % sys.version_info[:2])"],
             capture_output=True,
             text=True,
             timeout=30,
@@ -109,17 +106,16 @@ def find_python(accept: Callable[[tuple[int, int]], bool], names: Sequence[str])
     for name in names:
         for folder in os.get_exec_path():
             found = shutil.which(name, path=folder)
-            if found:
+            if found and os.path.isabs(found):  # Windows offers the folder that we stand in first
                 candidates.append(found)
         wanted = name.replace("python", "")
         if wanted:
             pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
             candidates += [str(p) for p in sorted(pyenv.glob(f"{wanted}.*/bin/{name}"), reverse=True)]
             launcher = shutil.which("py") if WINDOWS else None
-            if launcher:
-                located = subprocess.run(
-                    [launcher, f"-{wanted}", "-c", "import sys; print(sys.executable)"], capture_output=True, text=True
-                )
+            if launcher and os.path.isabs(launcher):
+                command = [launcher, f"-{wanted}", "-I", "-c", "import sys; print(sys.executable)"]
+                located = subprocess.run(command, capture_output=True, text=True)
                 if located.returncode == 0:
                     candidates.append(located.stdout.strip())
     for candidate in dict.fromkeys(candidates):
@@ -143,13 +139,20 @@ def hand_over_to_newer_python() -> int:
             file=sys.stderr,
         )
         return 9
-    return subprocess.call([newer, str(Path(__file__).resolve()), *sys.argv[1:]])
+    command = [newer, str(Path(__file__).resolve()), *sys.argv[1:]]
+    if WINDOWS:  # a program that takes another's place there is a second one, which nobody waits for
+        return subprocess.call(command)
+    os.execv(newer, command)  # noqa: S606  (no shell is wanted)
 
 
 if __name__ == "__main__" and sys.version_info[:2] < NEEDED_PYTHON:
     sys.exit(hand_over_to_newer_python())
 
-from torch_backend.contract import ExitCode, read_json  # noqa: E402  (needs 3.11)
+if str(ROOT) not in sys.path:  # -P and PYTHONSAFEPATH leave even a script's own folder out
+    sys.path.insert(0, str(ROOT))
+
+from torch_backend.cards import Card, nvidia_cards, why_unfit, why_unused  # noqa: E402  (needs 3.11)
+from torch_backend.contract import GRACE_SECONDS, ExitCode, program, python_child, read_json  # noqa: E402
 from torch_backend.shot import is_disk_full, locked, write_json  # noqa: E402
 
 
@@ -250,9 +253,10 @@ def bench_environment() -> Environment:
 
 
 def child_environ(**extra: str) -> dict[str, str]:
-    """Environment variables for a child: this checkout on its path, nothing of another Python."""
+    """Environment variables for a child: this checkout on its path, nothing of another Python or of where it stands."""
     environ = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP")}
-    environ.update(PYTHONPATH=str(ROOT), PYTHONUTF8="1", PYTHONUNBUFFERED="1", PYTHONNOUSERSITE="1", **extra)
+    environ.update(PYTHONPATH=str(ROOT), PYTHONSAFEPATH="1", PYTHONNOUSERSITE="1")
+    environ.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", **extra)
     return environ
 
 
@@ -283,16 +287,17 @@ def _make(environment: Environment, python: str) -> None:
     environment.state.mkdir(parents=True, exist_ok=True)
     environment.log.write_bytes(b"")
     if not usable:
-        _step(environment, "making the virtual environment", [python, "-m", "venv", str(environment.folder)])
+        _step(environment, "making the virtual environment", tied_command(python, "venv", str(environment.folder)))
     elif environment.begun.exists():
-        _step(environment, "checking what an interrupted set-up left", [environment.python, "-c", DROP_UNFINISHED])
+        command = [environment.python, "-P", "-c", DROP_UNFINISHED]
+        _step(environment, "checking what an interrupted set-up left", command)
     before = environment.installed()
     environment.begun.touch()
-    pip = [environment.python, "-m", "pip", "install", "--no-input", "--progress-bar", "off"]
+    pip = tied_command(environment.python, "pip", "install", "--no-input", "--progress-bar", "off")
     pip += ["--disable-pip-version-check", "--only-binary=:all:"]
     pip += ["--no-deps"] if environment.complete else []
-    index = os.environ.get("SPLANNEQUIN_TORCH_INDEX")
-    if index and environment.requirements[0] == "backend.txt":
+    index = torch_index() if environment.requirements[0] == "backend.txt" else ""
+    if index:
         if _reachable(index):
             pip += ["--extra-index-url", index]
         else:  # pip would ask it in vain for every single package, minutes in all
@@ -300,7 +305,7 @@ def _make(environment: Environment, python: str) -> None:
     for name in environment.requirements:
         pip += ["-r", str(REQUIREMENTS / name)]
     _step(environment, "installing packages", pip, condense_pip)
-    _step(environment, "importing what was installed", [environment.python, "-c", environment.probe])
+    _step(environment, "importing what was installed", [environment.python, "-P", "-c", environment.probe])
     venv = (environment.folder / "pyvenv.cfg").read_text(encoding="utf-8")
     write_json(environment.stamp, {"files": {**before, **environment.hashes()}, "venv": venv})
     environment.begun.unlink()
@@ -311,7 +316,8 @@ def _has_pip(environment: Environment) -> bool:
     version = python_version(environment.python)
     if version is None or version < NEEDED_PYTHON:
         return False
-    return subprocess.run([environment.python, "-m", "pip", "--version"], capture_output=True).returncode == 0
+    command = python_child(environment.python, "pip", "--version")
+    return subprocess.run(**command, env=child_environ(), capture_output=True).returncode == 0
 
 
 def _make_room(environment: Environment) -> None:
@@ -343,6 +349,16 @@ for package in importlib.metadata.distributions():
 """pip writes a package's RECORD last: without one the package is not all there, and pip must not believe it is."""
 
 
+def torch_index(windows: bool = WINDOWS) -> str:
+    """Package index, beside pip's own, that torch comes from; empty for none.
+
+    What the variable says; without it, on Windows, the one with CUDA where there is a card for it.
+    """
+    if TORCH_INDEX in os.environ:
+        return os.environ[TORCH_INDEX]
+    return CUDA_INDEX if windows and any(card.fits for card in nvidia_cards()[0]) else ""
+
+
 def _reachable(index: str) -> bool:
     """True if a package index answers about torch within ten seconds; a folder (file:) does if it is there."""
     try:
@@ -360,7 +376,9 @@ def _step(
     """Runs one step of a set-up, its output to the log and what `condense` makes of each line to the screen."""
     started = time.monotonic()
     lines: queue.Queue[str | None] = queue.Queue()
-    child = start_child(command, child_environ(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    child = start_child(
+        command, child_environ(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
 
     def read() -> None:
         assert child.stdout is not None  # PIPE, above
@@ -394,6 +412,8 @@ def _step(
     except KeyboardInterrupt:
         stop_child(child)
         raise
+    finally:
+        _close(child)
     if code:
         _refuse(environment, step, "\n".join(tail))
     if condense is None:
@@ -456,12 +476,13 @@ class Blender:
 
     def running(self, script: Path, *arguments: str) -> list[str]:
         """The command line that runs `script` with `arguments`."""
-        return [*self.command, str(script), *(() if self.is_wheel else ("--",)), *arguments]
+        safe, apart = (("-P",), ()) if self.is_wheel else ((), ("--",))
+        return [*self.command, *safe, str(script), *apart, *arguments]
 
 
 def find_blender() -> tuple[str, str] | None:
     """(path, version) of a `blender` on the PATH that is new enough."""
-    path = shutil.which("blender")
+    path = program("blender")
     if path is None:
         return None
     try:
@@ -530,7 +551,11 @@ def say(text: str) -> None:
 
 
 def start_child(command: Sequence[str], environ: dict[str, str], **streams: Any) -> subprocess.Popen[Any]:
-    """Starts a child in a process group of its own, so that Ctrl-C reaches it once, from here."""
+    """Starts a child in a process group of its own, so that Ctrl-C reaches it once, from here.
+
+    It stands beside its program, as in `contract.python_child`, unless `cwd` says where.
+    """
+    streams.setdefault("cwd", os.path.dirname(os.path.abspath(command[0])))
     try:
         if WINDOWS:
             group = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
@@ -558,13 +583,33 @@ def stop_child(child: subprocess.Popen[Any]) -> None:
         child.wait()
 
 
+def tied_command(python: str, module: str, *words: str) -> list[str]:
+    """`python -m module words` for a child that ends when we do, however that comes about: its standard input must be a
+    pipe (`run_child(tied=True)`), which closes with us."""
+    return [python, "-P", "-m", "torch_backend.tied", module, *words]
+
+
+def _close(child: subprocess.Popen[Any]) -> None:
+    """Closes our end of an ended child's standard input."""
+    if child.stdin is not None:
+        with contextlib.suppress(OSError):
+            child.stdin.close()
+
+
+HERE = Path()
+"""Where the user stands, for children that are given paths as they were typed."""
+
+
 def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = False, **environ: str) -> int:
     """Runs a child with our output; returns its exit code. On Ctrl-C it is cancelled and KeyboardInterrupt goes on.
 
+    `cwd`: where it stands, if not beside its program.
     `tied`: its standard input stays open as long as this process lives, however that ends; the child watches it.
     """
-    streams = {"stdin": subprocess.PIPE} if tied else {}
-    child = start_child(command, child_environ(**environ), cwd=cwd, **streams)
+    streams: dict[str, Any] = {"stdin": subprocess.PIPE} if tied else {}
+    if cwd is not None:
+        streams["cwd"] = cwd
+    child = start_child(command, child_environ(**environ), **streams)
     try:
         while True:
             # A wait without limit cannot be interrupted on Windows.
@@ -574,6 +619,8 @@ def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = Fals
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
         raise KeyboardInterrupt("the child has said so") from None
+    finally:
+        _close(child)
 
 
 def _documented(code: int) -> int:
@@ -593,8 +640,9 @@ BLENDERS_OWN = re.compile(
 
 
 def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
-    """`run_child` for Blender: all that it prints goes to `log`, what the add-on says also to the screen."""
-    child = start_child(command, child_environ(**environ), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    """`run_child(tied=True)` for Blender: all that it prints goes to `log`, what the add-on says also to the screen."""
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    child = start_child(command, child_environ(**environ), **streams)
     try:
         with open(log, "w", encoding="utf-8") as stream:
             for raw in child.stdout or ():
@@ -609,6 +657,8 @@ def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
         raise KeyboardInterrupt("the child has said so") from None
+    finally:
+        _close(child)
 
 
 # ------------------------------------------------------------------------------------------------------ summary
@@ -647,7 +697,8 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     setting_up += took
 
     say(f"Freezing {clip} into {output}")
-    code = run_child([backend.python, "-P", "-m", "torch_backend", "freeze", clip, "--output", str(output), *options])
+    command = tied_command(backend.python, "torch_backend", "freeze", clip, "--output", str(output), *options)
+    code = run_child(command, cwd=HERE, tied=True)
     if code:
         return code
     summary = read_summary(output)
@@ -656,7 +707,7 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     # The bake rewrites summary.json with what it adds; the wall time and the set-up are ours to add after it.
     say(f"Compositing in {blender.label}")
     baking = time.monotonic()
-    take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output)]
+    take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output), "--tied"]
     bake = blender.running(ROOT / "splannequin_addon" / "run_in_bpy.py", "bake", *take)
     code = run_blender(bake, output / "blender.log", SPLANNEQUIN_BACKEND_PYTHON=backend.python)
     if code:
@@ -720,17 +771,17 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
     set_up(backend, sys.executable)
     legs: list[Leg] = []
     if not pytest_args and not series:
-        legs.append(Leg("ruff", [backend.python, "-m", "ruff", "check", str(ROOT)]))
+        legs.append(Leg("ruff", [backend.python, "-P", "-m", "ruff", "check", str(ROOT)]))
         project = ["--project", str(ROOT), "--pythonpath", backend.python]
-        legs.append(Leg("pyright", [backend.python, "-m", "pyright", *project]))
+        legs.append(Leg("pyright", [backend.python, "-P", "-m", "pyright", *project]))
     if backend_paths:
-        command = [backend.python, "-m", "pytest", "--ignore=tests/addon", *backend_paths, *rest]
+        command = [backend.python, "-P", "-m", "pytest", "--ignore=tests/addon", *backend_paths, *rest]
         legs.append(Leg("backend", command, output / "junit-backend.xml"))
     if addon_paths:
         blender = set_up_wheel(series, True)[0] if series else get_blender(testing=True)[0]
         if not blender.is_wheel:
             raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
-        command = [*blender.command, "-m", "pytest", *addon_paths, *rest]
+        command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
         legs.append(Leg(f"add-on in {blender.label}", command, output / "junit-addon.xml"))
     output.mkdir(parents=True, exist_ok=True)
     for leg in legs:
@@ -754,7 +805,7 @@ def bench(arguments: Sequence[str], output: Path) -> int:
             )
         renderer, setting_up = ["--bpy", blender.command[0]], setting_up + took
     command = [backend.python, "-P", "-m", "benchmarks.bench", "--results", str(output), "--tied", *renderer]
-    code = run_child([*command, *arguments], tied=True)
+    code = run_child([*command, *arguments], cwd=HERE, tied=True)
     summary: dict[str, Any] = {"command": "bench", "exit_code": code}
     summary.update(wall_seconds=round(time.monotonic() - started, 2), setup_seconds=round(setting_up, 2))
     if code == 0:
@@ -904,47 +955,32 @@ def memory_gb() -> float | None:
 
 
 def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
-    """NVIDIA cards and whether driver and card fit the pinned Warp and torch."""
-    tool = shutil.which("nvidia-smi")
-    query = "--query-gpu=name,driver_version,compute_cap"
-    try:
-        command = [tool or "nvidia-smi", query, "--format=csv,noheader"]
-        rows = subprocess.run(command, capture_output=True, text=True, timeout=30).stdout if tool else ""
-    except (OSError, subprocess.TimeoutExpired):
-        rows = ""
-    cards = [row for row in rows.splitlines() if row.count(",") >= 2]
-    if not cards:
+    """NVIDIA cards: whether driver and card fit the pinned Warp and torch, and whether the backend uses them."""
+    cards, trouble = nvidia_cards()
+    if trouble:
+        advice = "restart the machine; if it stays, install the driver anew"
+        yield Finding("gpu", "note", f"the NVIDIA driver does not answer: {trouble}: {advice}")
+    elif not cards:
         yield Finding("gpu", "note", "no NVIDIA card or driver: the CPU is used, nothing is missing")
-    for card in cards:
-        yield gpu_finding(*(field.strip() for field in card.rsplit(",", 2)))
-    if cards and facts and facts.get("torch_device") != "cuda":
-        yield Finding(
-            "torch on gpu",
-            "note",
-            "torch sees no card: its CPU build is installed; set SPLANNEQUIN_TORCH_INDEX to "
-            "https://download.pytorch.org/whl/cu130, remove .venv and run setup again",
-        )
+    yield from map(gpu_finding, cards)
+    if any(card.fits for card in cards) and facts.get("trains_on") == "cpu":
+        unseen = None if facts.get("torch_device") == "cuda" else why_unused(facts.get("torch_cuda"))
+        told = " ".join(unseen) if unseen else facts.get("cuda_refusal") or "CUDA_VISIBLE_DEVICES hides the card"
+        yield Finding("torch on gpu", "note", told)
 
 
-def gpu_finding(name: str, driver: str, compute: str) -> Finding:
-    """One card against what Warp needs: `driver` as "580.65.06", `compute` as "9.0"."""
-    try:
-        new_driver, new_card = int(driver.split(".")[0]) >= WARP_DRIVER, float(compute) >= WARP_COMPUTE
-    except ValueError:
-        return Finding("gpu", "note", f"{name}: driver {driver}, compute {compute}: not understood, the CPU is used")
-    text = f"{name}, driver {driver}, compute capability {compute}"
-    if not new_card:
-        return Finding("gpu", "note", f"{text}: Warp needs {WARP_COMPUTE} or newer, the CPU is used")
-    if not new_driver:
-        return Finding("gpu", "note", f"{text}: Warp needs driver R{WARP_DRIVER} or newer, update it to use the card")
-    return Finding("gpu", "ok", text)
+def gpu_finding(card: Card) -> Finding:
+    """One card against what Warp and torch need."""
+    unfit = why_unfit(card)
+    if unfit is not None:
+        return Finding("gpu", "note", " ".join(unfit).strip())
+    return Finding("gpu", "ok", f"{card.name}, driver {card.driver}, compute capability {card.compute or 'unknown'}")
 
 
 def backend_facts(backend: Environment) -> dict[str, Any]:
     """What the backend says about its own environment."""
-    ran = subprocess.run(
-        [backend.python, "-P", "-m", "torch_backend", "doctor"], capture_output=True, text=True, env=child_environ()
-    )
+    command = python_child(backend.python, "torch_backend", "doctor")
+    ran = subprocess.run(**command, capture_output=True, text=True, env=child_environ())
     try:
         return json.loads(ran.stdout[ran.stdout.index("{") :])
     except ValueError:
@@ -1041,7 +1077,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     module = {"freeze": ["torch_backend", "freeze"], "bench": ["benchmarks.bench"]}.get(words[0] if words else "")
     if module and {"-h", "--help"} & set(words) and backend_environment().ready():
-        return run_child([backend_environment().python, "-P", "-m", *module, "--help"])
+        return run_child([backend_environment().python, "-P", "-m", *module, "--help"], cwd=HERE)
     args, rest = parser().parse_known_args(words)
     if rest and args.command in ("doctor", "setup"):
         parser().error(f"unrecognized arguments: {' '.join(rest)}")

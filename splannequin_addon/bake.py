@@ -100,11 +100,33 @@ def choose_output(scene: Any, shot: Path, take: str) -> list[str]:
     return [f"Output path set to {folder}."]
 
 
-def fit_take(scene: Any, shot: Path, take: str) -> list[str]:
-    """Gives the scene the size, rate and range of a take, so that its pixels leave as they are; says what changed."""
-    frozen = compositor.take_of(shot / "takes" / take)
-    fps = float(shots.read(shot).info.get("fps", 0.0))
-    return scene_setup.fit_clip(scene, frozen.size, fps, (frozen.first, frozen.last))
+def fit_take(scene: Any, shot: Path, take: str, new: bool = False) -> list[str]:
+    """Gives the scene the rate and range of a take, and a size that loses no pixel of it; says what changed.
+
+    Args:
+        scene: the scene. What the artist has set in it stays, and it never becomes smaller.
+        shot: shot folder.
+        take: name of the take.
+        new: the scene is a new one, which takes the plate's size.
+    """
+    frozen, state, render = compositor.take_of(shot / "takes" / take), shots.read(shot), scene.render
+    width, height = size = _plate_size(state) if new else (render.resolution_x, render.resolution_y)
+    alike = abs(width * frozen.size[1] - height * frozen.size[0]) <= 0.02 * width * frozen.size[1]
+    if frozen.size[0] > width or (new and not alike):  # of a camera of the artist's own
+        size = frozen.size
+    elif not new:
+        size = None
+    fps = float(state.info.get("fps", 0.0))
+    return scene_setup.fit_clip(scene, size, fps, (frozen.first, frozen.last), over=new)
+
+
+def _plate_size(state: shots.ShotState) -> tuple[int, int]:
+    """Width and height of the undistorted plate in pixels, (0, 0) before the import."""
+    solved = state.folder / "solve" / "cameras.json"
+    if not solved.is_file():
+        return state.size
+    path = contract.CameraPath.load(solved)
+    return path.width, path.height
 
 
 def render(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,19 @@ from ..torch_backend import contract
 CHECKPOINT = "checkpoint.safetensors"
 EXTENSION = "extension.safetensors"
 """Of steps that are added to a finished run and are not done."""
-_LONGEST = 1 << 26
+NEXT = "next"
+"""Folder in a run's: of trainings that will take the run's place when they are done."""
+_LONGEST = 1 << 22
 
 
 def facts(path: Path) -> dict[str, Any]:
     """The facts that the backend stored in a checkpoint, read from the file's header; empty if there is none."""
     try:
-        with open(path, "rb") as source:
+        with contract.open_regular(path) as source:
             (length,) = struct.unpack("<Q", source.read(8))
             header = json.loads(source.read(length)) if length < _LONGEST else {}
         told = json.loads(header["__metadata__"]["splannequin"])
-    except (OSError, ValueError, KeyError, TypeError, struct.error):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, struct.error):
         return {}
     return told if isinstance(told, dict) else {}
 
@@ -33,10 +36,30 @@ def paused(run: Path) -> dict[str, Any] | None:
     told = facts(run / CHECKPOINT)
     try:
         config = told["config"]
-        return {"iteration": int(told["iteration"]), "end": int(config["iterations"]), "preset": config["preset"],
-                "config": config}  # fmt: skip
-    except (KeyError, TypeError, ValueError):
+        asked: contract.TrainParams = contract.from_dict(contract.TrainParams, params_of(config))
+        done: _Count = contract.from_dict(_Count, {"steps": told["iteration"]})
+    except (KeyError, TypeError, AttributeError, ValueError):
         return None
+    return {"iteration": done.steps, "end": asked.iterations, "preset": asked.preset, "config": config}
+
+
+@dataclass
+class _Count:
+    steps: int
+
+
+def anew(run: Path) -> dict[str, Any] | None:
+    """Of a run that is trained anew, paused or at work: as `paused`, of the training that was saved last."""
+    saved = sorted((run / NEXT).glob(f"*/{CHECKPOINT}"), key=_saved)
+    told = paused(saved[-1].parent) if saved else None
+    return None if told is None else {**told, "folder": saved[-1].parent}
+
+
+def _saved(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def extension(run: Path) -> dict[str, int] | None:
@@ -48,9 +71,11 @@ def extension(run: Path) -> dict[str, int] | None:
         last = told["extensions"][-1]
         if (told["key"], last["from_iteration"]) != (base["key"], base["iteration"]):
             return None
-        return {"done": int(told["iteration"]) - int(last["from_iteration"]), "steps": int(last["steps"])}
+        done: _Count = contract.from_dict(_Count, {"steps": told["iteration"] - last["from_iteration"]})
+        added: _Count = contract.from_dict(_Count, {"steps": last["steps"]})
     except (KeyError, TypeError, ValueError, IndexError):
         return None
+    return {"done": done.steps, "steps": added.steps}
 
 
 def params_of(config: dict[str, Any]) -> dict[str, Any]:

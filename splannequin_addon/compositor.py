@@ -24,9 +24,16 @@ GROUP_NAME = "Splannequin Freeze"
 _TAG = "splannequin"
 _BEFORE = "splannequin_before"
 _CG = "cg"
+_LAYERS = ("Combined", "Depth", "Support", "Motion")
+"""Of a frozen frame; `_GRAIN` is in some."""
 _FROZEN, _DEPTH = "Frozen", "Depth in scene units"
 """Nodes inside the group."""
 _GAP = 200.0
+_NOTHING = 0.1 * contract.NO_DEPTH
+"""A depth of CG from here on is no surface's."""
+_SOFT = 0.01
+"""Share of the frozen depth within which CG goes from in front to behind. What is as far as the frozen is in front:
+frozen depth is a little uneven, and would come through what stands on it."""
 
 
 @dataclass
@@ -57,8 +64,14 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
 
     Returns:
         What was changed, one sentence each.
+
+    Raises:
+        ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is as it was.
     """
     changes: list[str] = []
+    frozen, stream = _frozen_image(take), None
+    if plate is not None and shows_plate(scene):
+        stream = load_sequence(plate, _plate_name(plate), "srgb")
     enabled = compat.compositor_enabled(scene)
     before = {**compat.compositor_switches(scene), "made_tree": False}
     tree = compat.compositor_tree(scene)
@@ -77,12 +90,27 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
     else:
         _set_defaults(node, _give_sockets(node.node_tree))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
-    _fill_group(scene, node.node_tree, take)
+    _fill_group(scene, node.node_tree, take, frozen)
     if node.inputs[_GRAIN].default_value and _GRAIN not in node.node_tree.nodes:
         changes.append("The take has no grain to add: freeze it again.")
-    if plate is not None and shows_plate(scene):
-        _show_plate(scene, tree, node, plate, take)
+    if stream is not None:
+        _show_plate(scene, tree, node, stream, take)
     return changes
+
+
+def _frozen_image(take: Take) -> Any:
+    """The take's frames as a data-block. ValueError if they lack a layer."""
+    image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
+    group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
+    try:
+        node = group.nodes.new("CompositorNodeImage")
+        show_sequence(node, image, take.first, take.last)
+        missing = [n for n in _LAYERS if n not in node.outputs]
+    finally:
+        bpy.data.node_groups.remove(group)
+    if missing:
+        raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+    return image
 
 
 def shows_plate(scene: Any) -> bool:
@@ -201,7 +229,7 @@ def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     From its header: Blender says 0 x 0 of a multilayer file. ValueError without one, or for margins that are not the
     same on opposite sides: Blender centres the pixels, wherever the frame lies in them.
     """
-    with open(path, "rb") as source:
+    with contract.open_regular(path) as source:
         header = source.read(16384)
     if header[:4] != b"\x76\x2f\x31\x01":
         raise ValueError(f"{path} is no OpenEXR file: render the take again")
@@ -223,7 +251,8 @@ def frame_numbers(folder: Path, suffix: str = ".exr") -> list[int]:
     """Numbers of the frames in a folder, ascending; empty if there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(int(p.stem) for p in folder.iterdir() if p.suffix == suffix and p.stem.lstrip("-").isdigit())
+    found = (contract.frame_number(p.stem) for p in folder.iterdir() if p.suffix == suffix)
+    return sorted(number for number in found if number is not None)
 
 
 def frame_path(folder: Path, frame: int, suffix: str = ".exr") -> Path:
@@ -275,6 +304,7 @@ def load_sequence(path: Path, name: str, encoding: str) -> Any:
                 image.reload()
             _ahead.discard(wanted)
             return image
+    compat.colour_space(encoding)  # before anything is made: a configuration may have none
     image = bpy.data.images.load(wanted)
     image.name = name
     image.source = "SEQUENCE"
@@ -391,14 +421,13 @@ def _insert_node(tree: Any, before: dict[str, bool]) -> Any:
     return node
 
 
-def _fill_group(scene: Any, group: Any, take: Take) -> None:
+def _fill_group(scene: Any, group: Any, take: Take, image: Any) -> None:
     """(Re)builds the inside of the group; its sockets, and so the links around it, stay."""
     old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image} - {_RAMP}
     group.nodes.clear()
     enter = group.nodes.new("NodeGroupInput")
     leave = group.nodes.new("NodeGroupOutput")
     frozen = group.nodes.new("CompositorNodeImage")
-    image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
     frozen.name = frozen.label = _FROZEN
     show_sequence(frozen, image, take.first, take.last)
     mix, factor, first, second, mixed = compat.new_mix_node(group)
@@ -406,13 +435,15 @@ def _fill_group(scene: Any, group: Any, take: Take) -> None:
     depth.name = depth.label = _DEPTH
     depth.inputs[1].default_value = take.depth_scale
     enter.location, frozen.location = (-2 * _GAP, 150.0), (-3 * _GAP, -100.0)
-    mix.location, depth.location, leave.location = (_GAP, 150.0), (_GAP, -100.0), (2 * _GAP, 0.0)
+    mix.location, depth.location, leave.location = (3 * _GAP, 150.0), (_GAP, -100.0), (4 * _GAP, 0.0)
 
     fitted = _fitted(scene, group, take, frozen)
     share = _share(group, enter, fitted)
+    nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0])
     group.links.new(share, factor)
-    group.links.new(enter.outputs["Image"], first)
-    group.links.new(_among(group, enter, _grainy(group, enter, fitted), depth.outputs[0]), second)
+    # CG stands in both: Mix, Wipe and mattes choose between stream and frozen frame, not whether an object is there.
+    group.links.new(_among(group, enter, enter.outputs["Image"], nearer, "CG in your stream"), first)
+    group.links.new(_among(group, enter, _grainy(group, enter, fitted), nearer, "CG among the frozen"), second)
     group.links.new(mixed, leave.inputs["Image"])
     group.links.new(fitted["Depth"], depth.inputs[0])
     group.links.new(depth.outputs[0], leave.inputs["Depth"])
@@ -437,27 +468,70 @@ def _grainy(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     return summed
 
 
-def _among(group: Any, enter: Any, frozen: Any, depth: Any) -> Any:
-    """Socket of the frozen picture with CG in front of it or behind, whichever is nearer, pixel by pixel."""
+def _among(group: Any, enter: Any, picture: Any, nearer: Any, label: str) -> Any:
+    """Socket of a picture with CG in front of it, as far as it is nearer, else behind, by as much as both cover."""
     front, under, over = compat.new_over_node(group)
-    group.links.new(frozen, under)
+    group.links.new(picture, under)
     group.links.new(enter.outputs["CG"], over)
     back, below, above = compat.new_over_node(group)
     group.links.new(enter.outputs["CG"], below)
-    group.links.new(frozen, above)
-    nearer = compat.new_math_node(group, "LESS_THAN")
-    nearer.label = "CG is nearer"
-    group.links.new(enter.outputs["CG Depth"], nearer.inputs[0])
-    group.links.new(depth, nearer.inputs[1])
+    group.links.new(picture, above)
     choose, factor, first, second, chosen = compat.new_mix_node(group)
-    choose.label = "CG among the frozen"
-    group.links.new(nearer.outputs[0], factor)
+    choose.label = label
+    group.links.new(nearer, factor)
     group.links.new(back.outputs[0], first)
     group.links.new(front.outputs[0], second)
-    for row, node in enumerate((nearer, front, back)):
-        node.location = (-_GAP, -350.0 - 170.0 * row)
-    choose.location = (0.0, -350.0)
+    for row, node in enumerate((front, back)):
+        node.location = (_GAP, -350.0 - 170.0 * row)
+    choose.location = (2 * _GAP, -350.0)
     return chosen
+
+
+def _cg_depth(group: Any, enter: Any) -> Any:
+    """Socket of the depth of CG; where a pixel has none, the nearest of its neighbours': it may be that one's edge.
+
+    A pixel that CG covers in part often tells the depth of what is behind: nothing.
+    """
+    around = compat.new_nearest_node(group)
+    group.links.new(enter.outputs["CG Depth"], around.inputs[0])
+    # Where there is a depth, the other is made so large that the lesser of the two is the pixel's own.
+    there = compat.new_math_node(group, "LESS_THAN")
+    there.inputs[1].default_value = _NOTHING
+    group.links.new(enter.outputs["CG Depth"], there.inputs[0])
+    far = compat.new_math_node(group, "MULTIPLY_ADD")
+    far.inputs[1].default_value = contract.NO_DEPTH
+    group.links.new(there.outputs[0], far.inputs[0])
+    group.links.new(around.outputs[0], far.inputs[2])
+    depth = compat.new_math_node(group, "MINIMUM")
+    depth.label = "Depth of CG, edges too"
+    group.links.new(enter.outputs["CG Depth"], depth.inputs[0])
+    group.links.new(far.outputs[0], depth.inputs[1])
+    for column, node in enumerate((around, there, far, depth)):
+        node.location = (_GAP * (column - 3), -1100.0)
+    return depth.outputs[0]
+
+
+def _nearer(group: Any, cg: Any, frozen: Any) -> Any:
+    """Socket of how much CG is in front: 1 up to the frozen depth, 0 from `_SOFT` of it behind, smooth between."""
+    ratio = compat.new_math_node(group, "DIVIDE")
+    group.links.new(cg, ratio.inputs[0])
+    group.links.new(frozen, ratio.inputs[1])
+    rise = compat.new_math_node(group, "MULTIPLY_ADD")
+    rise.inputs[1].default_value, rise.inputs[2].default_value = -1.0 / _SOFT, 1.0 + 1.0 / _SOFT
+    rise.use_clamp = True
+    group.links.new(ratio.outputs[0], rise.inputs[0])
+    # t * t * (3 - 2 * t)
+    square, slope, smooth = (compat.new_math_node(group, o) for o in ("MULTIPLY", "MULTIPLY_ADD", "MULTIPLY"))
+    slope.inputs[1].default_value, slope.inputs[2].default_value = -2.0, 3.0
+    smooth.label = "CG is nearer"
+    for source, target in (
+        (rise, square.inputs[0]), (rise, square.inputs[1]), (rise, slope.inputs[0]),
+        (square, smooth.inputs[0]), (slope, smooth.inputs[1]),
+    ):  # fmt: skip
+        group.links.new(source.outputs[0], target)
+    for column, node in enumerate((ratio, rise, square, slope, smooth)):
+        node.location = (_GAP * (column - 3), -1300.0)
+    return smooth.outputs[0]
 
 
 def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
@@ -553,12 +627,11 @@ def show_sequence(user: Any, image: Any, first: int, last: int) -> None:
 
 
 def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
-    """The frozen layers' sockets: without overscan, and led through Scale nodes if the render size is not theirs."""
-    names = ("Combined", "Depth", "Support", "Motion")
-    missing = [n for n in names if n not in frozen.outputs]
-    if missing:
-        raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
-    names += (_GRAIN,) if _GRAIN in frozen.outputs else ()
+    """The frozen layers' sockets: without overscan, and scaled to the render's size, whatever that is when it renders.
+
+    Frames wider than the scene's picture are cut, as the camera sees it; flatter ones leave bars.
+    """
+    names = _LAYERS + ((_GRAIN,) if _GRAIN in frozen.outputs else ())
     sockets = {n: frozen.outputs[n] for n in names}
     for row, name in enumerate(names if any(take.margin) else ()):
         node = compat.new_crop_node(group, take.margin, take.size)
@@ -566,15 +639,47 @@ def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
         node.location = (-2 * _GAP, -50.0 - 170.0 * row)
         group.links.new(sockets[name], node.inputs[0])
         sockets[name] = node.outputs[0]
-    if take.size == render_size(scene):
-        return sockets
-    for row, name in enumerate(names):
-        node = compat.new_fit_node(group)
-        node.label = f"Fit {name}"
+    how, shown = _how(scene, take.size), _whole(group, sockets["Depth"])
+    coverage = None
+    for row, name in enumerate(("", *names) if shown is not None else names):
+        node = compat.new_fit_node(group, how)
+        node.label = f"Fit {name}" if name else "Fit what there is"
         node.location = (-_GAP, 150.0 - 170.0 * row)
-        group.links.new(sockets[name], node.inputs[0])
-        sockets[name] = node.outputs[0]
+        group.links.new(sockets[name] if name else shown, node.inputs[0])
+        if not name:
+            coverage = node.outputs[0]
+        else:
+            sockets[name] = _unfaded(group, node.outputs[0], coverage, name in ("Combined", _GRAIN))
     return sockets
+
+
+def _how(scene: Any, size: tuple[int, int]) -> str:
+    """How a picture of a size is brought to the scene's: its width fits, as the solved camera's does."""
+    render = scene.render
+    return "Crop" if render.resolution_x * size[1] >= 0.99 * render.resolution_y * size[0] else "Fit"
+
+
+def _whole(group: Any, layer: Any) -> Any | None:
+    """Socket of 1 wherever a layer has pixels; None where a scaled picture does not fade out at its border."""
+    if compat.HAS_COMPOSITING_GROUP:
+        return None
+    node = compat.new_math_node(group, "GREATER_THAN")
+    node.inputs[1].default_value = -1.0
+    node.label = "Everywhere"
+    group.links.new(layer, node.inputs[0])
+    return node.outputs[0]
+
+
+def _unfaded(group: Any, layer: Any, coverage: Any | None, picture: bool) -> Any:
+    """Socket of a scaled layer whose outermost pixels are as strong as the others."""
+    if coverage is None:
+        return layer
+    if picture:
+        return compat.new_quotient(group, layer, coverage)
+    node = compat.new_math_node(group, "DIVIDE")
+    group.links.new(layer, node.inputs[0])
+    group.links.new(coverage, node.inputs[1])
+    return node.outputs[0]
 
 
 def render_size(scene: Any) -> tuple[int, int]:
@@ -584,24 +689,21 @@ def render_size(scene: Any) -> tuple[int, int]:
     return render.resolution_x * share // 100, render.resolution_y * share // 100
 
 
-def _show_plate(scene: Any, tree: Any, node: Any, plate: Path, take: Take) -> None:
+def _show_plate(scene: Any, tree: Any, node: Any, image: Any, take: Take) -> None:
     """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
     for old in [n for n in tree.nodes if n.get(_TAG) and n.get(_TAG) != _CG]:
         tree.nodes.remove(old)
     image_node = tree.nodes.new("CompositorNodeImage")
     image_node[_TAG] = True
     image_node.name = image_node.label = "Plate"
-    image = load_sequence(plate, _plate_name(plate), "srgb")
     show_sequence(image_node, image, take.first, take.last)
     stream = image_node.outputs["Image"]
     # The tree is ours: in a row, left to right.
     compat.output_socket(tree).node.location = (node.location.x + node.width + 60.0, node.location.y)
     image_node.location = (node.location.x - 2 * _GAP, node.location.y)
-    if tuple(image.size) != render_size(scene):
-        fit = compat.new_fit_node(tree)
-        fit[_TAG] = True
-        fit.label = "Fit Plate"
-        fit.location = (node.location.x - _GAP, node.location.y)
-        tree.links.new(stream, fit.inputs[0])
-        stream = fit.outputs[0]
-    tree.links.new(stream, node.inputs["Image"])
+    fit = compat.new_fit_node(tree, _how(scene, tuple(image.size)))
+    fit[_TAG] = True
+    fit.label = "Fit Plate"
+    fit.location = (node.location.x - _GAP, node.location.y)
+    tree.links.new(stream, fit.inputs[0])
+    tree.links.new(fit.outputs[0], node.inputs["Image"])

@@ -5,6 +5,7 @@ No bpy here: the job folder is all the state there is, so that any Blender that 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -26,6 +27,12 @@ _START_SECONDS = 30.0
 _LOG_LINES = 6
 _KILL_SECONDS = 20.0
 """A job that has not ended this long after it was asked to is ended by force on a second request."""
+_LONGEST_SECONDS = 1e7
+"""What is said to take longer is not told."""
+_LONGEST_REQUEST = 1 << 24
+"""Bytes of a request that are read; one with a t* for each of 100,000 frames takes a fifth."""
+_SILENT_SECONDS = 10 * contract.HEARTBEAT_SECONDS
+"""A job of an older backend is believed dead after this long without a sign of life."""
 
 
 @dataclass
@@ -94,12 +101,11 @@ def start(job: Job, python: str, package_root: Path) -> None:
     Raises:
         contract.JobError: the interpreter cannot be started.
     """
-    command = [python, "-m", "torch_backend", "run-job", str(job.folder)]
+    command = contract.python_child(python, "torch_backend", "run-job", str(job.folder.absolute()))
     try:
         with open(job.folder / contract.LOG_FILE, "ab") as log:
             job.process = subprocess.Popen(
-                command,
-                cwd=job.folder,  # not the extension's: Windows keeps the folder that a process stands in
+                **command,
                 env=backend_environ(package_root),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -129,6 +135,7 @@ def backend_environ(package_root: Path) -> dict[str, str]:
         PYTHONUTF8="1",
         PYTHONUNBUFFERED="1",
         PYTHONNOUSERSITE="1",
+        PYTHONSAFEPATH="1",  # what a child starts in turn takes no module from where it stands either
         PYTHONDONTWRITEBYTECODE="1",  # the extension's folder may be read-only, and is not ours to fill
     )
     return environ
@@ -155,24 +162,35 @@ def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
 
 
 def is_alive(job: Job, status: contract.Status | None) -> bool:
-    """True if the job's process still works on it, or may be about to."""
+    """True if the job's process still works on it, or may be about to. One of another computer is never judged dead.
+
+    A process that is only stopped, as by a computer that slept, is alive whatever its last sign of life.
+    """
     if job.process is not None:
         return job.process.poll() is None
     if status is None or not status.pid:
         return time.time() - _made(job.folder) < _START_SECONDS
-    if status.process_started and sys.platform == "linux":
-        return contract.process_start(status.pid) == status.process_started
-    return time.time() - status.heartbeat < 10 * contract.HEARTBEAT_SECONDS
+    if status.host and status.host != contract.host_name():
+        return True
+    if status.host or (status.process_started and sys.platform == "linux"):
+        return contract.runs_still(status.pid, status.process_started)
+    return time.time() - status.heartbeat < _SILENT_SECONDS  # from an older backend, that did not say where it ran
 
 
 def cancel(job: Job) -> None:
-    """Asks the job to stop with a checkpoint; asked again after `_KILL_SECONDS`, ends it by force."""
+    """Asks the job to stop with a checkpoint; asked again after `_KILL_SECONDS`, ends it by force.
+
+    JobError if it should be ended by force and cannot be told from other processes beyond doubt: those stay.
+    """
     flag = job.folder / contract.CANCEL_FILE
-    if flag.exists() and time.time() - flag.stat().st_mtime > _KILL_SECONDS and is_alive(job, job.status):
-        _kill(job)
-        return
-    if not flag.exists():
-        flag.touch()
+    try:
+        os.close(os.open(flag, os.O_WRONLY | os.O_CREAT | os.O_EXCL))  # whatever lies there, also a link, is left alone
+    except FileNotFoundError:
+        return  # the shot was moved or deleted, which ends the job too
+    except FileExistsError:
+        since = flag.lstat().st_mtime
+        if time.time() - since > _KILL_SECONDS and is_alive(job, job.status):
+            _kill(job)
 
 
 def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
@@ -206,12 +224,15 @@ def raise_if_failed(job: Job) -> None:
 
 
 def open_job(folder: Path) -> Job | None:
-    """A job from its folder; None if its request cannot be read."""
+    """A job from its folder; None if its request cannot be read, or is none."""
     try:
-        request = contract.from_dict(contract.JobRequest, contract.read_json(folder / contract.REQUEST_FILE))
+        data = contract.read_json(folder / contract.REQUEST_FILE, _LONGEST_REQUEST)
+        contract.check_version(data, "job request")
+        request: contract.JobRequest = contract.from_dict(contract.JobRequest, data)
+        params = dataclasses.asdict(request.typed_params())
     except (OSError, ValueError):
         return None
-    return Job(folder, request.kind, request.params)
+    return Job(folder, request.kind, params)
 
 
 def latest(shot: Path) -> dict[str, Job]:
@@ -236,21 +257,22 @@ def latest(shot: Path) -> dict[str, Job]:
 def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
     """Last lines of the job's log; empty if it has none."""
     try:
-        with open(folder / contract.LOG_FILE, "rb") as log:
+        with contract.open_regular(folder / contract.LOG_FILE) as log:
             log.seek(0, os.SEEK_END)
             log.seek(max(log.tell() - 8192, 0))
-            text = log.read().decode("utf-8", "replace")
-    except OSError:
+            text = log.read(8192).decode("utf-8", "replace")
+    except (OSError, ValueError):
         return []
-    return [line for line in text.splitlines() if line.strip()][-lines:]
+    return [contract.printable(line) for line in text.splitlines() if line.strip()][-lines:]
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Writes a JSON object beside `path`, fsyncs, renames over it: a reader never sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    beside.unlink(missing_ok=True)  # a link that another hand left there would be followed
     try:
-        with open(beside, "w", encoding="utf-8", newline="\n") as out:
+        with open(beside, "x", encoding="utf-8", newline="\n") as out:
             out.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
             out.flush()
             os.fsync(out.fileno())
@@ -261,47 +283,93 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def _read_status(folder: Path) -> contract.Status | None:
+    """The status as it stands; None before there is one. ValueError if it is none of ours."""
     try:
-        data = contract.read_json(folder / contract.STATUS_FILE)
-        contract.check_version(data, "job status")
-        return contract.from_dict(contract.Status, data)
+        data = contract.read_json(folder / contract.STATUS_FILE, contract.SHORT_JSON)
     except OSError:
         return None
+    contract.check_version(data, "job status", contract.STATUS_VERSION)
+    status: contract.Status = contract.from_dict(contract.Status, data)
+    for name in ("stage", "message", "hint", "host"):
+        setattr(status, name, contract.printable(getattr(status, name)))
+    status.fraction = min(max(status.fraction, 0.0), 1.0)
+    if status.eta_seconds is not None and not 0.0 <= status.eta_seconds < _LONGEST_SECONDS:
+        status.eta_seconds = None
+    return status
 
 
 def _read_events(job: Job, until: float) -> tuple[list[contract.Event], bool]:
-    """New whole lines of events.jsonl, and whether they were all read."""
+    """New whole lines of events.jsonl, and whether they were all read. A line that is no event is passed over."""
     events: list[contract.Event] = []
     try:
-        source = open(job.folder / contract.EVENTS_FILE, "rb")  # noqa: SIM115  (closed below; may not be there yet)
+        with contextlib.closing(contract.read_lines(job.folder / contract.EVENTS_FILE, job.read_to)) as lines:
+            for line, job.read_to in lines:
+                event = _event(line)
+                if event is not None:
+                    _take_in(job, event)
+                    events.append(event)
+                if time.monotonic() > until:
+                    return events, False
     except OSError:
-        return events, True
-    with source:
-        source.seek(job.read_to)
-        for line in source:
-            if not line.endswith(b"\n"):
-                return events, True  # half written: the rest comes with the next poll
-            job.read_to += len(line)
-            event = contract.from_dict(contract.Event, json.loads(line))
-            _take_in(job, event)
-            events.append(event)
-            if time.monotonic() > until:
-                return events, False
+        pass  # not there yet
     return events, True
+
+
+def _event(line: bytes) -> contract.Event | None:
+    try:
+        event: contract.Event = contract.from_dict(contract.Event, json.loads(line))
+        if event.type in _EVENT_DATA:
+            contract.from_dict(_EVENT_DATA[event.type], event.data)
+    except (ValueError, TypeError, RecursionError):
+        return None
+    return event
+
+
+@dataclass
+class _Words:
+    message: str
+    hint: str = ""
+    exit_code: int = 1
+
+
+@dataclass
+class _Figures:
+    values: dict[str, Any]
+    stage: str = ""
+
+
+@dataclass
+class _Picture:
+    label: str
+    path: str
+
+
+@dataclass
+class _End:
+    state: str
+    result: Any = None
+
+
+_EVENT_DATA: dict[str, type] = {
+    "warning": _Words, "error": _Words, "metric": _Figures, "image": _Picture, "done": _End,
+}  # fmt: skip
+"""What an event has to hold to be believed; those of other types are only handed on."""
 
 
 def _take_in(job: Job, event: contract.Event) -> None:
     if event.type == "warning":
-        job.warnings.append((event.data["message"], event.data["hint"]))
+        words = _Words(**event.data)
+        job.warnings.append((contract.printable(words.message), contract.printable(words.hint)))
     elif event.type == "metric":
         values = event.data["values"]
         job.metrics.update(values)
-        if values.get("heldout_psnr_db") is not None and "seconds" in values:
-            job.history.append((float(values["seconds"]), float(values["heldout_psnr_db"])))
+        point = contract.measured(values)
+        if point is not None:
+            job.history.append(point)
     elif event.type == "image":
         job.images[event.data["label"]] = event.data["path"]
     elif event.type == "done":
-        job.result = event.data["result"]
+        job.result = event.data.get("result")
 
 
 def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
@@ -333,14 +401,32 @@ def _made(folder: Path) -> float:
 
 
 def _kill(job: Job) -> None:
-    """Ends the job's process group. Only a process whose start time is the one in the status, or our own child."""
-    pid = job.process.pid if job.process else (job.status.pid if job.status else 0)
-    if not pid:
-        return
+    """Ends the job's process and its children: our own child, or what is the job's beyond doubt. JobError if not."""
+    if job.process is not None:
+        pid = job.process.pid  # ours until it is waited for: the system gives its number to no other
+    else:
+        status = job.status
+        if status is None or status.host not in ("", contract.host_name()):
+            where = status.host.partition(" (")[0] if status else "another computer"
+            raise _not_ours(f"This step runs on {where}: only there it can be ended.")
+        pid = status.pid
+        if not contract.runs_job(pid, status.process_started, job.folder):
+            raise _not_ours("The process of this step cannot be told from others for sure, so none was ended.")
     if sys.platform == "win32":
-        subprocess.run(["taskkill", "/F", "/T", "/PID", str(pid)], capture_output=True, check=False)
+        program = os.path.join(os.environ.get("SYSTEMROOT", r"C:\Windows"), "System32", "taskkill.exe")
+        subprocess.run([program, "/F", "/T", "/PID", str(pid)], capture_output=True, check=False)
         return
     try:
-        os.killpg(pid, signal.SIGKILL)
+        if os.getpgid(pid) == pid:
+            os.killpg(pid, signal.SIGKILL)
+        else:
+            os.kill(pid, signal.SIGKILL)  # in somebody else's group
     except ProcessLookupError:
         return  # it ended by itself in the meantime
+
+
+def _not_ours(message: str) -> contract.JobError:
+    return contract.JobError(
+        message, "It was asked to stop and does so with its next step, or end it where it was started.",
+        contract.ExitCode.USAGE,
+    )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import threading
@@ -9,6 +10,7 @@ import uuid
 from pathlib import Path
 from typing import Any
 
+from ..torch_backend import contract
 from . import shots
 
 _RUN_HEAD = ("Run", "dB", "Size", "Move", "Time")
@@ -20,11 +22,14 @@ _TAKE_WIDTHS = (0.3, 0.18, 0.24, 0.28)
 def run_rows(state: shots.ShotState) -> list[tuple[str, ...]]:
     """(name, dB on frames kept out, Gaussians, share that moves, time trained) of every run, as shown.
 
-    Of one that is not finished (name, how far it came).
+    Of one that is not finished (name, how far it came), of one that cannot be read (name, that it is damaged).
     """
     rows = []
-    for name in sorted({*state.runs, *state.unfinished}):
+    for name in state.listed("run"):
         run = state.runs.get(name)
+        if name in state.damaged["run"]:
+            rows.append((name, "damaged"))
+            continue
         if run is None:
             told = state.unfinished[name]
             share = 100.0 * told["iteration"] / max(1, told["end"])
@@ -39,12 +44,16 @@ def run_rows(state: shots.ShotState) -> list[tuple[str, ...]]:
 
 
 def take_rows(state: shots.ShotState) -> list[tuple[str, ...]]:
-    """(name, t*, frames on disk, run) of every take, as shown."""
-    return [
-        (name, "keyed" if take.get("t_star_per_frame") else str(take["t_star_frame"]), str(take["frame_count"]),
-         str(take["run"]))
-        for name, take in sorted(state.takes.items())
-    ]  # fmt: skip
+    """(name, t*, frames on disk, run) of every take, as shown; of one that cannot be read (name, "damaged")."""
+    rows = []
+    for name in state.listed("take"):
+        take = state.takes.get(name)
+        if take is None:
+            rows.append((name, "damaged"))
+            continue
+        instant = "keyed" if take.get("t_star_per_frame") else str(take["t_star_frame"])
+        rows.append((name, instant, str(take["frame_count"]), str(take["run"])))
+    return rows
 
 
 def duration(seconds: float | None) -> str:
@@ -89,9 +98,18 @@ def _cells(line: Any, widths: tuple[float, ...]) -> list[Any]:
 def remove(shot: Path, folder: Path, wait: bool) -> None:
     """Removes a folder of a shot: gone at once; its files are deleted in the background unless asked to `wait`.
 
-    OSError if it cannot be moved away, because a file of it is open elsewhere (Windows) or protected.
+    What lies behind a link is not the shot's: of a folder that is one, only the link is removed.
+    OSError if it cannot be moved away, because a file of it is open elsewhere (Windows) or protected, or lies behind a
+    link itself.
     """
+    if contract.is_link(folder.parent):
+        raise OSError(errno.EPERM, f"{folder.parent.name} is a link to another folder: remove it there", str(folder))
     trash = shot / "trash"
+    if contract.is_link(trash):
+        contract.remove_link(trash)
+    if contract.is_link(folder):
+        contract.remove_link(folder)
+        return
     trash.mkdir(exist_ok=True)
     os.replace(folder, trash / f"{folder.name}-{uuid.uuid4().hex[:8]}")
     if wait:
@@ -101,5 +119,5 @@ def remove(shot: Path, folder: Path, wait: bool) -> None:
 
 
 def _empty(trash: Path) -> None:
-    """Deletes what lies in the trash, what an earlier Blender left there too."""
+    """Deletes what lies in the trash, what an earlier Blender left there too. Links are removed, and never followed."""
     shutil.rmtree(trash, ignore_errors=True)

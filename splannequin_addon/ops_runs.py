@@ -50,7 +50,8 @@ class SPLANNEQUIN_OT_pick_run(_Pick, bpy.types.Operator):
         state = _known(context)[1]
         run = state.runs.get(self.name) or state.unfinished.get(self.name)
         if run is None:
-            self.report({"ERROR"}, tr(f"This shot has no run {self.name!r}"))
+            refusal = state.damaged["run"].get(self.name) or f"This shot has no run {self.name!r}"
+            self.report({"ERROR"}, tr(refusal))
             return {"CANCELLED"}
         settings = context.scene.splannequin
         settings.run_name = self.name
@@ -70,8 +71,10 @@ class SPLANNEQUIN_OT_pick_take(_Pick, bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Sets the take's name."""
-        if self.name not in _known(context)[1].takes:
-            self.report({"ERROR"}, tr(f"This shot has no take {self.name!r}"))
+        state = _known(context)[1]
+        if self.name not in state.takes:
+            refusal = state.damaged["take"].get(self.name) or f"This shot has no take {self.name!r}"
+            self.report({"ERROR"}, tr(refusal))
             return {"CANCELLED"}
         context.scene.splannequin.take_name = self.name
         return {"FINISHED"}
@@ -97,9 +100,9 @@ class _Remove(_Pick):
         if watch is None or state is None:
             return {"CANCELLED"}
         # Only what is listed, whose names come from the folder itself: any other may lead to somewhere else.
-        listed = {*state.runs, *state.unfinished} if self.kind == "run" else {*state.takes}
         folder = watch.shot / f"{self.kind}s" / name
-        refusal = self.refusal(watch.shot, folder) if name in listed else f"This shot has no {self.kind} {name!r}"
+        there = name in state.listed(self.kind)
+        refusal = self.refusal(watch.shot, folder) if there else f"This shot has no {self.kind} {name!r}"
         if not refusal:
             try:
                 listing.remove(watch.shot, folder, wait=bpy.app.background)

@@ -13,6 +13,7 @@ from typing import Any
 import bpy
 
 from . import (
+    backend,
     bake,
     cameras,
     compat,
@@ -23,7 +24,10 @@ from . import (
     made,
     markers,
     ops_align,
+    ops_jobs,
     pictures,
+    places,
+    preferences,
     scene_setup,
     shots,
     steps,
@@ -151,6 +155,8 @@ class _StepPanel:
 
     def _view(self, context: Any) -> View:
         watch = self._watch(context)
+        if watch is not None and places.missing(context.scene, watch.state):
+            return View(False, self.step == "footage", [], "" if self.step == "footage" else "Locate the shot first.")
         return VIEWS[self.step](context.scene, watch.state if watch else None)
 
     def _next_done(self, context: Any) -> bool:
@@ -179,23 +185,31 @@ class _StepPanel:
         """The step's body."""
         layout = self.layout  # type: ignore[attr-defined]
         watch, view = self._watch(context), self._view(context)
+        self.draw_trouble(context, layout)
         for line in view.state:
             wrap(layout, context, line)
         running = watch.running() if watch else None
         settings = layout.column()
         settings.enabled = view.ready and running is None
         self.draw_settings(context, settings)
+        self.draw_always(context, layout)
         if watch and running == self.step:
             self._progress(context, watch)
         else:
             self._button(context, layout, view, running)
             self._outcome(context, layout, watch)
-            if running is None and not (view.done and self._next_done(context)):
+            if running is None and view.advice and not (view.done and self._next_done(context)):
                 wrap(layout, context, view.advice, "INFO")
         body = sub_panel(layout, f"{self.step}_more", "Advanced")
         if body is not None:
             body.enabled = running is None
             self.draw_advanced(context, body)
+
+    def draw_trouble(self, context: Any, layout: Any) -> None:
+        """What keeps the step from being done at all, with the button that helps."""
+
+    def draw_always(self, context: Any, layout: Any) -> None:
+        """What stays in reach while a step runs."""
 
     def draw_settings(self, context: Any, layout: Any) -> None:
         """The settings that an artist needs."""
@@ -253,7 +267,7 @@ class _StepPanel:
             wrap(box, context, failure[0], "ERROR")
             if failure[1]:
                 wrap(box, context, failure[1], "BLANK1")
-            if job is not None:
+            if ops_jobs.log_of(watch, self.step) is not None:
                 box.operator("splannequin.open_log", text="Open Log", icon="TEXT").step = self.step
             return
         if job is not None and job.state == "cancelled" and not self._paused(context):
@@ -266,6 +280,16 @@ class _StepPanel:
     def _paused(self, context: Any) -> bool:
         """True if the panel says already that what was stopped can go on."""
         return False
+
+
+def can_load_camera(running: str | None) -> bool:
+    """True unless a step runs that makes another solve; the others leave this one as it is."""
+    return running not in ("footage", "camera")
+
+
+def can_scrub(view: View, running: str | None) -> bool:
+    """True if scrubbing may begin, and always while there is a session to be stopped."""
+    return viewport.session() is not None or (view.ready and running is None)
 
 
 def minutes(seconds: float) -> str:
@@ -291,14 +315,48 @@ class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
         span.enabled = props.use_range
         span.prop(props, "first", text="")
         span.prop(props, "last", text="")
-        if not supervisor.backend_found():
+
+    def draw_trouble(self, context: Any, layout: Any) -> None:
+        """No backend, no shot folder: what to do about it."""
+        self._backend_trouble(context, layout)
+        watch = self._watch(context)
+        if watch is not None and places.missing(context.scene, watch.state):
             box = layout.box()
             box.alert = True
-            wrap(box, context, "The backend is not set up: choose its Python in the add-on's preferences.", "ERROR")
+            name = watch.shot.name
+            wrap(box, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
+            box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
+
+    def _backend_trouble(self, context: Any, layout: Any) -> None:
+        """No backend, or one that is being set up."""
+        trouble, setup = supervisor.backend_trouble(), preferences.running_setup()
+        if setup is not None:
+            wrap(layout, context, "The backend is being set up.", "IMPORT")
+            for line in setup.said[-1:]:
+                wrap(layout, context, line)
+            layout.operator("splannequin.cancel_setup", icon=icons.of("splannequin.cancel_setup"))
+        elif trouble is not None:
+            box = layout.box()
+            column = box.column(align=True)
+            column.alert = True
+            wrap(column, context, trouble.message, "ERROR")
+            if not bpy.app.online_access:
+                wrap(
+                    column, context, "Blender may not go online: allow it in Preferences > System > Network.", "BLANK1"
+                )
+            box.operator("splannequin.set_up", icon=icons.of("splannequin.set_up"))
+            box.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = backend.PACKAGE
+
+    def _label(self, context: Any, view: View) -> str:
+        watch = self._watch(context)
+        gone = watch is not None and places.missing(context.scene, watch.state)
+        return "Import Anew" if gone else super()._label(context, view)
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
-        """Shot folder, consent to set the scene up."""
+        """Shot folder, which frames are solved, consent to set the scene up."""
         layout.prop(context.scene.splannequin, "shot_path", text="Folder")
+        layout.prop(context.scene.splannequin, "solve_step")
+        layout.prop(context.scene.splannequin, "fps")
         layout.prop(context.scene.splannequin, "set_up_scene")
 
 
@@ -337,7 +395,7 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
         if view.done and watch and cameras.find(context.scene, watch.shot, "CAMERA") is None:
             row = layout.row()
             row.scale_y = 1.4
-            row.enabled = running is None
+            row.enabled = can_load_camera(running)
             row.operator("splannequin.load_camera", icon=icons.of("splannequin.load_camera"))
             return
         super()._button(context, layout, view, running)
@@ -404,11 +462,13 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
 
     def _runs(self, context: Any, state: shots.ShotState) -> None:
         """All runs of the shot, to compare and pick."""
-        if not state.runs and not state.unfinished:
+        if not state.listed("run"):
             return
         body = sub_panel(self.layout, "runs", "Runs")  # type: ignore[attr-defined]
         if body is not None:
             listing.draw(body, "run", state, context.scene.splannequin.run_name)
+            for told in state.damaged["run"].values():
+                wrap(body, context, told, "ERROR")
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """The run's name."""
@@ -428,23 +488,41 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         props = context.scene.splannequin
         row = layout.row(heading="Frame t*")
         row.prop(props, "choose_t_star", text="")
-        value = row.row(align=True)
-        value.enabled = props.choose_t_star
-        value.prop(props, "t_star", text="")
+        if props.choose_t_star:
+            row.prop(props, "t_star", text="")
+        else:
+            at = self._suggested(context)
+            row.label(text=tr(f"{at}, suggested") if at is not None else "as suggested")
         row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
         shown = context.scene.timeline_markers.get(markers.NAME) is not None
         row.operator("splannequin.t_star_marker", text="", icon="MARKER_HLT" if shown else "MARKER", depress=shown)
-        self._live(context, layout)
+
+    def _suggested(self, context: Any) -> int | None:
+        """The instant that is taken while none is chosen, once it is known: scrubbing asks for it, so does Freeze."""
+        session, watch, props = viewport.session(), self._watch(context), context.scene.splannequin
+        at = viewport.instant(context.scene) if session is not None and watch and session.shot == watch.shot else None
+        if at is not None:
+            return round(at)
+        take = watch.state.takes.get(props.take_name) if watch is not None and watch.state is not None else None
+        return props.t_star if take is not None and take["t_star_frame"] == props.t_star else None
+
+    def draw_always(self, context: Any, layout: Any) -> None:
+        """Scrubbing: it can be stopped whatever runs, and whatever became of the shot."""
+        watch, live = self._watch(context), layout.column()
+        live.enabled = can_scrub(self._view(context), watch.running() if watch else None)
+        self._live(context, live)
 
     def draw(self, context: Any) -> None:
         """The step's body, and the takes to compare."""
         super().draw(context)
         watch = self._watch(context)
-        if watch is None or watch.state is None or not watch.state.takes:
+        if watch is None or watch.state is None or not watch.state.listed("take"):
             return
         body = sub_panel(self.layout, "takes", "Takes")  # type: ignore[attr-defined]
         if body is not None:
             listing.draw(body, "take", watch.state, context.scene.splannequin.take_name)
+            for told in watch.state.damaged["take"].values():
+                wrap(body, context, told, "ERROR")
 
     def _live(self, context: Any, layout: Any) -> None:
         """Scrubbing: on or off, what is shown, suggestions and why."""

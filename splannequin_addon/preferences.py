@@ -95,6 +95,11 @@ def busy() -> bool:
     return _setup is not None and _setup.running
 
 
+def running_setup() -> environment.SetUp | None:
+    """The set-up that runs."""
+    return _setup if busy() else None
+
+
 class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
     """Download and install what the backend needs, into an environment of its own"""
 

@@ -5,7 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 from ..torch_backend import contract
 from . import compat, made
@@ -65,11 +73,34 @@ class ShotSettings:
         subtype="DIR_PATH",
         options=compat.PATH_OPTIONS,
     )
+    shot_seen: StringProperty(
+        name="Shot Seen",
+        description="Shot folder that was there when this file was last at work: it can be missed",
+        subtype="DIR_PATH",
+        options=compat.PATH_OPTIONS | {"HIDDEN"},
+    )
     use_range: BoolProperty(
         name="Only a Range", description="Import a part of the clip instead of all of it", default=False, options=set()
     )
     first: IntProperty(name="First", description="First frame number of the clip to import", default=1, options=set())
     last: IntProperty(name="Last", description="Last frame number to import, inclusive", default=250, options=set())
+    solve_step: IntProperty(
+        name="Solve Every",
+        description="Every how many frames the camera is solved and trained on, all are delivered; 0: chosen by the "
+        "clip's length. Smaller where a solve loses its way, 1: every frame",
+        default=0,
+        min=0,
+        soft_max=10,
+        options=set(),
+    )
+    fps: FloatProperty(
+        name="Frame Rate",
+        description="Frames per second of an image sequence; 0: what its files say, else 24. A video has its own",
+        default=0.0,
+        min=0.0,
+        soft_max=120.0,
+        options=set(),
+    )
     camera_model: EnumProperty(
         name="Lens",
         description="How the lens bends straight lines",
@@ -188,6 +219,12 @@ class ShotSettings:
 class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
     """Settings of a shot of the scene that is not the chosen one."""
 
+    scene_settings: StringProperty(
+        name="Scene Settings",
+        description="Size, rate and range of the scene while this shot was chosen",
+        options={"HIDDEN"},
+    )
+
 
 class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
     """The chosen shot of the scene, and what is the scene's own."""
@@ -217,6 +254,12 @@ class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
     )
     loaded_shot: IntProperty(
         name="Loaded", description="Shot of the list whose settings are the scene's", default=0, options={"HIDDEN"}
+    )
+    camera_before: PointerProperty(
+        name="Camera Before",
+        description="Camera of the scene before a shot's was put in its place",
+        type=bpy.types.Object,
+        options={"HIDDEN"},
     )
     made: CollectionProperty(
         name="Made", description="What was put into this scene, by shot", type=made.SPLANNEQUIN_PG_made, options=set()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import json
+import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,15 +28,25 @@ class ShotState:
     """shot.json; empty if there is no shot."""
     frames: int = 0
     """Imported frames, 0 before the import."""
+    beside: str = ""
+    """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
     solve: dict[str, Any] = field(default_factory=dict)
     """solve.json; empty before the solve."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Trained runs: name -> summary.json, with `history`, `preview`, `extension` (see `checkpoints.extension`) and
+    """Trained runs: name -> summary.json, with `history`, `preview`, `extension`, `anew` (see `checkpoints`) and
     `other_cameras` added."""
     unfinished: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells."""
+    """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells, with
+    `history`, `preview`, `anew` and `other_cameras` added."""
     takes: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Frozen takes: name -> take.json, with `frame_count` added."""
+    damaged: dict[str, dict[str, str]] = field(default_factory=lambda: {"run": {}, "take": {}})
+    """Runs and takes whose files are not what we write: kind -> name -> what is wrong, in a sentence."""
+
+    def listed(self, kind: str) -> list[str]:
+        """Names of all runs or takes (`kind` "run" or "take"), damaged ones too, as they are shown."""
+        whole = {*self.runs, *self.unfinished} if kind == "run" else {*self.takes}
+        return sorted(whole | {*self.damaged[kind]})
 
     @property
     def size(self) -> tuple[int, int]:
@@ -49,9 +62,10 @@ class ShotState:
 def create(folder: Path, name: str = "") -> None:
     """Makes an empty shot folder, or checks the one that is there. ValueError on one from a newer Splannequin."""
     path = folder / "shot.json"
-    if path.is_file():
-        contract.check_version(contract.read_json(path), str(path))
+    if os.path.lexists(path):
+        _typed(_Info, path)
         return
+    folder.mkdir(parents=True, exist_ok=True)
     jobs.write_json(path, {"version": 1, "name": name or folder.name.removesuffix(SHOT_SUFFIX), "created": time.time()})
 
 
@@ -60,25 +74,30 @@ def read(folder: Path) -> ShotState:
     state = ShotState(folder)
     if not (folder / "shot.json").is_file():
         return state
-    state.info = contract.read_json(folder / "shot.json")
-    contract.check_version(state.info, str(folder / "shot.json"))
+    state.info = _typed(_Info, folder / "shot.json")
     listing = folder / "frames" / "frames.json"
     if listing.is_file():
-        state.frames = len(contract.read_json(listing)["frames"])
+        told = _typed(_Listing, listing, contract.LONGEST_JSON)
+        state.frames, state.beside = len(told["frames"]), told["beside"]
     if (folder / "solve" / "cameras.json").is_file():
-        state.solve = contract.read_json(folder / "solve" / "solve.json")
-    state.runs = _named(folder / "runs", "summary.json")
+        state.solve = _typed(_Solve, folder / "solve" / "solve.json")
+    state.runs = _named(_Run, folder / "runs", "summary.json", state.damaged["run"])
     for name, run in state.runs.items():
         run["extension"] = checkpoints.extension(folder / "runs" / name)
-    for path in sorted((folder / "runs").glob(f"*/{checkpoints.CHECKPOINT}")):
-        told = checkpoints.paused(path.parent) if path.parent.name not in state.runs else None
+    for name in _names(folder / "runs", checkpoints.CHECKPOINT):
+        known = name in state.runs or name in state.damaged["run"]
+        told = None if known else checkpoints.paused(folder / "runs" / name)
         if told is not None:
-            state.unfinished[path.parent.name] = told
+            state.unfinished[name] = told
     for name, run in [*state.runs.items(), *state.unfinished.items()]:
+        run["anew"] = checkpoints.anew(folder / "runs" / name)
+        if run["anew"] is not None:
+            run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
+            run["anew"]["history"] = _history(run["anew"]["folder"] / "metrics.jsonl")
         run["other_cameras"] = checkpoints.other_cameras(folder, folder / "runs" / name)
         run["history"] = _history(folder / "runs" / name / "metrics.jsonl")
         run["preview"] = max((folder / "runs" / name / "previews").glob("*.png"), default=None)
-    state.takes = _named(folder / "takes", "take.json")
+    state.takes = _named(_Take, folder / "takes", "take.json", state.damaged["take"])
     for name, take in state.takes.items():
         take["frame_count"] = sum(1 for p in (folder / "takes" / name).iterdir() if p.suffix == EXR)
     return state
@@ -88,12 +107,14 @@ def stamp(folder: Path) -> tuple[float, ...]:
     """Changes when something in the shot did: cheap to ask for on every tick."""
     parts = ("shot.json", "frames/frames.json", "solve/solve.json", "runs", "takes", "jobs")
     deep = [p for name in ("runs", "takes") if (folder / name).is_dir() for p in (folder / name).iterdir()]
-    return tuple(_mtime(p) for p in [*(folder / part for part in parts), *deep])
+    anew = [p for run in deep if (run / checkpoints.NEXT).is_dir() for p in (run / checkpoints.NEXT).iterdir()]
+    return tuple(_mtime(p) for p in [*(folder / part for part in parts), *deep, *anew])
 
 
 def plate_range(folder: Path) -> tuple[int, int] | None:
     """First and last number of the undistorted plates, None before the solve."""
-    numbers = [int(p.stem) for p in (folder / "frames").glob("*.png") if p.stem.lstrip("-").isdigit()]
+    found = (contract.frame_number(p.stem) for p in (folder / "frames").glob("*.png"))
+    numbers = [number for number in found if number is not None]
     return (min(numbers), max(numbers)) if numbers else None
 
 
@@ -101,22 +122,146 @@ def _history(path: Path) -> list[tuple[float, float]]:
     """(seconds, dB on frames kept out) of a run's metrics.jsonl; what cannot be read is passed over."""
     points = []
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError:
+        with contextlib.closing(contract.read_lines(path)) as lines:
+            for line, end in lines:
+                point = _measured(line)
+                if point is not None:
+                    points.append(point)
+                if end > _LONGEST_HISTORY:
+                    break
+    except (OSError, ValueError):
         return []
-    for line in lines:
-        try:
-            told = json.loads(line)
-            points.append((float(told["seconds"]), float(told["heldout_psnr_db"])))
-        except (ValueError, KeyError, TypeError):
-            continue
     return points
 
 
-def _named(folder: Path, file: str) -> dict[str, dict[str, Any]]:
-    if not folder.is_dir():
-        return {}
-    return {p.parent.name: contract.read_json(p) for p in sorted(folder.glob(f"*/{file}"))}
+def _measured(line: bytes) -> tuple[float, float] | None:
+    try:
+        told = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return contract.measured(told) if isinstance(told, dict) else None
+
+
+# ------------------------------------------------------------------------------------------------- what is believed
+# A shot folder may come from anywhere. What the panel draws of its files is read here, and nowhere else unchecked.
+
+
+@dataclass
+class _Info:
+    """Of shot.json."""
+
+    name: str = ""
+    source: str = ""
+    first: int = 0
+    last: int = 0
+    fps: float = 0.0
+    width: int = 0
+    height: int = 0
+    t_star: int | None = None
+
+
+@dataclass
+class _Listing:
+    """Of frames.json."""
+
+    frames: list[Any]
+    beside: str = ""
+
+
+@dataclass
+class _Solve:
+    """Of solve.json, and of the result in it."""
+
+    quality: str = ""
+    interpolated: int = 0
+    frames: int = 0
+    result: dict[str, Any] | None = None
+
+
+@dataclass
+class _Run:
+    """Of summary.json."""
+
+    run: str = ""
+    preset: str = "preview"
+    gaussians: int = 0
+    moving_share: float | None = None
+    heldout_psnr_db: float | None = None
+    train_seconds: float | None = None
+
+
+@dataclass
+class _Take:
+    """Of take.json."""
+
+    take: str
+    run: str
+    t_star_frame: int
+    query: str
+    width: int
+    height: int
+    first: int
+    last: int
+    t_star_per_frame: dict[str, Any] = field(default_factory=dict)
+    margin: list[Any] = field(default_factory=lambda: [0, 0])
+    camera_path: str = ""
+    overscan: float = 0.0
+
+    def __post_init__(self) -> None:
+        numbers = [*self.margin, *self.t_star_per_frame.values()]
+        if len(self.margin) != 2 or any(type(v) not in (int, float) or not abs(v) < _LARGEST for v in numbers):
+            raise ValueError("margin should be two numbers, and t_star_per_frame a number per frame")
+
+
+def _typed(kind: type, path: Path, longest: int = contract.SHORT_JSON) -> dict[str, Any]:
+    """A file of the shot, what the dataclass `kind` names in it checked and completed. ValueError says what is wrong.
+
+    OSError if there is none.
+    """
+    data = contract.read_json(path, longest)
+    contract.check_version(data, str(path))
+    try:
+        return _believed(kind, data)
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {str(error).lstrip('_')}.") from error
+
+
+def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
+    names = [one.name for one in dataclasses.fields(kind) if one.name in data]
+    values = vars(contract.from_dict(kind, {name: data[name] for name in names}))
+    for name, value in values.items():
+        if isinstance(value, (int, float)) and not abs(value) < _LARGEST:
+            raise ValueError(f"{kind.__name__}.{name} cannot be that large")
+        if isinstance(value, str) and name not in ("source", "camera_path"):
+            values[name] = contract.printable(value)
+    if isinstance(values.get("result"), dict):
+        values["result"] = _believed(_Solve, values["result"])
+    elif "result" in values:
+        del values["result"]
+    return {**data, **values}
+
+
+_LARGEST = 1 << 31
+"""Blender's whole numbers end there."""
+_LONGEST_HISTORY = 1 << 24
+"""Bytes of a run's measurements that are read; 100,000 take as much."""
+
+
+def _named(kind: type, folder: Path, file: str, damaged: dict[str, str]) -> dict[str, dict[str, Any]]:
+    """Name -> file of every folder that has it; of those that cannot be believed, in `damaged` why not."""
+    found = {}
+    for name in _names(folder, file):
+        try:
+            found[name] = _typed(kind, folder / name / file)
+        except (OSError, ValueError) as error:
+            damaged[name] = contract.printable(str(error))
+    return found
+
+
+def _names(folder: Path, file: str) -> list[str]:
+    """Folders that have the file; not one that is about to take another's place, or whose name cannot be shown."""
+    found = {p.parent.name for p in folder.glob(f"*/{file}")}
+    return sorted(name for name in found if name.isprintable() and not name.startswith("."))
 
 
 def _mtime(path: Path) -> float:

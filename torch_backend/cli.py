@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 from . import contract
 from .contract import DEVICES, Event, ExitCode
@@ -43,9 +43,9 @@ class Console:
         elif event.type == "metric" and event.data["values"].get("modelled"):
             self._line(modelled_table(event.data["values"]["modelled"]))
         elif event.type == "warning":
-            self._line(f"  note: {event.data['message']} {event.data['hint']}".rstrip())
+            self._line(contract.printable(f"  note: {event.data['message']} {event.data['hint']}".rstrip()))
         elif event.type == "error":
-            self._line(f"Error: {event.data['message']} {event.data['hint']}".rstrip())
+            self._line(contract.printable(f"Error: {event.data['message']} {event.data['hint']}".rstrip()))
         elif event.type == "done" and event.data["state"] == "cancelled":
             self._line("Cancelled. Start the same command again to go on: finished work is kept.")
 
@@ -83,8 +83,18 @@ def run_station(shot: Shot, kind: str, params: Any, console: Console) -> Any:
         _give_up(error, shot.root)
     code, result = run_job(folder, console)
     if code != ExitCode.OK:
+        if kind == "import":
+            contract.discard_unborn(shot.root)
         raise SystemExit(code)
     return result
+
+
+def _begun(folder: str) -> Shot:
+    """The shot of an import, made if it is not there. Ends the command, in one sentence, if it cannot be."""
+    try:
+        return Shot.create(folder)
+    except OSError as error:
+        _give_up(error, Path(folder).absolute(), "Choose another shot folder.")
 
 
 def freeze_clip(args: argparse.Namespace, console: Console) -> int:
@@ -162,6 +172,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     facts["torch_device"] = "cuda" if torch.cuda.is_available() else "cpu"
     facts["cuda_device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     facts["trains_on"] = choose_device("auto").type
+    facts["torch_cuda"] = torch.version.cuda
     facts["cuda_refusal"] = cuda_refusal()
     facts["cores"] = os.cpu_count()
     facts["h264"] = "libx264" in av.codecs_available
@@ -173,8 +184,12 @@ def status(args: argparse.Namespace, console: Console) -> int:
     """`status SHOT`: its jobs, newest last, one line each."""
     shot = Shot.open(args.shot)
     for path in sorted(shot.jobs.glob(f"*/{contract.STATUS_FILE}")):
-        job = contract.from_dict(contract.Status, contract.read_json(path))
-        print(f"{path.parent.name}  {job.state:<9} {job.stage} {100 * job.fraction:.0f}%  {job.message}".rstrip())
+        try:
+            job: contract.Status = contract.from_dict(contract.Status, contract.read_json(path, contract.SHORT_JSON))
+            told = f"{job.state:<9} {job.stage} {100 * job.fraction:.0f}%  {job.message}"
+        except (OSError, ValueError) as error:
+            told = f"damaged   {error}"
+        print(contract.printable(f"{path.parent.name}  {told}").rstrip())
     return ExitCode.OK
 
 
@@ -221,12 +236,6 @@ def stmaps(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
-def _import_params(args: argparse.Namespace) -> contract.ImportParams:
-    return contract.ImportParams(
-        _source(args.clip), args.first, args.last, args.step, args.working_height, args.fps, args.layer
-    )
-
-
 def _train_params(args: argparse.Namespace) -> contract.TrainParams:
     return contract.TrainParams(
         run=args.run,
@@ -262,15 +271,20 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
     )
 
 
+def _import_params(args: argparse.Namespace) -> contract.ImportParams:
+    span = (args.first, args.last)
+    return contract.ImportParams(_source(args.clip), *span, args.step, args.working_height, args.fps, args.layer)
+
+
 def _source(clip: str) -> str:
     return clip if not clip or "://" in clip else str(Path(clip).absolute())
 
 
-def _give_up(error: OSError, where: Path) -> Any:
-    """Ends the command on an output folder that cannot be written, in one sentence."""
+def _give_up(error: OSError, where: Path, hint: str = "Choose another --output folder.") -> NoReturn:
+    """Ends the command on a folder that cannot be written, in one sentence."""
     full = is_disk_full(error)
     message = disk_error(where) if full else f"Cannot write to {where}: {error.strerror or error}."
-    print(f"Error: {getattr(message, 'message', message)} Choose another --output folder.", file=sys.stderr)
+    print(f"Error: {getattr(message, 'message', message)} {hint}", file=sys.stderr)
     raise SystemExit(ExitCode.DISK if full else ExitCode.USAGE)
 
 
@@ -344,7 +358,7 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--last", type=int, help="last frame number, inclusive")
     to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
     to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
-    to.add_argument("--fps", type=float, default=0.0, help="rate of an image sequence (0: as its files say, else 24)")
+    to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
     to.add_argument("--layer", default="", metavar="NAME", help="EXR layer or part to take (default: the picture)")
     if not any(a.dest == "camera_model" for a in to._actions):
         to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
@@ -414,6 +428,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, FileNotFoundError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return ExitCode.USAGE
+    except OSError as error:
+        print(f"Error: {error.strerror or error}: {error.filename or ''}", file=sys.stderr)
+        return ExitCode.DISK
 
 
 def _dispatch(args: argparse.Namespace, console: Console) -> int:
@@ -428,7 +445,7 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
 
         return run_live(args.shot, args.run, args.device)
     if args.command == "import":
-        run_station(Shot.create(args.shot), "import", _import_params(args), console)
+        run_station(_begun(args.shot), "import", _import_params(args), console)
     elif args.command == "solve":
         given = str(Path(args.cameras).absolute()) if args.cameras else ""
         params = contract.SolveParams(camera_model=args.camera_model, cameras=given)

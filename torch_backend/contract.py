@@ -10,34 +10,56 @@ row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame number
 
 from __future__ import annotations
 
+import _thread
+import calendar
+import contextlib
 import dataclasses
 import enum
 import functools
+import hashlib
 import json
 import math
 import os
+import re
+import shutil
+import signal
+import socket
 import stat
 import struct
+import subprocess
+import sys
+import threading
+import time
 import typing
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 CONTRACT_VERSION = 1
+STATUS_VERSION = 2
+"""Of status.json: 2 has the host."""
 
 REQUEST_FILE = "request.json"
 STATUS_FILE = "status.json"
 EVENTS_FILE = "events.jsonl"
 LOG_FILE = "log.txt"
 CANCEL_FILE = "cancel"
+JOB_COMMAND = "-m torch_backend run-job"
+"""How the process of a job was called, but for its Python and the job's folder."""
 
 HEARTBEAT_SECONDS = 2.0
-"""How often a living job rewrites status.json. A reader believes a job dead after ten of these and no process."""
+"""How often a living job rewrites status.json."""
+GRACE_SECONDS = 30.0
+"""How long a cancelled process may take for its checkpoint before it is ended by force."""
 LAST_FRAME = 1_048_574
 """Blender's last frame number: no scene reaches further."""
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
+SHORT_JSON = 1 << 20
+"""Bytes of a file that Blender reads between two turns of its timer: a status, a run's figures."""
+LONGEST_LINE = 1 << 20
+"""Bytes of a line of events.jsonl or metrics.jsonl that are read."""
 
 
 class ExitCode(enum.IntEnum):
@@ -107,9 +129,9 @@ class ImportParams:
     working_height: int = 0
     """Height in pixels of the working frames; 0: the source's, at most 720."""
     fps: float = 0.0
-    """Frames per second of an image sequence; 0: what its files say, else 24. A video has its own."""
+    """Frames per second of a sequence; 0: the footage's own, 24 for a sequence that says none."""
     layer: str = ""
-    """Layer or part of an image sequence to take, by its name or the end of it; empty: the picture itself."""
+    """Layer or part of a sequence's pictures to take, by its name or the end of it; empty: the picture itself."""
 
 
 @dataclass
@@ -163,6 +185,18 @@ class TrainParams:
 
 PRESET_STEPS = {"preview": 3000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
+PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
+"""Width in pixels of each preset's training images, never above the working frames'."""
+HOSTS = ("control_points", "hexplane", "mlp")
+"""Hosts of the deformation, as their files in deformation/ name themselves."""
+METHODS = ("auto", *HOSTS, "static")
+"""What `TrainParams.method` may be."""
+HOST_CONFIGS = ("default", "reference")
+"""What `TrainParams.host_config` may be."""
+SUPERVISIONS = ("support", "paper", "none")
+"""What `TrainParams.supervision` may be."""
+DETECTORS = ("weight", "grad_norm", "grad_signed")
+"""What `TrainParams.detector` may be."""
 
 
 @dataclass
@@ -270,7 +304,7 @@ class Status:
     started: float
     """Start of the job, seconds since the epoch."""
     process_started: float
-    """Start time of the process as the system gives it, so that a reused pid is not believed; 0 if unknown."""
+    """`Process.started` of the child, so that a reused pid is not believed; 0 if unknown."""
     heartbeat: float
     """Last sign of life, seconds since the epoch."""
     stage: str = ""
@@ -285,8 +319,10 @@ class Status:
     """Seconds left in this stage, if it can be told."""
     exit_code: int | None = None
     """Exit code once it has ended."""
-    version: int = CONTRACT_VERSION
-    """Version of this contract."""
+    host: str = ""
+    """Computer that the job runs on, as `host_name` says; empty in files from before version 2."""
+    version: int = STATUS_VERSION
+    """Version of this file."""
 
     @property
     def ended(self) -> bool:
@@ -441,16 +477,203 @@ def _read_exactly(stream: BinaryIO, count: int) -> bytes | None:
     return b"".join(parts)
 
 
-# ------------------------------------------------------------------------------------------------- reading
+# ------------------------------------------------------------------------------------------------- processes
+
+
+def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]:
+    """`args` and `cwd` of the `Popen` that runs a module of ours; paths in `words` should be absolute.
+
+    Python takes modules from the folder that it stands in, and a shot folder may come from anywhere: -P says no. The
+    child stands beside its interpreter, where nobody puts files for it: a loader of libraries still looks there
+    (Windows always, Linux with an empty entry in LD_LIBRARY_PATH). It is neither the shot's folder nor the extension's:
+    Windows keeps the folder that a process stands in from being moved or removed.
+    """
+    python = os.path.abspath(python)
+    return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
+
+
+def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
+    """Stops this process, as Ctrl-C does, once its standard input closes: its starter holds that open, however it ends.
+
+    A checkpoint may take `grace_seconds`; then the process ends at once, with the group that it leads (POSIX).
+    """
+    starter = os.dup(0)
+    # Nobody else has it: on Windows a child of ours that inherits a pipe hangs at its start while we read from that.
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    watch = functools.partial(_stop_when_alone, starter, grace_seconds)
+    threading.Thread(target=watch, name="end with starter", daemon=True).start()
+
+
+def _stop_when_alone(starter: int, grace_seconds: float) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(starter, 1):
+            pass
+    if sys.platform == "win32":
+        _thread.interrupt_main()
+    else:  # a signal of its own also ends a wait of the main thread
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    time.sleep(grace_seconds)
+    if sys.platform != "win32" and os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(ExitCode.CANCELLED)
+
+
+def program(name: str) -> str | None:
+    """Absolute path of a program on the PATH; None if there is none, or if the folder we stand in has one to offer.
+
+    `shutil.which` looks into that folder first on Windows, and it may be one that came with a .blend or a clip.
+    """
+    found = shutil.which(name)
+    return found if found and os.path.isabs(found) else None
+
+
+@functools.cache
+def host_name() -> str:
+    """This computer as files name it: its name, and in brackets what tells it from another one of the same name.
+
+    On Linux that is a hash of the machine's id and, in a container, of its process ids' namespace; on Windows of the
+    machine's GUID; elsewhere there is none.
+    """
+    marks = []
+    if sys.platform == "win32":
+        import winreg
+
+        with contextlib.suppress(OSError):
+            with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, r"SOFTWARE\Microsoft\Cryptography") as known:
+                marks.append(str(winreg.QueryValueEx(known, "MachineGuid")[0]))
+    else:
+        with contextlib.suppress(OSError):
+            marks.append(Path("/etc/machine-id").read_text(encoding="ascii", errors="replace").strip())
+        with contextlib.suppress(OSError):
+            marks.append(os.readlink("/proc/self/ns/pid"))
+    mark = hashlib.sha256("\n".join(marks).encode()).hexdigest()[:8]
+    return f"{socket.gethostname()} ({mark})" if any(marks) else socket.gethostname()
+
+
+@dataclass(frozen=True)
+class Process:
+    """What the system says of a living process."""
+
+    started: float
+    """When it started, in the system's own unit: only to be compared with another answer. 0 if it does not tell."""
+    command: str
+    """Its command line, arguments separated by spaces; empty if the system does not tell."""
+
+
+def process(pid: int) -> Process | None:
+    """A living process of this computer; None if there is none of that id. Standard library, on all three systems."""
+    if not (isinstance(pid, int) and 0 < pid < 1 << 31):
+        return None
+    if sys.platform == "win32":
+        return _process_of_windows(pid)
+    try:
+        os.kill(pid, 0)  # asks only: no signal is sent
+    except ProcessLookupError:
+        return None
+    except OSError:
+        pass  # somebody else's, but there
+    return _process_of_proc(pid) if Path("/proc/self/stat").exists() else process_of_ps(pid)
 
 
 def process_start(pid: int) -> float:
-    """Start time of a process in clock ticks since boot, where the system tells (Linux); else 0."""
+    """`Process.started` of a process; 0 if there is none or the system does not tell."""
+    found = process(pid)
+    return found.started if found is not None else 0.0
+
+
+def runs_still(pid: int, started: float) -> bool:
+    """True if a process of this computer lives that has this id and start; one that is only stopped does.
+
+    Where the system tells no start, a process of this id is taken for it: a job is not declared dead on a guess.
+    """
+    found = process(pid)
+    return found is not None and (not found.started or not started or found.started == started)
+
+
+def _process_of_proc(pid: int) -> Process | None:
+    """From /proc. Start in clock ticks since boot."""
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-        return float(fields.rpartition(")")[2].split()[19])
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        fields = text.rpartition(")")[2].split()
+        if fields[0] in ("Z", "X"):
+            return None  # it has ended: only its exit code is kept for its parent
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        return Process(float(fields[19]), " ".join(os.fsdecode(word) for word in words).rstrip(" "))
     except (OSError, ValueError, IndexError):
-        return 0.0
+        return Process(0.0, "")  # hidden from us, or ending just now
+
+
+def process_of_ps(pid: int) -> Process | None:
+    """From `ps`, on systems without /proc (macOS). Start in seconds since the epoch, whole ones."""
+    command = ["/bin/ps", "-ww", "-o", "stat=,lstart=,command=", "-p", str(pid)]
+    environ = {"LC_ALL": "C", "TZ": "UTC0", "PATH": "/usr/bin:/bin"}
+    try:
+        # close_fds=False: macOS then spawns it without copying the parent, which may be a heavy Blender.
+        told = subprocess.run(command, capture_output=True, env=environ, close_fds=False, timeout=5.0, check=False)
+        state, _, month, day, clock, year, line = os.fsdecode(told.stdout).strip("\n").split(None, 6)
+        if state.startswith("Z"):
+            return None
+        hours, minutes, seconds = map(int, clock.split(":"))
+        when = (int(year), _MONTHS.index(month) + 1, int(day), hours, minutes, seconds)
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return Process(0.0, "")
+    return Process(float(calendar.timegm((*when, 0, 0, 0))), line)
+
+
+_MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
+
+
+def _process_of_windows(pid: int) -> Process | None:
+    """From the Windows API. Start in units of 100 ns since 1601; the command line since Windows 8.1."""
+    if sys.platform != "win32":
+        return None
+    import ctypes
+    from ctypes import wintypes
+
+    class UnicodeString(ctypes.Structure):
+        _fields_ = [("length", wintypes.USHORT), ("room", wintypes.USHORT), ("text", ctypes.c_void_p)]
+
+    kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+    kernel.OpenProcess.restype = wintypes.HANDLE
+    opened = kernel.OpenProcess(wintypes.DWORD(0x1000), False, wintypes.DWORD(pid))  # PROCESS_QUERY_LIMITED_INFORMATION
+    if not opened:
+        return None if ctypes.get_last_error() == 87 else Process(0.0, "")  # ERROR_INVALID_PARAMETER: no such process
+    handle = wintypes.HANDLE(opened)
+    try:
+        code, times = wintypes.DWORD(), [wintypes.FILETIME() for _ in range(4)]
+        if kernel.GetExitCodeProcess(handle, ctypes.byref(code)) and code.value != 259:  # STILL_ACTIVE
+            return None
+        told = kernel.GetProcessTimes(handle, *(ctypes.byref(time) for time in times))
+        started = times[0].dwHighDateTime << 32 | times[0].dwLowDateTime if told else 0
+        room, needed = ctypes.create_string_buffer(1 << 17), wintypes.ULONG()
+        query = ctypes.WinDLL("ntdll").NtQueryInformationProcess  # 60: ProcessCommandLineInformation
+        if query(handle, 60, room, wintypes.ULONG(len(room)), ctypes.byref(needed)):
+            return Process(float(started), "")
+        line = UnicodeString.from_buffer(room)
+        text = ctypes.string_at(line.text, line.length).decode("utf-16-le", "replace") if line.text else ""
+        return Process(float(started), text.replace('"', ""))
+    finally:
+        kernel.CloseHandle(handle)
+
+
+def runs_job(pid: int, started: float, folder: Path) -> bool:
+    """True if a process is the job of a folder beyond doubt: its start, and a command line that runs that job.
+
+    A file's word for a process is not enough to end it: whoever wrote the file could have anything ended.
+    """
+    found = process(pid) if pid > 1 else None
+    if found is None or not started or found.started != started:
+        return False
+    _, ours, told = found.command.rpartition(f" {JOB_COMMAND} ")
+    try:
+        return bool(ours) and os.path.isabs(told) and os.path.samefile(told, folder)
+    except (OSError, ValueError):
+        return False
+
+
+# ------------------------------------------------------------------------------------------------- reading
 
 
 def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VERSION) -> None:
@@ -458,7 +681,8 @@ def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VER
     version = data.get("version", 1)
     if not isinstance(version, int) or version > newest:
         raise ValueError(
-            f"{what} has version {version}, this Splannequin reads up to {newest}: update the add-on and its backend"
+            f"{what} has version {_short(version)}, this Splannequin reads up to {newest}: "
+            "update the add-on and its backend"
         )
 
 
@@ -479,19 +703,100 @@ def open_regular(path: str | Path) -> BinaryIO:
         raise
 
 
-def read_json(path: str | Path) -> dict[str, Any]:
-    """A JSON object from a file. FileNotFoundError, or ValueError naming the file and what is wrong in it."""
+def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
+    """A JSON object from a file of at most `longest` bytes.
+
+    FileNotFoundError, or ValueError naming the file and what is wrong in it.
+    """
     with open_regular(path) as source:
-        text = source.read(LONGEST_JSON + 1)
-    if len(text) > LONGEST_JSON:
-        raise ValueError(f"{path} is longer than {LONGEST_JSON >> 20} MB: nothing of ours is")
+        text = source.read(longest + 1)
+    if len(text) > longest:
+        raise ValueError(f"{path} is longer than {longest >> 20} MB: nothing of ours is")
     try:
-        data = json.loads(text)
+        data = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:  # ValueError: no JSON, no UTF-8, or a number of too many digits
         raise ValueError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(data, dict):
         raise ValueError(f"{path} should hold a JSON object, found {type(data).__name__}")
     return data
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def read_lines(
+    path: str | Path, start: int = 0, longest: int = LONGEST_LINE
+) -> Generator[tuple[bytes, int], None, None]:
+    """Whole lines of a file that grows, from a byte on: (line, where the next one begins).
+
+    One longer than `longest` bytes is passed over: (b"", where it goes on). OSError or ValueError as `open_regular`.
+    """
+    with open_regular(path) as source:
+        source.seek(start)
+        inside = False  # of a line that is too long
+        while line := source.readline(longest):
+            start += len(line)
+            whole = line.endswith(b"\n")
+            if not whole and len(line) < longest:
+                return  # half written: it is read with the next call
+            yield (line if whole and not inside else b""), start
+            inside = not whole
+
+
+def measured(row: Mapping[str, Any]) -> tuple[float, float] | None:
+    """(seconds of training, dB on frames kept out) of a measurement; None if it is none, or holds no plain numbers."""
+    seconds, quality = row.get("seconds"), row.get("heldout_psnr_db")
+    if any(isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e9 for v in (seconds, quality)):
+        return None
+    return float(seconds), float(quality)  # pyright: ignore[reportArgumentType]
+
+
+def printable(text: str, longest: int = 2000) -> str:
+    """Text from a file as it may be shown or printed: no escape codes or other control characters, and not endless."""
+    return "".join(c if c.isprintable() else " " for c in text[:longest])
+
+
+def checked_name(name: str, what: str) -> str:
+    """`name` if it is safe as a folder name on every system; ValueError otherwise."""
+    if not _NAME.fullmatch(name) or name.endswith((".", " ")):
+        raise ValueError(f"{what} name {name!r} should be 1 to 64 letters, digits, spaces, '.', '_' or '-'")
+    if name.partition(".")[0].rstrip().upper() in _DEVICES:
+        raise ValueError(f"{what} name {name!r} is the name of a device on Windows: choose another one")
+    return name
+
+
+_NAME = re.compile(r"\w[\w .-]{0,63}")
+_DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in "0123456789¹²³")}
+
+
+def frame_number(stem: str) -> int | None:
+    """Number of a frame's file by its name without suffix; None if it is no such file."""
+    return int(stem) if _NUMBER.fullmatch(stem) else None
+
+
+_NUMBER = re.compile(r"-?[0-9]{1,9}")
+
+
+def is_link(path: Path) -> bool:
+    """True for a symbolic link, and on Windows for a junction, whether or not it leads anywhere."""
+    try:
+        found = os.lstat(path)
+    except OSError:
+        return False
+    return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == _JUNCTION
+
+
+def remove_link(path: Path) -> None:
+    """Removes a link, never what it leads to."""
+    if sys.platform == "win32" and path.is_dir():
+        os.rmdir(path)  # how Windows removes a link to a folder
+    else:
+        os.unlink(path)
+
+
+_JUNCTION = 0xA0000003
+"""stat.IO_REPARSE_TAG_MOUNT_POINT, which only Windows has: its link between folders."""
 
 
 def from_dict(cls: type, data: Mapping[str, Any]) -> Any:
@@ -500,11 +805,21 @@ def from_dict(cls: type, data: Mapping[str, Any]) -> Any:
     unknown = set(data) - set(hints)
     if unknown:
         raise ValueError(f"{cls.__name__} has no field {sorted(unknown)[0]!r}: it has {', '.join(hints)}")
+    missing = _needed(cls) - set(data)
+    if missing:
+        raise ValueError(f"{cls.__name__} has no {min(missing)}")
     values = {name: _checked(cls.__name__, name, hints[name], value) for name, value in data.items()}
     try:
         return cls(**values)
-    except TypeError as error:
+    except (TypeError, OverflowError) as error:
         raise ValueError(f"{cls.__name__}: {error}") from error
+
+
+@functools.cache
+def _needed(cls: type) -> set[str]:
+    """Fields that have no default."""
+    none = dataclasses.MISSING
+    return {f.name for f in dataclasses.fields(cls) if f.default is none and f.default_factory is none}
 
 
 @functools.cache
@@ -520,11 +835,28 @@ def _checked(owner: str, name: str, hint: Any, value: Any) -> Any:
         base = typing.get_origin(option) or option
         if base is Any or (base is type(None) and value is None):
             return value
-        if base is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if base is float and number and abs(value) < _LARGEST_FLOAT:
             return float(value)
-        if isinstance(base, type) and isinstance(value, base) and not (base is int and isinstance(value, bool)):
+        if base is int:
+            if number and isinstance(value, int) and abs(value) < _LARGEST_INT:
+                return value
+        elif base is not float and isinstance(base, type) and isinstance(value, base):
             return value
-    raise ValueError(f"{owner}.{name} cannot be {value!r}")
+    raise ValueError(f"{owner}.{name} cannot be {_short(value)}")
+
+
+_LARGEST_FLOAT, _LARGEST_INT = 1e300, 1 << 53
+"""What JSON cannot hold without loss, or is no number (NaN, infinity), comes from no file of ours."""
+
+
+def _short(value: Any) -> str:
+    """A value as a sentence names it."""
+    if isinstance(value, (list, dict)):
+        return f"a {'list' if isinstance(value, list) else 'JSON object'}"
+    if isinstance(value, int) and abs(value) >= _LARGEST_INT:
+        return "a number that large"
+    return repr(value if not isinstance(value, str) else printable(value, 80))
 
 
 # ------------------------------------------------------------------------------------------------- frozen frames
@@ -567,3 +899,43 @@ def summarise(
 def frame_file(frame: int, suffix: str) -> str:
     """File name of a frame: its number in the clip, six digits (a minus sign for negative ones) and a suffix."""
     return f"{frame:06d}{suffix}"
+
+
+# ------------------------------------------------------------------------------------------------- unborn shots
+
+_UNBORN = {"shot.json", "jobs", "frames"}
+"""What an import that did not end well may leave in a shot folder."""
+
+
+def discard_unborn(shot: Path) -> bool:
+    """Takes away what a failed import left of a shot that it was to begin. True if it did; what cannot go stays.
+
+    A shot that has a frame, or anything else that took work, is left alone, and so are files that are not ours. Kept is
+    also the log of a job that ended without a sentence of its own.
+    """
+    try:
+        names = {p.name for p in shot.iterdir()}
+        frames = [p for p in (shot / "frames").rglob("*") if not p.is_dir()] if "frames" in names else []
+        jobs = list((shot / "jobs").iterdir()) if "jobs" in names else []
+        if "shot.json" not in names or frames or names & {"solve", "runs", "takes"} or (shot / "jobs").is_symlink():
+            return False
+        if not all("-import-" in job.name and not job.is_symlink() and _said_why(job) for job in jobs):
+            return False
+        for name in _UNBORN & names - {"shot.json"}:
+            shutil.rmtree(shot / name, ignore_errors=True)  # a link is left alone
+        (shot / "shot.json").unlink()
+        with contextlib.suppress(OSError):  # it holds something of the artist's
+            shot.rmdir()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _said_why(job: Path) -> bool:
+    """True if a job ended in a sentence, or was cancelled, or never wrote a word: nobody needs its log."""
+    status = from_dict(Status, read_json(job / STATUS_FILE)) if (job / STATUS_FILE).is_file() else None
+    log = job / LOG_FILE
+    if status is not None and not status.ended:
+        return False
+    named = status is not None and (status.state == "cancelled" or status.exit_code != ExitCode.INTERNAL)
+    return named or not log.is_file() or not log.stat().st_size

@@ -43,7 +43,8 @@ class JobReporter:
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
         now = time.time()
-        self.status = Status(kind, "running", os.getpid(), now, contract.process_start(os.getpid()), now)
+        pid, host = os.getpid(), contract.host_name()
+        self.status = Status(kind, "running", pid, now, contract.process_start(pid), now, host=host)
         self._events = open(folder / contract.EVENTS_FILE, "a", encoding="utf-8")  # noqa: SIM115 - lives as long as the job
         self._stop = threading.Event()
         self._write_status()
@@ -181,11 +182,12 @@ def _run(request: JobRequest, reporter: JobReporter) -> tuple[int, Any]:
         state, code, message = "cancelled", int(ExitCode.CANCELLED), "Cancelled."
     except JobError as error:
         state, code, message, hint = "failed", error.exit_code, error.message, error.hint
+        _log(reporter.folder, "\n".join([message, hint, *getattr(error, "__notes__", ())]) + "\n")
     except (ValueError, FileNotFoundError) as error:
         state, code, message = "failed", int(ExitCode.USAGE), str(error)
-        _log_traceback(reporter.folder)
+        _log(reporter.folder, traceback.format_exc())
     except Exception as error:
-        _log_traceback(reporter.folder)
+        _log(reporter.folder, traceback.format_exc())
         full = disk_error(request.shot) if isinstance(error, OSError) and is_disk_full(error) else None
         text = str(error).lower()
         state, code = "failed", full.exit_code if full else int(ExitCode.INTERNAL)
@@ -201,9 +203,10 @@ def _run(request: JobRequest, reporter: JobReporter) -> tuple[int, Any]:
     return code, result
 
 
-def _log_traceback(folder: Path) -> None:
+def _log(folder: Path, text: str) -> None:
+    """Adds to the job's log, which *Open Log* shows: what a sentence leaves out."""
     with contextlib.suppress(OSError), open(folder / contract.LOG_FILE, "a", encoding="utf-8") as log:
-        log.write(traceback.format_exc())
+        log.write(text)
 
 
 @contextlib.contextmanager

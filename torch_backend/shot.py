@@ -12,9 +12,7 @@ import errno
 import hashlib
 import json
 import os
-import re
 import shutil
-import stat
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -22,13 +20,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .contract import ExitCode, JobError, check_version, from_dict, read_json
+from .contract import ExitCode, JobError, check_version, checked_name, from_dict, is_link, read_json, remove_link
 
 SHOT_VERSION = 1
 SHOT_SUFFIX = ".splannequin"
-_JUNCTION = 0xA0000003
-"""Reparse tag of a mount point, Windows' link between folders (stat.IO_REPARSE_TAG_MOUNT_POINT, there alone)."""
-_NAME = re.compile(r"^[\w][\w .-]{0,63}$")
 
 
 @dataclass
@@ -70,10 +65,13 @@ class Shot:
     @classmethod
     def open(cls, root: str | Path) -> Shot:
         """An existing shot. FileNotFoundError if there is none, ValueError if it is from a newer version."""
+        from .solve.replacing import settle_solve
+
         shot = cls(root)
         if not shot.info_path.is_file():
             raise FileNotFoundError(f"{shot.root} is not a shot folder: it has no shot.json")
         shot.info()
+        settle_solve(shot)
         return shot
 
     @classmethod
@@ -147,22 +145,6 @@ class Shot:
         return info
 
 
-def is_link(path: Path) -> bool:
-    """True for a symbolic link, and on Windows for a junction, whether or not it leads anywhere."""
-    try:
-        found = os.lstat(path)
-    except OSError:
-        return False
-    return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == _JUNCTION
-
-
-def checked_name(name: str, what: str) -> str:
-    """`name` if it is safe as a folder name; ValueError otherwise."""
-    if not _NAME.match(name) or name.endswith((".", " ")):
-        raise ValueError(f"{what} name {name!r} should be 1 to 64 letters, digits, spaces, '.', '_' or '-'")
-    return name
-
-
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A path beside `path`, with the same suffix, to write to; fsynced and renamed over `path` if all went well."""
@@ -173,7 +155,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield beside
         with open(beside, "rb+") as handle:
             os.fsync(handle.fileno())
-        _replace(beside, path)
+        replace_file(beside, path)
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
@@ -189,30 +171,38 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     fresh, aside = path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
     restore_folder(path)
-    shutil.rmtree(fresh, ignore_errors=True)
+    _discard(fresh)
     fresh.mkdir(parents=True)
     try:
         yield fresh
-        if path.exists():
-            _replace(path, aside)
-        _replace(fresh, path)
+        if os.path.lexists(path):
+            replace_file(path, aside)
+        replace_file(fresh, path)
     except BaseException:
         restore_folder(path)
         raise
     finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-    shutil.rmtree(aside, ignore_errors=True)
+        _discard(fresh)
+    _discard(aside)
 
 
 def restore_folder(path: Path) -> None:
-    """Puts back the folder that `replacing_folder` had moved aside when it was killed; removes it if it was replaced."""
+    """Puts back the folder that `replacing_folder` moved aside and was killed; if it was replaced, removes it."""
     aside = path.with_name(f".{path.name}.old")
-    if aside.is_dir() and not path.exists():
-        _replace(aside, path)
-    shutil.rmtree(aside, ignore_errors=True)
+    if aside.is_dir() and not os.path.lexists(path):
+        replace_file(aside, path)
+    _discard(aside)
 
 
-def _replace(source: Path, target: Path) -> None:
+def _discard(folder: Path) -> None:
+    """Removes a folder, or a link to one without following it."""
+    if is_link(folder):
+        remove_link(folder)
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def replace_file(source: Path, target: Path) -> None:
     """Renames over `target`; on Windows a reader may hold it open for a moment, so that is tried for two seconds."""
     for attempt in range(40):
         try:

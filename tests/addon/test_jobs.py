@@ -202,3 +202,95 @@ def test_a_job_with_broken_files_is_passed_over(addon, contract, empty_shot):
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     (job.folder / "status.json").write_text("{ half")
     assert jobs.latest(empty_shot) == {}
+
+
+@pytest.fixture
+def sleeper():
+    """sleeper(*words) is a process that does nothing for a minute, with these words in its command line."""
+    started = []
+
+    def start(*words: str) -> subprocess.Popen:
+        command = [sys.executable, "-c", "import time; print(flush=True); time.sleep(60)", *words]
+        started.append(subprocess.Popen(command, start_new_session=True, stdout=subprocess.PIPE))
+        started[-1].stdout.readline()  # before, the system may still show it without its command line
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def believed_running(jobs, contract, shot, pid: int, started: float, host: str):
+    """A train job whose status names a process, and that was asked to stop a minute ago."""
+    job = jobs.new_job(shot, "train", contract.TrainParams())
+    now = time.time()
+    job.status = contract.Status("train", "running", pid, now - 900, started, now - 600, host=host)
+    jobs.write_json(job.folder / "status.json", dataclasses.asdict(job.status))
+    jobs.cancel(job)
+    os.utime(job.folder / "cancel", (now - 60, now - 60))
+    return job
+
+
+@pytest.mark.parametrize(
+    "words", [(), ("-m", "torch_backend", "run-job", sys.prefix), ("-m", "torch_backend", "run-job")]
+)
+def test_cancel_ends_no_process_on_a_files_word(addon, contract, empty_shot, sleeper, words):
+    jobs, innocent = addon("jobs"), sleeper(*words)
+    for host in ("", contract.host_name()):
+        job = believed_running(jobs, contract, empty_shot, innocent.pid, contract.process_start(innocent.pid), host)
+        with pytest.raises(contract.JobError, match="cannot be told from others"):
+            jobs.cancel(job)
+        assert innocent.poll() is None
+
+
+def test_cancel_ends_no_process_that_has_another_start(addon, contract, empty_shot, sleeper):
+    jobs = addon("jobs")
+    job = jobs.new_job(empty_shot, "train", contract.TrainParams())
+    innocent = sleeper("-m", "torch_backend", "run-job", str(job.folder))
+    started = contract.process_start(innocent.pid)
+    assert started and contract.runs_job(innocent.pid, started, job.folder)
+    assert not contract.runs_job(innocent.pid, started + 1, job.folder)
+    assert not contract.runs_job(innocent.pid, 0.0, job.folder)
+    assert not contract.runs_job(innocent.pid, started, empty_shot)
+    for pid in (1, 0, -1, -innocent.pid, 10**30):
+        assert not contract.runs_job(pid, contract.process_start(pid), job.folder)
+
+
+def test_a_job_of_another_computer_is_neither_dead_nor_ended(addon, contract, empty_shot, sleeper):
+    jobs, innocent = addon("jobs"), sleeper()
+    job = believed_running(jobs, contract, empty_shot, innocent.pid, 1.0, "elsewhere (0a1b2c3d)")
+    assert jobs.is_alive(job, job.status)
+    with pytest.raises(contract.JobError, match="runs on elsewhere: only there"):
+        jobs.cancel(job)
+    before = (job.folder / "status.json").read_bytes()
+    jobs.poll(job)
+    assert job.state == "running" and (job.folder / "status.json").read_bytes() == before
+
+
+def test_a_job_that_is_stopped_is_alive_and_can_be_ended_by_another_blender(addon, contract, start_import, clip):
+    if sys.platform == "win32":
+        pytest.skip("SIGSTOP is POSIX")
+    jobs = addon("jobs")
+    job = start_import(clip)
+    while jobs.poll(job, 0.5) == [] and not job.ended:
+        time.sleep(0.02)
+    os.kill(job.process.pid, signal.SIGSTOP)
+    status = json.loads((job.folder / "status.json").read_text())
+    jobs.write_json(job.folder / "status.json", {**status, "heartbeat": time.time() - 600})
+    found = jobs.latest(job.shot)["import"]
+    assert found.process is None and not found.ended, "it has only slept"
+    jobs.cancel(found)
+    os.utime(job.folder / "cancel", (time.time() - 60, time.time() - 60))
+    jobs.cancel(found)
+    assert job.process.wait(timeout=20) == -signal.SIGKILL
+    jobs.poll(found)
+    assert found.state == "failed"
+
+
+def test_cancel_follows_no_link(addon, contract, empty_shot, tmp_path):
+    jobs = addon("jobs")
+    job = jobs.new_job(empty_shot, "train", contract.TrainParams())
+    (job.folder / "cancel").symlink_to(tmp_path / "elsewhere")
+    jobs.cancel(job)
+    assert not (tmp_path / "elsewhere").exists()

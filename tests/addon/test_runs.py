@@ -62,6 +62,24 @@ def test_the_button_says_what_it_will_do(addon, with_runs, shot):
     assert plan(addon, with_runs).kind == "extend", "it was begun on a run that is no longer there"
 
 
+def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, shot):
+    """The backend trains other settings in the run's folder `next`: the run is still listed as it is."""
+    props, shots = with_runs.splannequin, addon("shots")
+    config, before = {**CONFIG, "preset": "final", "seed": 9}, shots.stamp(shot)
+    work = shot / "runs" / "main" / "next" / "0123456789abcdef"
+    checkpoint(work / "checkpoint.safetensors", key="other", iteration=450, config=config)
+    (work / "metrics.jsonl").write_text('{"seconds": 3.0, "heldout_psnr_db": 20.0}\n')
+    assert shots.stamp(shot) != before, "the panel notices"
+    state = shots.read(shot)
+    assert set(state.runs) == {"main"} and set(state.unfinished) == {"better"}
+    assert addon("training").history(state.runs["main"], [(4.0, 21.0)]) == [(3.0, 20.0), (4.0, 21.0)]
+    assert plan(addon, with_runs).button == "Train On", "the run that is there is of the preset that is chosen"
+    props.preset = "final"
+    assert plan(addon, with_runs).kind == "resume" and "as it was" in plan(addon, with_runs).words
+    asked = addon("steps").params_of(with_runs, "train")
+    assert (asked.run, asked.preset, asked.seed, asked.iterations, asked.extend) == ("main", "final", 9, 900, 0)
+
+
 def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
     props, params_of = with_runs.splannequin, addon("steps").params_of
     props.extend_steps = 70
@@ -227,3 +245,27 @@ def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root,
     assert shots.read(shot).runs["main"]["iterations"] == 360
     assert addon("headless").main(["train", str(shot), "--run", "none", "--extend", "10"]) == 5
     assert "no trained run 'none'" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("link", ["takes/mine", "trash", "takes"])
+def test_removing_a_take_deletes_nothing_behind_a_link(addon, shot, new_take, tmp_path, link):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "holiday.png").write_bytes(b"mine")
+    new_take(tmp_path / "elsewhere", "mine")
+    path = shot / link
+    if link == "takes":
+        path.rename(shot / "was")
+        path.symlink_to(tmp_path / "elsewhere" / "takes", target_is_directory=True)
+    else:
+        path.symlink_to(mine, target_is_directory=True)
+    take = shot / "takes" / ("freeze" if link == "trash" else "mine")
+    remove = addon("listing").remove
+    if link == "takes":
+        with pytest.raises(OSError, match="takes is a link to another folder"):
+            remove(shot, take, wait=True)
+        assert len(list((tmp_path / "elsewhere" / "takes" / "mine").iterdir())) == 4
+    else:
+        remove(shot, take, wait=True)
+        assert not os.path.lexists(take) and not os.path.lexists(shot / "trash")
+    assert [p.name for p in mine.iterdir()] == ["holiday.png"]

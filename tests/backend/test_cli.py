@@ -1,6 +1,7 @@
 """The whole backend on a very small real clip, by its command line: files, figures, pixels; refusals in words."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from torch_backend.contract import ExitCode
+from torch_backend.contract import ExitCode, python_child
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png, resize
 from torch_backend.freeze.exr import read_frozen_exr
@@ -23,8 +24,9 @@ KEYS = {
 
 
 def run(*arguments):
-    command = [sys.executable, "-m", "torch_backend", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    command = python_child(sys.executable, "torch_backend", *map(str, arguments))
+    environ = {**os.environ, "PYTHONPATH": str(CLIP.parents[1])}
+    return subprocess.run(**command, env=environ, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +139,26 @@ def test_a_sequences_rate_and_layer_come_from_the_command_line(tmp_path):
     info = json.loads((shot / "shot.json").read_text())
     assert (info["fps"], info["last"]) == (12.0, 9)
     assert np.abs(read_png(shot / "frames/raw/000000.png") / 65535 - linear_to_srgb(wide[:, :64])).max() < 2e-3
+
+
+def test_a_failed_import_leaves_no_empty_shot(tmp_path):
+    wrong = tmp_path / "text.mp4"
+    wrong.write_text("no video")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    for folder in ("s.splannequin", "mine"):
+        done = run("import", tmp_path / folder, wrong)
+        assert done.returncode == ExitCode.FOOTAGE and "text.mp4" in done.stdout
+    assert run("freeze", wrong, "--output", tmp_path / "out").returncode == ExitCode.FOOTAGE
+    assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+
+
+def test_a_shot_folder_that_cannot_be_is_one_sentence(tmp_path):
+    (tmp_path / "file").touch()
+    for where in ("file/s.splannequin", "s" * 300):
+        done = run("import", tmp_path / where, CLIP)
+        assert done.returncode == ExitCode.USAGE and "Traceback" not in done.stderr
+        assert done.stderr.startswith("Error: Cannot write to") and done.stderr.count("\n") == 1
+        done = run("train", tmp_path / where)
+        assert done.returncode != 0 and done.stderr.startswith("Error: ") and done.stderr.count("\n") == 1

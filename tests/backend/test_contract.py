@@ -2,6 +2,9 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
+import time
 
 import pytest
 
@@ -51,3 +54,41 @@ def test_json_error_names_the_file(tmp_path):
     path.write_text("{ not json", encoding="utf-8")
     with pytest.raises(ValueError, match=r"broken\.json"):
         contract.read_json(path)
+
+
+def child_process() -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-c", "import time; print(flush=True); time.sleep(60)", "a word"]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    child.stdout.readline()  # before, the system may still show it without its command line
+    return child
+
+
+def test_a_process_is_known_by_its_start_and_command():
+    child = child_process()
+    try:
+        found = contract.process(child.pid)
+        assert found is not None and found.started and found.command.endswith("sleep(60) a word")
+        assert contract.process(child.pid) == found and contract.runs_still(child.pid, found.started)
+        assert not contract.runs_still(child.pid, found.started + 1)
+    finally:
+        child.kill()
+    while contract.process(child.pid) is not None:  # it has ended, and nobody has asked for its exit code yet
+        time.sleep(0.01)
+    child.communicate()
+    for pid in (child.pid, 0, -1, 10**30):
+        assert contract.process(pid) is None and not contract.runs_still(pid, 0.0)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="ps is POSIX")
+def test_ps_tells_the_same_as_proc():
+    """What macOS is asked; ps of Linux answers in the same words."""
+    before = time.time()
+    child = child_process()
+    try:
+        told, known = contract.process_of_ps(child.pid), contract.process(child.pid)
+        assert told is not None and known is not None and told.command == known.command
+        assert before - 5.0 < told.started < time.time() + 5.0
+    finally:
+        child.kill()
+        child.communicate()

@@ -1,9 +1,11 @@
 """Jobs: events in order, statuses that are true, cancellation, errors in words. Real files, real processes."""
 
 import json
+import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -96,10 +98,25 @@ def test_child_process_reports_an_unreadable_clip(shot, tmp_path):
     clip = tmp_path / "notes.mp4"
     clip.write_text("not a video")
     folder = job.new_job(shot, "import", contract.ImportParams(source=str(clip)))
-    done = subprocess.run(
-        [sys.executable, "-m", "torch_backend", "run-job", str(folder)], capture_output=True, text=True, check=False
-    )
+    command = contract.python_child(sys.executable, "torch_backend", "run-job", str(folder))
+    environ = {**os.environ, "PYTHONPATH": str(Path(contract.__file__).parents[1])}
+    done = subprocess.run(**command, env=environ, capture_output=True, text=True, check=False)
     assert done.returncode == ExitCode.FOOTAGE
     assert "Traceback" not in done.stdout + done.stderr
     assert "notes.mp4" in status_of(folder).message
     assert not list(shot.root.glob("frames/**/*.png"))
+
+
+def test_status_prints_no_escape_codes_and_goes_on_after_a_damaged_job(shot, capsys):
+    from torch_backend.cli import main
+
+    texts = {"a-import-\x1b[31m": {"state": "done", "message": "\x1b]0;title\x07 here\nand there"}, "b-import-1": {}}
+    for name, told in texts.items():
+        folder = shot.jobs / name
+        folder.mkdir(parents=True)
+        status = {"kind": "import", "pid": 1, "started": 1.0, "process_started": 1.0, "heartbeat": 1.0, **told}
+        (folder / contract.STATUS_FILE).write_text(json.dumps(status))
+    assert main(["status", str(shot.root)]) == ExitCode.OK
+    printed = capsys.readouterr().out
+    assert len(printed.splitlines()) == 2 and all(line.isprintable() for line in printed.splitlines())
+    assert "here and there" in printed and "damaged" in printed and "Status has no state" in printed

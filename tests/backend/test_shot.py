@@ -47,10 +47,17 @@ def test_json_refuses_nan(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["../up", "a/b", "", ".", "x" * 65, "dot."])
+@pytest.mark.parametrize(
+    "name", ["../up", "a/b", "", ".", "x" * 65, "dot.", "end ", "main\n", "CON", "nul.take", "Com1", "lpt9 .x", "COM²"]
+)
 def test_names_cannot_leave_the_shot(name):
     with pytest.raises(ValueError, match="name"):
         checked_name(name, "run")
+
+
+@pytest.mark.parametrize("name", ["main", "CONtact", "com10", "a b.c-d_e", "Träume", "auxiliary"])
+def test_names_of_people_are_taken(name):
+    assert checked_name(name, "run") == name
 
 
 def test_need_disk_says_how_much(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import splannequin
+from torch_backend.cards import Card
 
 LAUNCHER = Path(splannequin.__file__)
 
@@ -119,11 +120,11 @@ def test_a_test_run_that_leaves_no_report_counts_as_failed(tmp_path: Path):
         ("580.65.06", "9.0", "ok", "driver 580.65.06"),
         ("610.10", "7.5", "ok", "compute capability 7.5"),
         ("575.57.08", "8.9", "note", "R580"),
-        ("580.65.06", "7.0", "note", "7.5 or newer"),
+        ("580.65.06", "7.0", "note", "7.5 (Turing) or newer"),
         ("[N/A]", "8.9", "note", "not understood"),
     ],
 )
 def test_cards_are_held_against_what_warp_needs(driver: str, compute: str, state: str, says: str):
-    finding = splannequin.gpu_finding("Some card", driver, compute)
+    finding = splannequin.gpu_finding(Card("Some card", driver, compute))
     assert finding.state == state
     assert says in finding.text

@@ -90,6 +90,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
         for message, hint in opened.warnings + _remarks(extracted):
             report.warning(message, hint)
         record = _record(opened, config, extracted, key)
+        record["beside"] = _beside(shot, source)
         write_json(fresh / FRAMES_FILE, record)
         _keep_strangers(shot.frames, fresh, record)
     _publish(shot, record, source)
@@ -349,6 +350,14 @@ def _publish(shot: Shot, record: dict[str, Any], source: str) -> None:
         height=record["height"],
         colour=record["colour"],
     )
+
+
+def _beside(shot: Shot, source: str) -> str:
+    """Where the footage lies seen from the shot folder, with slashes: it holds where both were moved together."""
+    try:
+        return Path(os.path.relpath(source, shot.root)).as_posix()
+    except ValueError:  # another drive on Windows
+        return ""
 
 
 def _result(shot: Shot, record: dict[str, Any]) -> dict[str, Any]:

@@ -75,9 +75,14 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     try:
         _render_all(folder, frames, done, scene, look, keys, report)
         there = done | {f.frame for f in frames}
-        return _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, report)
+        facts = _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, report)
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
+    if run.stale:
+        report.warning(
+            "The run was trained while it was frozen: the take shows what it was before.", "Freeze it again."
+        )
+    return facts
 
 
 @dataclass
@@ -112,7 +117,7 @@ class Look:
         """Identifies what a frame shows and from what, to tell stale frames from good ones."""
         return content_key(
             TAKE_VERSION,
-            self.run.folder / "checkpoint.safetensors",
+            self.run.stamp,
             self.query,
             self.size,
             None if self.grain is None else [self.grain.to_json(), self.grain_size],
@@ -213,7 +218,7 @@ def take_key(
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
         TAKE_VERSION,
-        run.folder / "checkpoint.safetensors",
+        run.stamp,
         t_star,
         params.t_star_per_frame,
         params.query,

@@ -13,7 +13,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
+from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, open_regular, read_json
 from ..footage import load_frames
 from ..footage.images import read_png, write_png
 from ..footage.sources import frame_words
@@ -24,6 +24,7 @@ from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
+from .replacing import Staged, replacing_solve, settle_solve
 from .undistort import Undistorter
 
 SOLVE_VERSION = 1
@@ -32,6 +33,7 @@ LEAST_REGISTERED = 8
 REFUSED_SHARE = 0.5
 GOOD_SHARE, GOOD_ERROR_PX = 0.95, 1.2
 _WRITERS = 2
+_LOG_END_BYTES = 16_384
 
 
 @dataclass
@@ -78,7 +80,8 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 
     Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
     contract.CameraPath in COLMAP's world ("solve units"), OpenCV axes, world-to-camera, pinhole of the undistorted
-    frames. A shot already solved from the same frames with the same configuration is left alone.
+    frames. They take the place of a solve of before when all of them are written; until then, and if this one fails,
+    that one stays. A shot already solved from the same frames with the same configuration is left alone.
 
     With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
     its world, frames without one interpolated.
@@ -88,6 +91,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     _check(config)
     for folder in (shot.frames, shot.solve / "colmap"):  # where files of before are replaced
         shot.own(folder)
+    settle_solve(shot)
     frames = load_frames(shot)
     source = [foreign.fingerprint(cameras)] if cameras else []
     key = content_key(SOLVE_VERSION, config, frames["key"], *source)
@@ -95,9 +99,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
         return done["result"]
-    taken = prepare(frames, cameras, report) if cameras else None  # before anything is thrown away
-    for name in ("solve.json", "cameras.json"):
-        (shot.solve / name).unlink(missing_ok=True)
+    taken = prepare(frames, cameras, report) if cameras else None
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
     size = sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
     need_disk(shot.root, 1.2 * size + (len(frames["frames"]) << 20), "The camera solve")
@@ -110,9 +112,14 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
         else:
             options = {"overlap": config.overlap, "features": config.features}
             answer = take_over(shot, frames, taken, options, scratch, report)
-        result = _finish(shot, frames, answer, scratch, config, key, report)
+        with replacing_solve(shot) as staged:
+            result = _finish(shot, frames, answer, scratch, staged, key, report)
+    except JobError as error:
+        error.add_note(_log_end(shot.solve / "colmap.log"))
+        raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    report.metric("solve", dict(result))
     return result
 
 
@@ -123,6 +130,17 @@ def load_points(shot: Shot) -> dict[str, NDArray]:
         raise FileNotFoundError(f"{path} does not exist: solve the shot first")
     with np.load(path, allow_pickle=False) as data:
         return {name: data[name] for name in ("xyz", "rgb", "error", "track")}
+
+
+def _log_end(log: Path) -> str:
+    """What COLMAP said last, for the job's own log."""
+    try:
+        with open_regular(log) as handle:
+            handle.seek(max(0, os.fstat(handle.fileno()).st_size - _LOG_END_BYTES))
+            end = handle.read().decode("utf-8", errors="replace")
+    except (OSError, ValueError):
+        return ""
+    return f"The end of {log}:\n{end}"
 
 
 def _check(config: SolveConfig) -> None:
@@ -183,15 +201,17 @@ def _failure(answer: dict[str, Any]) -> JobError:
     )
 
 
-def refuse_poor(answer: dict[str, Any], solved: int) -> None:
-    """JobError for a model that nothing could be trained on."""
+def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
+    """JobError for a model that nothing could be trained on; `frames` is frames.json, whose solved frames it is of."""
+    solved = [f["frame"] for f in frames["frames"] if f["solve"]]
     registered, angle = answer["registered"], answer["triangulation_angle_deg"]
-    if registered < min(LEAST_REGISTERED, solved) or registered < REFUSED_SHARE * solved:
-        sizes = [size for size in answer["model_sizes"] if size >= LEAST_REGISTERED]
-        parts = f" (it falls into {len(sizes)} parts that do not connect)" if len(sizes) > 1 else ""
+    if registered < min(LEAST_REGISTERED, len(solved)) or registered < REFUSED_SHARE * len(solved):
+        parts = [_spans(solved, part) for part in answer["parts"] if len(part) >= LEAST_REGISTERED]
+        apart = f"; {len(parts)} parts of the clip do not connect" if len(parts) > 1 else ""
+        worked = f": {_span_words(parts[0])}" if parts else ""
         raise JobError(
-            f"Cameras were found for only {registered} of {solved} frames{parts}.",
-            "Choose a range without fast pans or blur, or a smaller step.",
+            f"Cameras were found for only {registered} of {len(solved)} frames{worked}{apart}.",
+            _range_hint(parts, solved, frames["step"]),
             ExitCode.SOLVE,
         )
     refuse_narrow(angle)
@@ -203,19 +223,47 @@ def refuse_poor(answer: dict[str, Any], solved: int) -> None:
         )
 
 
+def _spans(solved: list[int], names: list[str]) -> list[tuple[int, int, int]]:
+    """(first, last, how many) of each unbroken row of `solved` frames whose pictures are among `names`."""
+    placed = {int(Path(name).stem) for name in names}
+    spans: list[tuple[int, int, int]] = []
+    before = False
+    for frame in solved:
+        if frame in placed:
+            first, count = (spans[-1][0], spans[-1][2]) if before else (frame, 0)
+            spans[-1 if before else len(spans) :] = [(first, frame, count + 1)]
+        before = frame in placed
+    return spans
+
+
+def _span_words(spans: list[tuple[int, int, int]]) -> str:
+    """'12 to 41, 60 to 74', the longest four of them, in the clip's order."""
+    longest = sorted(sorted(spans, key=lambda span: span[2], reverse=True)[:4])
+    return ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last, _ in longest)
+
+
+def _range_hint(parts: list[list[tuple[int, int, int]]], solved: list[int], step: int) -> str:
+    """What can help: a range that worked, and a smaller step only where there is one."""
+    best = max((span for part in parts for span in part), key=lambda span: span[2], default=(0, 0, 0))
+    smaller = " A smaller step shows more of each to the next." if step > 1 else ""
+    if best[2] < LEAST_REGISTERED or best[2] == len(solved):
+        return f"Choose a range without fast pans or blur.{smaller}"
+    return f"Frames {best[0]} to {best[1]} worked: import that range, or one without fast pans or blur.{smaller}"
+
+
 def _finish(
     shot: Shot,
     frames: dict[str, Any],
     answer: dict[str, Any],
     scratch: Path,
-    config: SolveConfig,
+    staged: Staged,
     key: str,
     report: Reporter,
 ) -> SolveResult:
-    """Checks the worker's answer and writes the solve's files, solve.json last."""
+    """Checks the worker's answer and writes the solve's files to where they wait until they are whole."""
     solved = sum(f["solve"] for f in frames["frames"])
     if "given" not in answer:
-        refuse_poor(answer, solved)
+        refuse_poor(answer, frames)
     poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
     maps = [scratch / f"undistort_{n}.npz" for n in range(1 + max(p.get("lens", 0) for p in poses.values()))]
     path, lenses = _camera_path(frames, poses, [_pinhole(file) for file in maps])
@@ -223,12 +271,11 @@ def _finish(
         points = filter_points({name: data[name] for name in data.files}, _centres(path))
     if "given" in answer:
         refuse_misfit(answer, len(points["xyz"]))
-    _undistort_all(shot, frames, lenses, maps, report)
-    with atomic_path(shot.solve / "points.npz") as beside:
+    _undistort_all(shot, frames, lenses, maps, staged.frames, report)
+    with atomic_path(staged.solve / "points.npz") as beside:
         np.savez(beside, **points)  # pyright: ignore[reportArgumentType]
-    shutil.rmtree(shot.solve / "colmap", ignore_errors=True)
-    (scratch / "model").rename(shot.solve / "colmap")
-    write_json(shot.solve / "cameras.json", path.to_json())
+    (scratch / "model").rename(staged.solve / "colmap")
+    write_json(staged.solve / "cameras.json", path.to_json())
     result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
     warnings = _warnings(frames, path, result, "given" in answer) + doubts(answer)
     for message, hint in warnings:
@@ -252,8 +299,7 @@ def _finish(
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,
     }
-    write_json(shot.solve / "solve.json", record)
-    report.metric("solve", dict(result))
+    write_json(staged.solve / "solve.json", record)
     return result
 
 
@@ -287,23 +333,29 @@ def _centres(path: CameraPath) -> NDArray[np.float64]:
     return np.array([camera_centre(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
 
 
-def _undistort_all(shot: Shot, frames: dict[str, Any], lenses: list[int], maps: list[Path], report: Reporter) -> None:
-    """Writes the undistorted frames, lens by lens: a map takes 128 bytes per pixel."""
+def _undistort_all(
+    shot: Shot, frames: dict[str, Any], lenses: list[int], maps: list[Path], into: Path, report: Reporter
+) -> None:
+    """Writes the undistorted frames to a folder, lens by lens: a map takes 128 bytes per pixel."""
     done = 0
     for number, file in enumerate(maps):
         rows = [frame for frame, lens in zip(frames["frames"], lenses, strict=True) if lens == number]
         if rows:
-            _undistort(shot, rows, file, done, len(lenses), report)
+            _undistort(shot, rows, file, into, (done, len(lenses)), report)
         done += len(rows)
 
 
-def _undistort(shot: Shot, listed: list[dict[str, Any]], file: Path, before: int, total: int, report: Reporter) -> None:
+def _undistort(
+    shot: Shot, listed: list[dict[str, Any]], file: Path, into: Path, counts: tuple[int, int], report: Reporter
+) -> None:
+    """Frames of one lens; `counts` are the frames done before these, and all there are."""
+    before, total = counts
     with np.load(file, allow_pickle=False) as data:
         undistort = Undistorter(data["where"])
 
     def one(frame: dict[str, Any]) -> int:
         pixels = read_png(shot.frames / frame["file"])
-        write_png(shot.frames / frame_file(frame["frame"], ".png"), undistort(pixels))
+        write_png(into / frame_file(frame["frame"], ".png"), undistort(pixels))
         return frame["frame"]
 
     with ThreadPoolExecutor(_WRITERS) as pool:

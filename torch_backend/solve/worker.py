@@ -84,16 +84,16 @@ def main(path: str) -> int:
     if not models:
         say(failure="turning" if turning_share(request) > TURNING_SHARE else "no_pair", flow_px=flow)
         return 0
-    sizes = sorted((m.num_reg_images() for m in models), reverse=True)
     # The first model that the mapper writes is often a fragment: the largest is meant.
-    model = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
+    models.sort(key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
+    model = models[0]
     poses = localise(request, model)
     write_answers(request, model, poses)
     camera = next(iter(model.cameras.values()))
     say(
         result={
             "registered": model.num_reg_images(),
-            "model_sizes": sizes,
+            "parts": [sorted(image.name for image in m.images.values() if image.has_pose) for m in models],
             "reprojection_error_px": model.compute_mean_reprojection_error(),
             "points": model.num_points3D(),
             "triangulation_angle_deg": triangulation_angle(model),

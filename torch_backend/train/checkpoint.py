@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +18,24 @@ from ..contract import ExitCode, JobError, check_version
 from ..shot import atomic_path
 
 CHECKPOINT_VERSION = 1
+CHECKPOINT_FILE = "checkpoint.safetensors"
+"""Of a run, in its folder."""
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-    """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then."""
+    """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then.
+
+    OSError if it cannot be written (errno ENOSPC when the disk is full).
+    """
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"version": CHECKPOINT_VERSION, **meta}, allow_nan=False)
     with atomic_path(path) as beside:
-        save_file(contiguous, str(beside), metadata={"splannequin": text})
+        try:
+            save_file(contiguous, str(beside), metadata={"splannequin": text})
+        except SafetensorError as error:  # it hands the system's reason on in words: "... (os error 28)"
+            code = int(told[1]) if (told := re.search(r"os error (\d+)", str(error))) else errno.EIO
+            windows = (code,) if os.name == "nt" else ()
+            raise OSError(code, f"checkpoint not written: {error}", str(path), *windows) from error
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -60,9 +73,17 @@ def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) 
 
 
 def restore_optimizer(named: dict[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Inverse of `optimizer_state`."""
+    """Inverse of `optimizer_state`: moments lie where their parameter does, in its type and order, counts beside them.
+
+    Gaussians may be cloned and dropped, moments with them, before the optimiser makes another step.
+    """
     for name, parameter in named.items():
         keys = ("step", "exp_avg", "exp_avg_sq")
         stored = {key: tensors.get(f"adam.{key}.{name}") for key in keys}
-        if all(value is not None for value in stored.values()):
-            optimizer.state[parameter] = {key: value.clone() for key, value in stored.items() if value is not None}
+        state = {}
+        for key, value in stored.items():
+            if value is not None:
+                like = torch.zeros((), device=parameter.device) if key == "step" else parameter.detach()
+                state[key] = torch.empty_like(like).copy_(value)
+        if len(state) == len(keys):
+            optimizer.state[parameter] = state

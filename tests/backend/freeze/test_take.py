@@ -1,6 +1,7 @@
 """Frozen frames of the tiny world against its truth: pixels, mattes, depth, stale frames, cancellation."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.gaussians.ply import read_ply
 from torch_backend.shot import write_json
 from torch_backend.train import load_run, train_shot
+from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +53,29 @@ def test_two_instants_differ_where_the_patch_moved_and_nowhere_else(trained, tak
     assert difference[moved].mean() > 0.05
     assert difference[still].mean() < 0.012
     assert early.motion[moved].mean() > 0.35 > 0.15 > early.motion[still].mean()
+
+
+def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(trained, quiet):
+    """They are the old model's: the key of the new one would keep them for good."""
+    world, _ = trained
+    run = shutil.copytree(world.shot.run("main"), world.shot.run("trained meanwhile"))
+    tensors, meta = load_checkpoint(run / "checkpoint.safetensors")
+    tensors["gaussians.sh0"] = -tensors["gaussians.sh0"]
+
+    class TrainsMeanwhile(quiet):
+        def warning(self, message, hint=""):
+            super().warning(message, hint)
+            if "was not trained on" in message:  # said between the loading of the model and the first frame
+                save_checkpoint(run / "checkpoint.safetensors", tensors, meta)
+
+    asked = FreezeParams(run=run.name, take="meanwhile", t_star=109, first=105, last=105, only_missing=True)
+    frame, report = world.shot.take("meanwhile") / "000105.exr", TrainsMeanwhile()
+    freeze_shot(world.shot, asked, report)
+    old, again = read_frozen_exr(frame), quiet()
+    freeze_shot(world.shot, asked, again)
+    assert np.abs(read_frozen_exr(frame).rgba - old.rgba).mean() > 0.1, "rendered again, from the new model"
+    told = ["trained while it was frozen" in "".join(str(e) for e in r.events) for r in (report, again)]
+    assert told == [True, False]
 
 
 def test_depth_is_in_solve_units_and_empty_is_1e10(trained, takes):

@@ -1,0 +1,185 @@
+"""Shots whose files are not what we write: no read of Blender's hangs, raises or draws them."""
+
+import copy
+import json
+import os
+import random
+import socket
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+RUN, TAKE = "runs/main/summary.json", "takes/freeze/take.json"
+WEIRD = [
+    None, True, -1, 0, 10**12, 10**400, 1e308, float("nan"), float("-inf"), "", "x" * 5000, "\x1b[31mred\n", "\ud800",
+    "../../up", [], [None], [[]], {}, {"a": {}}, "²",
+]  # fmt: skip
+
+
+@pytest.fixture
+def full_shot(addon, contract, shot) -> Path:
+    """The test shot with a paused run, measurements, and a job of every kind that has ended."""
+    (shot / "runs" / "main" / "metrics.jsonl").write_text('{"seconds": 1.0, "heldout_psnr_db": 20.0}\n' * 3)
+    jobs = addon("jobs")
+    for kind, cls in contract.PARAMS.items():
+        folder = jobs.new_job(shot, kind, cls()).folder
+        status = {"kind": kind, "state": "done", "pid": 1, "started": 1.0, "process_started": 2.0, "heartbeat": 2.0}
+        (folder / "status.json").write_text(json.dumps({**status, "stage": "s", "fraction": 0.5, "host": "elsewhere"}))
+        told = [("warning", {"message": "m", "hint": "h"}), ("image", {"label": "preview", "path": "p.png"})]
+        told += [("metric", {"stage": "s", "values": {"seconds": 1, "heldout_psnr_db": 2}})]
+        told += [("done", {"state": "done", "result": {"t_star_frame": 6}})]
+        lines = [{"type": t, "seq": n, "time": 1.0, "data": d, "version": 1} for n, (t, d) in enumerate(told)]
+        (folder / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        (folder / "log.txt").write_text("a line\n")
+        (folder / "step").write_text("footage")
+    return shot
+
+
+def files_of(shot: Path) -> list[Path]:
+    """What Blender's main thread reads of a shot."""
+    named = ["shot.json", "frames/frames.json", "solve/solve.json", RUN, TAKE, "runs/main/metrics.jsonl"]
+    jobs = sorted(p for p in (shot / "jobs").glob("*/*") if "train" in p.parent.name)
+    return [*(shot / name for name in named), *jobs]
+
+
+@pytest.fixture
+def look(addon, scene):
+    """look(shot) does all that Blender does with a shot that is chosen, and returns every text that it would draw."""
+    supervisor, jobs, panel, listing = addon("supervisor"), addon("jobs"), addon("panel"), addon("listing")
+
+    def all_of(shot: Path) -> list[str]:
+        supervisor.forget()
+        scene.splannequin.shot_path = str(shot)
+        watch = supervisor.watch_of(shot)
+        texts = [words for failure in watch.failures.values() for words in failure]
+        for name, view in panel.VIEWS.items():
+            shown = view(scene, watch.state)
+            texts += [*shown.state, shown.advice, name]
+        for row in listing.run_rows(watch.state) + listing.take_rows(watch.state):
+            texts += row
+        texts += [told for damaged in watch.state.damaged.values() for told in damaged.values()]
+        addon("training").plan(watch.state, "main", "preview")
+        for run in watch.state.runs.values():
+            if len(run["history"]) > 1:
+                addon("pictures").curve(run["history"], (64, 32))
+        for job in jobs.latest(shot).values():
+            job.status = None
+            jobs.poll(job)
+            texts += jobs.log_tail(job.folder)
+            if job.status is not None:
+                texts += [job.status.message, job.status.stage, job.status.hint]
+            texts += [words for warning in job.warnings for words in warning]
+        for kind in ("runs", "takes"):
+            texts += [words for pair in addon("props").names_of(scene.splannequin, kind) for words in pair]
+        return texts
+
+    return all_of
+
+
+def test_a_whole_shot_is_not_damaged(look, full_shot, addon):
+    assert not any("damaged" in text or "cannot be read" in text for text in look(full_shot))
+    state = addon("shots").read(full_shot)
+    assert state.listed("run") == ["main"] and state.listed("take") == ["freeze"] and len(state.runs["main"]["history"])
+
+
+def mutated(told: object, random_: random.Random) -> object:
+    """A JSON value with one part of it changed, left out, or put elsewhere."""
+    told = copy.deepcopy(told)
+    if not isinstance(told, (dict, list)) or not told or random_.random() < 0.15:
+        return random_.choice(WEIRD)
+    key = random_.choice(list(told) if isinstance(told, dict) else range(len(told)))
+    if random_.random() < 0.2:
+        del told[key]
+    else:
+        told[key] = mutated(told[key], random_)
+    return told
+
+
+def test_files_with_anything_in_them_are_passed_over_or_told(look, full_shot):
+    random_ = random.Random(13)
+    files = [f for f in files_of(full_shot) if f.suffix in (".json", ".jsonl")]
+    for n in range(400):
+        path = random_.choice(files)
+        before = path.read_bytes()
+        lines = before.splitlines()
+        line = random_.randrange(len(lines)) if path.suffix == ".jsonl" else 0
+        whole = json.loads(lines[line] if path.suffix == ".jsonl" else before)
+        after = json.dumps(mutated(whole, random_)).encode()
+        if random_.random() < 0.2:
+            cut = random_.randrange(len(after) + 1)
+            after = after[:cut] + random_.randbytes(3) + after[cut:]
+        elif random_.random() < 0.05:
+            after = b"[" * 100_000
+        lines[line : None if path.suffix == ".json" else line + 1] = [after]
+        path.write_bytes(b"\n".join(lines) + b"\n")
+        try:
+            for text in look(full_shot):
+                assert len(text) < 6000 and (text.isprintable() or len(text.splitlines()) == 1)
+                text.encode("utf-8")
+        except Exception as error:
+            raise AssertionError(f"mutation {n}: {path.name} with {after[:300]!r}") from error
+        path.write_bytes(before)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="special files are POSIX")
+@pytest.mark.parametrize("what", ["pipe", "zero", "socket", "folder", "dangling", "itself"])
+def test_files_that_are_none_hold_nothing_up(look, full_shot, what, tmp_path):
+    ended = threading.Event()
+    watchdog = threading.Thread(target=lambda: ended.wait(60) or os._exit(3), daemon=True)
+    watchdog.start()  # a read of a pipe waits for ever, and takes no exception
+    for path in files_of(full_shot):
+        before = path.read_bytes()
+        path.unlink()
+        if what == "pipe":
+            os.mkfifo(path)
+        elif what == "zero":
+            path.symlink_to("/dev/zero")
+        elif what == "socket":
+            os.chdir(path.parent)  # a socket's path may be 100 letters long
+            socket.socket(socket.AF_UNIX).bind(path.name)
+            os.chdir(tmp_path)
+        elif what == "folder":
+            path.mkdir()
+        else:
+            path.symlink_to(path if what == "itself" else path.parent / "gone")
+        look(full_shot)
+        path.rmdir() if what == "folder" else path.unlink()
+        path.write_bytes(before)
+    ended.set()
+
+
+def test_a_damaged_run_and_take_are_shown_as_such(look, full_shot, addon):
+    shots, listing = addon("shots"), addon("listing")
+    for file in (RUN, TAKE):
+        told = json.loads((full_shot / file).read_text())
+        (full_shot / file).write_text(json.dumps({**told, "run": ["main"]}))
+    state = shots.read(full_shot)
+    assert state.runs == {} and state.takes == {}
+    assert listing.run_rows(state) == [("main", "damaged")] and listing.take_rows(state) == [("freeze", "damaged")]
+    assert state.damaged["run"]["main"].endswith("summary.json is damaged: Run.run cannot be a list.")
+    assert any("take.json is damaged: Take.run" in text for text in look(full_shot))
+
+
+def test_folders_that_cannot_be_shown_are_no_runs(full_shot, addon):
+    names = ["main\n", ".main.new", os.fsdecode(b"\xff")]
+    for name in names if sys.platform == "linux" else names[1:2]:
+        (full_shot / "runs" / name).mkdir()
+        (full_shot / "runs" / name / "summary.json").write_text('{"gaussians": 3}')
+    assert addon("shots").read(full_shot).listed("run") == ["main"]
+
+
+def test_a_line_without_end_does_not_fill_the_memory(full_shot, addon, contract):
+    jobs = addon("jobs")
+    job = next(job for job in jobs.latest(full_shot).values() if job.kind == "train")
+    with open(job.folder / "events.jsonl", "r+b") as events:
+        events.truncate(1 << 40)  # a hole: no disk is used
+    events = jobs.poll(job, 0.05)
+    assert not events and job.read_to < 1 << 32
+    long = b'{"type": "' + b"x" * (3 * contract.LONGEST_LINE) + b'"}\n'
+    short = b'{"type": "warning", "seq": 0, "time": 0, "data": {"message": "after", "hint": ""}}\n'
+    (job.folder / "events.jsonl").write_bytes(long + short)
+    job.read_to, job.warnings = 0, []
+    jobs.poll(job, 1.0)
+    assert job.warnings == [("after", "")]
