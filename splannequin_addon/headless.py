@@ -319,7 +319,7 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
 
 def _import_params(args: argparse.Namespace) -> contract.ImportParams:
     clip = args.clip if "://" in args.clip else str(Path(args.clip).absolute())
-    return contract.ImportParams(clip, args.first, args.last, args.step, args.working_height, args.fps)
+    return contract.ImportParams(clip, args.first, args.last, args.step, args.working_height, args.fps, args.layer)
 
 
 def _train_params(args: argparse.Namespace) -> contract.TrainParams:
@@ -462,6 +462,7 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
     to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
     to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
+    to.add_argument("--layer", default="", metavar="NAME", help="EXR layer or part to take (default: the picture)")
 
 
 def _add_solve_flags(to: argparse.ArgumentParser) -> None:

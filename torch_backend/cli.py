@@ -273,7 +273,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
 
 def _import_params(args: argparse.Namespace) -> contract.ImportParams:
     span = (args.first, args.last)
-    return contract.ImportParams(_source(args.clip), *span, args.step, args.working_height, args.fps)
+    return contract.ImportParams(_source(args.clip), *span, args.step, args.working_height, args.fps, args.layer)
 
 
 def _source(clip: str) -> str:
@@ -359,6 +359,7 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
     to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
     to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
+    to.add_argument("--layer", default="", metavar="NAME", help="EXR layer or part to take (default: the picture)")
     if not any(a.dest == "camera_model" for a in to._actions):
         to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
 

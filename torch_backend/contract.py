@@ -52,6 +52,8 @@ HEARTBEAT_SECONDS = 2.0
 """How often a living job rewrites status.json."""
 GRACE_SECONDS = 30.0
 """How long a cancelled process may take for its checkpoint before it is ended by force."""
+LAST_FRAME = 1_048_574
+"""Blender's last frame number: no scene reaches further."""
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
 SHORT_JSON = 1 << 20
@@ -128,6 +130,8 @@ class ImportParams:
     """Height in pixels of the working frames; 0: the source's, at most 720."""
     fps: float = 0.0
     """Frames per second of a sequence; 0: the footage's own, 24 for a sequence that says none."""
+    layer: str = ""
+    """Layer or part of a sequence's pictures to take, by its name or the end of it; empty: the picture itself."""
 
 
 @dataclass

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import Reporter, frame_file, read_json
+from ..contract import LAST_FRAME, Reporter, frame_file, read_json
 from ..shot import Shot, content_key, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import resize, working_size, write_png
-from .sources import Source, SourceFrame, footage_error, frame_words, open_source
+from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, footage_error, frame_words, open_source
 
 FRAMES_VERSION = 1
 FRAMES_FILE = "frames.json"
@@ -106,10 +106,10 @@ def load_frames(shot: Shot) -> dict[str, Any]:
 
 
 def _check(config: FootageConfig) -> None:
-    if config.step < 0 or config.working_height < 0 or config.fps < 0:
-        raise ValueError(
-            f"step, working_height and fps cannot be negative: {config.step}, {config.working_height}, {config.fps}"
-        )
+    if config.step < 0 or config.working_height < 0:
+        raise ValueError(f"step and working_height cannot be negative: {config.step}, {config.working_height}")
+    if config.fps and not SLOWEST_FPS <= config.fps <= FASTEST_FPS:  # NaN is neither
+        raise ValueError(f"fps is {config.fps}: it should be {SLOWEST_FPS} to {FASTEST_FPS:g}, or 0: the footage's own")
     if config.first is not None and config.last is not None and config.last - config.first + 1 < LEAST_FRAMES:
         raise footage_error(
             f"Frames {config.first} to {config.last} are too few: a freeze needs at least {LEAST_FRAMES}.",
@@ -125,6 +125,12 @@ def _check_range(opened: Source, config: FootageConfig) -> None:
     last = info.last if config.last is None else config.last
     if first > info.last or last < info.first:
         raise footage_error(f"Frames {first} to {last} lie outside of the clip, which has {info.first} to {info.last}.")
+    first, last = max(first, info.first), min(last, info.last)
+    if last > LAST_FRAME or first < -LAST_FRAME:
+        raise footage_error(
+            f"The frames are numbered {first} to {last}: Blender's frames end at {LAST_FRAME}.",
+            "Renumber the files from 1, or from 1001, or choose a range below that.",
+        )
 
 
 def _finished(shot: Shot, key: str) -> dict[str, Any] | None:

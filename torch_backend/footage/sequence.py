@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 from .color import InputSpace, named_space, space_of_chromaticities
 from .images import resize
 from .layers import Layer, find_layer, shown
-from .sources import SourceFrame, SourceInfo, believable_aspect, footage_error, frame_words, square_size
+from .sources import (
+    FASTEST_FPS,
+    SLOWEST_FPS,
+    SourceFrame,
+    SourceInfo,
+    believable_aspect,
+    footage_error,
+    frame_words,
+    square_size,
+)
 
 PICTURES = {
     ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
@@ -94,7 +103,7 @@ class SequenceSource:
         rate = spec.getattribute("framesPerSecond") or spec.getattribute("FramesPerSecond")
         if isinstance(rate, tuple):  # a rational, as OpenEXR stores it
             rate = rate[0] / rate[1] if rate[1] else 0.0
-        rate = rate if isinstance(rate, (int, float)) and 0.1 <= rate <= 1000.0 else 0.0
+        rate = rate if isinstance(rate, (int, float)) and SLOWEST_FPS <= rate <= FASTEST_FPS else 0.0
         space, light = self._space, self._space.is_light
         told = [space.name, self._layer.name, float(self._aspect), "straight"]
         ordinary = space.as_it_stands or space == InputSpace("lin", told=space.told)

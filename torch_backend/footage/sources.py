@@ -17,6 +17,10 @@ LONGEST_PIXEL = 4
 """Anamorphic pixels are at most about 2 times as wide as high."""
 
 
+SLOWEST_FPS, FASTEST_FPS = 0.1, 1000.0
+"""Rates of image sequences that are believed: what else a file or a person says is a slip."""
+
+
 @dataclass
 class SourceFrame:
     """One frame as the source holds it."""
@@ -132,4 +136,8 @@ def open_source(source: str, fps: float = 0.0, layer: str = "") -> Source:
         raise footage_error(
             f"The footage {source} does not exist.", "Check the path; a clip on a server must be mounted."
         )
-    return VideoSource(path)
+    video = VideoSource(path)
+    for value, what, own in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
+        if value:
+            video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {own}.", ""))
+    return video

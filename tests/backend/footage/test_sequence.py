@@ -1,5 +1,7 @@
 """Image sequences: real EXR and PNG files, their numbers, depth and colour."""
 
+import struct
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -359,6 +361,28 @@ def test_film_log_becomes_light(tmp_path, transfer):
     assert pixel == pytest.approx((10 ** ((codes - 685) * 0.002 / 0.6) - black) / (1 - black), abs=2e-4)
     assert said(source)[0].startswith("The pictures are Cineon log: read with black at code 95")
     assert source.info.colour == "linear"
+
+
+def write_cineon(path, codes):
+    """8 x 8 pixels of one colour in ten bits, by Kodak's description of the format: OpenImageIO only reads it."""
+    head = struct.pack(">6I8s100s12s12s36x", 0x802A5FD7, 2048, 1024, 1024, 0, 2304, b"V4.5", b"", b"", b"")
+    head += struct.pack(">BB2x", 0, 3)
+    for i in range(8):
+        sides = (10, 8, 8) if i < 3 else (0, 0, 0)
+        head += struct.pack(">BBBxII4f", 0, i + 1 if i < 3 else 0, *sides, 0, 0, 1023, 2.046)
+    head += bytes(260) + struct.pack(">4B2I20x", 0, 5, 0, 0, 0, 0)
+    red, green, blue = codes
+    path.write_bytes(head.ljust(2048, b"\0") + struct.pack(">I", red << 22 | green << 12 | blue << 2) * 64)
+
+
+def test_cineon_files_are_read_as_film_log(tmp_path):
+    codes = np.array([95, 470, 685])
+    for i in range(3):
+        write_cineon(tmp_path / f"a.{i}.cin", codes.tolist())
+    source, pixel = first_of(tmp_path)
+    black = 10 ** ((95 - 685) * 0.002 / 0.6)
+    assert pixel == pytest.approx((10 ** ((codes - 685) * 0.002 / 0.6) - black) / (1 - black), abs=2e-4)
+    assert said(source)[0].startswith("The pictures are Cineon log")
 
 
 def test_a_dpx_that_does_not_say_what_it_is_is_told(tmp_path):
