@@ -239,10 +239,7 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
     if folder is None:
         raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
     backend.python()  # before anything is written: without a backend there is nothing to start
-    if any(not job.ended and jobs.is_alive(job, job.status) for job in jobs.latest(folder).values()):
-        raise contract.JobError(
-            f"A step of {folder.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
-        )
+    jobs.refuse_second_writer(folder)
     try:
         if step == "footage":
             shots.create(folder)
