@@ -367,7 +367,8 @@ def _train(spec: RunSpec, truth: TruthScene, run_name: str, jobs: int) -> tuple[
         facts = {"version": 1, **pace, "train_cpu_seconds": None}
         write_json(path, facts)
     since = time.process_time()
-    code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print)
+    # Several children train runs of one shot at once, each under the lock of its run's name.
+    code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print, alone=False)
     if code != ExitCode.OK:
         return int(code), "", facts
     if whole:

@@ -61,6 +61,8 @@ class Job:
     """Latest picture by label: path."""
     result: Any = None
     """What the job answered in its `done` event."""
+    beat: tuple[float, float] | None = None
+    """Last sign of life of a job of another computer, and when it was first seen, monotonic seconds."""
 
     @property
     def shot(self) -> Path:
@@ -162,19 +164,53 @@ def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
 
 
 def is_alive(job: Job, status: contract.Status | None) -> bool:
-    """True if the job's process still works on it, or may be about to. One of another computer is never judged dead.
+    """True if the job's process still works on it, or may be about to.
 
-    A process that is only stopped, as by a computer that slept, is alive whatever its last sign of life.
+    A process that is only stopped, as by a computer that slept, is alive whatever its last sign of life. One of
+    another computer is alive as long as the shot's lock is its: that can be taken away there, or by hand.
     """
     if job.process is not None:
         return job.process.poll() is None
     if status is None or not status.pid:
         return time.time() - _made(job.folder) < _START_SECONDS
     if status.host and status.host != contract.host_name():
-        return True
+        return _holds(job) or not _silent(job, status)
     if status.host or (status.process_started and sys.platform == "linux"):
         return contract.runs_still(status.pid, status.process_started)
     return time.time() - status.heartbeat < _SILENT_SECONDS  # from an older backend, that did not say where it ran
+
+
+def refuse_second_writer(shot: Path) -> None:
+    """JobError, with what runs, since when, where and what to do, if a job writes into the shot or is about to."""
+    try:
+        writer = contract.read_writer(shot)
+    except (OSError, ValueError):
+        writer = None  # a damaged lock: the backend says so
+    if writer is not None and writer.works():
+        raise contract.busy(shot, writer)
+    for job in latest(shot).values():
+        here = job.status is None or job.status.host in ("", contract.host_name())  # others have the lock
+        if here and not job.ended and is_alive(job, job.status):
+            raise contract.JobError(
+                f"A step of {shot.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
+            )
+
+
+def _holds(job: Job) -> bool:
+    """True if the shot's lock is the job's, or cannot be read."""
+    try:
+        writer = contract.read_writer(job.shot)
+    except (OSError, ValueError):
+        return True
+    return writer is not None and writer.job == job.folder.name
+
+
+def _silent(job: Job, status: contract.Status) -> bool:
+    """True if a job gave no sign of life while we watched: another computer's clock may be wrong, its beats are not."""
+    now = time.monotonic()
+    if job.beat is None or job.beat[0] != status.heartbeat:
+        job.beat = (status.heartbeat, now)
+    return now - job.beat[1] > _SILENT_SECONDS
 
 
 def cancel(job: Job) -> None:
@@ -346,7 +382,7 @@ class _Picture:
 
 @dataclass
 class _End:
-    state: str
+    state: str = "done"
     result: Any = None
 
 
@@ -389,7 +425,8 @@ def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
         if killed
         else f"Start it again: finished work is kept. Its whole log is {job.folder / contract.LOG_FILE}"
     )
-    write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
+    if status.host in ("", contract.host_name()):  # what another computer writes is not ours to correct
+        write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
     return status
 
 

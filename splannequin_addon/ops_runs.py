@@ -9,7 +9,8 @@ from typing import Any
 import bpy
 from bpy.props import StringProperty
 
-from . import listing, props, steps, supervisor, viewport
+from ..torch_backend import contract
+from . import jobs, listing, props, steps, supervisor, viewport
 from .translations import tr
 
 
@@ -105,7 +106,10 @@ class _Remove(_Pick):
         refusal = self.refusal(watch.shot, folder) if there else f"This shot has no {self.kind} {name!r}"
         if not refusal:
             try:
+                jobs.refuse_second_writer(watch.shot)  # also one that was started from a command line
                 listing.remove(watch.shot, folder, wait=bpy.app.background)
+            except contract.JobError as error:
+                refusal = f"{error.message} {error.hint}"
             except OSError as error:
                 refusal = f"{folder} cannot be removed: {error.strerror or error}"
         if refusal:

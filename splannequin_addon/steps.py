@@ -246,6 +246,10 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
     params = params or params_of(scene, step)
     folder = _needed(scene, step)
     backend.python()  # before anything is written: without a backend there is nothing to start
+<<<<<<< HEAD
+=======
+    jobs.refuse_second_writer(folder)
+>>>>>>> h-jobs
     try:
         if any(not job.ended and jobs.is_alive(job, job.status) for job in jobs.latest(folder).values()):
             raise contract.JobError(

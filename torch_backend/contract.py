@@ -28,7 +28,10 @@ import stat
 import struct
 import subprocess
 import sys
+<<<<<<< HEAD
 import threading
+=======
+>>>>>>> h-jobs
 import time
 import typing
 from collections.abc import Generator, Mapping
@@ -45,6 +48,7 @@ STATUS_FILE = "status.json"
 EVENTS_FILE = "events.jsonl"
 LOG_FILE = "log.txt"
 CANCEL_FILE = "cancel"
+WRITER_FILE = "lock.json"
 JOB_COMMAND = "-m torch_backend run-job"
 """How the process of a job was called, but for its Python and the job's folder."""
 
@@ -328,6 +332,62 @@ class Status:
     def ended(self) -> bool:
         """True once the job will write nothing more."""
         return self.state in ("done", "failed", "cancelled")
+
+
+# ------------------------------------------------------------------------------------------------- one writer
+
+
+@dataclass
+class Writer:
+    """lock.json of a shot: who writes into it. There is none while nobody does."""
+
+    host: str
+    """Computer that it runs on, as `host_name` says."""
+    pid: int
+    """Its process."""
+    process_started: float
+    """`Process.started` of it."""
+    kind: str
+    """Kind of job."""
+    job: str
+    """Name of the job's folder."""
+    since: float
+    """When it took the shot, seconds since the epoch."""
+    version: int = CONTRACT_VERSION
+    """Version of this contract."""
+
+    def works(self) -> bool:
+        """True if its process lives, stopped or not. That of another computer is never said not to."""
+        return self.host != host_name() or runs_still(self.pid, self.process_started)
+
+
+WORK = {"import": "The import", "solve": "The camera solve", "train": "The training", "freeze": "The freeze"}
+"""Kind of job -> what a sentence calls it."""
+
+
+def read_writer(shot: Path) -> Writer | None:
+    """Who writes into a shot, as its lock says, dead or alive; None without a lock. ValueError on a damaged one."""
+    path = shot / WRITER_FILE
+    try:
+        data = read_json(path, SHORT_JSON)
+    except FileNotFoundError:
+        return None
+    check_version(data, str(path))
+    return from_dict(Writer, data)
+
+
+def busy(shot: Path, writer: Writer) -> JobError:
+    """What the second one who would write into a shot is told: who does, since when, where, and what to do."""
+    try:
+        now, then = time.localtime(), time.localtime(writer.since)
+        since = time.strftime("%H:%M" if now[:3] == then[:3] else "%Y-%m-%d %H:%M", then)
+    except (OSError, OverflowError, ValueError):
+        since = "an unknown time"
+    what, where = WORK.get(writer.kind, "A step"), printable(writer.host.partition(" (")[0], 80)
+    hint, lock = "Wait for it or cancel it.", shot / WRITER_FILE
+    if writer.host != host_name():
+        hint = f"Wait for it or cancel it there. If {where} surely works on it no longer, delete {lock}."
+    return JobError(f"{what} of {shot.name} has been running on {where} since {since}.", hint, ExitCode.USAGE)
 
 
 # ------------------------------------------------------------------------------------------------- camera paths

@@ -23,6 +23,7 @@ from typing import Any
 from . import contract
 from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status
 from .shot import Shot, disk_error, is_disk_full, write_json
+from .writer import only_writer
 
 _CANCEL_POLL_SECONDS = 0.2
 _PROGRESS_SECONDS = 0.1
@@ -152,9 +153,16 @@ def new_job(shot: Shot, kind: str, params: Any) -> Path:
     return folder
 
 
-def run_job(folder: str | Path, listener: Listener | None = None) -> tuple[int, Any]:
-    """Runs the request in `folder` to its end. Returns (exit code, result or None); never raises for a failed job."""
-    folder = Path(folder)
+def run_job(folder: str | Path, listener: Listener | None = None, alone: bool = True) -> tuple[int, Any]:
+    """Runs the request in `folder` to its end. Returns (exit code, result or None); never raises for a failed job.
+
+    Args:
+        folder: the job's folder.
+        listener: hears every event.
+        alone: be the shot's only writer, and fail in words if there is one. Without, several may train runs of
+            different names at once: the caller sees to it that nothing else is written.
+    """
+    folder = Path(folder).absolute()
     try:
         data = contract.read_json(folder / contract.REQUEST_FILE)
         contract.check_version(data, "job request")
@@ -163,16 +171,18 @@ def run_job(folder: str | Path, listener: Listener | None = None) -> tuple[int, 
         print(f"{folder} holds no job that can be run: {error}", file=sys.stderr)
         return ExitCode.USAGE, None
     reporter = JobReporter(folder, request.kind, listener)
-    with _signals_cancel(reporter):
-        return _run(request, reporter)
+    with contextlib.ExitStack() as held, _signals_cancel(reporter):  # held until the last status is written
+        return _run(request, reporter, held if alone else None)
 
 
-def _run(request: JobRequest, reporter: JobReporter) -> tuple[int, Any]:
+def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack | None) -> tuple[int, Any]:
     result: Any = None
     state, code, message, hint = "done", int(ExitCode.OK), "", ""
     try:
         params = request.typed_params()
         shot = Shot.open(request.shot)
+        if held is not None:
+            held.enter_context(only_writer(shot.root, request.kind, reporter.folder.name))
         reporter.check_cancelled()
         result = STATIONS[request.kind](shot, params, reporter)
     except Cancelled:

@@ -223,7 +223,7 @@ def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Itera
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+b") as lock:
         told = False
-        while not _try_lock(lock.fileno()):
+        while not try_lock(lock.fileno()):
             if not told and waiting is not None:
                 waiting()
                 told = True
@@ -231,7 +231,8 @@ def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Itera
         yield
 
 
-def _try_lock(handle: int) -> bool:
+def try_lock(handle: int) -> bool:
+    """Locks an open file for this process, without waiting; False if another one has it. Closing it gives it back."""
     try:
         if sys.platform == "win32":
             import msvcrt

@@ -218,7 +218,8 @@ def sleeper():
     yield start
     for process in started:
         process.kill()
-        process.communicate()
+        process.wait()
+        process.stdout.close()
 
 
 def believed_running(jobs, contract, shot, pid: int, started: float, host: str):
@@ -264,8 +265,44 @@ def test_a_job_of_another_computer_is_neither_dead_nor_ended(addon, contract, em
     with pytest.raises(contract.JobError, match="runs on elsewhere: only there"):
         jobs.cancel(job)
     before = (job.folder / "status.json").read_bytes()
+    writer = contract.Writer("elsewhere (0a1b2c3d)", innocent.pid, 1.0, "train", job.folder.name, time.time())
+    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
+    for beat in (None, (job.status.heartbeat, time.monotonic() - 600)):
+        job.beat = beat
+        jobs.poll(job)
+        assert job.state == "running" and (job.folder / "status.json").read_bytes() == before
+    (empty_shot / "lock.json").unlink()  # by hand, as the artist is told if that computer is gone
+    job.beat = (job.status.heartbeat, time.monotonic() - 600)
     jobs.poll(job)
-    assert job.state == "running" and (job.folder / "status.json").read_bytes() == before
+    assert job.state == "failed" and (job.folder / "status.json").read_bytes() == before, "what it wrote stays its own"
+
+
+def test_a_step_is_refused_while_another_process_writes_into_the_shot(
+    addon, contract, empty_shot, scene, clip, sleeper
+):
+    jobs, steps, worker = addon("jobs"), addon("steps"), sleeper()
+    scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(empty_shot)
+    started = contract.process_start(worker.pid)
+    writer = contract.Writer(contract.host_name(), worker.pid, started, "train", "from a terminal", time.time() - 90000)
+    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
+    with pytest.raises(contract.JobError) as told:
+        steps.begin(scene, "footage")
+    assert told.value.exit_code == contract.ExitCode.USAGE and told.value.hint == "Wait for it or cancel it."
+    since = time.strftime("%Y-%m-%d %H:%M", time.localtime(writer.since))
+    where = contract.host_name().partition(" (")[0]
+    assert told.value.message == f"The training of {empty_shot.name} has been running on {where} since {since}."
+    german = addon("translations").translate(told.value.message, "de_DE")
+    assert german == f"Das Training von {empty_shot.name} läuft seit {since} auf {where}."
+    assert not (empty_shot / "jobs").exists(), "nothing was written"
+    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, host="elsewhere")))
+    with pytest.raises(contract.JobError, match="on elsewhere since") as told:
+        steps.begin(scene, "footage")
+    assert str(empty_shot / "lock.json") in told.value.hint
+    worker.kill()
+    worker.wait()
+    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
+    jobs.wait(steps.begin(scene, "footage", contract.ImportParams(str(clip), 1, 8)))
+    assert not (empty_shot / "lock.json").exists()
 
 
 def test_a_job_that_is_stopped_is_alive_and_can_be_ended_by_another_blender(addon, contract, start_import, clip):

@@ -1,0 +1,191 @@
+"""One writer per shot: real jobs in real processes, stopped, killed, and all at once."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from torch_backend import contract, job
+from torch_backend.contract import ExitCode, JobError, Writer
+from torch_backend.shot import Shot
+from torch_backend.writer import only_writer
+
+CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
+ELSEWHERE = "elsewhere (0a1b2c3d)"
+
+
+@pytest.fixture
+def shot(tmp_path):
+    return Shot.create(tmp_path / "a.splannequin")
+
+
+def lock_of(shot) -> Path:
+    return shot.root / contract.WRITER_FILE
+
+
+def begin_import(shot, last: int = 8) -> tuple[subprocess.Popen[bytes], Path]:
+    folder = job.new_job(shot, "import", contract.ImportParams(source=str(CLIP), first=1, last=last))
+    command = [sys.executable, "-P", "-m", "torch_backend", "run-job", str(folder)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE), folder
+
+
+def status_of(folder: Path) -> contract.Status:
+    return contract.from_dict(contract.Status, contract.read_json(folder / contract.STATUS_FILE))
+
+
+def wait_for_lock(shot, child) -> Writer:
+    while child.poll() is None:
+        writer = contract.read_writer(shot.root)
+        if writer is not None:
+            return writer
+        time.sleep(0.001)
+    raise AssertionError("it never held the shot")
+
+
+def dead_writer() -> Writer:
+    ended = subprocess.Popen([sys.executable, "-c", "pass"])
+    ended.wait()
+    return Writer(contract.host_name(), ended.pid, 12345.0, "train", "a job", time.time())
+
+
+def put_lock(shot, writer: Writer) -> None:
+    lock_of(shot).write_text(json.dumps(dataclasses.asdict(writer)))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP is POSIX")
+def test_the_second_job_is_refused_in_words_and_the_first_goes_on(shot):
+    first, one = begin_import(shot, 60)
+    try:
+        writer = wait_for_lock(shot, first)
+        os.kill(first.pid, signal.SIGSTOP)  # it works on for as long as we look
+        assert (writer.pid, writer.kind, writer.job) == (first.pid, "import", one.name)
+        second, other = begin_import(shot)
+        assert second.wait() == ExitCode.USAGE and second.communicate()
+        told = status_of(other)
+        assert told.state == "failed" and told.host == contract.host_name()
+        where, since = contract.host_name().partition(" (")[0], time.strftime("%H:", time.localtime(writer.since))
+        assert told.message.startswith(f"The import of a.splannequin has been running on {where} since {since}")
+        assert told.hint == "Wait for it or cancel it."
+        assert contract.read_writer(shot.root) == writer
+    finally:
+        os.kill(first.pid, signal.SIGCONT)
+        first.communicate()
+    assert first.returncode == ExitCode.OK and not lock_of(shot).exists()
+    assert len(list(shot.frames.glob("raw/*.png"))) == 60
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")
+def test_what_a_killed_job_holds_is_taken_over(shot):
+    first, _ = begin_import(shot, 60)
+    wait_for_lock(shot, first)
+    first.kill()
+    first.communicate()
+    assert lock_of(shot).exists()
+    second, folder = begin_import(shot)
+    assert second.communicate() and second.returncode == ExitCode.OK, status_of(folder).message
+    assert not lock_of(shot).exists() and len(list(shot.frames.glob("raw/*.png"))) == 8
+
+
+@pytest.mark.parametrize("ends", ["well", "badly", "cancelled"])
+def test_the_shot_is_free_again_however_a_job_ends(shot, monkeypatch, ends):
+    seen = []
+
+    def station(shot, params, report):
+        seen.append(contract.read_writer(shot.root))
+        if ends == "badly":
+            raise ZeroDivisionError
+        if ends == "cancelled":
+            raise contract.Cancelled
+
+    monkeypatch.setitem(job.STATIONS, "import", station)
+    folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
+    job.run_job(folder)
+    assert seen[0].pid == os.getpid() and seen[0].job == folder.name and seen[0].works()
+    assert [p.name for p in shot.root.iterdir() if "lock" in p.name] == []
+
+
+def test_runs_of_one_benchmark_may_be_trained_at_once(shot, monkeypatch):
+    monkeypatch.setitem(job.STATIONS, "train", lambda *_: "trained")
+    with only_writer(shot.root, "train", "another"):
+        folder = job.new_job(shot, "train", contract.TrainParams(run="mine"))
+        assert job.run_job(folder)[0] == ExitCode.USAGE
+        assert job.run_job(folder, alone=False) == (ExitCode.OK, "trained")
+
+
+def test_another_computers_lock_is_never_taken_over(shot):
+    put_lock(shot, dataclasses.replace(dead_writer(), host=ELSEWHERE, since=1.0))
+    with pytest.raises(JobError, match="^The training of a.splannequin has been running on elsewhere since 19") as told:
+        with only_writer(shot.root, "import", "mine"):
+            raise AssertionError("it was")
+    assert str(lock_of(shot)) in told.value.hint and told.value.exit_code == ExitCode.USAGE
+    put_lock(shot, dead_writer())
+    with only_writer(shot.root, "import", "mine") as writer:
+        assert contract.read_writer(shot.root) == writer
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[" * 5000, '{"host": 1}'])
+def test_a_lock_that_cannot_be_read_is_left_alone_and_named(shot, text, monkeypatch):
+    monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
+    lock_of(shot).write_text(text)
+    with pytest.raises(JobError, match="cannot be told") as told, only_writer(shot.root, "import", "mine"):
+        raise AssertionError("it was taken")
+    assert str(lock_of(shot)) in told.value.hint and lock_of(shot).read_text() == text
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
+def test_a_lock_that_is_a_link_is_not_written_through(shot, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
+    text = json.dumps(dataclasses.asdict(dead_writer()))
+    (tmp_path / "mine").write_text(text)
+    lock_of(shot).symlink_to(tmp_path / "mine")
+    with pytest.raises(JobError, match="cannot be replaced"), only_writer(shot.root, "import", "mine"):
+        raise AssertionError("it was taken")
+    assert (tmp_path / "mine").read_text() == text
+
+
+CROWD = """
+import dataclasses, json, os, random, sys, time
+from pathlib import Path
+from torch_backend import contract
+from torch_backend.writer import only_writer
+
+root, dead, mark, seed = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), int(sys.argv[4])
+random.seed(seed)
+while not mark.with_name("go").exists():
+    pass
+held = 0
+until = time.monotonic() + 60
+while held < 60 and time.monotonic() < until:
+    try:
+        with only_writer(root, "train", f"{seed}"):
+            os.close(os.open(mark, os.O_CREAT | os.O_EXCL))  # fails if two are inside
+            time.sleep(random.random() * 0.002)
+            os.unlink(mark)
+            held += 1
+            if random.random() < 0.7:  # it dies here: its lock stays, of a process that is gone
+                beside = root / f"{seed}.json"
+                beside.write_text(dead)
+                os.replace(beside, root / contract.WRITER_FILE)
+    except contract.JobError as error:
+        assert "has been running" in error.message, error.message
+print(held)
+"""
+
+
+def test_of_all_who_take_a_dead_ones_place_one_gets_it(shot, tmp_path):
+    dead, mark = json.dumps(dataclasses.asdict(dead_writer())), tmp_path / "inside"
+    lock_of(shot).write_text(dead)
+    command = [sys.executable, "-c", CROWD, str(shot.root), dead, str(mark)]
+    crowd = [
+        subprocess.Popen([*command, str(n)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for n in range(4)
+    ]
+    (tmp_path / "go").touch()
+    told = [child.communicate() for child in crowd]
+    assert [errors for _, errors in told] == [""] * 4 and [held for held, _ in told] == ["60\n"] * 4

@@ -1,0 +1,155 @@
+"""One writer per shot: the lock that a job holds while its station works.
+
+The lock is a file in the shot, so that it holds between computers that share a disk. It names its process: what a
+killed one left is taken over on the same computer, by one of all that try.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import sys
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+from . import contract
+from .contract import ExitCode, JobError, Writer
+from .shot import is_disk_full, try_lock
+
+_SECONDS = 5.0
+"""How long the lock is tried for while others come and go."""
+_LENGTH = 1024
+"""Bytes of every lock: it is taken over in its place, by one write of as many."""
+_BARE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+@contextlib.contextmanager
+def only_writer(root: Path, kind: str, job: str) -> Iterator[Writer]:
+    """Holds the shot in `root` for a job. JobError if another one does, or if the shot cannot be written."""
+    pid = os.getpid()
+    mine = Writer(contract.host_name(), pid, contract.process_start(pid), kind, job, time.time())
+    try:
+        _take(root, mine)
+    except OSError as error:
+        if is_disk_full(error) or isinstance(error, FileNotFoundError):
+            raise
+        reason = error.strerror or error
+        raise JobError(f"Cannot write to {root}: {reason}.", "Choose another shot folder.", ExitCode.DISK) from error
+    folder = os.open(root, os.O_RDONLY) if os.unlink in os.supports_dir_fd else None
+    try:
+        yield mine
+    finally:
+        _release(root, mine, folder)
+        if folder is not None:
+            os.close(folder)
+
+
+def _take(root: Path, mine: Writer) -> None:
+    path, until = root / contract.WRITER_FILE, time.monotonic() + _SECONDS
+    while not _make(path, mine):
+        try:
+            there = contract.read_writer(root)
+        except (OSError, ValueError) as error:  # being written just now, or by no hand of ours
+            if time.monotonic() > until:
+                hint = f"If nothing works on this shot, delete {path}."
+                raise JobError(f"Whether a step works on {root.name} cannot be told: {error}.", hint, ExitCode.USAGE) \
+                    from error  # fmt: skip
+            time.sleep(0.05)
+            continue
+        if there is None:
+            continue  # given back in between
+        if there.works():
+            raise contract.busy(root, there)
+        if _take_over(path, there, mine):
+            return
+        if time.monotonic() > until:
+            what = f"{path} was left by a step that was ended, and cannot be replaced."
+            raise JobError(what, "Delete it, then start again.", ExitCode.USAGE)
+        time.sleep(0.01)
+
+
+def _text(writer: Writer) -> bytes:
+    return json.dumps(dataclasses.asdict(writer)).encode().ljust(_LENGTH)
+
+
+def _make(path: Path, mine: Writer) -> bool:
+    """Puts a lock where there is none, whole at once; False if there is one.
+
+    A link is made or refused by the server of a network disk itself; where a disk knows none, an exclusive open is.
+    """
+    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
+    try:
+        _write(beside, mine)
+        if sys.platform == "win32":
+            os.rename(beside, path)  # which refuses to replace, there
+        else:
+            try:
+                os.link(beside, path)
+            except FileExistsError:
+                return os.stat(beside).st_nlink == 2  # NFS asked twice, and was told of its own success
+            except OSError:  # no links on this disk
+                _write(path, mine)
+    except FileExistsError:
+        return False
+    finally:
+        beside.unlink(missing_ok=True)
+    return True
+
+
+def _write(path: Path, mine: Writer) -> None:
+    """Makes a file of its own. FileExistsError if there is one."""
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BARE)
+    try:
+        os.write(handle, _text(mine))
+        os.fsync(handle)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(handle)
+
+
+def _take_over(path: Path, dead: Writer, mine: Writer) -> bool:
+    """Puts us in the place of a dead process of this computer; False if another one was faster: look again.
+
+    All who may do so are on this computer, where the system lets one of them at a time hold the file.
+    """
+    try:
+        handle = os.open(path, os.O_RDWR | _BARE)
+    except OSError:
+        return False  # given back in between, or a link
+    with os.fdopen(handle, "r+b") as lock:
+        if not try_lock(handle):
+            return False
+        try:
+            same = contract.from_dict(Writer, json.loads(lock.read(_LENGTH))) == dead
+            if not same or not os.path.samestat(os.stat(path), os.fstat(handle)):
+                return False
+        except (FileNotFoundError, ValueError):
+            return False
+        lock.seek(0)
+        lock.write(_text(mine))
+        lock.truncate(_LENGTH)
+        lock.flush()
+        os.fsync(handle)
+    return True
+
+
+def _release(root: Path, mine: Writer, folder: int | None) -> None:
+    """Takes our lock away, also from a shot that was renamed meanwhile (`folder`, a handle of it). Another's stays."""
+    path = Path(contract.WRITER_FILE) if folder is not None else root / contract.WRITER_FILE
+    for _ in range(40):
+        try:
+            with os.fdopen(os.open(path, os.O_RDONLY | _BARE, dir_fd=folder), "rb") as lock:
+                if lock.read(_LENGTH) != _text(mine):
+                    return
+            os.unlink(path, dir_fd=folder)
+            return
+        except PermissionError:
+            time.sleep(0.05)  # Windows: somebody reads it
+        except OSError:
+            return
