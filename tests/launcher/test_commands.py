@@ -74,7 +74,8 @@ def test_an_output_that_cannot_be_a_folder_is_one_sentence(tmp_path: Path):
 def test_an_output_that_cannot_be_written_is_refused_before_any_work(tmp_path: Path, output: str):
     (tmp_path / "file").touch()
     home = tmp_path / "home"
-    ran = launch("setup", "--backend", "--output", tmp_path / output, SPLANNEQUIN_HOME=str(home))
+    nothing = {"PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull, "PIP_FIND_LINKS": ""}
+    ran = launch("setup", "--backend", "--output", tmp_path / output, SPLANNEQUIN_HOME=str(home), **nothing)
     assert (ran.returncode, ran.stdout) == (2, "")
     assert ran.stderr.startswith("Error: Cannot write to") and ran.stderr.count("\n") == 1
     assert not home.exists()

@@ -21,10 +21,14 @@ def site_packages(environment: Environment) -> Path:
     return next(environment.folder.rglob("smallthing.py")).parent
 
 
-def test_set_up_once_then_nothing_is_started(environment: Environment, monkeypatch: pytest.MonkeyPatch):
+def test_set_up_once_then_nothing_is_started(
+    environment: Environment, monkeypatch: pytest.MonkeyPatch, hostile, tmp_path: Path
+):
+    trap = hostile(tmp_path / "clips", tmp_path / "home", tmp_path)  # modules where a child could stand
     assert not environment.ready()
     assert set_up(environment, sys.executable) > 0
     assert environment.ready()
+    assert not trap.exists(), trap.read_text()
     assert value_of(environment) == "1"
 
     monkeypatch.setattr(subprocess, "Popen", None)  # any child process would now fail
@@ -172,7 +176,10 @@ def offline(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PIP_INDEX_URL", "http://name:secret@127.0.0.1:9/simple")
 
 
-def test_an_index_that_cannot_be_reached_is_what_is_wrong(environment: Environment, requirements, offline, monkeypatch):
+def test_an_index_that_cannot_be_reached_is_what_is_wrong(
+    environment: Environment, requirements: Path, offline, made, monkeypatch: pytest.MonkeyPatch
+):
+    made(environment.folder)
     (requirements / "small.txt").write_text("smallthing==1.0\n")
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)
