@@ -30,6 +30,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import urllib.error
@@ -220,7 +221,7 @@ class Environment:
             stamp = json.loads(self.stamp.read_text(encoding="utf-8"))
             same = stamp["venv"] == (self.folder / "pyvenv.cfg").read_text(encoding="utf-8")
             return dict(stamp["files"]) if same and not self.begun.exists() else {}
-        except (OSError, ValueError, KeyError):
+        except (OSError, ValueError, KeyError, TypeError):
             return {}
 
     def ready(self) -> bool:
@@ -230,7 +231,7 @@ class Environment:
 
 def home() -> Path:
     """The folder that holds the environments."""
-    return Path(os.environ.get("SPLANNEQUIN_HOME") or ROOT).expanduser().resolve()
+    return Path(os.path.realpath(os.path.expanduser(os.environ.get("SPLANNEQUIN_HOME") or ROOT)))
 
 
 def backend_environment(testing: bool = False) -> Environment:
@@ -275,7 +276,13 @@ def set_up(environment: Environment, python: str) -> float:
             if not environment.ready():
                 _make(environment, python)
     except OSError as error:
-        _refuse(environment, "writing the environment", str(error))
+        where = error.filename2 or error.filename or environment.folder
+        advice = "free some disk" if is_disk_full(error) else "make it writable"
+        raise LauncherError(
+            f"{environment.name[:1].upper()}{environment.name[1:]} cannot be set up in {environment.folder.parent}: "
+            f"{where}: {error.strerror or error}; {advice}, or name another folder in SPLANNEQUIN_HOME.",
+            ExitCode.DISK if is_disk_full(error) else ExitCode.ENVIRONMENT,
+        ) from error
     return time.monotonic() - started
 
 
@@ -387,7 +394,7 @@ def _step(
         lines.put(None)
 
     threading.Thread(target=read, daemon=True).start()
-    tail: list[str] = []
+    said: list[str] = []
     spoke = started
     try:
         with open(environment.log, "a", encoding="utf-8") as log:
@@ -403,7 +410,7 @@ def _step(
                 if line is None:
                     break
                 log.write(line)
-                tail = [*tail[-40:], line.strip()]
+                said.append(line.strip())
                 text = condense(line.strip()) if condense else None
                 if text:
                     spoke = time.monotonic()
@@ -415,7 +422,7 @@ def _step(
     finally:
         _close(child)
     if code:
-        _refuse(environment, step, "\n".join(tail))
+        _refuse(environment, step, "\n".join([*said[:5], *said[-40:]]))  # pip names its indexes first
     if condense is None:
         say(f"  {time.monotonic() - started:5.0f} s  {step}: done")
 
@@ -434,20 +441,28 @@ def condense_pip(line: str) -> str | None:
     return "installed" if line.startswith("Successfully installed") else None
 
 
+BROKEN_CONNECTION = re.compile(
+    r"connection broken by|ConnectionError|Max retries exceeded|Temporary failure|Name or service|getaddrinfo|"
+    r"timed out|Network is unreachable|ProxyError|SSLError|IncompleteRead|RemoteDisconnected"
+)
+"""What pip says of an index that it cannot ask. What it says last is that no version was found."""
+
+
 def _refuse(environment: Environment, step: str, output: str) -> None:
     """Raises the sentence for a failed step of a set-up, from what it printed."""
     lines = [line.strip() for line in output.splitlines() if line.strip()] or ["no output"]
     telling = [line for line in lines if re.search(r"error|not found|cannot|No space", line, re.I)]
     last = re.sub(r"^(ERROR: |\w*Error: )", "", (telling or lines)[-1]).rstrip(".")
     code = ExitCode.ENVIRONMENT
+    answered = re.search(r"from versions: (?!none)", output)
     if re.search(r"No space left|Errno 28|not enough space", output, re.I):
         code, advice = ExitCode.DISK, "free some disk, or name a folder on another disk in SPLANNEQUIN_HOME"
+    elif BROKEN_CONNECTION.search(output) and not answered:
+        last, advice = _unreachable(output)
     elif re.search(r"ensurepip|python3-venv", output):
         advice = "install the venv module of this Python (Debian and Ubuntu: apt install python3-venv)"
     elif re.search(r"No matching distribution|from versions:", output):
         advice = "use Python 3.11 or 3.13 on 64-bit Windows, macOS or Linux, or check the package index pip is set to"
-    elif re.search(r"ConnectionError|Temporary failure|Name or service|timed out|ProxyError|SSLError", output):
-        advice = "check the network (pip reads its proxy and index from pip.conf) and start the same command again"
     elif re.search(r"lib\S+\.so\S*: cannot open shared object", output):
         advice = "install that library with the system's package manager"
     else:
@@ -455,6 +470,23 @@ def _refuse(environment: Environment, step: str, output: str) -> None:
     raise LauncherError(
         f"Setting up {environment.name} failed at {step} ({last[:200]}): {advice}. Log: {environment.log}", code
     )
+
+
+def _unreachable(output: str) -> tuple[str, str]:
+    """What pip could not reach, and what to do about it, from what it printed."""
+    told = re.search(r"host='([^']+)'", output)
+    listed = re.search(r"Looking in indexes: (.*)", output)
+    urls = [url.strip() for url in listed.group(1).split(",")] if listed else ["https://pypi.org/simple"]
+    hosts = [part.hostname for part in map(urllib.parse.urlsplit, urls) if part.scheme != "file" and part.hostname]
+    what = told.group(1) if told else " or ".join(dict.fromkeys(hosts)) or "the package index"
+    again = "then start the same command again: it goes on where it stopped"
+    if re.search(r"ProxyError|Cannot connect to proxy", output):
+        return f"the proxy on the way to {what} cannot be used", f"check HTTPS_PROXY and pip.conf, {again}"
+    if "SSLError" in output or "certificate" in output:
+        advice = "if a proxy signs for it, name its certificate in PIP_CERT"
+        return f"the certificate of {what} is not accepted", f"{advice}, {again}"
+    advice = "check the network; behind a firewall name a proxy (HTTPS_PROXY) or an index of your own (PIP_INDEX_URL)"
+    return f"{what} cannot be reached", f"{advice}, {again}"
 
 
 # ------------------------------------------------------------------------------------------------------ Blender
@@ -674,11 +706,13 @@ def read_summary(output: Path) -> dict[str, Any]:
 
 def failed_job(output: Path) -> str:
     """The sentence of the newest job of the shots in `output`, if it failed; else nothing."""
-    statuses = sorted(output.glob("*.splannequin/jobs/*/status.json"), key=lambda path: path.stat().st_mtime)
-    if not statuses:
+    try:
+        statuses = sorted(output.glob("*.splannequin/jobs/*/status.json"), key=lambda path: path.stat().st_mtime)
+        status = read_json(statuses[-1]) if statuses else {}
+    except (OSError, ValueError):
         return ""
-    status = read_json(statuses[-1])
-    return f"{status['message']} {status['hint']}".strip() if status.get("state") == "failed" else ""
+    words = (status.get("message", ""), status.get("hint", ""))
+    return " ".join(filter(None, map(str, words))) if status.get("state") == "failed" else ""
 
 
 # ----------------------------------------------------------------------------------------------------- commands
@@ -926,7 +960,9 @@ def machine_findings() -> Iterator[Finding]:
         yield Finding(
             "memory", "ok" if enough else "note", f"{memory:.1f} GB{'' if enough else ': close other programs'}"
         )
-    folder = next(p for p in (home(), *home().parents) if p.exists())
+    folder = next(p for p in (home(), *home().parents) if os.path.exists(p))
+    if not backend_environment().ready() and not (folder.is_dir() and os.access(folder, os.W_OK)):
+        yield Finding("home", "missing", f"{folder} cannot be written: name another folder in SPLANNEQUIN_HOME")
     free = shutil.disk_usage(folder).free / 1e9
     need = 1.0 if backend_environment().ready() else BACKEND_DISK_GB + BPY_DISK_GB
     advice = "" if free >= need else f": {need:.0f} GB are needed, free some or set SPLANNEQUIN_HOME to another disk"
@@ -1085,11 +1121,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), _interrupt)
     default = re.sub(r"[^\w.-]+", "_", Path(args.clip).stem) if args.command == "freeze" else args.command
-    output = Path(args.output or Path("output") / default).absolute()
+    try:
+        output = Path(os.path.abspath(args.output or Path("output") / default))
+    except OSError:
+        print("Error: The folder that you stand in is gone: change to another and start again.", file=sys.stderr)
+        return ExitCode.USAGE
     error = ""
     try:
+        output.mkdir(parents=True, exist_ok=True)
         # A summary of an earlier run must not pass for this one's.
         (output / "summary.json").unlink(missing_ok=True)
+        tempfile.TemporaryFile(dir=output).close()  # said now, not after minutes of work
         code = dispatch(args, rest, output)
     except LauncherError as refused:
         error, code = str(refused), refused.exit_code
@@ -1098,9 +1140,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not interrupt.args:
             print("Cancelled. Start the same command again to go on.", file=sys.stderr, flush=True)
     except OSError as failed:
-        full = is_disk_full(failed)
-        error = f"Cannot write to {output}: {failed.strerror or failed}. Choose another --output folder."
-        code = ExitCode.DISK if full else ExitCode.USAGE
+        error, code = _unwritable(failed, output)
     if code and not error:
         error = failed_job(output) or f"{args.command} ended with exit code {code}: see what it printed."
     elif error and code != ExitCode.CANCELLED:
@@ -1110,6 +1150,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             failure = {"command": args.command, "exit_code": code, "error": error}
             write_json(output / "summary.json", {**read_summary(output), **failure})
     return code
+
+
+def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:
+    """(sentence, exit code) of what the system refused, most often to write into the output folder."""
+    where = Path(os.fsdecode(failed.filename)) if isinstance(failed.filename, (str, bytes)) else output
+    code = ExitCode.DISK if is_disk_full(failed) else ExitCode.USAGE
+    if where != output and where not in output.parents and output not in where.parents:
+        code = ExitCode.DISK if code == ExitCode.DISK else ExitCode.ENVIRONMENT
+        return f"{failed.strerror or failed}: {where}. See `doctor`, then start the same command again.", code
+    return f"Cannot write to {output}: {failed.strerror or failed}. Choose another --output folder.", code
 
 
 def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:

@@ -241,9 +241,10 @@ splannequin.set_up(splannequin.Environment("x", pathlib.Path(sys.argv[2]), ("sma
 """
 
 
-def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent):
+def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent, made):
     """pip waits for an index that does not answer; that sees how long it is waited for."""
     (requirements / "small.txt").write_text("there-is-no-such-package==1.0\n")
+    made(tmp_path / "home" / ".venv")
     with socket.create_server(("127.0.0.1", 0)) as index:
         index.settimeout(120)
         address = f"http://127.0.0.1:{index.getsockname()[1]}/simple"

@@ -7,18 +7,11 @@ from pathlib import Path
 import pytest
 
 import splannequin
-from splannequin import Environment, set_up
 
 
 @pytest.fixture
 def trap(hostile, tmp_path: Path) -> Path:
     return hostile(tmp_path / "clips", tmp_path / "home", tmp_path)
-
-
-def test_an_environment_is_made_without_it(environment: Environment, trap: Path):
-    set_up(environment, sys.executable)
-    assert environment.ready()
-    assert not trap.exists(), trap.read_text()
 
 
 def test_the_backend_runs_without_it(trap: Path, tmp_path: Path):
