@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..torch_backend import contract
-from . import checkpoints, jobs
+from . import checkpoints, jobs, kept
 
 SHOT_SUFFIX = ".splannequin"
 EXR = ".exr"
@@ -62,14 +63,13 @@ def read(folder: Path) -> ShotState:
     state = ShotState(folder)
     if not (folder / "shot.json").is_file():
         return state
-    state.info = contract.read_json(folder / "shot.json")
+    state.info = dict(kept.of(folder / "shot.json", contract.read_json))
     contract.check_version(state.info, str(folder / "shot.json"))
     listing = folder / "frames" / "frames.json"
     if listing.is_file():
-        told = contract.read_json(listing)
-        state.frames, state.beside = len(told["frames"]), str(told.get("beside", ""))
+        state.frames, state.beside = kept.of(listing, _listed)
     if (folder / "solve" / "cameras.json").is_file():
-        state.solve = contract.read_json(folder / "solve" / "solve.json")
+        state.solve = dict(kept.of(folder / "solve" / "solve.json", contract.read_json))
     state.runs = _named(folder / "runs", "summary.json")
     for name, run in state.runs.items():
         run["extension"] = checkpoints.extension(folder / "runs" / name)
@@ -79,11 +79,12 @@ def read(folder: Path) -> ShotState:
             state.unfinished[path.parent.name] = told
     for name, run in [*state.runs.items(), *state.unfinished.items()]:
         run["other_cameras"] = checkpoints.other_cameras(folder, folder / "runs" / name)
-        run["history"] = _history(folder / "runs" / name / "metrics.jsonl")
+        metrics = folder / "runs" / name / "metrics.jsonl"
+        run["history"] = kept.of(metrics, _history) if metrics.is_file() else []
         run["preview"] = max((folder / "runs" / name / "previews").glob("*.png"), default=None)
     state.takes = _named(folder / "takes", "take.json")
     for name, take in state.takes.items():
-        take["frame_count"] = sum(1 for p in (folder / "takes" / name).iterdir() if p.suffix == EXR)
+        take["frame_count"] = kept.of(folder / "takes" / name, _frame_count)
     return state
 
 
@@ -98,6 +99,17 @@ def plate_range(folder: Path) -> tuple[int, int] | None:
     """First and last number of the undistorted plates, None before the solve."""
     numbers = [int(p.stem) for p in (folder / "frames").glob("*.png") if p.stem.lstrip("-").isdigit()]
     return (min(numbers), max(numbers)) if numbers else None
+
+
+def _listed(path: Path) -> tuple[int, str]:
+    """Of frames.json: how many frames there are, and `ShotState.beside`."""
+    told = contract.read_json(path)
+    return len(told["frames"]), str(told.get("beside", ""))
+
+
+def _frame_count(take: Path) -> int:
+    with os.scandir(take) as entries:
+        return sum(1 for entry in entries if entry.name.endswith(EXR))
 
 
 def _history(path: Path) -> list[tuple[float, float]]:
@@ -119,7 +131,7 @@ def _history(path: Path) -> list[tuple[float, float]]:
 def _named(folder: Path, file: str) -> dict[str, dict[str, Any]]:
     if not folder.is_dir():
         return {}
-    return {p.parent.name: contract.read_json(p) for p in sorted(folder.glob(f"*/{file}"))}
+    return {p.parent.name: dict(kept.of(p, contract.read_json)) for p in sorted(folder.glob(f"*/{file}"))}
 
 
 def _mtime(path: Path) -> float:
