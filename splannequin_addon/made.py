@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import PointerProperty, StringProperty
+from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from . import compositor, shots
 
@@ -31,6 +31,7 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     plate: PointerProperty(
         name="Plate", description="The camera that shows the clip until it is solved", type=bpy.types.Object
     )
+    scaled: BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
     collection: PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
     marks: StringProperty(name="Marks", description="Markers that were put on the timeline, as JSON", options=set())
 

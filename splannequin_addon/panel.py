@@ -5,7 +5,6 @@ Drawing only reads what the supervisor keeps; it touches the disk when a shot is
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from . import (
     cameras,
     compat,
     compositor,
+    estimates,
     guesses,
     icons,
     listing,
@@ -35,9 +35,12 @@ from . import (
     training,
     viewport,
 )
+from .props import PRESETS
+from .sentences import cells, wrap
 from .translations import tr
 
 CATEGORY = "Splannequin"
+_PRESET_WIDTHS = (0.34, 0.2, 0.2, 0.26)
 
 
 @dataclass
@@ -127,17 +130,6 @@ def view_bake(scene: Any, state: shots.ShotState | None) -> View:
 
 
 VIEWS = {"footage": view_footage, "camera": view_camera, "train": view_train, "freeze": view_freeze, "bake": view_bake}
-
-
-def wrap(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:
-    """A sentence, in the interface's language, in as many lines as the sidebar's width asks for."""
-    text = tr(text)
-    scale = context.preferences.system.ui_scale
-    room = context.region.width / scale - (75 if icon != "NONE" else 50)
-    column = layout.column(align=True)
-    column.scale_y = 0.8
-    for number, line in enumerate(textwrap.wrap(text, max(int(room / 6.2), 16)) or [""]):
-        column.label(text=line, translate=False, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 
 
 class _StepPanel:
@@ -293,8 +285,10 @@ def can_scrub(view: View, running: str | None) -> bool:
 
 
 def minutes(seconds: float) -> str:
-    """A duration for people: "45 s", "3 min"."""
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+    """A duration for people: "45 s", "3 min", "1.5 h"."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
@@ -374,6 +368,10 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
         watch = self._watch(context)
         if watch is None or cameras.find(context.scene, watch.shot, "EMPTY") is None:
             return
+        if not ops_align.scaled(context.scene, watch.shot):
+            layout = self.layout  # type: ignore[attr-defined]
+            wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")
+            layout.operator("splannequin.align_scale", icon=icons.of("splannequin.align_scale")).selected = False
         body = sub_panel(self.layout, "camera_alignment", "Alignment")  # type: ignore[attr-defined]
         if body is not None:
             ops_align.draw(body)
@@ -412,14 +410,35 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
     def draw_settings(self, context: Any, layout: Any) -> None:
         """The preset; what the button will do to the run that is there."""
         props = context.scene.splannequin
-        layout.row().prop(props, "preset", expand=True)
         watch, plan = self._watch(context), self._plan(context)
+        self._presets(context, layout, watch.state if watch is not None else None)
         if watch is None or watch.running() is not None:
             return
         if plan.kind == "extend":
             layout.prop(props, "extend_steps")
         if plan.words:
             wrap(layout, context, plan.words, "PAUSE" if self._paused(context) else "INFO")
+
+    def _presets(self, context: Any, layout: Any, state: shots.ShotState | None) -> None:
+        """A button for each preset: how large, how many steps, how long on this machine."""
+        props, (rows, told) = context.scene.splannequin, estimates.costs(state)
+        column = layout.column(align=True)
+        head = cells(column.row(align=True), _PRESET_WIDTHS)
+        for place, text in zip(head, ("Preset", "Pixels", "Steps", "About" if told else "Time"), strict=True):
+            place.label(text=text)
+        names = {name: label for name, label, _ in PRESETS}
+        for row in rows:
+            columns = cells(column.row(align=True), _PRESET_WIDTHS)
+            columns[0].prop_enum(props, "preset", row.preset, text=names[row.preset])
+            spent = "-" if row.seconds is None else minutes(row.seconds) + ("" if row.measured else " ?")
+            for place, text in zip(columns[1:], (str(row.width), f"{row.steps / 1000:g}k", spent), strict=True):
+                place.label(text=text, translate=False)
+        if told is None:
+            words = "Preview took 150 s on two cores without a graphics card. Times here come with the first run."
+        else:
+            where = "graphics card" if told.get("device") == "cuda" else "processor"
+            words = f"As run {told.get('run', '')} took on the {where}; with a ? by pixels and steps."
+        wrap(layout, context, words)
 
     def _plan(self, context: Any) -> training.Plan:
         props, watch = context.scene.splannequin, self._watch(context)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..torch_backend import contract
-from . import checkpoints, jobs
+from . import checkpoints, jobs, kept
 
 SHOT_SUFFIX = ".splannequin"
 EXR = ".exr"
@@ -77,8 +77,7 @@ def read(folder: Path) -> ShotState:
     state.info = _typed(_Info, folder / "shot.json")
     listing = folder / "frames" / "frames.json"
     if listing.is_file():
-        told = _typed(_Listing, listing, contract.LONGEST_JSON)
-        state.frames, state.beside = len(told["frames"]), told["beside"]
+        state.frames, state.beside = kept.of(listing, _listed)
     if (folder / "solve" / "cameras.json").is_file():
         state.solve = _typed(_Solve, folder / "solve" / "solve.json")
     state.runs = _named(_Run, folder / "runs", "summary.json", state.damaged["run"])
@@ -95,11 +94,12 @@ def read(folder: Path) -> ShotState:
             run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
             run["anew"]["history"] = _history(run["anew"]["folder"] / "metrics.jsonl")
         run["other_cameras"] = checkpoints.other_cameras(folder, folder / "runs" / name)
-        run["history"] = _history(folder / "runs" / name / "metrics.jsonl")
+        metrics = folder / "runs" / name / "metrics.jsonl"
+        run["history"] = kept.of(metrics, _history) if metrics.is_file() else []
         run["preview"] = max((folder / "runs" / name / "previews").glob("*.png"), default=None)
     state.takes = _named(_Take, folder / "takes", "take.json", state.damaged["take"])
     for name, take in state.takes.items():
-        take["frame_count"] = sum(1 for p in (folder / "takes" / name).iterdir() if p.suffix == EXR)
+        take["frame_count"] = kept.of(folder / "takes" / name, _frame_count)
     return state
 
 
@@ -116,6 +116,17 @@ def plate_range(folder: Path) -> tuple[int, int] | None:
     found = (contract.frame_number(p.stem) for p in (folder / "frames").glob("*.png"))
     numbers = [number for number in found if number is not None]
     return (min(numbers), max(numbers)) if numbers else None
+
+
+def _listed(path: Path) -> tuple[int, str]:
+    """Of frames.json: how many frames there are, and `ShotState.beside`."""
+    told = _read_typed(path, _Listing, contract.LONGEST_JSON)
+    return len(told["frames"]), told["beside"]
+
+
+def _frame_count(take: Path) -> int:
+    with os.scandir(take) as entries:
+        return sum(1 for entry in entries if entry.name.endswith(EXR))
 
 
 def _history(path: Path) -> list[tuple[float, float]]:
@@ -213,11 +224,15 @@ class _Take:
             raise ValueError("margin should be two numbers, and t_star_per_frame a number per frame")
 
 
-def _typed(kind: type, path: Path, longest: int = contract.SHORT_JSON) -> dict[str, Any]:
+def _typed(kind: type, path: Path) -> dict[str, Any]:
     """A file of the shot, what the dataclass `kind` names in it checked and completed. ValueError says what is wrong.
 
     OSError if there is none.
     """
+    return dict(kept.of(path, _read_typed, kind))
+
+
+def _read_typed(path: Path, kind: type, longest: int = contract.SHORT_JSON) -> dict[str, Any]:
     data = contract.read_json(path, longest)
     contract.check_version(data, str(path))
     try:

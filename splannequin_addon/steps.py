@@ -246,15 +246,8 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
     params = params or params_of(scene, step)
     folder = _needed(scene, step)
     backend.python()  # before anything is written: without a backend there is nothing to start
-<<<<<<< HEAD
-=======
-    jobs.refuse_second_writer(folder)
->>>>>>> h-jobs
     try:
-        if any(not job.ended and jobs.is_alive(job, job.status) for job in jobs.latest(folder).values()):
-            raise contract.JobError(
-                f"A step of {folder.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
-            )
+        jobs.refuse_second_writer(folder)
         if step == "footage":
             shots.create(folder)
         job = jobs.new_job(folder, STEPS[step].kind, params)

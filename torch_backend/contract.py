@@ -28,10 +28,7 @@ import stat
 import struct
 import subprocess
 import sys
-<<<<<<< HEAD
 import threading
-=======
->>>>>>> h-jobs
 import time
 import typing
 from collections.abc import Generator, Mapping

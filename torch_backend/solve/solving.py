@@ -319,7 +319,7 @@ def _camera_path(
     names = [Path(f["file"]).name for f in listed]
     known = {i: np.array(poses[name]["pose"]) for i, name in enumerate(names) if name in poses}
     filled = fill_poses(np.array([f["seconds"] for f in listed]), known)
-    nearest = [min(known, key=lambda k: abs(k - i)) for i in range(len(names))]
+    nearest = _nearest(sorted(known), len(names))
     lenses = [int(poses[names[k]].get("lens", 0)) for k in nearest]
     cameras = []
     for frame, name, pose, lens in zip(listed, names, filled, lenses, strict=True):
@@ -327,6 +327,15 @@ def _camera_path(
         source = poses[name]["source"] if name in poses else "interpolated"
         cameras.append(CameraFrame(frame["frame"], viewmat, pinholes[lens].tolist(), source))
     return CameraPath(frames["width"], frames["height"], cameras), lenses
+
+
+def _nearest(known: list[int], count: int) -> list[int]:
+    """The nearest of some ascending indices to each of 0 to `count` - 1; of two as near the lower."""
+    spots = np.array(known)
+    every = np.arange(count)
+    above = np.searchsorted(spots, every).clip(0, len(spots) - 1)
+    below = (above - 1).clip(0)
+    return np.where(every - spots[below] <= spots[above] - every, spots[below], spots[above]).tolist()
 
 
 def _centres(path: CameraPath) -> NDArray[np.float64]:
