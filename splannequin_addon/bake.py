@@ -22,7 +22,7 @@ def insert(scene: Any, shot: Path, take: str) -> list[str]:
         contract.JobError: the take has no frames.
     """
     frozen, plate = _sources(scene, shot, take)
-    changes = compositor.insert(scene, frozen, plate)
+    changes = compositor.insert(scene, frozen, plate, _footage(scene, shot, plate), scene.splannequin.insert_at)
     lacking = missing_frames(shot, take, frames_of(scene))
     if lacking:
         changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
@@ -45,6 +45,14 @@ def _sources(scene: Any, shot: Path, take: str) -> tuple[compositor.Take, Path |
         ) from error
     plate = compositor.frame_path(shot / "frames", frozen.first, ".png")
     return frozen, plate if plate.is_file() else None
+
+
+def _footage(scene: Any, shot: Path, plate: Path | None) -> list[Path]:
+    """Files by which a node that shows the plate is known: the undistorted plate, the clip."""
+    told = str(shots.read(shot).info.get("source", ""))
+    chosen = scene.splannequin.clip
+    files = [plate, Path(told) if told else None, Path(bpy.path.abspath(chosen)) if chosen else None]
+    return [file for file in files if file is not None]
 
 
 def shown(scene: Any, shot: Path) -> str:

@@ -1,15 +1,18 @@
-"""The node group "Splannequin Freeze" in the scene's compositor: inserted before the output, updated, removed.
+"""The node group "Splannequin Freeze" in the scene's compositor: inserted, updated, removed.
 
-Nothing else in the artist's tree is touched: the one link into the output is led through the group, and led back
-when the group is removed. The group reads the take's multilayer EXR files; scene frame n shows n.exr.
+It stands in for the plate where a node of the artist's tree shows it, so that the grade goes on from there; else before
+the output. Nothing else in the tree is touched: the links that leave the plate, or the one into the output, are led
+through the group, and led back when the group is removed. The group reads the take's multilayer EXR files; scene frame
+n shows n.exr.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,8 @@ from . import compat
 
 GROUP_NAME = "Splannequin Freeze"
 _TAG = "splannequin"
+_STANDS_IN = "splannequin_stands_in"
+_PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 _BEFORE = "splannequin_before"
 _CG = "cg"
 _LAYERS = ("Combined", "Depth", "Support", "Motion")
@@ -54,21 +59,28 @@ class Take:
     """Pixels beyond the frame on the left and right, and above and below: overscan."""
 
 
-def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
-    """Puts the freeze group in front of the output of the scene's compositor, or updates the one that is there.
+def insert(
+    scene: Any, take: Take, plate: Path | None = None, footage: Sequence[Path] = (), where: str = "AUTO"
+) -> list[str]:
+    """Puts the freeze group into the scene's compositor, or updates the one that is there.
 
     Args:
         scene: the scene; given a minimal tree (plate, group, output) if it has none.
         take: the frozen frames.
         plate: first file of the undistorted plate, for the minimal tree.
+        footage: files by which a node that shows the plate is known: the plate's, the clip's.
+        where: "PLATE" behind the node that shows the plate, "OUTPUT" before the output, "AUTO" the first of these
+            that there is. A group that is there already stays where it is with "AUTO".
 
     Returns:
         What was changed, one sentence each.
 
     Raises:
+        contract.JobError: "PLATE", and no node shows it.
         ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is as it was.
     """
     changes: list[str] = []
+    behind = _place_of(scene, footage, where)
     frozen, stream = _frozen_image(take), None
     if plate is not None and shows_plate(scene):
         stream = load_sequence(plate, _plate_name(plate), "srgb")
@@ -86,8 +98,14 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
     node = group_node(tree)
     if node is None:
         node = _insert_node(tree, before)
-        changes.append(f'The node group "{GROUP_NAME}" was inserted before the output.')
+        _lead_through(tree, node, behind)
+        place = "as the plate: what follows it goes on from there" if behind is not None else "before the output"
+        changes.append(f'The node group "{GROUP_NAME}" was inserted {place}.')
     else:
+        if where != "AUTO" and _stands_in(node) != (behind is not None):
+            _lead_past(tree, node)
+            _lead_through(tree, node, behind)
+            changes.append(f'The node group "{GROUP_NAME}" was moved.')
         _set_defaults(node, _give_sockets(node.node_tree))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
     _fill_group(scene, node.node_tree, take, frozen)
@@ -185,11 +203,7 @@ def remove(scene: Any) -> bool:
         return False
     group = node.node_tree
     before = json.loads(group.get(_BEFORE, "{}"))
-    sources = [link.from_socket for link in node.inputs["Image"].links]
-    targets = [link.to_socket for link in node.outputs["Image"].links]
-    for target in targets:
-        if sources:
-            tree.links.new(sources[0], target)
+    _lead_past(tree, node)
     images = [n.image for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image]
     textures = [n.texture for n in group.nodes if n.bl_idname == "CompositorNodeTexture" and n.texture]
     tree.nodes.remove(node)
@@ -406,19 +420,114 @@ def _insert_node(tree: Any, before: dict[str, bool]) -> Any:
     group[_TAG] = True
     group[_BEFORE] = json.dumps(before)
     _give_sockets(group)
-    target = compat.output_socket(tree) or compat.new_output_node(tree)
-    source = target.links[0].from_socket if target.is_linked else None
     node = tree.nodes.new("CompositorNodeGroup")
     node.node_tree = group
     node.name = node.label = GROUP_NAME
     node.width = 180.0
-    end = target.node
-    node.location = (end.location.x - node.width - 30.0, end.location.y - 160.0)
     _set_defaults(node, {s.name for s in node.inputs})
+    return node
+
+
+def _lead_through(tree: Any, node: Any, behind: Any | None) -> None:
+    """Leads a picture through our node: all that leaves a socket, or with None what goes to the output."""
+    if behind is not None:
+        source, targets, beside = behind, [link.to_socket for link in behind.links], behind.node
+        node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 160.0)
+    else:
+        end = compat.output_socket(tree) or compat.new_output_node(tree)
+        source, targets = end.links[0].from_socket if end.is_linked else None, [end]
+        node.location = (end.node.location.x - node.width - 30.0, end.node.location.y - 160.0)
+    for target in targets:
+        tree.links.new(node.outputs["Image"], target)
     if source is not None:
         tree.links.new(source, node.inputs["Image"])
-    tree.links.new(node.outputs["Image"], target)
-    return node
+    node.node_tree[_STANDS_IN] = behind is not None
+
+
+def _lead_past(tree: Any, node: Any) -> None:
+    """Leads what goes through our node past it again."""
+    sources = [link.from_socket for link in node.inputs["Image"].links]
+    for target in [link.to_socket for link in node.outputs["Image"].links]:
+        if sources:
+            tree.links.new(sources[0], target)
+    for link in list(node.inputs["Image"].links):
+        tree.links.remove(link)
+
+
+def _stands_in(node: Any) -> bool:
+    """True if our node stands behind the plate, not before the output."""
+    return bool(node.node_tree.get(_STANDS_IN))
+
+
+def _place_of(scene: Any, footage: Sequence[Path], where: str) -> Any | None:
+    """Socket that the group goes behind: the plate's, in the artist's tree; None for before the output.
+
+    A plate that is undistorted or brought to the render's size first is taken after that, as the frozen frames are.
+    """
+    tree = compat.compositor_tree(scene)
+    if where == "OUTPUT" or tree is None:
+        return None
+    led = [n for n in _upstream(tree) if n.bl_idname in _PICTURES and not n.get(_TAG) and not n.mute]
+    nodes = [n for n in tree.nodes if n in led and _picture(n).is_linked]
+    found = [n for n in nodes if _shows(n, footage)]
+    if where == "PLATE" and not found:  # by another name, then: the chosen one, or the only one
+        found = [n for n in nodes if n == tree.nodes.active] or (nodes if len(nodes) == 1 else [])
+    if not found:
+        if where == "PLATE":
+            raise contract.JobError(
+                "No node of this compositor shows the plate.",
+                "Select the Image or Movie Clip node that does, or insert before the output.",
+                contract.ExitCode.BAKE,
+            )
+        return None
+    socket = _picture(found[0])
+    while len(socket.links) == 1 and _conforms(scene, socket.links[0].to_node, found[0]):
+        following = socket.links[0].to_node.outputs[0]
+        if not following.is_linked:
+            break
+        socket = following
+    return socket
+
+
+def _picture(node: Any) -> Any:
+    """Output of an Image or Movie Clip node that the picture leaves through."""
+    return next(s for s in node.outputs if s.enabled and s.type == "RGBA")
+
+
+def _upstream(tree: Any) -> list[Any]:
+    """Nodes whose picture gets to the tree's output."""
+    end = compat.output_socket(tree)
+    waiting, found = [end.node] if end is not None else [], []
+    while waiting:
+        node = waiting.pop()
+        if node not in found:
+            found.append(node)
+            waiting += [link.from_node for socket in node.inputs for link in socket.links]
+    return found
+
+
+def _shows(node: Any, footage: Sequence[Path]) -> bool:
+    """True if an Image or Movie Clip node shows one of these files, or another of the sequence that it belongs to."""
+    data = node.image if node.bl_idname == _PICTURES[0] else node.clip
+    if data is None or not data.filepath:
+        return False
+    numbered = data.source == "SEQUENCE"
+    path = _footage_key(Path(bpy.path.abspath(data.filepath)), numbered)
+    return any(path == _footage_key(known, numbered) for known in footage)
+
+
+def _footage_key(path: Path, numbered: bool) -> tuple[str, str]:
+    """Folder and name of a file; of one of a sequence without its number, which may stand there as ####."""
+    folder, name = os.path.split(os.path.realpath(path))
+    return os.path.normcase(folder), re.sub(r"\d+|#+", "#", name) if numbered else os.path.normcase(name)
+
+
+def _conforms(scene: Any, node: Any, plate: Any) -> bool:
+    """True if a node only undistorts the plate, or brings one of another size to the render's."""
+    if node.mute or node.bl_idname == "CompositorNodeMovieDistortion":
+        return not node.mute
+    data = plate.image if plate.bl_idname == _PICTURES[0] else plate.clip
+    return node.bl_idname == "CompositorNodeScale" and tuple(data.size) != render_size(scene)
 
 
 def _fill_group(scene: Any, group: Any, take: Take, image: Any) -> None:

@@ -595,6 +595,7 @@ class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """Colours, and the parts of the step one by one."""
         layout.prop(context.scene.splannequin, "keep_colours")
+        layout.prop(context.scene.splannequin, "insert_at")
         name = "splannequin.insert_freeze"
         layout.operator(name, text="Insert in Compositor Only", icon=icons.of(name))
         for name in ("splannequin.combine_cg", "splannequin.remove_shot"):

@@ -243,6 +243,17 @@ class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
         default=True,
         options=set(),
     )
+    insert_at: EnumProperty(
+        name="Insert",
+        description="Where the freeze goes in a compositor that you have built",
+        items=[
+            ("AUTO", "Automatic", "As the plate where a node shows it, else before the output"),
+            ("PLATE", "As Plate", "Behind the node that shows the plate, so that your grade goes on from there"),
+            ("OUTPUT", "Before Output", "Behind everything else"),
+        ],
+        default="AUTO",
+        options=set(),
+    )
     shots: CollectionProperty(
         name="Shots",
         description="All shots of the scene if there are several",

@@ -250,6 +250,122 @@ def test_frames_of_another_size_are_fitted(addon, scene, take, shot, tmp_path, l
             assert found[rows, columns].mean() == pytest.approx(small.mean(), abs=0.06)
 
 
+@pytest.fixture
+def graded(addon, scene, shot):
+    """graded(file): a tree of the artist's that shows a sequence, two stops brighter, and its alpha elsewhere."""
+
+    def build(file: Path, kind: str = "CompositorNodeImage"):
+        compat = addon("compat")
+        tree = compat.new_compositor_tree(scene, "Artist")
+        plate = tree.nodes.new(kind)
+        if kind == "CompositorNodeImage":
+            plate.image = bpy.data.images.load(str(file))
+            plate.image.source = "SEQUENCE"
+            addon("compositor").show_sequence(plate, plate.image, 5, 7)
+        else:
+            plate.clip = bpy.data.movieclips.load(str(file))
+        brighter = tree.nodes.new("CompositorNodeExposure")
+        brighter.inputs["Exposure"].default_value = 2.0
+        blur = tree.nodes.new("CompositorNodeBlur")
+        tree.links.new(plate.outputs["Image"], brighter.inputs["Image"])
+        tree.links.new(plate.outputs["Image"], blur.inputs["Image"])
+        tree.links.new(brighter.outputs["Image"], compat.output_socket(tree))
+        return tree, plate
+
+    return build
+
+
+def test_behind_a_plate_the_grade_goes_on_from_the_frozen_frame(addon, scene, shot, graded, tmp_path, layers, pictures):
+    tree, plate = graded(shot / "frames" / "000005.png")
+    before = snapshot(tree)
+    said = addon("bake").insert(scene, shot, "freeze")
+    assert "as the plate" in said[0]
+    compositor = addon("compositor")
+    node = compositor.group_node(tree)
+    nodes, links = snapshot(tree, compositor.GROUP_NAME)
+    assert nodes == before[0] and len(before[1] - links) == 2 and not links - before[1]
+    assert [link.to_node for link in plate.outputs["Image"].links] == [node]
+    kinds = {link.to_node.bl_idname for link in node.outputs["Image"].links}
+    assert kinds == {"CompositorNodeExposure", "CompositorNodeBlur"}
+    assert compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))[0].endswith("was updated.")
+    assert [link.to_node for link in plate.outputs["Image"].links] == [node]
+    render(addon, scene, tmp_path / "out")
+    found = pictures.read(tmp_path / "out" / "000006.png")
+    assert np.abs(found - pictures.srgb(4.0 * layers(6)["rgba"][..., :3])).max() * 255 < 1.1
+    assert addon("bake").remove(scene) and snapshot(tree) == before, "the links too"
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "behind"),
+    [
+        ("clip.####.png", "CompositorNodeImage", True),
+        ("clip.####.png", "CompositorNodeMovieClip", True),
+        ("other.####.png", "CompositorNodeImage", False),
+    ],
+)
+def test_a_plate_is_known_by_the_clips_file(addon, scene, shot, graded, tmp_path, pictures, name, kind, behind):
+    for n in (5, 6, 7):
+        pictures.write(tmp_path / name.replace("####", f"{n:04d}"), np.zeros((12, 16, 3), np.uint8))
+    tree, plate = graded(tmp_path / name.replace("####", "0005"), kind)
+    scene.splannequin.clip = str(tmp_path / "clip.####.png")
+    addon("bake").insert(scene, shot, "freeze")
+    node = addon("compositor").group_node(tree)
+    assert (plate.outputs["Image"].links[0].to_node == node) == behind
+    assert (addon("compat").output_socket(tree).links[0].from_node == node) != behind
+
+
+def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene, shot, graded, tmp_path, pictures):
+    pictures.write(tmp_path / "a 0005.png", np.zeros((12, 16, 3), np.uint8))
+    tree, plate = graded(tmp_path / "a 0005.png")
+    before, bake, props = snapshot(tree), addon("bake"), scene.splannequin
+    output = addon("compat").output_socket(tree)
+    other = tree.nodes.new("CompositorNodeImage")
+    over = tree.nodes.new("CompositorNodeAlphaOver")
+    tree.links.new(other.outputs["Image"], over.inputs[2])
+    with_other = snapshot(tree)
+    tree.nodes.active = None
+    props.insert_at = "PLATE"
+    bake.insert(scene, shot, "freeze")
+    node = addon("compositor").group_node(tree)
+    assert plate.outputs["Image"].links[0].to_node == node, "the only one that gets to the output"
+    props.insert_at, node.inputs["Mix"].default_value = "OUTPUT", 0.25
+    assert any("was moved" in line for line in bake.insert(scene, shot, "freeze"))
+    node = addon("compositor").group_node(tree)
+    assert output.links[0].from_node == node and node.inputs["Mix"].default_value == 0.25
+    assert not [link for link in plate.outputs["Image"].links if link.to_node == node]
+    bake.remove(scene)
+    assert snapshot(tree) == with_other
+    tree.nodes.remove(other)
+    tree.nodes.remove(over)
+    assert snapshot(tree) == before
+    tree.nodes.remove(plate)
+    props.insert_at, bare = "PLATE", snapshot(tree)
+    with pytest.raises(contract.JobError, match="No node of this compositor shows the plate"):
+        bake.insert(scene, shot, "freeze")
+    assert snapshot(tree) == bare and addon("compositor").group_node(tree) is None
+
+
+def test_a_plate_of_another_size_is_taken_where_it_has_the_renders(addon, scene, shot, graded):
+    compat = addon("compat")
+    tree, plate = graded(shot / "frames" / "000005.png")
+    targets = [link.to_socket for link in plate.outputs["Image"].links]
+    fit = compat.new_fit_node(tree)
+    tree.links.new(plate.outputs["Image"], fit.inputs[0])
+    for target in targets:
+        tree.links.new(fit.outputs[0], target)
+    before = snapshot(tree)
+    scene.render.resolution_x, scene.render.resolution_y = 32, 24
+    addon("bake").insert(scene, shot, "freeze")
+    node = addon("compositor").group_node(tree)
+    assert [link.to_node for link in fit.outputs[0].links] == [node] and len(node.outputs["Image"].links) == 2
+    addon("bake").remove(scene)
+    assert snapshot(tree) == before
+    scene.render.resolution_x, scene.render.resolution_y = 16, 12
+    addon("bake").insert(scene, shot, "freeze")
+    node = addon("compositor").group_node(tree)
+    assert plate.outputs["Image"].links[0].to_node == node, "a scale that the artist wants, of the frozen frame too"
+
+
 @pytest.mark.parametrize("mix", [0.0, 1.0])
 @pytest.mark.parametrize(("baked", "rendered"), [(50, 100), (100, 50), (25, 100)])
 def test_a_take_fills_the_frame_at_any_percentage(
