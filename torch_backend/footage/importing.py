@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import LAST_FRAME, Reporter, frame_file, read_json
+from ..contract import LAST_FRAME, JobError, Reporter, frame_file, read_json
 from ..shot import Shot, content_key, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
-from .images import resize, working_size, write_png
+from .images import is_whole_png, resize, working_size, write_png
 from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, footage_error, frame_words, open_source
 
 FRAMES_VERSION = 1
@@ -98,11 +98,20 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
 
 
 def load_frames(shot: Shot) -> dict[str, Any]:
-    """frames.json of a finished import. JobError says to import first."""
+    """frames.json of a finished import. JobError says to import first, or again if it is damaged."""
     path = shot.frames / FRAMES_FILE
     if not path.is_file():
         raise footage_error(f"The shot {shot.root.name} has no frames yet.", "Import footage first.")
-    return read_json(path)
+    try:
+        record = read_json(path)
+        rows = [(int(f["frame"]), float(f["seconds"]), str(f["file"]), bool(f["solve"])) for f in record["frames"]]
+        numbers = [number for number, *_ in rows]
+        whole = bool(rows) and numbers == sorted(set(numbers)) and int(record["width"]) * int(record["height"]) > 0
+    except (ValueError, TypeError, KeyError, OverflowError):
+        whole = False
+    if not whole:
+        raise footage_error(f"{path} is damaged.", "Import the clip again.")
+    return record
 
 
 def _check(config: FootageConfig) -> None:
@@ -134,11 +143,11 @@ def _check_range(opened: Source, config: FootageConfig) -> None:
 
 
 def _finished(shot: Shot, key: str) -> dict[str, Any] | None:
-    path = shot.frames / FRAMES_FILE
-    if not path.is_file():
+    try:
+        record = load_frames(shot)
+    except JobError:  # none yet, or damaged: it is imported anew
         return None
-    record = read_json(path)
-    whole = record.get("key") == key and all((shot.frames / f["file"]).is_file() for f in record["frames"])
+    whole = record.get("key") == key and all(is_whole_png(shot.frames / f["file"]) for f in record["frames"])
     return record if whole else None
 
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraPath, ExitCode, JobError, read_json
+from ..contract import ExitCode, JobError
 from ..shot import Shot
+from .stored import load_cameras, load_record
 
 _EXTRA = {
     "SIMPLE_PINHOLE": (),
@@ -139,12 +140,9 @@ class Lens:
 
 def load_lens(shot: Shot) -> Lens:
     """The lens of a solved shot, from solve.json and cameras.json. JobError (SOLVE) if they do not tell it."""
-    record, cameras = shot.solve / "solve.json", shot.solve / "cameras.json"
-    if not (record.is_file() and cameras.is_file()):
-        raise JobError(f"{shot.root.name} has no cameras yet.", "Run the camera step first.", ExitCode.SOLVE)
-    told, path = read_json(record), CameraPath.load(cameras)
+    told, path = load_record(shot), load_cameras(shot)
     model, extra, focal = told.get("camera_model"), told.get("distortion"), told.get("focal_px")
-    if model is None or extra is None or not focal or not path.frames:
+    if model is None or extra is None or not focal:
         raise JobError(
             f"The solve of {shot.root.name} does not tell its lens.", "Solve the camera again.", ExitCode.SOLVE
         )

@@ -13,9 +13,9 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, open_regular, read_json
+from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, open_regular
 from ..footage import load_frames
-from ..footage.images import read_png, write_png
+from ..footage.images import is_whole_png, read_frame, write_png
 from ..footage.sources import frame_words
 from ..shot import Shot, atomic_path, content_key, need_disk, write_json
 from . import foreign
@@ -25,6 +25,7 @@ from .given import doubts, prepare, refuse_misfit, take_over
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
 from .replacing import Staged, replacing_solve, settle_solve
+from .stored import load_cameras, load_points, load_record
 from .undistort import Undistorter
 
 SOLVE_VERSION = 1
@@ -94,11 +95,12 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     settle_solve(shot)
     frames = load_frames(shot)
     source = [foreign.fingerprint(cameras)] if cameras else []
-    key = content_key(SOLVE_VERSION, config, frames["key"], *source)
+    key = content_key(SOLVE_VERSION, config, frames.get("key"), *source)
     done = _finished(shot, frames, key)
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
         return done["result"]
+    _refuse_damaged(shot, frames)
     taken = prepare(frames, cameras, report) if cameras else None
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
     size = sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
@@ -123,15 +125,6 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     return result
 
 
-def load_points(shot: Shot) -> dict[str, NDArray]:
-    """points.npz: xyz float32 [P, 3] solve units, rgb uint8 [P, 3], error float32 [P] px, track uint16 [P]."""
-    path = shot.solve / "points.npz"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: solve the shot first")
-    with np.load(path, allow_pickle=False) as data:
-        return {name: data[name] for name in ("xyz", "rgb", "error", "track")}
-
-
 def _log_end(log: Path) -> str:
     """What COLMAP said last, for the job's own log."""
     try:
@@ -154,13 +147,28 @@ def _check(config: SolveConfig) -> None:
 
 
 def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | None:
-    path = shot.solve / "solve.json"
-    if not path.is_file():
+    """solve.json if it is of this key and the solve is whole: to solve again is how a damaged one is mended."""
+    try:
+        record = load_record(shot)
+        if record.get("key") != key or not isinstance(record.get("result"), dict):
+            return None
+        load_cameras(shot)
+        load_points(shot)
+    except (JobError, ValueError):
         return None
-    record = read_json(path)
-    needed = [shot.solve / "cameras.json", shot.solve / "points.npz"]
-    needed += [shot.frames / frame_file(f["frame"], ".png") for f in frames["frames"]]
-    return record if record.get("key") == key and all(p.is_file() for p in needed) else None
+    plates = [shot.frames / frame_file(f["frame"], ".png") for f in frames["frames"]]
+    return record if all(is_whole_png(p) for p in plates) else None
+
+
+def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
+    """JobError (FOOTAGE) if a frame cannot be read: COLMAP would leave it out, and say so in its log alone."""
+    bad = [f["frame"] for f in frames["frames"] if not is_whole_png(shot.frames / f["file"])]
+    if bad:
+        raise JobError(
+            f"Damaged or missing in {shot.frames / 'raw'}: {frame_words(bad)}.",
+            "Import the clip again.",
+            ExitCode.FOOTAGE,
+        )
 
 
 def _ask_worker(
@@ -363,7 +371,7 @@ def _undistort(
         undistort = Undistorter(data["where"])
 
     def one(frame: dict[str, Any]) -> int:
-        pixels = read_png(shot.frames / frame["file"])
+        pixels = read_frame(shot.frames / frame["file"])
         write_png(into / frame_file(frame["frame"], ".png"), undistort(pixels))
         return frame["frame"]
 

@@ -56,19 +56,6 @@ def of_old(shot, before):
     return {name: now.get(name) for name in before} == before
 
 
-@pytest.fixture
-def again(solved, tmp_path):
-    """A copy of the solved shot, and a model to solve it from again: quicker than from its pictures.
-
-    Its frames are as another lens would have left them.
-    """
-    shutil.copytree(solved.shot.solve / "colmap", tmp_path / "model")
-    shot = Shot(shutil.copytree(solved.shot.root, tmp_path / "a.splannequin"))
-    for raw in (shot.frames / "raw").iterdir():
-        shutil.copy(raw, shot.frames)
-    return shot, str(tmp_path / "model")
-
-
 def killed(shot, cameras, stage="", rename=0):
     done = subprocess.run([sys.executable, "-c", AGAIN, shot.root, stage, str(rename), cameras], cwd=ROOT, check=False)
     assert done.returncode == -signal.SIGKILL
