@@ -7,8 +7,11 @@ percentile of the distance from it) is 1, so learning rates, near planes and thr
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,14 +82,17 @@ def load_scene(shot: Shot) -> Scene:
     if not cameras_path.is_file() or not points_path.is_file():
         raise JobError(f"{shot.root.name} has no cameras yet.", "Run the camera step first.", ExitCode.SOLVE)
     path = CameraPath.load(cameras_path)
-    table = {row["frame"]: row for row in read_json(shot.frames / "frames.json")["frames"]}
+    table = frame_table(shot)
+    strange = [camera.frame for camera in path.frames if camera.frame not in table]
+    if strange:
+        message = f"{shot.root.name} has a camera for frame {strange[0]}, which was not imported."
+        raise JobError(message, "Solve the shot again.", ExitCode.SOLVE)
     frames = [camera.frame for camera in path.frames]
     viewmats = np.array([camera.viewmat for camera in path.frames], dtype=np.float64).reshape(-1, 4, 4)
     solved = [i for i, c in enumerate(path.frames) if c.source == "registered" and table[c.frame]["solve"]]
     if len(solved) < 3:
         raise JobError(f"Only {len(solved)} frames have a solved camera.", "Solve the shot again.", ExitCode.SOLVE)
-    with np.load(points_path, allow_pickle=False) as stored:
-        xyz, rgb = stored["xyz"].astype(np.float64), stored["rgb"]
+    xyz, rgb = _points(points_path)
     scale, centre = _normalisation(viewmats[solved], xyz)
     seconds = np.array([table[f]["seconds"] for f in frames], dtype=np.float64)
     seconds -= seconds[0]
@@ -108,6 +114,36 @@ def load_scene(shot: Shot) -> Scene:
         centre=centre,
         folder=shot.frames,
     )
+
+
+def frame_table(shot: Shot) -> dict[int, dict[str, Any]]:
+    """Frame number -> its row of frames.json. JobError if that holds something else."""
+    path = shot.frames / "frames.json"
+    if not path.is_file():
+        raise JobError(f"{shot.root.name} has no frames yet.", "Import the clip first.", ExitCode.FOOTAGE)
+    try:
+        rows = {int(row["frame"]): row for row in read_json(path)["frames"]}
+        for row in rows.values():
+            row["seconds"], row["solve"] = float(row["seconds"]), bool(row["solve"])
+            row["sharpness"] = float(row.get("sharpness", 0.0))
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        message = f"{path} cannot be read ({type(error).__name__})."
+        raise JobError(message, "Import the clip again.", ExitCode.FOOTAGE) from error
+    return rows
+
+
+def _points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """xyz [P, 3] float64 in solve units and rgb [P, 3] of the solve's points. JobError on a damaged file."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            xyz, rgb = stored["xyz"].astype(np.float64), stored["rgb"].astype(np.float32)
+        fits = xyz.ndim == 2 and xyz.shape[1] == 3 and rgb.shape == xyz.shape
+        if not (fits and np.isfinite(xyz).all() and np.isfinite(rgb).all()):
+            raise ValueError("points of another shape, or not finite")
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        message = f"{path} cannot be read ({type(error).__name__})."
+        raise JobError(message, "Solve the shot again.", ExitCode.SOLVE) from error
+    return xyz, rgb
 
 
 def _in_scene(viewmats: np.ndarray, scale: float, centre: np.ndarray) -> np.ndarray:
