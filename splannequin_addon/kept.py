@@ -16,7 +16,7 @@ _known: OrderedDict[tuple[Any, ...], tuple[tuple[int, ...], Any]] = OrderedDict(
 
 
 def of(path: Path, read: Callable[..., T], *words: Any) -> T:
-    """`read(path, *words)`, remembered while file or folder is what it was: the same, as long, changed at no other time.
+    """`read(path, *words)`, remembered while file or folder is what it was: same file, same length, same times.
 
     The value is given out again and again: nobody may change it. What `read` raises is not remembered.
 

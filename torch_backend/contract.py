@@ -237,7 +237,10 @@ class FreezeParams:
 
 def overscan(text: str) -> float:
     """`FreezeParams.overscan` as a command line gives it: 0 to 100 percent, or "lens" (-1). ValueError on else."""
-    value = -1.0 if text == "lens" else float(text)
+    try:
+        value = -1.0 if text == "lens" else float(text)
+    except ValueError:
+        value = math.nan
     if text != "lens" and not 0.0 <= value <= 100.0:
         raise ValueError(f"overscan is 0 to 100 percent, or lens, got {text!r}")
     return value
@@ -255,6 +258,67 @@ PARAMS: dict[str, type] = {
 """Kind of job -> the dataclass of its parameters."""
 
 
+@dataclass(frozen=True)
+class Limit:
+    """What a number among a job's parameters may be."""
+
+    what: str
+    """What a sentence calls it."""
+    low: float
+    """Least."""
+    high: float
+    """Most."""
+    also: Mapping[int, str] = field(default_factory=dict)
+    """Values outside of that which have a meaning -> what they are for."""
+
+
+_FRAMES = ((1 << 31) - 1) * 1.0
+_PRESET = {0: "the preset's"}
+LIMITS: dict[type, dict[str, Limit]] = {
+    ImportParams: {
+        "first": Limit("first frame", -_FRAMES, _FRAMES),
+        "last": Limit("last frame", -_FRAMES, _FRAMES),
+        "step": Limit("step between solved frames", 1, 100_000, {0: "one that is chosen"}),
+        "working_height": Limit("height of the working frames", 16, 16_384, {0: "the source's"}),
+    },
+    SolveParams: {"overlap": Limit("number of following frames that are matched", 1, 1000)},
+    TrainParams: {
+        "iterations": Limit("number of training steps (iterations)", 10, 10_000_000, _PRESET),
+        "width": Limit("width of the training images", 16, 16_384, _PRESET),
+        "max_gaussians": Limit("budget of Gaussians", 100, 20_000_000, _PRESET),
+        "holdout": Limit("distance between held-out frames", 2, 1_000_000, {0: "none", -1: "the preset's"}),
+        "seed": Limit("random seed", 0, (1 << 53) - 1),
+        "extend": Limit("number of steps to add", 1, 10_000_000, {0: "none"}),
+    },
+    FreezeParams: {
+        "t_star": Limit("t*", -_FRAMES, _FRAMES),
+        "t_star_per_frame": Limit("t* of a frame", -_FRAMES, _FRAMES),
+        "first": Limit("first frame", -_FRAMES, _FRAMES),
+        "last": Limit("last frame", -_FRAMES, _FRAMES),
+        "step": Limit("step between frozen frames", 1, 1_000_000),
+        "width": Limit("width of the frozen frames", 16, 16_384, {0: "the training's"}),
+        "overscan": Limit("overscan in percent", 0, 100, {-1: "what the lens needs"}),
+    },
+}
+"""The numbers of each kind of parameters, by field."""
+
+
+def check_params(params: Any) -> None:
+    """ValueError, in a sentence, names the first number of a job's parameters that is out of its `LIMITS`."""
+    for name, limit in LIMITS.get(type(params), {}).items():
+        given = getattr(params, name)
+        values = given.values() if isinstance(given, dict) else (given,)
+        for value in values:
+            if value is None or value in limit.also or limit.low <= value <= limit.high:  # NaN is none of them
+                continue
+            also = "".join(f", or {value} for {meaning}" for value, meaning in limit.also.items())
+            message = f"The {limit.what} is {value}: it should be {limit.low:.0f} to {limit.high:.0f}{also}."
+            raise ValueError(message)
+    odd = [key for key in getattr(params, "t_star_per_frame", {}) if not key.lstrip("-").isdecimal()]
+    if odd:
+        raise ValueError(f"t* is given for frame {odd[0]!r}: it should be the number of a frame.")
+
+
 @dataclass
 class JobRequest:
     """What Blender asks for: one station, on one shot."""
@@ -269,10 +333,12 @@ class JobRequest:
     """Version of this contract."""
 
     def typed_params(self) -> Any:
-        """The parameters as their dataclass. ValueError names an unknown kind, field or a value of the wrong type."""
+        """The parameters as their dataclass. ValueError names an unknown kind or field, or a value that cannot be."""
         if self.kind not in PARAMS:
             raise ValueError(f"unknown job kind {self.kind!r}: expected one of {', '.join(PARAMS)}")
-        return from_dict(PARAMS[self.kind], self.params)
+        params = from_dict(PARAMS[self.kind], self.params)
+        check_params(params)
+        return params
 
 
 @dataclass
@@ -445,7 +511,11 @@ class CameraPath:
     @staticmethod
     def load(path: str | Path) -> CameraPath:
         """Reads a path; FileNotFoundError or ValueError names the file."""
-        return CameraPath.from_json(read_json(path))
+        data = read_json(path)
+        try:
+            return CameraPath.from_json(data)
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(f"{path} holds no camera path: {error}") from error
 
 
 # ------------------------------------------------------------------------------------------------- live session

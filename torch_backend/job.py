@@ -22,7 +22,7 @@ from typing import Any
 
 from . import contract
 from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status
-from .shot import Shot, disk_error, is_disk_full, write_json
+from .shot import Shot, disk_error, is_disk_full, path_error, write_json
 from .writer import only_writer
 
 _CANCEL_POLL_SECONDS = 0.2
@@ -193,24 +193,29 @@ def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack 
     except JobError as error:
         state, code, message, hint = "failed", error.exit_code, error.message, error.hint
         _log(reporter.folder, "\n".join([message, hint, *getattr(error, "__notes__", ())]) + "\n")
-    except (ValueError, FileNotFoundError) as error:
+    except ValueError as error:
         state, code, message = "failed", int(ExitCode.USAGE), str(error)
         _log(reporter.folder, traceback.format_exc())
     except Exception as error:
         _log(reporter.folder, traceback.format_exc())
-        full = disk_error(request.shot) if isinstance(error, OSError) and is_disk_full(error) else None
-        text = str(error).lower()
-        state, code = "failed", full.exit_code if full else int(ExitCode.INTERNAL)
+        told, text = _about_a_path(error, request.shot), str(error).lower()
+        state, code = "failed", told.exit_code if told else int(ExitCode.INTERNAL)
         if isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
             message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."
-        elif isinstance(error, PermissionError):
-            message = f"{error.filename2 or error.filename} cannot be written: it is protected, or open elsewhere."
-            hint = "Close it, or choose another folder, then start again: finished work is kept."
         else:
-            message = full.message if full else f"The {request.kind} step broke: {type(error).__name__}: {error}"
-            hint = full.hint if full else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
+            message = told.message if told else f"The {request.kind} step broke: {type(error).__name__}: {error}"
+            hint = told.hint if told else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
     reporter.finish(state, code, message, hint, result)
     return code, result
+
+
+def _about_a_path(error: Exception, shot: str) -> JobError | None:
+    """The sentence for a full disk, or for a file that the system refuses; None for any other error."""
+    if not isinstance(error, OSError):
+        return None
+    if isinstance(error, FileNotFoundError) and not error.filename:
+        return JobError(str(error), "", ExitCode.USAGE)  # said in words by whoever looked for it
+    return disk_error(shot) if is_disk_full(error) else path_error(error)
 
 
 def _log(folder: Path, text: str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -77,8 +78,7 @@ def resize_intrinsics(Ks: Tensor, width: int, height: int, new_width: int, new_h
 
 def load_scene(shot: Shot) -> Scene:
     """The scene of a solved shot. JobError if it is not solved, is damaged, or cannot be normalised."""
-    path, sparse = load_cameras(shot), load_points(shot)
-    table = {row["frame"]: row for row in load_frames(shot)["frames"]}
+    path, sparse, table = load_cameras(shot), load_points(shot), frame_table(shot)
     frames = [camera.frame for camera in path.frames]
     if not set(frames) <= set(table):
         raise damaged(shot.solve / "cameras.json", f"frame {min(set(frames) - set(table))} was not imported")
@@ -108,6 +108,11 @@ def load_scene(shot: Shot) -> Scene:
         centre=centre,
         folder=shot.frames,
     )
+
+
+def frame_table(shot: Shot) -> dict[int, dict[str, Any]]:
+    """Frame number -> its row of frames.json. JobError if that is missing or damaged."""
+    return {int(row["frame"]): row for row in load_frames(shot)["frames"]}
 
 
 def _in_scene(viewmats: np.ndarray, scale: float, centre: np.ndarray) -> np.ndarray:

@@ -294,3 +294,28 @@ def disk_error(folder: str | Path, detail: str = "the disk is full") -> JobError
 def is_disk_full(error: OSError) -> bool:
     """True if the system refused to write for want of space or quota."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+_REFUSED = {
+    errno.ENAMETOOLONG: ("has a name that is too long for this system", "Choose a shorter one."),
+    errno.ENOTDIR: ("leads through a file where a folder is needed", "Choose another place."),
+    errno.EEXIST: ("is a file where a folder is needed", "Choose another place."),
+    errno.EISDIR: ("is a folder where a file is needed", "Choose another place."),
+    errno.ENOENT: ("does not exist", "Check the name."),
+    errno.ELOOP: ("is a link that leads to itself", "Choose another place."),
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS),
+        ("cannot be used: it is protected, or open elsewhere", "Close it, or choose another place."),
+    ),
+}
+
+
+def path_error(error: OSError) -> JobError | None:
+    """The sentence for a file or folder that the system refuses, or for a full disk; None if it is about no path."""
+    where = error.filename2 or error.filename
+    if is_disk_full(error):
+        return disk_error(where or "the output folder")
+    if not where or error.errno not in _REFUSED:
+        return None
+    what, hint = _REFUSED[error.errno]
+    return JobError(f"{where} {what}.", hint, ExitCode.USAGE)

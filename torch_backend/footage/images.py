@@ -41,13 +41,14 @@ def write_png(path: str | Path, pixels: NDArray) -> None:
     buffer.specmod().attribute("png:compressionLevel", PNG_COMPRESSION)
     buffer.specmod().attribute("oiio:ColorSpace", "sRGB")
     with atomic_path(path) as beside:
-        if not (buffer.write(str(beside)) and _is_whole(beside)):
+        # OpenImageIO's writer says nothing when the disk is full.
+        if not (buffer.write(str(beside)) and _has_end(beside)):
             full = shutil.disk_usage(beside.parent).free < max(_FULL_BYTES, pixels.nbytes)
             raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot write picture: {buffer.geterror()}", str(path))
 
 
-def _is_whole(png: Path) -> bool:
-    """True if a PNG has its end: OpenImageIO's writer says nothing when the disk is full."""
+def _has_end(png: Path) -> bool:
+    """True if the last part of a PNG is there."""
     with open(png, "rb") as written:
         written.seek(max(0, png.stat().st_size - 8))
         return written.read(4) == b"IEND"

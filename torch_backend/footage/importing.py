@@ -105,6 +105,8 @@ def load_frames(shot: Shot) -> dict[str, Any]:
     try:
         record = read_json(path)
         rows = [(int(f["frame"]), float(f["seconds"]), str(f["file"]), bool(f["solve"])) for f in record["frames"]]
+        for row in record["frames"]:
+            row["sharpness"] = float(row.get("sharpness", 0.0))
         numbers = [number for number, *_ in rows]
         whole = bool(rows) and numbers == sorted(set(numbers)) and int(record["width"]) * int(record["height"]) > 0
     except (ValueError, TypeError, KeyError, OverflowError):

@@ -16,7 +16,7 @@ from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, R
 from ..footage.color import premultiplied_srgb_to_linear
 from ..footage.images import read_png
 from ..gaussians.ply import write_ply
-from ..scene import Scene, load_scene
+from ..scene import Scene, frame_table, load_scene
 from ..shot import Shot, content_key, disk_error, is_disk_full, need_disk, write_json
 from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
@@ -139,8 +139,8 @@ def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams
     """The frame to freeze at, snapped to a trained one: a time that no frame constrains is a guess."""
     trained = np.array(run.train_frames)
     if params.t_star is None:
-        table = {row["frame"]: row for row in read_json(shot.frames / "frames.json")["frames"]}
-        sharpness = np.array([float(table[int(f)].get("sharpness", 0.0)) for f in trained])
+        table = frame_table(shot)
+        sharpness = np.array([table[int(f)]["sharpness"] if int(f) in table else 0.0 for f in trained])
         times = np.array([scene.time_of_frame(f) for f in trained])
         return int(trained[suggest_t_star(run.model, times, sharpness)])
     if not scene.frames[0] <= params.t_star <= scene.frames[-1]:
@@ -185,7 +185,7 @@ def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFram
     numbers = [f.frame for f in frames]
     first = numbers[0] if params.first is None else params.first
     last = numbers[-1] if params.last is None else params.last
-    asked = set(range(first, last + 1, max(1, params.step)))
+    asked = range(first, last + 1, max(1, params.step))
     chosen = [f for f in frames if f.frame in asked]
     if not chosen:
         raise JobError(

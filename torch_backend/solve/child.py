@@ -38,7 +38,7 @@ def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
     # Threads that spin while they wait take the core from whoever shares it.
     environment.setdefault("OMP_WAIT_POLICY", "passive")
     with open(log, "wb") as errors:
-        process = subprocess.Popen(
+        process: subprocess.Popen[bytes] = subprocess.Popen(
             **python_child(sys.executable, "torch_backend.solve.worker", str(request.absolute())),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

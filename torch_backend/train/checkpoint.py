@@ -22,6 +22,10 @@ CHECKPOINT_FILE = "checkpoint.safetensors"
 """Of a run, in its folder."""
 
 
+_DAMAGED = (SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError)
+"""What reading a file that is no checkpoint of ours raises."""
+
+
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
     """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then.
 
@@ -42,11 +46,11 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """(tensors, facts). JobError in words if the file is damaged or from a newer version."""
     try:
         with safe_open(str(path), framework="pt", device="cpu") as stored:
-            meta = json.loads((stored.metadata() or {})["splannequin"])
+            meta = _facts(stored)
             check_version(meta, str(path), CHECKPOINT_VERSION)
             # Copies: views of the mapped file would keep Windows from replacing it at the next save.
             return {name: stored.get_tensor(name).clone() for name in stored.keys()}, meta  # noqa: SIM118 - not a dict
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+    except _DAMAGED as error:
         raise JobError(
             f"The checkpoint {path} cannot be read ({type(error).__name__}).",
             "Train the run again with --restart.",
@@ -58,9 +62,17 @@ def read_meta(path: Path) -> dict[str, Any]:
     """The facts of a checkpoint without its tensors; empty if the file is damaged."""
     try:
         with safe_open(str(path), framework="pt", device="cpu") as stored:
-            return json.loads((stored.metadata() or {})["splannequin"])
-    except (SafetensorError, KeyError, json.JSONDecodeError):
+            return _facts(stored)
+    except _DAMAGED:
         return {}
+
+
+def _facts(stored: Any) -> dict[str, Any]:
+    """What an open file says of itself. One of `_DAMAGED` if that is no object of JSON."""
+    facts = json.loads((stored.metadata() or {})["splannequin"])
+    if not isinstance(facts, dict):
+        raise TypeError(f"the facts are a {type(facts).__name__}")
+    return facts
 
 
 def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:

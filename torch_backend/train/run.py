@@ -326,13 +326,17 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
     else:
         message = f"The run {name!r} is written again and again while it is read."
         raise JobError(message, "Wait for its training to end.", ExitCode.FREEZE)
-    config = config_from_json(meta["config"])
-    if meta["solve"] != solve_key(shot):
+    if meta.get("solve") != solve_key(shot):
         message = f"The run {name!r} was trained on other cameras than the shot has now."
         raise JobError(message, "Train it again.", ExitCode.FREEZE)
-    model = restore_model(tensors, meta, config, device)
-    size = int(meta["width"]), int(meta["height"])
-    return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp)
+    try:
+        config = config_from_json(meta["config"])
+        model = restore_model(tensors, meta, config, device)
+        size = int(meta["width"]), int(meta["height"])
+        return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp)
+    except (KeyError, TypeError, IndexError, AttributeError) as error:  # whole, but not as `save` wrote it
+        message = f"The checkpoint {checkpoint} does not fit this version ({type(error).__name__}: {error})."
+        raise JobError(message, "Train the run again with --restart.", ExitCode.FREEZE) from error
 
 
 def _stamp(checkpoint: Path) -> list[Any]:
