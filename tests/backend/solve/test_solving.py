@@ -133,22 +133,18 @@ def test_a_solved_shot_is_left_alone(solved, tools):
 
 
 def test_the_same_frames_give_the_same_cameras(solved, tools, tmp_path):
-    """The seeds are fixed; two threads may still add in another order, so equal up to a thousandth of the path."""
+    """To the last bit: seeds are fixed, and nothing that adds or matches does so in two threads."""
     shot = Shot.create(tmp_path / "again.splannequin")
     import_footage(shot, solved.shot.info().source, FootageConfig(step=2), tools.recorder())
     solve_shot(shot, SolveConfig(features=1500), tools.recorder())
-    one, two = (CameraPath.load(s.solve / "cameras.json") for s in (solved.shot, shot))
-    assert [(f.frame, f.source) for f in one.frames] == [(f.frame, f.source) for f in two.frames]
-    np.testing.assert_allclose([f.K for f in one.frames], [f.K for f in two.frames], rtol=2e-3)
-    np.testing.assert_allclose(path_shape(one), path_shape(two), atol=1e-3)
+    for name in ("cameras.json", "points.npz"):
+        assert (shot.solve / name).read_bytes() == (solved.shot.solve / name).read_bytes()
 
 
-def path_shape(path):
-    """[F, F] distances between the cameras over the longest: what is left of a path without its gauge."""
-    viewmats = np.array([f.viewmat for f in path.frames]).reshape(-1, 4, 4)
-    centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    return distances / distances.max()
+def test_pairs_are_matched_by_one_thread():
+    """Two get wrong products of OpenBLAS now and then: too seldom for a test to meet."""
+    code = "from torch_backend.solve.worker import _matching\nassert _matching()[0].num_threads == 1"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def imported(tmp_path, tools, poses, **options):
