@@ -33,6 +33,44 @@ _ALONG = 24
 """Points on each line from the middle to the border at which the picture is tested for a fold."""
 
 
+NARROWEST_DEG, WIDEST_DEG = 12.0, 130.0
+"""Angle of view along the longer side that a clip's lens is believed to have: 171 mm to 8.4 mm on full frame. A focal
+length that nothing in the clip holds runs off beyond them."""
+LEAST_DEG, MOST_DEG = 5.0, 150.0
+"""Beyond these it is refused: 412 mm, 4.8 mm."""
+_MOST_STRETCH = 2.0
+"""How much farther from the middle than straight lines have it a corner may lie, or how much less far."""
+
+
+def view_deg(width: int, height: int, focal: float) -> float:
+    """Angle of view in degrees along the longer side of a pinhole camera; 0 or 180 where there is no focal length."""
+    if not np.isfinite(focal) or focal <= 0:
+        return 0.0
+    return float(np.degrees(2.0 * np.arctan(0.5 * max(width, height) / focal)))
+
+
+def doubtful(width: int, height: int, focal: tuple[float, float], k1: float, k2: float = 0.0) -> str:
+    """Why a lens that a solve found cannot be right: "narrow", "wide", "bent", or "" if it can.
+
+    `focal` is fx, fy in pixels. A lens is bent if its radial terms fold the picture over before its corner, or stretch
+    the corner out of all measure, or if its pixels are far from square.
+    """
+    angle = view_deg(width, height, 0.5 * (focal[0] + focal[1]))
+    if not angle >= NARROWEST_DEG:
+        return "narrow"
+    if angle > WIDEST_DEG:
+        return "wide"
+    corner = float(np.hypot(0.5 * width / focal[0], 0.5 * height / focal[1]))
+    ideal = np.linspace(0.0, _MOST_STRETCH * corner, 1024)
+    at = ideal * (1.0 + k1 * ideal**2 + k2 * ideal**4)
+    falls = np.flatnonzero(np.diff(at) <= 0.0)
+    reached = np.flatnonzero(at >= corner)
+    folds = not len(reached) or (len(falls) > 0 and falls[0] < reached[0])
+    if folds or ideal[reached[0]] * _MOST_STRETCH < corner or not 0.8 < focal[0] / focal[1] < 1.25:
+        return "bent"
+    return ""
+
+
 @dataclass(frozen=True)
 class Lens:
     """A lens model and the pinhole camera of the frames that were undistorted with it."""

@@ -22,6 +22,7 @@ from . import foreign
 from .child import run_worker
 from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
+from .lens import LEAST_DEG, MOST_DEG, view_deg
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
 from .replacing import Staged, replacing_solve, settle_solve
@@ -222,6 +223,7 @@ def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
             _range_hint(parts, solved, frames["step"]),
             ExitCode.SOLVE,
         )
+    _refuse_lens(answer)
     refuse_narrow(angle)
     if answer["points"] < LEAST_POINTS:
         raise JobError(
@@ -229,6 +231,47 @@ def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
             "Choose a sharper range, or film with more light and texture in view.",
             ExitCode.SOLVE,
         )
+
+
+def _refuse_lens(answer: dict[str, Any]) -> None:
+    """JobError for a lens that no camera has."""
+    lens = answer["lens"]
+    angle = view_deg(lens["width"], lens["height"], answer["focal_px"])
+    if not LEAST_DEG <= angle <= MOST_DEG:
+        raise JobError(
+            f"The solve found a lens that no camera has: {angle:.1f} degrees wide ({answer['focal_px']:.0f} px).",
+            "Choose a longer range, in which the camera travels more and less of the picture moves by itself.",
+            ExitCode.SOLVE,
+        )
+
+
+def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
+    """(sentence, hint) for a lens that is doubtful, or was put in the place of one that is."""
+    lens = answer["lens"]
+    found, taken = (view_deg(lens["width"], lens["height"], px) for px in (lens["found_px"], answer["focal_px"]))
+    if lens["held"]:
+        off = "found one that folds the picture over" if lens["doubt"] == "bent" else f"ran off to {found:.0f} degrees"
+        return [
+            (
+                f"The clip does not tell its lens (the solve {off}): a usual one of {taken:.0f} degrees was taken.",
+                "Depth may look stretched; a range in which the camera travels more tells the lens.",
+            )
+        ]
+    if lens["doubt"] == "bent":
+        return [
+            (
+                "The lens that the solve found bends the picture more than lenses do, or folds it over at its corners.",
+                "Try the other camera model; a range in which the camera travels more tells the lens.",
+            )
+        ]
+    if lens["doubt"]:
+        return [
+            (
+                f"The lens that the solve found is unusual: {taken:.0f} degrees wide.",
+                "If yours is not, choose a range in which the camera travels more.",
+            )
+        ]
+    return []
 
 
 def _spans(solved: list[int], names: list[str]) -> list[tuple[int, int, int]]:
@@ -285,7 +328,8 @@ def _finish(
     (scratch / "model").rename(staged.solve / "colmap")
     write_json(staged.solve / "cameras.json", path.to_json())
     result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
-    warnings = _warnings(frames, path, result, "given" in answer) + doubts(answer)
+    warnings = _warnings(frames, path, result, "given" in answer)
+    warnings += doubts(answer) if "given" in answer else lens_remarks(answer)
     for message, hint in warnings:
         report.warning(message, hint)
     record = {
