@@ -154,7 +154,7 @@ def test_ctrl_c_while_frames_render_ends_the_bake_with_130(run, shot, tmp_path, 
     assert (bpy.context.scene.frame_start, bpy.context.scene.frame_end) == (5, 7)
 
 
-@pytest.mark.skipif(not getattr(bpy.app, "module", False), reason="a Blender is no Python that runs a script")
+@pytest.mark.skipif(bool(bpy.app.binary_path), reason="a Blender is no Python that runs a script")
 @pytest.mark.parametrize(("starter", "code", "baked"), [("gone", 130, False), ("there", 0, True)])
 def test_a_bake_ends_with_the_launcher_that_started_it(shot, tmp_path, root, starter, code, baked):
     script = root / "splannequin_addon" / "run_in_bpy.py"
