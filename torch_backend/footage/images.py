@@ -12,6 +12,7 @@ import shutil
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -33,6 +34,14 @@ _MADE_BY = {
 """Folder of working frames -> what makes them anew, and the exit code."""
 
 
+def told_by(source: Any = oiio) -> str:
+    """The pending error of OpenImageIO or of one of its objects, which is thereby taken back."""
+    try:
+        return source.geterror()
+    except UnicodeDecodeError:  # it quotes the bytes of a damaged file
+        return "it is damaged"
+
+
 def write_png(path: str | Path, pixels: NDArray) -> None:
     """Writes [H, W, 3] uint8 or uint16 as PNG of the same depth, whole or not at all. OSError if it cannot."""
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype not in (np.uint8, np.uint16):
@@ -44,7 +53,7 @@ def write_png(path: str | Path, pixels: NDArray) -> None:
         # OpenImageIO's writer says nothing when the disk is full.
         if not (buffer.write(str(beside)) and _has_end(beside)):
             full = shutil.disk_usage(beside.parent).free < max(_FULL_BYTES, pixels.nbytes)
-            raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot write picture: {buffer.geterror()}", str(path))
+            raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot write picture: {told_by(buffer)}", str(path))
 
 
 def _has_end(png: Path) -> bool:
@@ -63,7 +72,7 @@ def read_png(path: str | Path) -> NDArray:
     kind = oiio.UINT16 if str(buffer.spec().format) == "uint16" else oiio.UINT8
     pixels = None if buffer.has_error else buffer.get_pixels(kind)
     if pixels is None or buffer.has_error:
-        raise ValueError(f"picture {path} cannot be read: {buffer.geterror()}")
+        raise ValueError(f"picture {path} cannot be read: {told_by(buffer)}")
     pixels = np.asarray(pixels)
     return pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
 

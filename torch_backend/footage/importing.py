@@ -69,7 +69,8 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     from the first frame of the range. A finished import of the same source and configuration is left alone. Another
     one takes its place once it is whole, and the solve made from it is removed; files that are not ours stay.
 
-    Returns {frames, solved_frames, first, last, step, width, height, fps, colour, source}.
+    Returns {frames, solved_frames, first, last, step, width, height, fps, colour, reading,
+    source}.
     Raises JobError (FOOTAGE, DISK) in one sentence, and Cancelled; either leaves no half import behind.
     """
     _check(config)
@@ -379,5 +380,6 @@ def _result(shot: Shot, record: dict[str, Any]) -> dict[str, Any]:
         "first": frames[0]["frame"],
         "last": frames[-1]["frame"],
         **{name: record[name] for name in ("step", "width", "height", "fps", "colour")},
+        "reading": record.get("reading", {}),
         "source": shot.info().source,
     }

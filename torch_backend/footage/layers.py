@@ -7,6 +7,7 @@ from pathlib import Path
 
 import OpenImageIO as oiio
 
+from .images import told_by
 from .sources import footage_error
 
 BEAUTY = ("", "rgba", "rgb", "beauty", "combined", "c", "composite", "color", "colour", "final", "main", "master")
@@ -79,7 +80,7 @@ def _layers(file: Path) -> tuple[list[Layer], list[str]]:
     """Layers with colour, and the names of all, in the order of the file."""
     image = oiio.ImageInput.open(str(file))
     if image is None:
-        raise OSError(f"{file}: {oiio.geterror()}")
+        raise OSError(f"{file}: {told_by()}")
     found: list[Layer] = []
     names: list[str] = []
     try:
@@ -96,6 +97,8 @@ def _layers(file: Path) -> tuple[list[Layer], list[str]]:
                 names.append(prefix or title or ("" if layer else "/".join(spec.channelnames)))
                 found += [layer] if layer else []
             part += 1
+    except UnicodeDecodeError as error:
+        raise OSError(f"{file}: the name of a layer is damaged") from error
     finally:
         image.close()
     return found, names

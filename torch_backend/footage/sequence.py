@@ -17,7 +17,7 @@ from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
 from .color import InputSpace, named_space, space_of_chromaticities
-from .images import resize
+from .images import resize, told_by
 from .layers import Layer, find_layer, shown
 from .sources import (
     FASTEST_FPS,
@@ -92,8 +92,7 @@ class SequenceSource:
         self._files = {n: file for n, file in self._files.items() if file.is_file()}
         if len(self._files) < FEW:
             raise footage_error(f"{sequence} holds fewer than {FEW} pictures.", "Choose a longer sequence.")
-        first, self._layer, names = self._first_readable(layer)
-        spec = _open(first, self._layer.part).spec()
+        first, spec, self._layer, names = self._first_readable(layer)
         self._channels = spec.channelnames
         self._space = _input_space(first, spec, self.warnings)
         self._aspect = believable_aspect(_pixel_aspect(spec), self.warnings)
@@ -146,7 +145,7 @@ class SequenceSource:
         for number in sorted(n for n in self._files if first <= n <= last):
             try:
                 pixels, clipped = self._read(self._files[number], met)
-            except OSError:
+            except (OSError, UnicodeDecodeError):  # the name of a channel may be damaged too
                 unreadable.append(number)
                 continue
             yield SourceFrame(number, (number - self.info.first) / self.info.fps, pixels, clipped=clipped)
@@ -177,12 +176,15 @@ class SequenceSource:
         if self._space.primaries != "rec709":
             self.warnings.append((f"The pictures are {self._space.name}: converted to Rec.709.", ""))
 
-    def _first_readable(self, layer: str) -> tuple[Path, Layer, list[str]]:
+    def _first_readable(self, wanted: str) -> tuple[Path, oiio.ImageSpec, Layer, list[str]]:
         for file in self._files.values():
             try:
-                return file, *find_layer(file, layer)
+                layer, names = find_layer(file, wanted)
             except OSError:
                 continue
+            spec, _, failed = _open(file, layer.part)
+            if not failed:
+                return file, spec, layer, names
         raise footage_error(
             f"No picture of the sequence in {file.parent} can be read.",
             "Open one in Blender to see whether it is whole.",
@@ -190,13 +192,14 @@ class SequenceSource:
 
     def _read(self, file: Path, met: _Met) -> tuple[NDArray, float]:
         """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels. OSError if unreadable."""
-        buffer, layer = _open(file, self._layer.part), self._layer
-        if buffer.has_error or buffer.spec().channelnames != self._channels:
+        (spec, buffer, failed), layer = _open(file, self._layer.part), self._layer
+        if spec.channelnames != self._channels:
             layer = self._same_layer(file)
-            buffer = _open(file, layer.part)
-        spec = buffer.spec()
+            spec, buffer, failed = _open(file, layer.part)
+        if failed:
+            raise OSError(f"{file}: {failed}")
         size = spec.full_width, spec.full_height
-        if not buffer.has_error and size != self._stored:
+        if size != self._stored:
             raise footage_error(
                 f"{file.name} is {size[0]}x{size[1]}, the sequence began with {self._stored[0]}x{self._stored[1]}.",
                 "All pictures of a sequence need one size.",
@@ -206,9 +209,9 @@ class SequenceSource:
         x, y = spec.full_x, spec.full_y
         roi = oiio.ROI(x, x + size[0], y, y + size[1], 0, 1, first, beyond)
         kind = oiio.FLOAT if self.info.deep else oiio.UINT8
-        pixels = None if buffer.has_error else buffer.get_pixels(kind, roi)
+        pixels = buffer.get_pixels(kind, roi)
         if pixels is None or buffer.has_error:
-            raise OSError(f"{file}: {buffer.geterror()}")
+            raise OSError(f"{file}: {told_by(buffer)}")
         pixels = np.asarray(pixels)
         rgb = pixels[..., [c - first for c in layer.channels]]
         inner = _data_window(spec)
@@ -249,8 +252,11 @@ _AS_STORED.attribute("oiio:UnassociatedAlpha", 1)
 """Colour is not to be multiplied by alpha where the file has not done so."""
 
 
-def _open(file: Path, part: int) -> oiio.ImageBuf:
-    return oiio.ImageBuf(str(file), part, 0, _AS_STORED)
+def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
+    """Header and pixels, and what is wrong with them, if anything is."""
+    buffer = oiio.ImageBuf(str(file), part, 0, _AS_STORED)
+    spec = buffer.spec()
+    return spec, buffer, (told_by(buffer) or "it is damaged") if buffer.has_error else ""
 
 
 def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:
@@ -290,6 +296,11 @@ def _input_space(file: Path, spec: oiio.ImageSpec, warnings: list[tuple[str, str
             return space_of_chromaticities(primaries)
         except ValueError:
             warnings.append((f"The chromaticities in {file.name} are impossible: Rec.709 is assumed.", ""))
+    profile = str(spec.getattribute("ICCProfile:profile_description") or "")
+    if profile and not any(word in profile.lower() for word in ("srgb", "709", "gray", "grey")):
+        warnings.append(
+            (f"The pictures carry the colour profile {profile!r}, which is not applied.", "Convert them to sRGB.")
+        )
     if named is not None:
         return named
     is_light = str(spec.format) in ("half", "float", "double") or suffix in (".exr", ".hdr")

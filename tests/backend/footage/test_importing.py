@@ -262,8 +262,9 @@ def test_a_rate_that_is_none_is_refused(shot, clip, recorder, fps):
 
 
 def test_the_listing_says_how_the_footage_was_read(shot, clip, sequence, recorder):
-    import_footage(shot, clip, FootageConfig(), recorder())
+    result = import_footage(shot, clip, FootageConfig(), recorder())
     reading = load_frames(shot)["reading"]
+    assert result["reading"] == reading
     assert (reading["colour"], reading["colour_told"]) == ("video, Rec.709", False)
     assert (reading["matrix"], reading["matrix_told"], reading["range"]) == ("ITU601", False, "video")
     import_footage(shot, str(sequence(1)), FootageConfig(step=1), recorder())

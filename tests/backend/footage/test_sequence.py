@@ -363,6 +363,40 @@ def test_film_log_becomes_light(tmp_path, transfer):
     assert source.info.colour == "linear"
 
 
+def profile(name):
+    """A colour profile with nothing in it but its name."""
+    text = name.encode() + b"\0"
+    described = b"desc" + bytes(4) + struct.pack(">I", len(text)) + text + bytes(78)
+    head = struct.pack(">I4sI4s4s4s", 144 + len(described), b"none", 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+    head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + b"APPL"
+    head = head.ljust(68, b"\0") + struct.pack(">3I", 0xF6D6, 0x10000, 0xD32D)
+    return head.ljust(128, b"\0") + struct.pack(">I4sII", 1, b"desc", 144, len(described)) + described
+
+
+@pytest.mark.parametrize(("name", "words"), [("Display P3", True), ("sRGB IEC61966-2.1", False)])
+def test_a_colour_profile_that_is_not_applied_is_told(tmp_path, name, words):
+    content = np.frombuffer(profile(name), np.uint8)
+    pixels = flat(200, 100, 50, kind=np.uint8)
+    for i in range(3):
+        spec = spec_of(pixels)
+        spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{content.size}]"), content)
+        out = oiio.ImageOutput.create(str(tmp_path / f"a.{i}.png"))
+        assert out.open(str(tmp_path / f"a.{i}.png"), spec) and out.write_image(pixels) and out.close()
+    told = [f"The pictures carry the colour profile {name!r}, which is not applied."]
+    assert said(first_of(tmp_path)[0]) == (told if words else [])
+
+
+def test_damaged_headers_leave_their_frames_out(exrs):
+    """OpenImageIO quotes the damaged bytes in its error, which are no text."""
+    for number, name in ((1006, b"channels"), (1007, b"chlist")):
+        file = exrs / f"shot.{number}.exr"
+        content = file.read_bytes()
+        file.write_bytes(content.replace(name, b"\xff\xfe" + name[2:], 1))
+    source = open_source(str(exrs))
+    assert [f.number for f in source.frames(None, None)] == [1001, 1002, 1003, 1004, 1005, 1008, 1009, 1010]
+    assert said(source) == ["Frames 1006-1007 cannot be read: left out of the shot."]
+
+
 def write_cineon(path, codes):
     """8 x 8 pixels of one colour in ten bits, by Kodak's description of the format: OpenImageIO only reads it."""
     head = struct.pack(">6I8s100s12s12s36x", 0x802A5FD7, 2048, 1024, 1024, 0, 2304, b"V4.5", b"", b"", b"")
