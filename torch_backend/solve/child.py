@@ -37,9 +37,11 @@ def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
     environment["PYTHONPATH"] = os.pathsep.join([str(package_root), *inherited])
     # Threads that spin while they wait take the core from whoever shares it.
     environment.setdefault("OMP_WAIT_POLICY", "passive")
+    command = python_child(sys.executable, "torch_backend.solve.worker", str(request.absolute()))
     with open(log, "wb") as errors:
         process = subprocess.Popen(
-            **python_child(sys.executable, "torch_backend.solve.worker", str(request.absolute())),
+            command["args"],
+            cwd=command["cwd"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
