@@ -57,10 +57,14 @@ def replacing_solve(shot: Shot) -> Iterator[Staged]:
 def settle_solve(shot: Shot) -> None:
     """Moves what `replacing_solve` had finished, but not moved, to its place. Does nothing if there is none.
 
-    Two processes may do so at once: each file is moved by one of them.
+    Two processes may do so at once: each file is moved by one of them. Nothing is moved through a link: a folder from
+    elsewhere could have it replace any file.
     """
-    ready = shot.solve / _NEXT
-    if not ready.is_dir() or ready.is_symlink():
+    ready, root = shot.solve / _NEXT, shot.root.resolve()
+    if not ready.is_dir():
+        return
+    inside = (Path("solve") / _NEXT, Path("frames"), Path("solve", "colmap"))
+    if any((root / part).resolve() != root / part for part in inside):
         return
     for source in sorted(_files(ready), key=_turn):
         target = shot.root / source.relative_to(ready)

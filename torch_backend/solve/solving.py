@@ -101,8 +101,8 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
         return done["result"]
-    _refuse_damaged(shot, frames)
     taken = prepare(frames, cameras, report) if cameras else None
+    _refuse_damaged(shot, frames)
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
     size = sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
     need_disk(shot.root, 1.2 * size + (len(frames["frames"]) << 20), "The camera solve")

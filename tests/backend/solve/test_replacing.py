@@ -98,3 +98,20 @@ def test_a_model_of_fewer_files_leaves_none_of_the_one_before_it(again, tools):
     (shot.solve / "colmap" / "rigs.bin").write_bytes(b"of a solve of before")
     solve_shot(shot, SolveConfig(), tools.recorder(), cameras)
     assert {p.name for p in (shot.solve / "colmap").iterdir()} == {"cameras.bin", "images.bin", "points3D.bin"}
+
+
+@pytest.mark.parametrize("linked", ["frames", "solve/colmap", "solve/next"])
+def test_opening_a_shot_moves_nothing_through_a_link(tmp_path, linked):
+    shot, mine = Shot.create(tmp_path / "a.splannequin"), tmp_path / "mine"
+    for name in ("frames/000001.png", "colmap/cameras.bin", "solve/colmap/cameras.bin", "000001.png", "cameras.bin"):
+        (mine / name).parent.mkdir(parents=True, exist_ok=True)
+        (mine / name).write_text("mine")
+    for name in ("frames/000001.png", "solve/colmap/cameras.bin"):
+        (shot.solve / "next" / name).parent.mkdir(parents=True, exist_ok=True)
+        (shot.solve / "next" / name).write_text("theirs")
+    if linked == "solve/next":
+        shutil.rmtree(shot.root / linked)
+    (shot.root / linked).symlink_to(mine)
+    Shot.open(shot.root)
+    assert {p.read_text() for p in mine.rglob("*") if p.is_file()} == {"mine"}
+    assert len([p for p in mine.rglob("*") if p.is_file()]) == 5
