@@ -431,7 +431,7 @@ def _lead_through(tree: Any, node: Any, behind: Any | None) -> None:
     """Leads a picture through our node: all that leaves a socket, or with None what goes to the output."""
     if behind is not None:
         source, targets, beside = behind, [link.to_socket for link in behind.links], behind.node
-        node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 160.0)
+        node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 320.0)
     else:
         end = compat.output_socket(tree) or compat.new_output_node(tree)
         source, targets = end.links[0].from_socket if end.is_linked else None, [end]
