@@ -763,8 +763,10 @@ def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
 
 def _how(scene: Any, size: tuple[int, int]) -> str:
     """How a picture of a size is brought to the scene's: its width fits, as the solved camera's does."""
-    render = scene.render
-    return "Crop" if render.resolution_x * size[1] >= 0.99 * render.resolution_y * size[0] else "Fit"
+    tall = scene.render.resolution_x * size[1] / (scene.render.resolution_y * size[0])
+    # Of one shape but for rounding: both do; where cropping leaves a line unset, not that.
+    alike = abs(tall - 1.0) < 0.01 and not compat.CROPS_WHOLE
+    return "Crop" if tall > 0.99 and not alike else "Fit"
 
 
 def _whole(group: Any, layer: Any) -> Any | None:
