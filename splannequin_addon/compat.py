@@ -17,6 +17,8 @@ HAS_COMPOSITING_GROUP = bpy.app.version >= (5, 0, 0)
 """True where the compositor is a node group of the scene (5.0 on)."""
 HAS_TEXTURE_NODE = not HAS_COMPOSITING_GROUP
 """True where the compositor has a Texture node, which knows a pixel's place in the frame (until 5.0)."""
+CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
+"""True where a Scale node that crops sets every pixel: before 4.5 a row or column at the border is left unset."""
 
 PATH_OPTIONS: set[str] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
 """Options of a path property that may hold a path relative to the .blend (`//`); said aloud since 4.5."""

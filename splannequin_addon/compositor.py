@@ -432,7 +432,7 @@ def _lead_through(tree: Any, node: Any, behind: Any | None) -> None:
     """Leads a picture through our node: all that leaves a socket, or with None what goes to the output."""
     if behind is not None:
         source, targets, beside = behind, [link.to_socket for link in behind.links], behind.node
-        node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 160.0)
+        node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 320.0)
     else:
         end = compat.output_socket(tree) or compat.new_output_node(tree)
         source, targets = end.links[0].from_socket if end.is_linked else None, [end]
@@ -764,8 +764,10 @@ def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
 
 def _how(scene: Any, size: tuple[int, int]) -> str:
     """How a picture of a size is brought to the scene's: its width fits, as the solved camera's does."""
-    render = scene.render
-    return "Crop" if render.resolution_x * size[1] >= 0.99 * render.resolution_y * size[0] else "Fit"
+    tall = scene.render.resolution_x * size[1] / (scene.render.resolution_y * size[0])
+    # Of one shape but for rounding: both do; where cropping leaves a line unset, not that.
+    alike = abs(tall - 1.0) < 0.01 and not compat.CROPS_WHOLE
+    return "Crop" if tall > 0.99 and not alike else "Fit"
 
 
 def _whole(group: Any, layer: Any) -> Any | None:

@@ -398,6 +398,28 @@ def test_a_take_fills_the_frame_at_any_percentage(
         assert border.mean() == pytest.approx(inner.mean(), abs=0.03), "as strong as the rest"
 
 
+@pytest.mark.parametrize(("width", "height"), [(30, 10), (33, 19), (25, 18), (20, 20)])
+def test_a_take_of_another_shape_fits_the_width_as_the_camera_sees_it(
+    addon, scene, take, shot, tmp_path, layers, pictures, width, height
+):
+    """Cut above and below in a wider frame, bars in a higher one: against the nearest pixels."""
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
+    addon("scene_setup").keep_plate_colours(scene)
+    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
+    scene.frame_start = scene.frame_end = 6
+    addon("bake").render(scene, tmp_path)
+    found = pictures.read(tmp_path / "000006.png")
+    scale = width / 16.0
+    y = (np.arange(height) + 0.5 - height / 2) / scale + 6.0
+    rows = np.nonzero((y > 0.5) & (y < 11.5))[0]
+    columns = np.clip(((np.arange(width) + 0.5) / scale).astype(int), 0, 15)
+    expected = pictures.srgb(layers(6)["rgba"][..., :3])[y[rows].astype(int)][:, columns]
+    middle = slice(2 * width // 16, width - 1)
+    assert np.abs(found[rows] - expected)[1:-1, middle].mean() < 0.13
+    if height / width < 0.74 and addon("compat").CROPS_WHOLE:
+        assert (found[[0, -1]][:, middle].max(axis=2) > 0.05).mean() > 0.9, "to the border"
+
+
 def test_only_moving_leaves_cg_where_nothing_moves(addon, scene, take, shot, tmp_path, layers, pictures):
     compositor, compat = addon("compositor"), addon("compat")
     scene.render.resolution_x, scene.render.resolution_y = 16, 12

@@ -1,0 +1,215 @@
+"""What a bake leaves in an artist's comp, in a real Blender window: sizes, CG, a grade, the way back. With pictures.
+
+    python tests/addon/window/comp.py --blender BLENDER --shot SHOT.splannequin [--output docs/images]
+
+BLENDER has the extension installed, as for press_steps.py; the shot is of the bundled clip and has a take "freeze" with
+frame 48 (`freeze examples/sitting.mp4`, any preset). Exit status 0 if the take, put in at 50 %, fills the frame at
+100 %; a cube stands where Only Moving shows the plate, and its edge is soft; a grade behind the plate stays; the scene
+kept its size, and has its camera back in the end.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import press_steps as press
+
+FRAME, SIZE = 48, (1280, 720)
+GOOD = (
+    "size_kept", "filled", "cube_kept", "edge_soft", "as_plate", "grade_kept", "frozen", "links_back", "camera_back",
+)  # fmt: skip
+
+
+def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+    import bpy
+
+    work = Path(plan["work"])
+    shot = work / "comp.splannequin"
+    shutil.copytree(plan["shot"], shot, ignore=shutil.ignore_patterns("jobs", "runs"))
+    yield from press._arrange()
+    scene = bpy.context.scene
+    own, render = scene.camera.name, scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = *SIZE, 50
+    scene.frame_start = scene.frame_end = FRAME
+    scene.frame_set(FRAME)
+    scene.splannequin.shot_path = str(shot)
+    for light in [o for o in scene.objects if o.type == "LIGHT"]:
+        bpy.data.objects.remove(light)
+    for operator in ("load_camera", "insert_freeze"):
+        told[operator] = str(_press(operator))
+        yield 1.0
+    told["size_kept"] = (render.resolution_x, render.resolution_y, render.resolution_percentage) == (*SIZE, 50)
+    yield from _cg(work, told)
+    yield from _grade(work, shot, told)
+    told["removed"] = str(_press("remove_shot"))
+    told["camera_back"] = scene.camera is not None and scene.camera.name == own
+    bpy.context.window_manager.windows[0].workspace = bpy.data.workspaces["Layout"]
+    yield 2.0
+    yield from press._shoot(work, "11-removed")
+
+
+def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
+    """Put in at 50 %, rendered at 100 %: alone, with a cube, and where only what moves is frozen."""
+    import bpy
+    import cube
+    import numpy as np
+
+    scene, compositor, compat = bpy.context.scene, press.addon_module("compositor"), press.addon_module("compat")
+    scene.render.resolution_percentage = 100
+    scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
+    scene.cycles.samples, scene.cycles.use_denoising = 1, False
+    clean = _render(work, "half-at-full")
+    border = np.concatenate([clean[:, :60].reshape(-1, 3), clean[:, -60:].reshape(-1, 3)])
+    told["filled"] = bool((border.max(axis=1) > 0.02).mean() > 0.9)
+    yield from _show(work, "11-half-at-full", "Rendering")
+    _press("combine_cg")
+    node = compositor.group_node(compat.compositor_tree(scene))
+    depth = cube.see(node.outputs["Depth"], work, "depth")[..., 0]
+    cube.put_cube(depth)
+    scene.cycles.samples = 12
+    layers = next(n for n in compat.compositor_tree(scene).nodes if n.bl_idname == "CompositorNodeRLayers")
+    alone = cube.see(layers.outputs["Image"], work, "cube")
+    compat.set_png(scene.render.image_settings)
+    yield 0.5
+    among = _render(work, "cube")
+    yield from _crop(work, among, alone[..., 3])
+    edge = (alone[..., 3] > 0.3) & (alone[..., 3] < 0.7)
+    solid = alone[..., 3] > 0.999
+    changed = np.abs(among - clean).max(axis=2)
+    seen = changed > 0.1
+    told["edge_soft"] = bool(edge.sum() > 50 and changed[edge & _beside(seen & solid)].mean() > 0.03)
+    node.inputs["Only Moving"].default_value = 1.0
+    moving = _render(work, "only-moving")
+    told["cube_kept"] = bool(np.abs(moving - among)[solid & seen].max(axis=1).mean() < 0.05)
+    yield from _show(work, "11-only-moving", "Rendering")
+    bpy.data.objects.remove(next(o for o in scene.objects if o.type == "MESH" and not o.hide_render))
+    _press("remove_shot")
+
+
+def _beside(mask: Any) -> Any:
+    """Pixels within two of a mask's."""
+    import numpy as np
+
+    found = mask.copy()
+    for rows in range(-2, 3):
+        for columns in range(-2, 3):
+            found |= np.roll(mask, (rows, columns), (0, 1))
+    return found
+
+
+def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
+    """A comp of the artist's: the plate, without its colours. The freeze goes in between, and out again."""
+    import bpy
+    import numpy as np
+
+    scene, compositor, compat = bpy.context.scene, press.addon_module("compositor"), press.addon_module("compat")
+    tree = compat.compositor_tree(scene)
+    if tree is None or not len(tree.nodes):
+        tree = compat.new_compositor_tree(scene, "Comp")
+    compat.enable_compositor(scene)
+    plate, fit, grade = (tree.nodes.new(f"CompositorNode{n}") for n in ("Image", "Scale", "HueSat"))
+    tree.nodes.remove(fit)
+    fit = compat.new_fit_node(tree, "Crop")
+    plate.image = bpy.data.images.load(str(compositor.frame_path(shot / "frames", FRAME, ".png")))
+    plate.image.source = "SEQUENCE"
+    compositor.show_sequence(plate, plate.image, 1, 74)
+    grade.inputs["Saturation"].default_value = 0.0
+    plate.label, grade.label = "My plate", "My grade: no colour"
+    end = compat.output_socket(tree) or compat.new_output_node(tree)
+    for source, target in ((plate, fit), (fit, grade)):
+        tree.links.new(source.outputs["Image"], target.inputs["Image"])
+    tree.links.new(grade.outputs["Image"], end)
+    for column, node in enumerate((plate, fit, grade, end.node)):
+        node.location = (-600.0 + 300.0 * column, 0.0)
+    links = sorted((k.from_node.name, k.to_node.name) for k in tree.links)
+    mine = _render(work, "plate")
+    _press("load_camera")
+    _press("insert_freeze")
+    node = compositor.group_node(tree)
+    told["as_plate"] = grade.inputs["Image"].links[0].from_node == node
+    graded = _render(work, "graded")
+    told["grade_kept"] = bool(np.ptp(graded, axis=2).max() < 0.02)
+    told["frozen"] = bool(np.abs(graded - mine).mean() > 0.005)
+    window = bpy.context.window_manager.windows[0]
+    window.workspace = bpy.data.workspaces["Compositing"]
+    yield 2.0
+    area = next(a for a in window.screen.areas if a.type == "NODE_EDITOR")
+    region = next(r for r in area.regions if r.type == "WINDOW")
+    if compat.HAS_COMPOSITING_GROUP:
+        area.spaces.active.node_tree = tree
+        area.spaces.active.show_region_asset_shelf = False  # it would lie over the nodes
+        yield 1.0
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.node.view_all()
+    yield from _show(work, "11-as-plate", "Compositing")
+    compositor.remove(scene)
+    told["links_back"] = sorted((k.from_node.name, k.to_node.name) for k in tree.links) == links
+
+
+def _press(operator: str) -> set[str]:
+    """Runs an operator of ours, as its button does."""
+    import bpy
+
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+        return getattr(bpy.ops.splannequin, operator)()
+
+
+def _render(work: Path, name: str) -> Any:
+    """The frame as it leaves the compositor, [H, W, 3] in 0..1 as shown, top row first."""
+    import bpy
+    import numpy as np
+
+    scene = bpy.context.scene
+    press.addon_module("compat").set_png(scene.render.image_settings)
+    scene.render.filepath = str(work / f"{name}.png")
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+        bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(str(work / f"{name}.png"))
+    width, height = image.size
+    pixels = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    bpy.data.images.remove(image)
+    return pixels.reshape(height, width, 4)[::-1, :, :3]
+
+
+def _crop(work: Path, picture: Any, alpha: Any) -> Iterator[float]:
+    """A picture of a part of the frame about the cube's left edge, each pixel four times as large."""
+    import bpy
+    import numpy as np
+
+    rows, columns = np.nonzero(alpha > 0.5)
+    top, left = max(int(rows.min()) - 20, 0), max(int(columns.min()) - 20, 0)
+    part = picture[top : top + 200, left : left + 320].repeat(4, axis=0).repeat(4, axis=1)
+    image = bpy.data.images.new("Edges at 400 %", part.shape[1], part.shape[0])
+    whole = np.concatenate([part, np.ones_like(part[..., :1])], axis=2)
+    image.pixels.foreach_set(np.ascontiguousarray(whole[::-1]).ravel())
+    yield from _show(work, "11-edges", "Rendering", image)
+
+
+def _show(work: Path, name: str, workspace: str, image: Any = None) -> Iterator[float]:
+    """A picture of the window with a workspace in it; an image editor shows an image, or the render."""
+    import bpy
+
+    window = bpy.context.window_manager.windows[0]
+    window.workspace = bpy.data.workspaces[workspace]
+    yield 2.0
+    for area in [a for a in window.screen.areas if a.type == "IMAGE_EDITOR"]:
+        area.spaces.active.image = image or bpy.data.images["Render Result"]
+        region = next(r for r in area.regions if r.type == "WINDOW")
+        with bpy.context.temp_override(window=window, area=area, region=region):
+            bpy.ops.image.view_all(fit_view=True)
+    yield 0.5
+    yield from press._shoot(work, name)
+
+
+if __name__ == "__main__":
+    needs = "shot of the bundled clip with a take"
+    code = press.on_a_shot(__file__, __doc__ or "", _play, needs, ":91", lambda told: all(map(told.get, GOOD)))
+    if "bpy" not in sys.modules:
+        sys.exit(code)
