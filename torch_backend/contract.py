@@ -338,6 +338,15 @@ WORK = {"import": "The import", "solve": "The camera solve", "train": "The train
 """Kind of job -> what a sentence calls it."""
 
 
+def gone(shot: Path, kind: str) -> JobError:
+    """What is told of a job whose shot was moved or deleted while it ran."""
+    return JobError(
+        f"{WORK.get(kind, 'A step')} ended: the shot folder {shot} was moved or deleted meanwhile.",
+        "Finished work is in the folder, wherever it is now: choose it there and start again.",
+        ExitCode.USAGE,
+    )
+
+
 def read_writer(shot: Path) -> Writer | None:
     """Who writes into a shot, as its lock says, dead or alive; None without a lock. ValueError on a damaged one."""
     path = shot / WRITER_FILE
