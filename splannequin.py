@@ -30,6 +30,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import urllib.error
@@ -57,8 +58,6 @@ BACKEND_DISK_GB = 4.0
 BPY_DISK_GB = 2.0
 HEARTBEAT_SECONDS = 15.0
 """A set-up that has printed nothing for this long says that it is still at work."""
-GRACE_SECONDS = 30.0
-"""How long a cancelled child may take for its checkpoint before it is terminated."""
 
 BLENDER_LIBRARIES = {
     "libX11.so.6": "libx11-6",
@@ -73,10 +72,9 @@ BLENDER_LIBRARIES = {
 }
 """What Blender opens on Linux and a bare server lacks: file, Debian package."""
 
-WARP_DRIVER = 580
-"""Oldest NVIDIA driver branch for the CUDA 13 builds of Warp and torch pinned here."""
-WARP_COMPUTE = 7.5
-"""Oldest CUDA compute capability of the same."""
+TORCH_INDEX = "SPLANNEQUIN_TORCH_INDEX"
+CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
+"""Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
 
 # ------------------------------------------------------------------------------------------------- interpreters
 
@@ -85,7 +83,7 @@ def python_version(executable: str) -> tuple[int, int] | None:
     """(major, minor) of the Python at `executable`; None if it does not run (a pyenv shim without a version, say)."""
     try:
         found = subprocess.run(
-            [executable, "-c", "import sys; print('%d %d' % sys.version_info[:2])"],
+            [executable, "-I", "-c", "import sys; print('%d %d' % sys.version_info[:2])"],
             capture_output=True,
             text=True,
             timeout=30,
@@ -109,17 +107,16 @@ def find_python(accept: Callable[[tuple[int, int]], bool], names: Sequence[str])
     for name in names:
         for folder in os.get_exec_path():
             found = shutil.which(name, path=folder)
-            if found:
+            if found and os.path.isabs(found):  # Windows offers the folder that we stand in first
                 candidates.append(found)
         wanted = name.replace("python", "")
         if wanted:
             pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
             candidates += [str(p) for p in sorted(pyenv.glob(f"{wanted}.*/bin/{name}"), reverse=True)]
             launcher = shutil.which("py") if WINDOWS else None
-            if launcher:
-                located = subprocess.run(
-                    [launcher, f"-{wanted}", "-c", "import sys; print(sys.executable)"], capture_output=True, text=True
-                )
+            if launcher and os.path.isabs(launcher):
+                command = [launcher, f"-{wanted}", "-I", "-c", "import sys; print(sys.executable)"]
+                located = subprocess.run(command, capture_output=True, text=True)
                 if located.returncode == 0:
                     candidates.append(located.stdout.strip())
     for candidate in dict.fromkeys(candidates):
@@ -143,13 +140,20 @@ def hand_over_to_newer_python() -> int:
             file=sys.stderr,
         )
         return 9
-    return subprocess.call([newer, str(Path(__file__).resolve()), *sys.argv[1:]])
+    command = [newer, str(Path(__file__).resolve()), *sys.argv[1:]]
+    if WINDOWS:  # a program that takes another's place there is a second one, which nobody waits for
+        return subprocess.call(command)
+    os.execv(newer, command)  # noqa: S606  (no shell is wanted)
 
 
 if __name__ == "__main__" and sys.version_info[:2] < NEEDED_PYTHON:
     sys.exit(hand_over_to_newer_python())
 
-from torch_backend.contract import ExitCode, read_json  # noqa: E402  (needs 3.11)
+if str(ROOT) not in sys.path:  # -P and PYTHONSAFEPATH leave even a script's own folder out
+    sys.path.insert(0, str(ROOT))
+
+from torch_backend.cards import Card, nvidia_cards, why_unfit, why_unused  # noqa: E402  (needs 3.11)
+from torch_backend.contract import GRACE_SECONDS, ExitCode, program, python_child, read_json  # noqa: E402
 from torch_backend.shot import is_disk_full, locked, write_json  # noqa: E402
 
 
@@ -217,7 +221,7 @@ class Environment:
             stamp = json.loads(self.stamp.read_text(encoding="utf-8"))
             same = stamp["venv"] == (self.folder / "pyvenv.cfg").read_text(encoding="utf-8")
             return dict(stamp["files"]) if same and not self.begun.exists() else {}
-        except (OSError, ValueError, KeyError):
+        except (OSError, ValueError, KeyError, TypeError):
             return {}
 
     def ready(self) -> bool:
@@ -227,7 +231,7 @@ class Environment:
 
 def home() -> Path:
     """The folder that holds the environments."""
-    return Path(os.environ.get("SPLANNEQUIN_HOME") or ROOT).expanduser().resolve()
+    return Path(os.path.realpath(os.path.expanduser(os.environ.get("SPLANNEQUIN_HOME") or ROOT)))
 
 
 def backend_environment(testing: bool = False) -> Environment:
@@ -250,9 +254,10 @@ def bench_environment() -> Environment:
 
 
 def child_environ(**extra: str) -> dict[str, str]:
-    """Environment variables for a child: this checkout on its path, nothing of another Python."""
+    """Environment variables for a child: this checkout on its path, nothing of another Python or of where it stands."""
     environ = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP")}
-    environ.update(PYTHONPATH=str(ROOT), PYTHONUTF8="1", PYTHONUNBUFFERED="1", PYTHONNOUSERSITE="1", **extra)
+    environ.update(PYTHONPATH=str(ROOT), PYTHONSAFEPATH="1", PYTHONNOUSERSITE="1")
+    environ.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", **extra)
     return environ
 
 
@@ -271,7 +276,13 @@ def set_up(environment: Environment, python: str) -> float:
             if not environment.ready():
                 _make(environment, python)
     except OSError as error:
-        _refuse(environment, "writing the environment", str(error))
+        where = error.filename2 or error.filename or environment.folder
+        advice = "free some disk" if is_disk_full(error) else "make it writable"
+        raise LauncherError(
+            f"{environment.name[:1].upper()}{environment.name[1:]} cannot be set up in {environment.folder.parent}: "
+            f"{where}: {error.strerror or error}; {advice}, or name another folder in SPLANNEQUIN_HOME.",
+            ExitCode.DISK if is_disk_full(error) else ExitCode.ENVIRONMENT,
+        ) from error
     return time.monotonic() - started
 
 
@@ -283,16 +294,17 @@ def _make(environment: Environment, python: str) -> None:
     environment.state.mkdir(parents=True, exist_ok=True)
     environment.log.write_bytes(b"")
     if not usable:
-        _step(environment, "making the virtual environment", [python, "-m", "venv", str(environment.folder)])
+        _step(environment, "making the virtual environment", tied_command(python, "venv", str(environment.folder)))
     elif environment.begun.exists():
-        _step(environment, "checking what an interrupted set-up left", [environment.python, "-c", DROP_UNFINISHED])
+        command = [environment.python, "-P", "-c", DROP_UNFINISHED]
+        _step(environment, "checking what an interrupted set-up left", command)
     before = environment.installed()
     environment.begun.touch()
-    pip = [environment.python, "-m", "pip", "install", "--no-input", "--progress-bar", "off"]
+    pip = tied_command(environment.python, "pip", "install", "--no-input", "--progress-bar", "off")
     pip += ["--disable-pip-version-check", "--only-binary=:all:"]
     pip += ["--no-deps"] if environment.complete else []
-    index = os.environ.get("SPLANNEQUIN_TORCH_INDEX")
-    if index and environment.requirements[0] == "backend.txt":
+    index = torch_index() if environment.requirements[0] == "backend.txt" else ""
+    if index:
         if _reachable(index):
             pip += ["--extra-index-url", index]
         else:  # pip would ask it in vain for every single package, minutes in all
@@ -300,7 +312,7 @@ def _make(environment: Environment, python: str) -> None:
     for name in environment.requirements:
         pip += ["-r", str(REQUIREMENTS / name)]
     _step(environment, "installing packages", pip, condense_pip)
-    _step(environment, "importing what was installed", [environment.python, "-c", environment.probe])
+    _step(environment, "importing what was installed", [environment.python, "-P", "-c", environment.probe])
     venv = (environment.folder / "pyvenv.cfg").read_text(encoding="utf-8")
     write_json(environment.stamp, {"files": {**before, **environment.hashes()}, "venv": venv})
     environment.begun.unlink()
@@ -311,7 +323,8 @@ def _has_pip(environment: Environment) -> bool:
     version = python_version(environment.python)
     if version is None or version < NEEDED_PYTHON:
         return False
-    return subprocess.run([environment.python, "-m", "pip", "--version"], capture_output=True).returncode == 0
+    command = python_child(environment.python, "pip", "--version")
+    return subprocess.run(**command, env=child_environ(), capture_output=True).returncode == 0
 
 
 def _make_room(environment: Environment) -> None:
@@ -343,6 +356,16 @@ for package in importlib.metadata.distributions():
 """pip writes a package's RECORD last: without one the package is not all there, and pip must not believe it is."""
 
 
+def torch_index(windows: bool = WINDOWS) -> str:
+    """Package index, beside pip's own, that torch comes from; empty for none.
+
+    What the variable says; without it, on Windows, the one with CUDA where there is a card for it.
+    """
+    if TORCH_INDEX in os.environ:
+        return os.environ[TORCH_INDEX]
+    return CUDA_INDEX if windows and any(card.fits for card in nvidia_cards()[0]) else ""
+
+
 def _reachable(index: str) -> bool:
     """True if a package index answers about torch within ten seconds; a folder (file:) does if it is there."""
     try:
@@ -360,7 +383,9 @@ def _step(
     """Runs one step of a set-up, its output to the log and what `condense` makes of each line to the screen."""
     started = time.monotonic()
     lines: queue.Queue[str | None] = queue.Queue()
-    child = start_child(command, child_environ(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    child = start_child(
+        command, child_environ(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
 
     def read() -> None:
         assert child.stdout is not None  # PIPE, above
@@ -369,7 +394,7 @@ def _step(
         lines.put(None)
 
     threading.Thread(target=read, daemon=True).start()
-    tail: list[str] = []
+    said: list[str] = []
     spoke = started
     try:
         with open(environment.log, "a", encoding="utf-8") as log:
@@ -385,7 +410,7 @@ def _step(
                 if line is None:
                     break
                 log.write(line)
-                tail = [*tail[-40:], line.strip()]
+                said.append(line.strip())
                 text = condense(line.strip()) if condense else None
                 if text:
                     spoke = time.monotonic()
@@ -394,8 +419,10 @@ def _step(
     except KeyboardInterrupt:
         stop_child(child)
         raise
+    finally:
+        _close(child)
     if code:
-        _refuse(environment, step, "\n".join(tail))
+        _refuse(environment, step, "\n".join([*said[:5], *said[-40:]]))  # pip names its indexes first
     if condense is None:
         say(f"  {time.monotonic() - started:5.0f} s  {step}: done")
 
@@ -414,20 +441,28 @@ def condense_pip(line: str) -> str | None:
     return "installed" if line.startswith("Successfully installed") else None
 
 
+BROKEN_CONNECTION = re.compile(
+    r"connection broken by|ConnectionError|Max retries exceeded|Temporary failure|Name or service|getaddrinfo|"
+    r"timed out|Network is unreachable|ProxyError|SSLError|IncompleteRead|RemoteDisconnected"
+)
+"""What pip says of an index that it cannot ask. What it says last is that no version was found."""
+
+
 def _refuse(environment: Environment, step: str, output: str) -> None:
     """Raises the sentence for a failed step of a set-up, from what it printed."""
     lines = [line.strip() for line in output.splitlines() if line.strip()] or ["no output"]
     telling = [line for line in lines if re.search(r"error|not found|cannot|No space", line, re.I)]
     last = re.sub(r"^(ERROR: |\w*Error: )", "", (telling or lines)[-1]).rstrip(".")
     code = ExitCode.ENVIRONMENT
+    answered = re.search(r"from versions: (?!none)", output)
     if re.search(r"No space left|Errno 28|not enough space", output, re.I):
         code, advice = ExitCode.DISK, "free some disk, or name a folder on another disk in SPLANNEQUIN_HOME"
+    elif BROKEN_CONNECTION.search(output) and not answered:
+        last, advice = _unreachable(output)
     elif re.search(r"ensurepip|python3-venv", output):
         advice = "install the venv module of this Python (Debian and Ubuntu: apt install python3-venv)"
     elif re.search(r"No matching distribution|from versions:", output):
         advice = "use Python 3.11 or 3.13 on 64-bit Windows, macOS or Linux, or check the package index pip is set to"
-    elif re.search(r"ConnectionError|Temporary failure|Name or service|timed out|ProxyError|SSLError", output):
-        advice = "check the network (pip reads its proxy and index from pip.conf) and start the same command again"
     elif re.search(r"lib\S+\.so\S*: cannot open shared object", output):
         advice = "install that library with the system's package manager"
     else:
@@ -435,6 +470,23 @@ def _refuse(environment: Environment, step: str, output: str) -> None:
     raise LauncherError(
         f"Setting up {environment.name} failed at {step} ({last[:200]}): {advice}. Log: {environment.log}", code
     )
+
+
+def _unreachable(output: str) -> tuple[str, str]:
+    """What pip could not reach, and what to do about it, from what it printed."""
+    told = re.search(r"host='([^']+)'", output)
+    listed = re.search(r"Looking in indexes: (.*)", output)
+    urls = [url.strip() for url in listed.group(1).split(",")] if listed else ["https://pypi.org/simple"]
+    hosts = [part.hostname for part in map(urllib.parse.urlsplit, urls) if part.scheme != "file" and part.hostname]
+    what = told.group(1) if told else " or ".join(dict.fromkeys(hosts)) or "the package index"
+    again = "then start the same command again: it goes on where it stopped"
+    if re.search(r"ProxyError|Cannot connect to proxy", output):
+        return f"the proxy on the way to {what} cannot be used", f"check HTTPS_PROXY and pip.conf, {again}"
+    if "SSLError" in output or "certificate" in output:
+        advice = "if a proxy signs for it, name its certificate in PIP_CERT"
+        return f"the certificate of {what} is not accepted", f"{advice}, {again}"
+    advice = "check the network; behind a firewall name a proxy (HTTPS_PROXY) or an index of your own (PIP_INDEX_URL)"
+    return f"{what} cannot be reached", f"{advice}, {again}"
 
 
 # ------------------------------------------------------------------------------------------------------ Blender
@@ -456,12 +508,13 @@ class Blender:
 
     def running(self, script: Path, *arguments: str) -> list[str]:
         """The command line that runs `script` with `arguments`."""
-        return [*self.command, str(script), *(() if self.is_wheel else ("--",)), *arguments]
+        safe, apart = (("-P",), ()) if self.is_wheel else ((), ("--",))
+        return [*self.command, *safe, str(script), *apart, *arguments]
 
 
 def find_blender() -> tuple[str, str] | None:
     """(path, version) of a `blender` on the PATH that is new enough."""
-    path = shutil.which("blender")
+    path = program("blender")
     if path is None:
         return None
     try:
@@ -530,7 +583,11 @@ def say(text: str) -> None:
 
 
 def start_child(command: Sequence[str], environ: dict[str, str], **streams: Any) -> subprocess.Popen[Any]:
-    """Starts a child in a process group of its own, so that Ctrl-C reaches it once, from here."""
+    """Starts a child in a process group of its own, so that Ctrl-C reaches it once, from here.
+
+    It stands beside its program, as in `contract.python_child`, unless `cwd` says where.
+    """
+    streams.setdefault("cwd", os.path.dirname(os.path.abspath(command[0])))
     try:
         if WINDOWS:
             group = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
@@ -558,13 +615,33 @@ def stop_child(child: subprocess.Popen[Any]) -> None:
         child.wait()
 
 
+def tied_command(python: str, module: str, *words: str) -> list[str]:
+    """`python -m module words` for a child that ends when we do, however that comes about: its standard input must be a
+    pipe (`run_child(tied=True)`), which closes with us."""
+    return [python, "-P", "-m", "torch_backend.tied", module, *words]
+
+
+def _close(child: subprocess.Popen[Any]) -> None:
+    """Closes our end of an ended child's standard input."""
+    if child.stdin is not None:
+        with contextlib.suppress(OSError):
+            child.stdin.close()
+
+
+HERE = Path()
+"""Where the user stands, for children that are given paths as they were typed."""
+
+
 def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = False, **environ: str) -> int:
     """Runs a child with our output; returns its exit code. On Ctrl-C it is cancelled and KeyboardInterrupt goes on.
 
+    `cwd`: where it stands, if not beside its program.
     `tied`: its standard input stays open as long as this process lives, however that ends; the child watches it.
     """
-    streams = {"stdin": subprocess.PIPE} if tied else {}
-    child = start_child(command, child_environ(**environ), cwd=cwd, **streams)
+    streams: dict[str, Any] = {"stdin": subprocess.PIPE} if tied else {}
+    if cwd is not None:
+        streams["cwd"] = cwd
+    child = start_child(command, child_environ(**environ), **streams)
     try:
         while True:
             # A wait without limit cannot be interrupted on Windows.
@@ -574,6 +651,8 @@ def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = Fals
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
         raise KeyboardInterrupt("the child has said so") from None
+    finally:
+        _close(child)
 
 
 def _documented(code: int) -> int:
@@ -593,8 +672,9 @@ BLENDERS_OWN = re.compile(
 
 
 def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
-    """`run_child` for Blender: all that it prints goes to `log`, what the add-on says also to the screen."""
-    child = start_child(command, child_environ(**environ), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    """`run_child(tied=True)` for Blender: all that it prints goes to `log`, what the add-on says also to the screen."""
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    child = start_child(command, child_environ(**environ), **streams)
     try:
         with open(log, "w", encoding="utf-8") as stream:
             for raw in child.stdout or ():
@@ -609,6 +689,8 @@ def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
         say("\nCancelling; Ctrl-C again stops at once.")
         stop_child(child)
         raise KeyboardInterrupt("the child has said so") from None
+    finally:
+        _close(child)
 
 
 # ------------------------------------------------------------------------------------------------------ summary
@@ -624,11 +706,13 @@ def read_summary(output: Path) -> dict[str, Any]:
 
 def failed_job(output: Path) -> str:
     """The sentence of the newest job of the shots in `output`, if it failed; else nothing."""
-    statuses = sorted(output.glob("*.splannequin/jobs/*/status.json"), key=lambda path: path.stat().st_mtime)
-    if not statuses:
+    try:
+        statuses = sorted(output.glob("*.splannequin/jobs/*/status.json"), key=lambda path: path.stat().st_mtime)
+        status = read_json(statuses[-1]) if statuses else {}
+    except (OSError, ValueError):
         return ""
-    status = read_json(statuses[-1])
-    return f"{status['message']} {status['hint']}".strip() if status.get("state") == "failed" else ""
+    words = (status.get("message", ""), status.get("hint", ""))
+    return " ".join(filter(None, map(str, words))) if status.get("state") == "failed" else ""
 
 
 # ----------------------------------------------------------------------------------------------------- commands
@@ -647,7 +731,8 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     setting_up += took
 
     say(f"Freezing {clip} into {output}")
-    code = run_child([backend.python, "-P", "-m", "torch_backend", "freeze", clip, "--output", str(output), *options])
+    command = tied_command(backend.python, "torch_backend", "freeze", clip, "--output", str(output), *options)
+    code = run_child(command, cwd=HERE, tied=True)
     if code:
         return code
     summary = read_summary(output)
@@ -656,7 +741,7 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     # The bake rewrites summary.json with what it adds; the wall time and the set-up are ours to add after it.
     say(f"Compositing in {blender.label}")
     baking = time.monotonic()
-    take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output)]
+    take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output), "--tied"]
     bake = blender.running(ROOT / "splannequin_addon" / "run_in_bpy.py", "bake", *take)
     code = run_blender(bake, output / "blender.log", SPLANNEQUIN_BACKEND_PYTHON=backend.python)
     if code:
@@ -720,17 +805,17 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
     set_up(backend, sys.executable)
     legs: list[Leg] = []
     if not pytest_args and not series:
-        legs.append(Leg("ruff", [backend.python, "-m", "ruff", "check", str(ROOT)]))
+        legs.append(Leg("ruff", [backend.python, "-P", "-m", "ruff", "check", str(ROOT)]))
         project = ["--project", str(ROOT), "--pythonpath", backend.python]
-        legs.append(Leg("pyright", [backend.python, "-m", "pyright", *project]))
+        legs.append(Leg("pyright", [backend.python, "-P", "-m", "pyright", *project]))
     if backend_paths:
-        command = [backend.python, "-m", "pytest", "--ignore=tests/addon", *backend_paths, *rest]
+        command = [backend.python, "-P", "-m", "pytest", "--ignore=tests/addon", *backend_paths, *rest]
         legs.append(Leg("backend", command, output / "junit-backend.xml"))
     if addon_paths:
         blender = set_up_wheel(series, True)[0] if series else get_blender(testing=True)[0]
         if not blender.is_wheel:
             raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
-        command = [*blender.command, "-m", "pytest", *addon_paths, *rest]
+        command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
         legs.append(Leg(f"add-on in {blender.label}", command, output / "junit-addon.xml"))
     output.mkdir(parents=True, exist_ok=True)
     for leg in legs:
@@ -754,7 +839,7 @@ def bench(arguments: Sequence[str], output: Path) -> int:
             )
         renderer, setting_up = ["--bpy", blender.command[0]], setting_up + took
     command = [backend.python, "-P", "-m", "benchmarks.bench", "--results", str(output), "--tied", *renderer]
-    code = run_child([*command, *arguments], tied=True)
+    code = run_child([*command, *arguments], cwd=HERE, tied=True)
     summary: dict[str, Any] = {"command": "bench", "exit_code": code}
     summary.update(wall_seconds=round(time.monotonic() - started, 2), setup_seconds=round(setting_up, 2))
     if code == 0:
@@ -875,7 +960,9 @@ def machine_findings() -> Iterator[Finding]:
         yield Finding(
             "memory", "ok" if enough else "note", f"{memory:.1f} GB{'' if enough else ': close other programs'}"
         )
-    folder = next(p for p in (home(), *home().parents) if p.exists())
+    folder = next(p for p in (home(), *home().parents) if os.path.exists(p))
+    if not backend_environment().ready() and not (folder.is_dir() and os.access(folder, os.W_OK)):
+        yield Finding("home", "missing", f"{folder} cannot be written: name another folder in SPLANNEQUIN_HOME")
     free = shutil.disk_usage(folder).free / 1e9
     need = 1.0 if backend_environment().ready() else BACKEND_DISK_GB + BPY_DISK_GB
     advice = "" if free >= need else f": {need:.0f} GB are needed, free some or set SPLANNEQUIN_HOME to another disk"
@@ -904,47 +991,32 @@ def memory_gb() -> float | None:
 
 
 def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
-    """NVIDIA cards and whether driver and card fit the pinned Warp and torch."""
-    tool = shutil.which("nvidia-smi")
-    query = "--query-gpu=name,driver_version,compute_cap"
-    try:
-        command = [tool or "nvidia-smi", query, "--format=csv,noheader"]
-        rows = subprocess.run(command, capture_output=True, text=True, timeout=30).stdout if tool else ""
-    except (OSError, subprocess.TimeoutExpired):
-        rows = ""
-    cards = [row for row in rows.splitlines() if row.count(",") >= 2]
-    if not cards:
+    """NVIDIA cards: whether driver and card fit the pinned Warp and torch, and whether the backend uses them."""
+    cards, trouble = nvidia_cards()
+    if trouble:
+        advice = "restart the machine; if it stays, install the driver anew"
+        yield Finding("gpu", "note", f"the NVIDIA driver does not answer: {trouble}: {advice}")
+    elif not cards:
         yield Finding("gpu", "note", "no NVIDIA card or driver: the CPU is used, nothing is missing")
-    for card in cards:
-        yield gpu_finding(*(field.strip() for field in card.rsplit(",", 2)))
-    if cards and facts and facts.get("torch_device") != "cuda":
-        yield Finding(
-            "torch on gpu",
-            "note",
-            "torch sees no card: its CPU build is installed; set SPLANNEQUIN_TORCH_INDEX to "
-            "https://download.pytorch.org/whl/cu130, remove .venv and run setup again",
-        )
+    yield from map(gpu_finding, cards)
+    if any(card.fits for card in cards) and facts.get("trains_on") == "cpu":
+        unseen = None if facts.get("torch_device") == "cuda" else why_unused(facts.get("torch_cuda"))
+        told = " ".join(unseen) if unseen else facts.get("cuda_refusal") or "CUDA_VISIBLE_DEVICES hides the card"
+        yield Finding("torch on gpu", "note", told)
 
 
-def gpu_finding(name: str, driver: str, compute: str) -> Finding:
-    """One card against what Warp needs: `driver` as "580.65.06", `compute` as "9.0"."""
-    try:
-        new_driver, new_card = int(driver.split(".")[0]) >= WARP_DRIVER, float(compute) >= WARP_COMPUTE
-    except ValueError:
-        return Finding("gpu", "note", f"{name}: driver {driver}, compute {compute}: not understood, the CPU is used")
-    text = f"{name}, driver {driver}, compute capability {compute}"
-    if not new_card:
-        return Finding("gpu", "note", f"{text}: Warp needs {WARP_COMPUTE} or newer, the CPU is used")
-    if not new_driver:
-        return Finding("gpu", "note", f"{text}: Warp needs driver R{WARP_DRIVER} or newer, update it to use the card")
-    return Finding("gpu", "ok", text)
+def gpu_finding(card: Card) -> Finding:
+    """One card against what Warp and torch need."""
+    unfit = why_unfit(card)
+    if unfit is not None:
+        return Finding("gpu", "note", " ".join(unfit).strip())
+    return Finding("gpu", "ok", f"{card.name}, driver {card.driver}, compute capability {card.compute or 'unknown'}")
 
 
 def backend_facts(backend: Environment) -> dict[str, Any]:
     """What the backend says about its own environment."""
-    ran = subprocess.run(
-        [backend.python, "-P", "-m", "torch_backend", "doctor"], capture_output=True, text=True, env=child_environ()
-    )
+    command = python_child(backend.python, "torch_backend", "doctor")
+    ran = subprocess.run(**command, capture_output=True, text=True, env=child_environ())
     try:
         return json.loads(ran.stdout[ran.stdout.index("{") :])
     except ValueError:
@@ -1041,7 +1113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     module = {"freeze": ["torch_backend", "freeze"], "bench": ["benchmarks.bench"]}.get(words[0] if words else "")
     if module and {"-h", "--help"} & set(words) and backend_environment().ready():
-        return run_child([backend_environment().python, "-P", "-m", *module, "--help"])
+        return run_child([backend_environment().python, "-P", "-m", *module, "--help"], cwd=HERE)
     args, rest = parser().parse_known_args(words)
     if rest and args.command in ("doctor", "setup"):
         parser().error(f"unrecognized arguments: {' '.join(rest)}")
@@ -1049,11 +1121,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), _interrupt)
     default = re.sub(r"[^\w.-]+", "_", Path(args.clip).stem) if args.command == "freeze" else args.command
-    output = Path(args.output or Path("output") / default).absolute()
+    try:
+        output = Path(os.path.abspath(args.output or Path("output") / default))
+    except OSError:
+        print("Error: The folder that you stand in is gone: change to another and start again.", file=sys.stderr)
+        return ExitCode.USAGE
     error = ""
     try:
+        output.mkdir(parents=True, exist_ok=True)
         # A summary of an earlier run must not pass for this one's.
         (output / "summary.json").unlink(missing_ok=True)
+        tempfile.TemporaryFile(dir=output).close()  # said now, not after minutes of work
         code = dispatch(args, rest, output)
     except LauncherError as refused:
         error, code = str(refused), refused.exit_code
@@ -1062,9 +1140,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not interrupt.args:
             print("Cancelled. Start the same command again to go on.", file=sys.stderr, flush=True)
     except OSError as failed:
-        full = is_disk_full(failed)
-        error = f"Cannot write to {output}: {failed.strerror or failed}. Choose another --output folder."
-        code = ExitCode.DISK if full else ExitCode.USAGE
+        error, code = _unwritable(failed, output)
     if code and not error:
         error = failed_job(output) or f"{args.command} ended with exit code {code}: see what it printed."
     elif error and code != ExitCode.CANCELLED:
@@ -1074,6 +1150,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             failure = {"command": args.command, "exit_code": code, "error": error}
             write_json(output / "summary.json", {**read_summary(output), **failure})
     return code
+
+
+def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:
+    """(sentence, exit code) of what the system refused, most often to write into the output folder."""
+    where = Path(os.fsdecode(failed.filename)) if isinstance(failed.filename, (str, bytes)) else output
+    code = ExitCode.DISK if is_disk_full(failed) else ExitCode.USAGE
+    if where != output and where not in output.parents and output not in where.parents:
+        code = ExitCode.DISK if code == ExitCode.DISK else ExitCode.ENVIRONMENT
+        return f"{failed.strerror or failed}: {where}. See `doctor`, then start the same command again.", code
+    return f"Cannot write to {output}: {failed.strerror or failed}. Choose another --output folder.", code
 
 
 def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:

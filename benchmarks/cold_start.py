@@ -38,7 +38,8 @@ print(json.dumps({"import": imported - start, "first": first, "second": second})
 
 def one(cache: pathlib.Path) -> dict[str, float]:
     """Seconds of a new process whose Warp cache is the folder `cache`."""
-    run = subprocess.run([sys.executable, "-c", CHILD], cwd=ROOT, env={**os.environ, "WARP_CACHE_PATH": str(cache)},
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(cache)}
+    run = subprocess.run([sys.executable, "-P", "-c", CHILD], cwd=ROOT, env=environment,
                          capture_output=True, text=True, check=True)
     return json.loads(run.stdout)
 

@@ -1,14 +1,16 @@
 """How many views a second a live session draws: `python -m benchmarks.live_rate SHOT [--run main]`, 320 x 180."""
 
 import argparse
+import os
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from torch_backend.contract import CameraPath, read_message, write_message
+from torch_backend.contract import CameraPath, python_child, read_message, write_message
 
 SIZE = (320, 180)
 
@@ -21,8 +23,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     args = parser.parse_args()
     path = CameraPath.load(f"{args.shot}/solve/cameras.json")
-    command = [sys.executable, "-m", "torch_backend", "live", args.shot, "--run", args.run]
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    command = python_child(sys.executable, "torch_backend", "live", os.path.abspath(args.shot), "--run", args.run)
+    root = str(Path(__file__).resolve().parents[1])
+    environment = {**os.environ, "PYTHONPATH": root, "PYTHONSAFEPATH": "1"}
+    child = subprocess.Popen(**command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     requests, answers = cast("BinaryIO", child.stdin), cast("BinaryIO", child.stdout)
     ready = read_message(answers)
     if ready is None or ready[0]["kind"] != "ready":

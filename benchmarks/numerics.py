@@ -675,8 +675,8 @@ def _table(rows: list[tuple[str, Errors]]) -> list[str]:
 
 def _generated(asked: int) -> str:
     """Run the property tests; their count of generated cases, and pytest's verdict."""
-    command = [sys.executable, "-m", "pytest", "-q", "tests/backend/raster/test_properties.py"]
-    environment = {**os.environ, **({"SPLANNEQUIN_CASES": str(asked)} if asked else {})}
+    command = [sys.executable, "-P", "-m", "pytest", "-q", "tests/backend/raster/test_properties.py"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **({"SPLANNEQUIN_CASES": str(asked)} if asked else {})}
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     counts = [line for line in run.stdout.splitlines() if line.startswith("rasteriser:")]
     if not counts:

@@ -332,6 +332,7 @@ def _peak(size: tuple[int, int, int], body: Body) -> float:
 
 def memory(size: tuple[int, int, int], bodies: dict[str, Body]) -> dict[str, float]:
     """Peak MiB of each body, each in a process of its own."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # a spawned Python takes its first modules from where it stands otherwise
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
         return {label: pool.submit(_peak, size, body).result() for label, body in bodies.items()}

@@ -123,8 +123,8 @@ def make_scenes(
 
 
 def child_environ(**extra: str) -> dict[str, str]:
-    """Environment of a child of the benchmark: this checkout on its path."""
-    return {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", **extra}
+    """Environment of a child of the benchmark: this checkout on its path, and not the folder that it stands in."""
+    return {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1", "PYTHONUNBUFFERED": "1", **extra}
 
 
 def end_with_parent() -> None:

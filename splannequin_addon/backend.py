@@ -77,12 +77,18 @@ def python() -> str:
     )
 
 
+def trouble() -> contract.JobError | None:
+    """Why there is no Python for the backend; None if there is."""
+    try:
+        python()
+    except contract.JobError as error:
+        return error
+    return None
+
+
 def available() -> bool:
     """True if a Python for the backend was found."""
-    try:
-        return bool(python())
-    except contract.JobError:
-        return False
+    return trouble() is None
 
 
 @dataclass
@@ -120,10 +126,10 @@ class Doctor:
 def begin_doctor() -> Doctor:
     """Asks the backend what it can do, without waiting. JobError if there is none, or it cannot be started."""
     root = package_root()
-    command = [python(), "-m", "torch_backend", "doctor"]
+    command = contract.python_child(python(), "torch_backend", "doctor")
     try:
         child = subprocess.Popen(
-            command, cwd=root, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            **command, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
     except OSError as error:

@@ -22,7 +22,7 @@ def insert(scene: Any, shot: Path, take: str) -> list[str]:
         contract.JobError: the take has no frames.
     """
     frozen, plate = _sources(scene, shot, take)
-    changes = compositor.insert(scene, frozen, plate)
+    changes = compositor.insert(scene, frozen, plate, _footage(scene, shot, plate), scene.splannequin.insert_at)
     lacking = missing_frames(shot, take, frames_of(scene))
     if lacking:
         changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
@@ -45,6 +45,14 @@ def _sources(scene: Any, shot: Path, take: str) -> tuple[compositor.Take, Path |
         ) from error
     plate = compositor.frame_path(shot / "frames", frozen.first, ".png")
     return frozen, plate if plate.is_file() else None
+
+
+def _footage(scene: Any, shot: Path, plate: Path | None) -> list[Path]:
+    """Files by which a node that shows the plate is known: the undistorted plate, the clip."""
+    told = str(shots.read(shot).info.get("source", ""))
+    chosen = scene.splannequin.clip
+    files = [plate, Path(told) if told else None, Path(bpy.path.abspath(chosen)) if chosen else None]
+    return [file for file in files if file is not None]
 
 
 def shown(scene: Any, shot: Path) -> str:
@@ -100,11 +108,33 @@ def choose_output(scene: Any, shot: Path, take: str) -> list[str]:
     return [f"Output path set to {folder}."]
 
 
-def fit_take(scene: Any, shot: Path, take: str) -> list[str]:
-    """Gives the scene the size, rate and range of a take, so that its pixels leave as they are; says what changed."""
-    frozen = compositor.take_of(shot / "takes" / take)
-    fps = float(shots.read(shot).info.get("fps", 0.0))
-    return scene_setup.fit_clip(scene, frozen.size, fps, (frozen.first, frozen.last))
+def fit_take(scene: Any, shot: Path, take: str, new: bool = False) -> list[str]:
+    """Gives the scene the rate and range of a take, and a size that loses no pixel of it; says what changed.
+
+    Args:
+        scene: the scene. What the artist has set in it stays, and it never becomes smaller.
+        shot: shot folder.
+        take: name of the take.
+        new: the scene is a new one, which takes the plate's size.
+    """
+    frozen, state, render = compositor.take_of(shot / "takes" / take), shots.read(shot), scene.render
+    width, height = size = _plate_size(state) if new else (render.resolution_x, render.resolution_y)
+    alike = abs(width * frozen.size[1] - height * frozen.size[0]) <= 0.02 * width * frozen.size[1]
+    if frozen.size[0] > width or (new and not alike):  # of a camera of the artist's own
+        size = frozen.size
+    elif not new:
+        size = None
+    fps = float(state.info.get("fps", 0.0))
+    return scene_setup.fit_clip(scene, size, fps, (frozen.first, frozen.last), over=new)
+
+
+def _plate_size(state: shots.ShotState) -> tuple[int, int]:
+    """Width and height of the undistorted plate in pixels, (0, 0) before the import."""
+    solved = state.folder / "solve" / "cameras.json"
+    if not solved.is_file():
+        return state.size
+    path = contract.CameraPath.load(solved)
+    return path.width, path.height
 
 
 def render(

@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix, Quaternion
 
 from ..torch_backend import contract
-from . import alignment, compat, compositor, guesses, made, shots
+from . import alignment, compat, compositor, guesses, intact, made, shots
 
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 """Kind of our objects -> which of `made.PARTS` it is, and last word of the name it is made with."""
@@ -201,9 +201,33 @@ def build(scene: Any, shot: Path) -> Any:
 
     Raises:
         FileNotFoundError: there is no solve.
+        ValueError: a file of it is broken, or Blender cannot show the plate. The scene is then as it was.
     """
     path = contract.CameraPath.load(shot / "solve" / "cameras.json")
     xyz, rgb = _points(shot)
+    floor, unsolved = _floor(shot), guesses.ranges(path, guesses.solved(shot, path))
+    with intact.scene_of(scene):
+        # All that can fail comes before what was there is taken away.
+        camera, cloud = _new_camera(shot, path), _new_points(shot, xyz, rgb)
+        _place(scene, shot, camera, cloud, scene_from_solve(path, xyz, floor), _extent(path))
+        camera.data.clip_start, camera.data.clip_end = (v * depth_scale(scene, shot) for v in _clip(path, xyz))
+        guesses.mark(scene, shot, unsolved)
+        made.keep_camera(scene)
+        scene.camera = camera
+    return camera
+
+
+def _place(scene: Any, shot: Path, camera: Any, cloud: Any, stands: np.ndarray, size: float) -> None:
+    """Puts a new camera and new points of a shot into the scene, in place of those that are there.
+
+    Args:
+        scene: the scene.
+        shot: shot folder.
+        camera: not in any scene yet.
+        cloud: the points, alike.
+        stands: where the root is put if there is none, [4, 4].
+        size: of that root.
+    """
     name = made.name_of(shot)
     _clear(scene, shot, but=("root",))  # what the artist hung on the root, and where it stands, stays
     entry = made.new(scene, shot)
@@ -216,25 +240,38 @@ def build(scene: Any, shot: Path) -> Any:
     if root is None:
         root = entry.root = bpy.data.objects.new(f"{name} root", None)
         root.empty_display_type = "ARROWS"
-        root.matrix_world = Matrix(scene_from_solve(path, xyz, _floor(shot)).tolist())
-        root.empty_display_size = _extent(path)
+        root.matrix_world = Matrix(stands.tolist())
+        root.empty_display_size = size
         collection.objects.link(root)
-    camera_data = bpy.data.cameras.new(f"{name} camera")
-    camera = entry.camera = bpy.data.objects.new(f"{name} camera", camera_data)
-    cloud = entry.points = bpy.data.objects.new(f"{name} points", _point_mesh(f"{name} points", xyz, rgb))
-    cloud.hide_render = True
-    cloud.display_type = "BOUNDS"  # Blender draws loose points black, whatever their colour: points.py draws them
-    camera_data.display_size = max(_extent(path) * 0.5, 0.05)
-    for item in (camera, cloud):
+    entry.camera, entry.points = camera, cloud
+    for item, kind in ((camera, "camera"), (cloud, "points")):
         collection.objects.link(item)
         item.parent = root
         item.hide_select = item is cloud
+        for block in (item, item.data):  # now that the names are free
+            block.name = f"{name} {kind}"
+            if block.animation_data is not None and block.animation_data.action is not None:
+                block.animation_data.action.name = f"{block.name}Action"
+
+
+def _new_camera(shot: Path, path: contract.CameraPath) -> Any:
+    """The solved camera with its keys and the plate behind it, in no scene yet."""
+    name = made.name_of(shot)
+    data = bpy.data.cameras.new(f"{name} camera")
+    camera = bpy.data.objects.new(f"{name} camera", data)
+    data.display_size = max(_extent(path) * 0.5, 0.05)
     _animate(camera, path)
-    camera_data.clip_start, camera_data.clip_end = (v * depth_scale(scene, shot) for v in _clip(path, xyz))
-    _show_plate(camera_data, shot, name)
-    guesses.mark(scene, shot, path)
-    scene.camera = camera
+    _show_plate(data, shot, name)
     return camera
+
+
+def _new_points(shot: Path, xyz: np.ndarray, rgb: np.ndarray) -> Any:
+    """The sparse points as an object, in no scene yet."""
+    name = f"{made.name_of(shot)} points"
+    cloud = bpy.data.objects.new(name, _point_mesh(name, xyz, rgb))
+    cloud.hide_render = True
+    cloud.display_type = "BOUNDS"  # Blender draws loose points black, whatever their colour: points.py draws them
+    return cloud
 
 
 def find(scene: Any, shot: Path, kind: str) -> Any | None:
@@ -256,8 +293,11 @@ def remove(scene: Any, shot: Path) -> bool:
     """
     if made.of(scene, shot) is None:
         return False
+    was, ours = scene.camera is not None, scene.camera == made.part(scene, shot, "camera")
     _clear(scene, shot)
     made.drop(scene, shot)
+    if was and ours:
+        made.give_camera_back(scene)
     return True
 
 

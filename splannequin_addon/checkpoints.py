@@ -10,15 +10,26 @@ from pathlib import Path
 from typing import Any
 
 from ..torch_backend import contract
+from . import kept
 
 CHECKPOINT = "checkpoint.safetensors"
 EXTENSION = "extension.safetensors"
 """Of steps that are added to a finished run and are not done."""
+NEXT = "next"
+"""Folder in a run's: of trainings that will take the run's place when they are done."""
 _LONGEST = 1 << 22
 
 
 def facts(path: Path) -> dict[str, Any]:
-    """The facts that the backend stored in a checkpoint, read from the file's header; empty if there is none."""
+    """The facts that the backend stored in a checkpoint, read from the file's header; empty if there is none. Not to be
+    changed: they are remembered."""
+    try:
+        return kept.of(path, _facts)
+    except OSError:
+        return {}
+
+
+def _facts(path: Path) -> dict[str, Any]:
     try:
         with contract.open_regular(path) as source:
             (length,) = struct.unpack("<Q", source.read(8))
@@ -44,6 +55,20 @@ def paused(run: Path) -> dict[str, Any] | None:
 @dataclass
 class _Count:
     steps: int
+
+
+def anew(run: Path) -> dict[str, Any] | None:
+    """Of a run that is trained anew, paused or at work: as `paused`, of the training that was saved last."""
+    saved = sorted((run / NEXT).glob(f"*/{CHECKPOINT}"), key=_saved)
+    told = paused(saved[-1].parent) if saved else None
+    return None if told is None else {**told, "folder": saved[-1].parent}
+
+
+def _saved(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def extension(run: Path) -> dict[str, int] | None:
@@ -79,8 +104,13 @@ def other_cameras(shot: Path, run: Path) -> bool:
     try:
         if cameras.stat().st_mtime <= trained.stat().st_mtime:
             return False
-        told = contract.read_json(run / "config.json")["solve"]
-        text = json.dumps(contract.read_json(cameras), sort_keys=True)
+        told = kept.of(run / "config.json", contract.read_json)["solve"]
+        return kept.of(cameras, _key) != told
     except (OSError, ValueError, KeyError):
         return False
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16] != told  # as torch_backend.shot.content_key
+
+
+def _key(cameras: Path) -> str:
+    """What a run notes of the solve it was trained on: as torch_backend.shot.content_key."""
+    text = json.dumps(contract.read_json(cameras), sort_keys=True)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]

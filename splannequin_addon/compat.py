@@ -11,6 +11,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Color
 
 HAS_COMPOSITING_GROUP = bpy.app.version >= (5, 0, 0)
 """True where the compositor is a node group of the scene (5.0 on)."""
@@ -133,14 +134,52 @@ def new_over_node(tree: Any) -> tuple[Any, Any, Any]:
 
 
 def new_fit_node(tree: Any, how: str = "Fit") -> Any:
-    """A Scale node that brings inputs[0] to the render size: "Fit" keeps its shape, "Stretch" does not."""
+    """A Scale node that brings inputs[0] to the render size, and leaves what has that size as it is, bit by bit.
+
+    Args:
+        tree: where it is made.
+        how: "Fit" shows all and leaves bars, "Crop" fills the frame and cuts off what is over; both keep the shape.
+            "Stretch" does not.
+    """
     node = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Render Size"
         node.inputs["Frame Type"].default_value = how
+        if how == "Crop":  # else the outermost pixels fade out
+            node.inputs["Extension X"].default_value = node.inputs["Extension Y"].default_value = "Extend"
     else:
         node.space = "RENDER_SIZE"
         node.frame_method = how.upper()
+    return node
+
+
+def new_quotient(tree: Any, picture: Any, value: Any) -> Any:
+    """Socket of a picture whose four channels are divided by a value; 0 where that is 0. Until 4.5."""
+    node = tree.nodes.new("CompositorNodeMixRGB")
+    node.blend_type = "DIVIDE"
+    parts, whole = tree.nodes.new("CompositorNodeSeparateColor"), tree.nodes.new("CompositorNodeSetAlpha")
+    alpha = new_math_node(tree, "DIVIDE")
+    whole.mode = "REPLACE_ALPHA"
+    for source, target in (
+        (picture, node.inputs[1]), (value, node.inputs[2]), (picture, parts.inputs[0]),
+        (parts.outputs["Alpha"], alpha.inputs[0]), (value, alpha.inputs[1]),
+        (node.outputs[0], whole.inputs["Image"]), (alpha.outputs[0], whole.inputs["Alpha"]),
+    ):  # fmt: skip
+        tree.links.new(source, target)
+    return whole.outputs[0]
+
+
+def new_nearest_node(tree: Any) -> Any:
+    """A node whose output is the least of inputs[0] at a pixel and its eight neighbours."""
+    node = tree.nodes.new("CompositorNodeDilateErode")
+    if "Size" in node.inputs:  # 4.5 on
+        node.inputs["Size"].default_value = -1
+    else:
+        node.distance = -1
+    if "Type" in node.inputs:  # 5.0 on
+        node.inputs["Type"].default_value = "Steps"
+    else:
+        node.mode = "STEP"
     return node
 
 
@@ -169,15 +208,59 @@ def set_png(settings: Any) -> None:
     settings.compression = 15
 
 
+_PROBE = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n" + bytes((200, 100, 50, 128))
+"""A picture of one pixel, 0.78, 0.39 and 0.20, as a file."""
+_LIKELY = {
+    "linear": ("Linear Rec.709", "Linear Rec.709 (sRGB)", "lin_rec709", "Utility - Linear - sRGB", "Linear"),
+    "srgb": ("sRGB", "sRGB - Texture", "sRGB Encoded Rec.709 (sRGB)", "Utility - sRGB - Texture", "sRGB EOTF"),
+}
+"""What colour configurations call these spaces: looked at first, and believed where none can be told by its effect."""
+_spaces: dict[str, str] = {}
+"""Encoding -> colour space. The configuration is chosen once, when Blender starts."""
+
+
 def set_image_colour(image: Any, encoding: str) -> None:
-    """States the encoding of an image's file: "linear" (Rec.709 primaries) or "srgb"."""
-    known = image.colorspace_settings.bl_rna.properties["name"].enum_items.keys()
-    wanted = ("Linear Rec.709", "Linear", "scene_linear") if encoding == "linear" else ("sRGB", "sRGB EOTF")
-    name = next((n for n in wanted if n in known), None)
-    if name is None:
-        raise ValueError(f"this Blender's colour configuration has none of {', '.join(wanted)}: use the standard one")
+    """States the encoding of an image's file: "linear" (Rec.709 primaries) or "srgb". ValueError as `colour_space`."""
+    name = colour_space(encoding)
     if image.colorspace_settings.name != name:
         image.colorspace_settings.name = name
+
+
+def colour_space(encoding: str) -> str:
+    """Name that Blender's colour configuration (its own, or that of $OCIO) gives an encoding: "linear" or "srgb".
+
+    The space is known by what it does to a pixel, so it may be called anything. ValueError if there is none.
+    """
+    if encoding not in _spaces:
+        likely = _LIKELY[encoding]
+        image = bpy.data.images.new("Splannequin Probe", 1, 1)
+        try:
+            known = image.colorspace_settings.bl_rna.properties["name"].enum_items.keys()
+            first = [n for n in (*likely, image.colorspace_settings.name) if n in known]  # the second is a role: bytes
+            image.pack(data=_PROBE, data_len=len(_PROBE))
+            image.source = "FILE"
+            image.colorspace_settings.is_data = True
+            value = Color(image.pixels[:3])
+            to_scene = Color.from_rec709_linear_to_scene_linear, Color.from_srgb_to_scene_linear
+            wanted = to_scene[encoding == "srgb"](value)
+            found = (n for n in [*first, *known] if _reads_as(image, n, wanted))
+            name = next(found, next((n for n in first if n in likely), ""))
+        finally:
+            bpy.data.images.remove(image)
+        if not name:
+            told = {"linear": "scene-linear Rec.709", "srgb": "sRGB"}[encoding]
+            raise ValueError(
+                f"The colour configuration that Blender was started with (OCIO) has no colour space for {told}. "
+                "Start Blender without it, or add one to it."
+            )
+        _spaces[encoding] = name
+    return _spaces[encoding]
+
+
+def _reads_as(image: Any, name: str, wanted: Any) -> bool:
+    """True if a picture is read as the wanted scene-linear colour in the named space. Its space is set."""
+    image.colorspace_settings.name = name
+    return max(abs(a - b) for a, b in zip(image.pixels[:3], wanted, strict=True)) < 2e-3
 
 
 def fcurves(datablock: Any) -> Iterator[Any]:

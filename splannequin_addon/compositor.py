@@ -1,15 +1,18 @@
-"""The node group "Splannequin Freeze" in the scene's compositor: inserted before the output, updated, removed.
+"""The node group "Splannequin Freeze" in the scene's compositor: inserted, updated, removed.
 
-Nothing else in the artist's tree is touched: the one link into the output is led through the group, and led back
-when the group is removed. The group reads the take's multilayer EXR files; scene frame n shows n.exr.
+It stands in for the plate where a node of the artist's tree shows it, so that the grade goes on from there; else before
+the output. Nothing else in the tree is touched: the links that leave the plate, or the one into the output, are led
+through the group, and led back when the group is removed. The group reads the take's multilayer EXR files; scene frame
+n shows n.exr.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,11 +25,20 @@ from . import compat
 
 GROUP_NAME = "Splannequin Freeze"
 _TAG = "splannequin"
+_STANDS_IN = "splannequin_stands_in"
+_PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 _BEFORE = "splannequin_before"
 _CG = "cg"
+_LAYERS = ("Combined", "Depth", "Support", "Motion")
+"""Of a frozen frame; `_GRAIN` is in some."""
 _FROZEN, _DEPTH = "Frozen", "Depth in scene units"
 """Nodes inside the group."""
 _GAP = 200.0
+_NOTHING = 0.1 * contract.NO_DEPTH
+"""A depth of CG from here on is no surface's."""
+_SOFT = 0.01
+"""Share of the frozen depth within which CG goes from in front to behind. What is as far as the frozen is in front:
+frozen depth is a little uneven, and would come through what stands on it."""
 
 
 @dataclass
@@ -47,18 +59,31 @@ class Take:
     """Pixels beyond the frame on the left and right, and above and below: overscan."""
 
 
-def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
-    """Puts the freeze group in front of the output of the scene's compositor, or updates the one that is there.
+def insert(
+    scene: Any, take: Take, plate: Path | None = None, footage: Sequence[Path] = (), where: str = "AUTO"
+) -> list[str]:
+    """Puts the freeze group into the scene's compositor, or updates the one that is there.
 
     Args:
         scene: the scene; given a minimal tree (plate, group, output) if it has none.
         take: the frozen frames.
         plate: first file of the undistorted plate, for the minimal tree.
+        footage: files by which a node that shows the plate is known: the plate's, the clip's.
+        where: "PLATE" behind the node that shows the plate, "OUTPUT" before the output, "AUTO" the first of these
+            that there is. A group that is there already stays where it is with "AUTO".
 
     Returns:
         What was changed, one sentence each.
+
+    Raises:
+        contract.JobError: "PLATE", and no node shows it.
+        ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is as it was.
     """
     changes: list[str] = []
+    behind = _place_of(scene, footage, where)
+    frozen, stream = _frozen_image(take), None
+    if plate is not None and shows_plate(scene):
+        stream = load_sequence(plate, _plate_name(plate), "srgb")
     enabled = compat.compositor_enabled(scene)
     before = {**compat.compositor_switches(scene), "made_tree": False}
     tree = compat.compositor_tree(scene)
@@ -73,16 +98,37 @@ def insert(scene: Any, take: Take, plate: Path | None = None) -> list[str]:
     node = group_node(tree)
     if node is None:
         node = _insert_node(tree, before)
-        changes.append(f'The node group "{GROUP_NAME}" was inserted before the output.')
+        _lead_through(tree, node, behind)
+        place = "as the plate: what follows it goes on from there" if behind is not None else "before the output"
+        changes.append(f'The node group "{GROUP_NAME}" was inserted {place}.')
     else:
+        if where != "AUTO" and _stands_in(node) != (behind is not None):
+            _lead_past(tree, node)
+            _lead_through(tree, node, behind)
+            changes.append(f'The node group "{GROUP_NAME}" was moved.')
         _set_defaults(node, _give_sockets(node.node_tree))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
-    _fill_group(scene, node.node_tree, take)
+    _fill_group(scene, node.node_tree, take, frozen)
     if node.inputs[_GRAIN].default_value and _GRAIN not in node.node_tree.nodes:
         changes.append("The take has no grain to add: freeze it again.")
-    if plate is not None and shows_plate(scene):
-        _show_plate(scene, tree, node, plate, take)
+    if stream is not None:
+        _show_plate(scene, tree, node, stream, take)
     return changes
+
+
+def _frozen_image(take: Take) -> Any:
+    """The take's frames as a data-block. ValueError if they lack a layer."""
+    image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
+    group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
+    try:
+        node = group.nodes.new("CompositorNodeImage")
+        show_sequence(node, image, take.first, take.last)
+        missing = [n for n in _LAYERS if n not in node.outputs]
+    finally:
+        bpy.data.node_groups.remove(group)
+    if missing:
+        raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+    return image
 
 
 def shows_plate(scene: Any) -> bool:
@@ -157,11 +203,7 @@ def remove(scene: Any) -> bool:
         return False
     group = node.node_tree
     before = json.loads(group.get(_BEFORE, "{}"))
-    sources = [link.from_socket for link in node.inputs["Image"].links]
-    targets = [link.to_socket for link in node.outputs["Image"].links]
-    for target in targets:
-        if sources:
-            tree.links.new(sources[0], target)
+    _lead_past(tree, node)
     images = [n.image for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image]
     textures = [n.texture for n in group.nodes if n.bl_idname == "CompositorNodeTexture" and n.texture]
     tree.nodes.remove(node)
@@ -276,6 +318,7 @@ def load_sequence(path: Path, name: str, encoding: str) -> Any:
                 image.reload()
             _ahead.discard(wanted)
             return image
+    compat.colour_space(encoding)  # before anything is made: a configuration may have none
     image = bpy.data.images.load(wanted)
     image.name = name
     image.source = "SEQUENCE"
@@ -377,29 +420,123 @@ def _insert_node(tree: Any, before: dict[str, bool]) -> Any:
     group[_TAG] = True
     group[_BEFORE] = json.dumps(before)
     _give_sockets(group)
-    target = compat.output_socket(tree) or compat.new_output_node(tree)
-    source = target.links[0].from_socket if target.is_linked else None
     node = tree.nodes.new("CompositorNodeGroup")
     node.node_tree = group
     node.name = node.label = GROUP_NAME
     node.width = 180.0
-    end = target.node
-    node.location = (end.location.x - node.width - 30.0, end.location.y - 160.0)
     _set_defaults(node, {s.name for s in node.inputs})
-    if source is not None:
-        tree.links.new(source, node.inputs["Image"])
-    tree.links.new(node.outputs["Image"], target)
     return node
 
 
-def _fill_group(scene: Any, group: Any, take: Take) -> None:
+def _lead_through(tree: Any, node: Any, behind: Any | None) -> None:
+    """Leads a picture through our node: all that leaves a socket, or with None what goes to the output."""
+    if behind is not None:
+        source, targets, beside = behind, [link.to_socket for link in behind.links], behind.node
+        node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 160.0)
+    else:
+        end = compat.output_socket(tree) or compat.new_output_node(tree)
+        source, targets = end.links[0].from_socket if end.is_linked else None, [end]
+        node.location = (end.node.location.x - node.width - 30.0, end.node.location.y - 160.0)
+    for target in targets:
+        tree.links.new(node.outputs["Image"], target)
+    if source is not None:
+        tree.links.new(source, node.inputs["Image"])
+    node.node_tree[_STANDS_IN] = behind is not None
+
+
+def _lead_past(tree: Any, node: Any) -> None:
+    """Leads what goes through our node past it again."""
+    sources = [link.from_socket for link in node.inputs["Image"].links]
+    for target in [link.to_socket for link in node.outputs["Image"].links]:
+        if sources:
+            tree.links.new(sources[0], target)
+    for link in list(node.inputs["Image"].links):
+        tree.links.remove(link)
+
+
+def _stands_in(node: Any) -> bool:
+    """True if our node stands behind the plate, not before the output."""
+    return bool(node.node_tree.get(_STANDS_IN))
+
+
+def _place_of(scene: Any, footage: Sequence[Path], where: str) -> Any | None:
+    """Socket that the group goes behind: the plate's, in the artist's tree; None for before the output.
+
+    A plate that is undistorted or brought to the render's size first is taken after that, as the frozen frames are.
+    """
+    tree = compat.compositor_tree(scene)
+    if where == "OUTPUT" or tree is None:
+        return None
+    led = [n for n in _upstream(tree) if n.bl_idname in _PICTURES and not n.get(_TAG) and not n.mute]
+    nodes = [n for n in tree.nodes if n in led and _picture(n).is_linked]
+    found = [n for n in nodes if _shows(n, footage)]
+    if where == "PLATE" and not found:  # by another name, then: the chosen one, or the only one
+        found = [n for n in nodes if n == tree.nodes.active] or (nodes if len(nodes) == 1 else [])
+    if not found:
+        if where == "PLATE":
+            raise contract.JobError(
+                "No node of this compositor shows the plate.",
+                "Select the Image or Movie Clip node that does, or insert before the output.",
+                contract.ExitCode.BAKE,
+            )
+        return None
+    socket = _picture(found[0])
+    while len(socket.links) == 1 and _conforms(scene, socket.links[0].to_node, found[0]):
+        following = socket.links[0].to_node.outputs[0]
+        if not following.is_linked:
+            break
+        socket = following
+    return socket
+
+
+def _picture(node: Any) -> Any:
+    """Output of an Image or Movie Clip node that the picture leaves through."""
+    return next(s for s in node.outputs if s.enabled and s.type == "RGBA")
+
+
+def _upstream(tree: Any) -> list[Any]:
+    """Nodes whose picture gets to the tree's output."""
+    end = compat.output_socket(tree)
+    waiting, found = [end.node] if end is not None else [], []
+    while waiting:
+        node = waiting.pop()
+        if node not in found:
+            found.append(node)
+            waiting += [link.from_node for socket in node.inputs for link in socket.links]
+    return found
+
+
+def _shows(node: Any, footage: Sequence[Path]) -> bool:
+    """True if an Image or Movie Clip node shows one of these files, or another of the sequence that it belongs to."""
+    data = node.image if node.bl_idname == _PICTURES[0] else node.clip
+    if data is None or not data.filepath:
+        return False
+    numbered = data.source == "SEQUENCE"
+    path = _footage_key(Path(bpy.path.abspath(data.filepath)), numbered)
+    return any(path == _footage_key(known, numbered) for known in footage)
+
+
+def _footage_key(path: Path, numbered: bool) -> tuple[str, str]:
+    """Folder and name of a file; of one of a sequence without its number, which may stand there as ####."""
+    folder, name = os.path.split(os.path.realpath(path))
+    return os.path.normcase(folder), re.sub(r"\d+|#+", "#", name) if numbered else os.path.normcase(name)
+
+
+def _conforms(scene: Any, node: Any, plate: Any) -> bool:
+    """True if a node only undistorts the plate, or brings one of another size to the render's."""
+    if node.mute or node.bl_idname == "CompositorNodeMovieDistortion":
+        return not node.mute
+    data = plate.image if plate.bl_idname == _PICTURES[0] else plate.clip
+    return node.bl_idname == "CompositorNodeScale" and tuple(data.size) != render_size(scene)
+
+
+def _fill_group(scene: Any, group: Any, take: Take, image: Any) -> None:
     """(Re)builds the inside of the group; its sockets, and so the links around it, stay."""
     old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image} - {_RAMP}
     group.nodes.clear()
     enter = group.nodes.new("NodeGroupInput")
     leave = group.nodes.new("NodeGroupOutput")
     frozen = group.nodes.new("CompositorNodeImage")
-    image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
     frozen.name = frozen.label = _FROZEN
     show_sequence(frozen, image, take.first, take.last)
     mix, factor, first, second, mixed = compat.new_mix_node(group)
@@ -407,13 +544,15 @@ def _fill_group(scene: Any, group: Any, take: Take) -> None:
     depth.name = depth.label = _DEPTH
     depth.inputs[1].default_value = take.depth_scale
     enter.location, frozen.location = (-2 * _GAP, 150.0), (-3 * _GAP, -100.0)
-    mix.location, depth.location, leave.location = (_GAP, 150.0), (_GAP, -100.0), (2 * _GAP, 0.0)
+    mix.location, depth.location, leave.location = (3 * _GAP, 150.0), (_GAP, -100.0), (4 * _GAP, 0.0)
 
     fitted = _fitted(scene, group, take, frozen)
     share = _share(group, enter, fitted)
+    nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0])
     group.links.new(share, factor)
-    group.links.new(enter.outputs["Image"], first)
-    group.links.new(_among(group, enter, _grainy(group, enter, fitted), depth.outputs[0]), second)
+    # CG stands in both: Mix, Wipe and mattes choose between stream and frozen frame, not whether an object is there.
+    group.links.new(_among(group, enter, enter.outputs["Image"], nearer, "CG in your stream"), first)
+    group.links.new(_among(group, enter, _grainy(group, enter, fitted), nearer, "CG among the frozen"), second)
     group.links.new(mixed, leave.inputs["Image"])
     group.links.new(fitted["Depth"], depth.inputs[0])
     group.links.new(depth.outputs[0], leave.inputs["Depth"])
@@ -438,27 +577,70 @@ def _grainy(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     return summed
 
 
-def _among(group: Any, enter: Any, frozen: Any, depth: Any) -> Any:
-    """Socket of the frozen picture with CG in front of it or behind, whichever is nearer, pixel by pixel."""
+def _among(group: Any, enter: Any, picture: Any, nearer: Any, label: str) -> Any:
+    """Socket of a picture with CG in front of it, as far as it is nearer, else behind, by as much as both cover."""
     front, under, over = compat.new_over_node(group)
-    group.links.new(frozen, under)
+    group.links.new(picture, under)
     group.links.new(enter.outputs["CG"], over)
     back, below, above = compat.new_over_node(group)
     group.links.new(enter.outputs["CG"], below)
-    group.links.new(frozen, above)
-    nearer = compat.new_math_node(group, "LESS_THAN")
-    nearer.label = "CG is nearer"
-    group.links.new(enter.outputs["CG Depth"], nearer.inputs[0])
-    group.links.new(depth, nearer.inputs[1])
+    group.links.new(picture, above)
     choose, factor, first, second, chosen = compat.new_mix_node(group)
-    choose.label = "CG among the frozen"
-    group.links.new(nearer.outputs[0], factor)
+    choose.label = label
+    group.links.new(nearer, factor)
     group.links.new(back.outputs[0], first)
     group.links.new(front.outputs[0], second)
-    for row, node in enumerate((nearer, front, back)):
-        node.location = (-_GAP, -350.0 - 170.0 * row)
-    choose.location = (0.0, -350.0)
+    for row, node in enumerate((front, back)):
+        node.location = (_GAP, -350.0 - 170.0 * row)
+    choose.location = (2 * _GAP, -350.0)
     return chosen
+
+
+def _cg_depth(group: Any, enter: Any) -> Any:
+    """Socket of the depth of CG; where a pixel has none, the nearest of its neighbours': it may be that one's edge.
+
+    A pixel that CG covers in part often tells the depth of what is behind: nothing.
+    """
+    around = compat.new_nearest_node(group)
+    group.links.new(enter.outputs["CG Depth"], around.inputs[0])
+    # Where there is a depth, the other is made so large that the lesser of the two is the pixel's own.
+    there = compat.new_math_node(group, "LESS_THAN")
+    there.inputs[1].default_value = _NOTHING
+    group.links.new(enter.outputs["CG Depth"], there.inputs[0])
+    far = compat.new_math_node(group, "MULTIPLY_ADD")
+    far.inputs[1].default_value = contract.NO_DEPTH
+    group.links.new(there.outputs[0], far.inputs[0])
+    group.links.new(around.outputs[0], far.inputs[2])
+    depth = compat.new_math_node(group, "MINIMUM")
+    depth.label = "Depth of CG, edges too"
+    group.links.new(enter.outputs["CG Depth"], depth.inputs[0])
+    group.links.new(far.outputs[0], depth.inputs[1])
+    for column, node in enumerate((around, there, far, depth)):
+        node.location = (_GAP * (column - 3), -1100.0)
+    return depth.outputs[0]
+
+
+def _nearer(group: Any, cg: Any, frozen: Any) -> Any:
+    """Socket of how much CG is in front: 1 up to the frozen depth, 0 from `_SOFT` of it behind, smooth between."""
+    ratio = compat.new_math_node(group, "DIVIDE")
+    group.links.new(cg, ratio.inputs[0])
+    group.links.new(frozen, ratio.inputs[1])
+    rise = compat.new_math_node(group, "MULTIPLY_ADD")
+    rise.inputs[1].default_value, rise.inputs[2].default_value = -1.0 / _SOFT, 1.0 + 1.0 / _SOFT
+    rise.use_clamp = True
+    group.links.new(ratio.outputs[0], rise.inputs[0])
+    # t * t * (3 - 2 * t)
+    square, slope, smooth = (compat.new_math_node(group, o) for o in ("MULTIPLY", "MULTIPLY_ADD", "MULTIPLY"))
+    slope.inputs[1].default_value, slope.inputs[2].default_value = -2.0, 3.0
+    smooth.label = "CG is nearer"
+    for source, target in (
+        (rise, square.inputs[0]), (rise, square.inputs[1]), (rise, slope.inputs[0]),
+        (square, smooth.inputs[0]), (slope, smooth.inputs[1]),
+    ):  # fmt: skip
+        group.links.new(source.outputs[0], target)
+    for column, node in enumerate((ratio, rise, square, slope, smooth)):
+        node.location = (_GAP * (column - 3), -1300.0)
+    return smooth.outputs[0]
 
 
 def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
@@ -554,12 +736,11 @@ def show_sequence(user: Any, image: Any, first: int, last: int) -> None:
 
 
 def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
-    """The frozen layers' sockets: without overscan, and led through Scale nodes if the render size is not theirs."""
-    names = ("Combined", "Depth", "Support", "Motion")
-    missing = [n for n in names if n not in frozen.outputs]
-    if missing:
-        raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
-    names += (_GRAIN,) if _GRAIN in frozen.outputs else ()
+    """The frozen layers' sockets: without overscan, and scaled to the render's size, whatever that is when it renders.
+
+    Frames wider than the scene's picture are cut, as the camera sees it; flatter ones leave bars.
+    """
+    names = _LAYERS + ((_GRAIN,) if _GRAIN in frozen.outputs else ())
     sockets = {n: frozen.outputs[n] for n in names}
     for row, name in enumerate(names if any(take.margin) else ()):
         node = compat.new_crop_node(group, take.margin, take.size)
@@ -567,15 +748,47 @@ def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
         node.location = (-2 * _GAP, -50.0 - 170.0 * row)
         group.links.new(sockets[name], node.inputs[0])
         sockets[name] = node.outputs[0]
-    if take.size == render_size(scene):
-        return sockets
-    for row, name in enumerate(names):
-        node = compat.new_fit_node(group)
-        node.label = f"Fit {name}"
+    how, shown = _how(scene, take.size), _whole(group, sockets["Depth"])
+    coverage = None
+    for row, name in enumerate(("", *names) if shown is not None else names):
+        node = compat.new_fit_node(group, how)
+        node.label = f"Fit {name}" if name else "Fit what there is"
         node.location = (-_GAP, 150.0 - 170.0 * row)
-        group.links.new(sockets[name], node.inputs[0])
-        sockets[name] = node.outputs[0]
+        group.links.new(sockets[name] if name else shown, node.inputs[0])
+        if not name:
+            coverage = node.outputs[0]
+        else:
+            sockets[name] = _unfaded(group, node.outputs[0], coverage, name in ("Combined", _GRAIN))
     return sockets
+
+
+def _how(scene: Any, size: tuple[int, int]) -> str:
+    """How a picture of a size is brought to the scene's: its width fits, as the solved camera's does."""
+    render = scene.render
+    return "Crop" if render.resolution_x * size[1] >= 0.99 * render.resolution_y * size[0] else "Fit"
+
+
+def _whole(group: Any, layer: Any) -> Any | None:
+    """Socket of 1 wherever a layer has pixels; None where a scaled picture does not fade out at its border."""
+    if compat.HAS_COMPOSITING_GROUP:
+        return None
+    node = compat.new_math_node(group, "GREATER_THAN")
+    node.inputs[1].default_value = -1.0
+    node.label = "Everywhere"
+    group.links.new(layer, node.inputs[0])
+    return node.outputs[0]
+
+
+def _unfaded(group: Any, layer: Any, coverage: Any | None, picture: bool) -> Any:
+    """Socket of a scaled layer whose outermost pixels are as strong as the others."""
+    if coverage is None:
+        return layer
+    if picture:
+        return compat.new_quotient(group, layer, coverage)
+    node = compat.new_math_node(group, "DIVIDE")
+    group.links.new(layer, node.inputs[0])
+    group.links.new(coverage, node.inputs[1])
+    return node.outputs[0]
 
 
 def render_size(scene: Any) -> tuple[int, int]:
@@ -585,24 +798,21 @@ def render_size(scene: Any) -> tuple[int, int]:
     return render.resolution_x * share // 100, render.resolution_y * share // 100
 
 
-def _show_plate(scene: Any, tree: Any, node: Any, plate: Path, take: Take) -> None:
+def _show_plate(scene: Any, tree: Any, node: Any, image: Any, take: Take) -> None:
     """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
     for old in [n for n in tree.nodes if n.get(_TAG) and n.get(_TAG) != _CG]:
         tree.nodes.remove(old)
     image_node = tree.nodes.new("CompositorNodeImage")
     image_node[_TAG] = True
     image_node.name = image_node.label = "Plate"
-    image = load_sequence(plate, _plate_name(plate), "srgb")
     show_sequence(image_node, image, take.first, take.last)
     stream = image_node.outputs["Image"]
     # The tree is ours: in a row, left to right.
     compat.output_socket(tree).node.location = (node.location.x + node.width + 60.0, node.location.y)
     image_node.location = (node.location.x - 2 * _GAP, node.location.y)
-    if tuple(image.size) != render_size(scene):
-        fit = compat.new_fit_node(tree)
-        fit[_TAG] = True
-        fit.label = "Fit Plate"
-        fit.location = (node.location.x - _GAP, node.location.y)
-        tree.links.new(stream, fit.inputs[0])
-        stream = fit.outputs[0]
-    tree.links.new(stream, node.inputs["Image"])
+    fit = compat.new_fit_node(tree, _how(scene, tuple(image.size)))
+    fit[_TAG] = True
+    fit.label = "Fit Plate"
+    fit.location = (node.location.x - _GAP, node.location.y)
+    tree.links.new(stream, fit.inputs[0])
+    tree.links.new(fit.outputs[0], node.inputs["Image"])

@@ -50,7 +50,7 @@ def sources() -> str:
 
 def nvidia_card() -> bool:
     """True if this machine has an NVIDIA driver."""
-    return shutil.which("nvidia-smi") is not None
+    return contract.program("nvidia-smi") is not None
 
 
 @dataclass
@@ -90,16 +90,18 @@ def start(folder: Path, python: str, package_root: Path) -> SetUp:
         contract.JobError: the folder cannot be written, or Python not started.
     """
     setup = SetUp(folder)
-    environ = {**jobs.backend_environ(package_root), "SPLANNEQUIN_HOME": str(folder)}
+    environ = {**jobs.backend_environ(package_root), "SPLANNEQUIN_HOME": str(folder.absolute())}
     if torch_index():
         environ.setdefault("SPLANNEQUIN_TORCH_INDEX", torch_index())
-    command = [python, str(package_root / "splannequin.py"), "setup", "--backend", "--output", str(setup.log.parent)]
+    python = os.path.abspath(python)
+    launcher = str(package_root / "splannequin.py")
+    command = [python, "-P", launcher, "setup", "--backend", "--output", str(setup.log.parent.absolute())]
     try:
         setup.log.parent.mkdir(parents=True, exist_ok=True)
         with open(setup.log, "wb") as log:
             setup.process = subprocess.Popen(
                 command,
-                cwd=folder,
+                cwd=os.path.dirname(python),  # see contract.python_child
                 env=environ,
                 stdin=subprocess.DEVNULL,
                 stdout=log,

@@ -43,12 +43,12 @@ def ranges(path: contract.CameraPath, solved: set[int]) -> list[tuple[int, int]]
     return [(numbers[0], numbers[-1]) for numbers in found if solved & set(numbers)]
 
 
-def mark(scene: Any, shot: Path, path: contract.CameraPath) -> None:
-    """Puts a marker where each such range begins. After `made.new`."""
+def mark(scene: Any, shot: Path, unsolved: list[tuple[int, int]]) -> None:
+    """Puts a marker where each such range begins, which are `ranges`. After `made.new`."""
     entry = made.of(scene, shot)
     others = [e for e in scene.splannequin.made if e != entry]
     put = []
-    for first, last in ranges(path, _solved(shot, path)):
+    for first, last in unsolved:
         name = f"no solve {first}-{last}" if last > first else f"no solve {first}"
         name += f" ({entry.name})" if others else ""
         put.append([scene.timeline_markers.new(name, frame=first).name, first])
@@ -76,7 +76,7 @@ def told(result: dict[str, Any]) -> str:
     return f"{guessed} of {total} frames have a guessed camera: pink keys on the timeline."
 
 
-def _solved(shot: Path, path: contract.CameraPath) -> set[int]:
+def solved(shot: Path, path: contract.CameraPath) -> set[int]:
     """Frames that the solve was to find; all of them if nothing says otherwise."""
     listing = shot / "frames" / "frames.json"
     left_out: set[int] = set()

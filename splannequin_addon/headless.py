@@ -23,7 +23,7 @@ import bpy
 
 from ..torch_backend import contract
 from ..torch_backend.contract import ExitCode
-from . import backend, bake, cameras, compositor, jobs, made, scene_setup, shots, solves, steps, stmaps
+from . import backend, bake, cameras, compositor, jobs, scene_setup, shots, solves, steps, stmaps
 
 
 class Console:
@@ -89,6 +89,8 @@ def main(argv: Sequence[str]) -> int:
             before[number] = signal.signal(number, _interrupt)
     try:
         args = parser().parse_args(list(argv))
+        if getattr(args, "tied", False):
+            contract.end_with_starter()
         return int(args.run(args, Console(args.json)))
     except SystemExit as stop:
         return int(stop.code or 0)
@@ -139,8 +141,7 @@ def train(args: argparse.Namespace, console: Console) -> int:
 def freeze(args: argparse.Namespace, console: Console) -> int:
     """`freeze CLIP`: import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
     began = time.perf_counter()
-    output = Path(args.output).absolute()
-    output.mkdir(parents=True, exist_ok=True)
+    output = _output(args)
     shot = output / (args.shot_name + shots.SHOT_SUFFIX)
     scene, fresh = _scene(args.blend)
     scene.splannequin.shot_path = str(shot)
@@ -148,14 +149,7 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
         "footage": _import_params(args),
         "camera": contract.SolveParams(camera_model=args.camera_model),
         "train": _train_params(args),
-        "freeze": contract.FreezeParams(
-            run=args.run_name,
-            take=args.take,
-            t_star=args.t_star,
-            query=args.freeze_query,
-            width=args.freeze_width,
-            overscan=args.overscan,
-        ),
+        "freeze": _freeze_params(args),
     }
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
@@ -179,10 +173,8 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
 def bake_take(args: argparse.Namespace, console: Console) -> int:
     """`bake --shot SHOT --take TAKE --output DIR`: a frozen take through the compositor."""
     began = time.perf_counter()
-    shot, output = Path(args.shot).absolute(), Path(args.output).absolute()
-    if not shots.read(shot).info:
-        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
-    output.mkdir(parents=True, exist_ok=True)
+    shot = _shot(args)
+    output = _output(args)
     scene, fresh = _scene(args.blend)
     scene.splannequin.shot_path = str(shot)
     if fresh:  # else the range is the artist's, like everything else in the file
@@ -200,6 +192,7 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
     if stale or not steps.complete(shot, args.take, span):
         params = steps.take_params(shot, args.take) or contract.FreezeParams(take=args.take, only_missing=True)
         params.first, params.last, params.step = span.start, span.stop - 1, span.step
+        params.device = _device(args)
         steps.run(scene, "freeze", params, console)
     if cameras.find(scene, shot, "CAMERA") is None and (shot / "solve" / "cameras.json").is_file():
         steps.load_camera(scene, shot)
@@ -214,9 +207,7 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
 
 def write_stmaps(args: argparse.Namespace, console: Console) -> int:
     """`stmaps SHOT`: ST maps of the lens, both ways."""
-    shot = Path(args.shot).absolute()
-    if not shots.read(shot).info:
-        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+    shot = _shot(args)
     asked = stmaps.begin(shot, args.width)
     asked.wait()
     facts = asked.answer()
@@ -229,9 +220,7 @@ def write_stmaps(args: argparse.Namespace, console: Console) -> int:
 
 def status(args: argparse.Namespace, console: Console) -> int:
     """`status SHOT`: the newest job of each kind, one line each."""
-    shot = Path(args.shot).absolute()
-    if not shots.read(shot).info:
-        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+    shot = _shot(args)
     for kind, job in jobs.latest(shot).items():
         told = job.status or contract.Status(kind, "queued", 0, 0.0, 0.0, 0.0)
         if console.as_json:
@@ -258,7 +247,7 @@ def _one_step(args: argparse.Namespace, console: Console, step: str, params: Any
     scene = bpy.context.scene
     scene.splannequin.shot_path = str(Path(args.shot).absolute())
     job = steps.begin(scene, step, params)
-    result = jobs.wait(job, console)
+    result = steps.wait(job, console)
     if console.as_json:
         print(json.dumps({"result": result}))
     return ExitCode.OK
@@ -288,7 +277,7 @@ def _bake(
     scene: Any, fresh: bool, shot: Path, take: str, output: Path, console: Console, span: range | None = None
 ) -> dict[str, Any]:
     """Compositor, render of `span` (None: the scene's range), shot.blend; returns what the summary tells of it."""
-    changes = bake.fit_take(scene, shot, take) if fresh or scene_setup.fitted(scene) else []
+    changes = bake.fit_take(scene, shot, take, fresh) if fresh or scene_setup.fitted(scene) else []
     if span is not None:
         scene.frame_start, scene.frame_end, scene.frame_step = span.start, span.stop - 1, span.step
     changes += steps.insert_freeze(scene, shot, take)
@@ -318,9 +307,7 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
         files.save_version = 0
         scene = bpy.context.scene
         compositor.relative_images()
-        made.relative_folders(scene)
         scene.render.filepath = compositor.blend_path(frames / bake.DIGITS)
-        scene.splannequin.shot_path = compositor.blend_path(Path(bpy.path.abspath(scene.splannequin.shot_path)))
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
     except RuntimeError as error:
         raise contract.JobError(
@@ -332,7 +319,7 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
 
 def _import_params(args: argparse.Namespace) -> contract.ImportParams:
     clip = args.clip if "://" in args.clip else str(Path(args.clip).absolute())
-    return contract.ImportParams(clip, args.first, args.last, args.step, args.working_height)
+    return contract.ImportParams(clip, args.first, args.last, args.step, args.working_height, args.fps, args.layer)
 
 
 def _train_params(args: argparse.Namespace) -> contract.TrainParams:
@@ -340,6 +327,9 @@ def _train_params(args: argparse.Namespace) -> contract.TrainParams:
         run=args.run_name,
         preset=args.preset,
         method=args.method,
+        host=args.host,
+        host_config=args.host_config,
+        detector=args.detector,
         supervision=args.supervision,
         iterations=args.iterations,
         width=args.width,
@@ -347,8 +337,47 @@ def _train_params(args: argparse.Namespace) -> contract.TrainParams:
         holdout=args.holdout,
         seed=args.seed,
         resume=not args.restart,
+        device=_device(args),
         extend=getattr(args, "extend", 0),
     )
+
+
+def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
+    return contract.FreezeParams(
+        run=args.run_name,
+        take=args.take,
+        t_star=args.t_star,
+        camera_path=str(Path(args.camera_path).absolute()) if args.camera_path else "",
+        query=args.freeze_query,
+        width=args.freeze_width,
+        overscan=args.overscan,
+        grain=not args.no_grain,
+        only_missing=True,
+        device=_device(args),
+    )
+
+
+def _device(args: argparse.Namespace) -> str:
+    """Where the backend works: as this command says, else as the preferences do."""
+    return args.device or backend.device()
+
+
+def _shot(args: argparse.Namespace) -> Path:
+    """The shot folder that a command is about. JobError if there is none."""
+    shot = Path(args.shot).absolute()
+    if not shots.read(shot).info:
+        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+    return shot
+
+
+def _output(args: argparse.Namespace) -> Path:
+    """The --output folder, made if it is not there. JobError if it cannot be."""
+    output = Path(args.output).absolute()
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise steps.unwritable(output, error, "Choose another --output folder.") from error
+    return output
 
 
 def parser() -> argparse.ArgumentParser:
@@ -387,17 +416,23 @@ def parser() -> argparse.ArgumentParser:
     _add_train_flags(one)
     text = "add N steps to a finished run, which keeps its settings (other flags are passed over)"
     one.add_argument("--extend", type=int, default=0, metavar="N", help=text)
+    _add_device_flag(one)
     whole = add("freeze", freeze, "Clip to baked shot: import, solve, train, freeze, bake; writes OUTPUT/shot.blend.")
     _add_import_flags(whole)
     _add_solve_flags(whole)
     _add_train_flags(whole)
+    _add_device_flag(whole)
     whole.add_argument("--t-star", type=int, help="frame number at which time stands still (default: suggested)")
     whole.add_argument("--take", default="freeze", help="name of the take")
+    text = "JSON camera path to render from (default: the clip's poses)"
+    whole.add_argument("--camera-path", default="", metavar="FILE", help=text)
     whole.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"), help="see the user guide")
     whole.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
     whole.add_argument(
         "--overscan", type=contract.overscan, default=0.0, metavar="PERCENT", help="beyond the frame, or: lens"
     )
+    text = "leave the plate's grain out of the files: a third smaller"
+    whole.add_argument("--no-grain", action="store_true", help=text)
     whole.add_argument("--shot-name", default="shot", help="name of the shot folder in OUTPUT")
     whole.add_argument("--output", default="output", metavar="DIR", help="folder for everything that comes out")
     whole.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
@@ -408,7 +443,9 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--first", type=int, help="first frame to bake (default: the take's, or the .blend's range)")
     one.add_argument("--last", type=int, help="last frame to bake, inclusive")
     one.add_argument("--step", type=int, default=0, help="bake every n-th frame (0: the scene's step)")
+    _add_device_flag(one)
     one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
+    one.add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # to the launcher, by the standard input
     one = add("stmaps", write_stmaps, "ST maps of the lens, both ways, into SHOT/solve.")
     one.add_argument("shot", help="shot folder")
     one.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")
@@ -424,18 +461,30 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--last", type=int, help="last frame number, inclusive")
     to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
     to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
+    to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
+    to.add_argument("--layer", default="", metavar="NAME", help="EXR layer or part to take (default: the picture)")
 
 
 def _add_solve_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"), help="lens")
 
 
+def _add_device_flag(to: argparse.ArgumentParser) -> None:
+    text = "where to train and freeze (default: as the preferences say)"
+    to.add_argument("--device", default="", choices=contract.DEVICES, help=text)
+
+
 def _add_train_flags(to: argparse.ArgumentParser) -> None:
     # dest: `run` is the command's function.
     to.add_argument("--run", dest="run_name", default="main", help="name of the run")
-    to.add_argument("--preset", default="preview", choices=("preview", "standard", "final"), help="how much to spend")
-    to.add_argument("--method", default="auto", choices=("auto", "hexplane", "static"), help="see the user guide")
-    to.add_argument("--supervision", default="support", choices=("support", "paper", "none"), help="see the user guide")
+    to.add_argument("--preset", default="preview", choices=tuple(contract.PRESET_STEPS), help="how much to spend")
+    to.add_argument("--method", default="auto", choices=contract.METHODS, help="a host's name: all move")
+    to.add_argument("--host", default="hexplane", choices=contract.HOSTS, help="which host `auto` puts behind the gate")
+    text = "our numbers or the published ones"
+    to.add_argument("--host-config", default="default", choices=contract.HOST_CONFIGS, help=text)
+    to.add_argument("--supervision", default="support", choices=contract.SUPERVISIONS, help="see the user guide")
+    text = "paper: what tells an ill-supervised Gaussian"
+    to.add_argument("--detector", default="grad_norm", choices=contract.DETECTORS, help=text)
     to.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
     to.add_argument("--width", type=int, default=0, help="width of the training images in pixels (0: the preset's)")
     to.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")

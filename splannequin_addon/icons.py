@@ -17,6 +17,7 @@ OF = {
     "splannequin.insert_freeze": "NODE_COMPOSITING",
     "splannequin.live": "HIDE_OFF",
     "splannequin.load_camera": "OUTLINER_OB_CAMERA",
+    "splannequin.locate_shot": "FILE_FOLDER",
     "splannequin.open_log": "TEXT",
     "splannequin.pick_run": "RESTRICT_SELECT_OFF",
     "splannequin.pick_take": "RESTRICT_SELECT_OFF",

@@ -106,12 +106,11 @@ def start(job: Job, python: str, package_root: Path) -> None:
     Raises:
         contract.JobError: the interpreter cannot be started.
     """
-    command = [python, "-m", "torch_backend", "run-job", str(job.folder)]
+    command = contract.python_child(python, "torch_backend", "run-job", str(job.folder.absolute()))
     try:
         with open(job.folder / contract.LOG_FILE, "ab") as log:
             job.process = subprocess.Popen(
-                command,
-                cwd=job.folder,  # not the extension's: Windows keeps the folder that a process stands in
+                **command,
                 env=backend_environ(package_root),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -141,6 +140,7 @@ def backend_environ(package_root: Path) -> dict[str, str]:
         PYTHONUTF8="1",
         PYTHONUNBUFFERED="1",
         PYTHONNOUSERSITE="1",
+        PYTHONSAFEPATH="1",  # what a child starts in turn takes no module from where it stands either
         PYTHONDONTWRITEBYTECODE="1",  # the extension's folder may be read-only, and is not ours to fill
     )
     return environ

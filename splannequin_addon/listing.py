@@ -12,6 +12,7 @@ from typing import Any
 
 from ..torch_backend import contract
 from . import shots
+from .sentences import cells as _cells
 
 _RUN_HEAD = ("Run", "dB", "Size", "Move", "Time")
 _RUN_WIDTHS = (0.24, 0.19, 0.18, 0.23, 0.16)  # a sidebar of Blender's own width shows all of it
@@ -83,16 +84,6 @@ def draw(layout: Any, kind: str, state: shots.ShotState, chosen: str) -> None:
             line.operator(f"splannequin.remove_{kind}", text="", icon="TRASH").name = row[0]
         for text, cell in zip(row[1:], cells[1:], strict=True):
             cell.label(text=text, translate=row is head)
-
-
-def _cells(line: Any, widths: tuple[float, ...]) -> list[Any]:
-    """Parts of a row, as wide as `widths` say, which sum to 1."""
-    cells, left = [], 1.0
-    for width in widths[:-1]:
-        line = line.split(factor=width / left, align=True)
-        cells.append(line.row(align=True))
-        left -= width
-    return [*cells, line.row(align=True)]
 
 
 def remove(shot: Path, folder: Path, wait: bool) -> None:

@@ -178,8 +178,7 @@ def open_session(shot: Path, run: str, python: str, package_root: Path) -> Sessi
         log.parent.mkdir(parents=True, exist_ok=True)
         with open(log, "wb") as errors:
             session._process = subprocess.Popen(
-                [python, "-m", "torch_backend", "live", str(shot), "--run", run],
-                cwd=shot,
+                **contract.python_child(python, "torch_backend", "live", str(shot.absolute()), "--run", run),
                 env=jobs.backend_environ(package_root),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,

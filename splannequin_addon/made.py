@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import PointerProperty, StringProperty
+from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from . import compositor, shots
 
@@ -28,6 +28,10 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     root: PointerProperty(name="Root", description="Where the solve stands in the scene", type=bpy.types.Object)
     camera: PointerProperty(name="Camera", description="The solved camera", type=bpy.types.Object)
     points: PointerProperty(name="Points", description="The sparse points", type=bpy.types.Object)
+    plate: PointerProperty(
+        name="Plate", description="The camera that shows the clip until it is solved", type=bpy.types.Object
+    )
+    scaled: BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
     collection: PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
     marks: StringProperty(name="Marks", description="Markers that were put on the timeline, as JSON", options=set())
 
@@ -64,27 +68,41 @@ def drop(scene: Any, shot: Path) -> None:
 
 
 def part(scene: Any, shot: Path, name: str) -> Any | None:
-    """One of `PARTS` if the scene still has it."""
+    """One of `PARTS`, or the plate, if the scene still has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
     return item if item is not None and scene.objects.get(item.name) == item else None
 
 
+def keep_camera(scene: Any) -> None:
+    """Remembers the scene's camera, before a shot's takes its place."""
+    camera = scene.camera
+    if camera is not None and camera not in [entry.camera for entry in scene.splannequin.made]:
+        scene.splannequin.camera_before = camera
+
+
+def give_camera_back(scene: Any) -> None:
+    """Where the scene's camera went with a shot: another shot's takes its place, or the one before all of them."""
+    held = scene.splannequin
+    if scene.camera is None:
+        others = [entry.camera for entry in held.made] + [held.camera_before]
+        scene.camera = next((c for c in others if c is not None and scene.objects.get(c.name) == c), None)
+    if not len(held.made):
+        held.camera_before = None
+
+
 def tidy(scene: Any) -> None:
     """Lets go of what the artist deleted: the pointer would keep it in the file, out of sight."""
+    before = scene.splannequin.camera_before
+    if before is not None and not before.users_scene:
+        scene.splannequin.camera_before = None
     for entry in scene.splannequin.made:
-        for name in PARTS:
+        for name in (*PARTS, "plate"):
             item = getattr(entry, name)
             if item is not None and not item.users_scene:
                 setattr(entry, name, None)
         if entry.collection is not None and entry.collection not in scene.collection.children_recursive:
             entry.collection = None
-
-
-def relative_folders(scene: Any) -> None:
-    """Makes the folders relative to the .blend, once it has a place."""
-    for entry in scene.splannequin.made:
-        entry.folder = compositor.blend_path(Path(bpy.path.abspath(entry.folder)))
 
 
 def adopt(scene: Any, shot: Path) -> None:

@@ -14,7 +14,7 @@ _GROUPS = (
     ("t_star_here", "t_star_marker", "suggested_instant", "live", "freeze"),
     ("bake", "insert_freeze", "combine_cg", "render"),
     ("set_up", "check_backend", "remove_backend"),
-    ("remove_shot",),
+    ("locate_shot", "remove_shot"),
 )
 """Names of operators in the order of the work; those that are named nowhere come last."""
 _ELSEWHERE = {"use_movie_clip"}

@@ -19,7 +19,7 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
 from ..torch_backend import contract
-from . import alignment, bake, cameras, points, steps, supervisor
+from . import alignment, bake, cameras, made, points, steps, supervisor
 from .translations import tr
 
 REACH_PIXELS = 18.0
@@ -312,6 +312,14 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
         """One factor for all axes."""
         return alignment.scaled(places, self.distance)
 
+    def execute(self, context: Any) -> set[str]:
+        """Moves the root; from now on the scale is known."""
+        outcome = super().execute(context)
+        entry = made.of(context.scene, _shot_of(context.scene))
+        if outcome == {"FINISHED"} and entry is not None:
+            entry.scaled = True
+        return outcome
+
     def picked(self, context: Any) -> set[str]:
         """Asks for the distance, in a call of its own: this one is still busy with the mouse."""
         bpy.ops.splannequin.align_scale("INVOKE_DEFAULT", places=list(self.places))
@@ -327,6 +335,12 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
         self.places = np.concatenate([one, other]).tolist()
         self.distance = float(np.linalg.norm(other - one))
         return context.window_manager.invoke_props_dialog(self)
+
+
+def scaled(scene: Any, shot: Path) -> bool:
+    """True if somebody gave a shot its scale: by Set Scale, or by hand on its root."""
+    entry = made.of(scene, shot)
+    return (entry is not None and entry.scaled) or abs(cameras.depth_scale(scene, shot) - 1.0) > 1e-5
 
 
 def view_under(window: Any, x: int, y: int) -> tuple[Any, Any] | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty
+from bpy.props import BoolProperty, StringProperty
 
-from . import shot_list, steps, supervisor
+from ..torch_backend import contract
+from . import places, shot_list, steps, supervisor
 from .translations import tr
 
 
@@ -84,6 +86,37 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
+    """Say where the folder of this shot is now. The camera, the points and the compositor's frames follow it"""
+
+    bl_idname = "splannequin.locate_shot"
+    bl_label = "Locate Shot Folder"
+    bl_options = {"REGISTER", "UNDO"}
+
+    directory: StringProperty(
+        name="Folder", description="Folder of the shot: the one that holds shot.json", subtype="DIR_PATH"
+    )
+    filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Has the folder chosen, beginning where it was."""
+        folder = steps.shot_folder(context.scene)
+        if folder is not None:
+            there = next((p for p in folder.parents if p.is_dir()), None)
+            self.directory = f"{there}/" if there is not None else ""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Takes it, if there is a shot in it."""
+        try:
+            places.locate(context.scene, Path(places.absolute(self.directory)))
+        except contract.JobError as error:
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
 class SPLANNEQUIN_PT_shots(bpy.types.Panel):
     """Which shot of the scene the five steps below are about"""
 
@@ -110,4 +143,10 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
         column.operator("splannequin.shot_remove", text="", icon="REMOVE")
 
 
-CLASSES = (SPLANNEQUIN_UL_shots, SPLANNEQUIN_OT_shot_add, SPLANNEQUIN_OT_shot_remove, SPLANNEQUIN_PT_shots)
+CLASSES = (
+    SPLANNEQUIN_UL_shots,
+    SPLANNEQUIN_OT_shot_add,
+    SPLANNEQUIN_OT_shot_remove,
+    SPLANNEQUIN_OT_locate_shot,
+    SPLANNEQUIN_PT_shots,
+)

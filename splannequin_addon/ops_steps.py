@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, jobs, markers, steps, supervisor, viewport
+from . import backend, bake, cameras, markers, steps, supervisor, viewport
 from .translations import tr
 
 
@@ -33,7 +33,7 @@ class _StepOperator:
             supervisor.follow(self.step, job)
             if not bpy.app.background:
                 return {"FINISHED"}
-            jobs.wait(job)
+            steps.wait(job)
             notes = self.after(scene, job)
         except contract.Cancelled:
             self.report({"WARNING"}, "Cancelled: finished work is kept")  # type: ignore[attr-defined]
@@ -310,6 +310,8 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Off without a trained run, and where there is no view."""
+        if viewport.session() is not None:
+            return True  # it can be stopped, whatever became of the run
         if bpy.app.background:
             cls.poll_message_set(tr("There is no 3D view"))
             return False

@@ -5,7 +5,6 @@ Drawing only reads what the supervisor keeps; it touches the disk when a shot is
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,22 @@ from typing import Any
 import bpy
 
 from . import (
+    backend,
     bake,
     cameras,
     compat,
     compositor,
+    estimates,
     guesses,
     icons,
     listing,
     made,
     markers,
     ops_align,
+    ops_jobs,
     pictures,
+    places,
+    preferences,
     scene_setup,
     shots,
     steps,
@@ -31,9 +35,12 @@ from . import (
     training,
     viewport,
 )
+from .props import PRESETS
+from .sentences import cells, wrap
 from .translations import tr
 
 CATEGORY = "Splannequin"
+_PRESET_WIDTHS = (0.34, 0.2, 0.2, 0.26)
 
 
 @dataclass
@@ -125,17 +132,6 @@ def view_bake(scene: Any, state: shots.ShotState | None) -> View:
 VIEWS = {"footage": view_footage, "camera": view_camera, "train": view_train, "freeze": view_freeze, "bake": view_bake}
 
 
-def wrap(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:
-    """A sentence, in the interface's language, in as many lines as the sidebar's width asks for."""
-    text = tr(text)
-    scale = context.preferences.system.ui_scale
-    room = context.region.width / scale - (75 if icon != "NONE" else 50)
-    column = layout.column(align=True)
-    column.scale_y = 0.8
-    for number, line in enumerate(textwrap.wrap(text, max(int(room / 6.2), 16)) or [""]):
-        column.label(text=line, translate=False, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
-
-
 class _StepPanel:
     """What the five panels share. State, settings, one button, progress with Cancel, what comes next."""
 
@@ -151,6 +147,8 @@ class _StepPanel:
 
     def _view(self, context: Any) -> View:
         watch = self._watch(context)
+        if watch is not None and places.missing(context.scene, watch.state):
+            return View(False, self.step == "footage", [], "" if self.step == "footage" else "Locate the shot first.")
         return VIEWS[self.step](context.scene, watch.state if watch else None)
 
     def _next_done(self, context: Any) -> bool:
@@ -179,23 +177,31 @@ class _StepPanel:
         """The step's body."""
         layout = self.layout  # type: ignore[attr-defined]
         watch, view = self._watch(context), self._view(context)
+        self.draw_trouble(context, layout)
         for line in view.state:
             wrap(layout, context, line)
         running = watch.running() if watch else None
         settings = layout.column()
         settings.enabled = view.ready and running is None
         self.draw_settings(context, settings)
+        self.draw_always(context, layout)
         if watch and running == self.step:
             self._progress(context, watch)
         else:
             self._button(context, layout, view, running)
             self._outcome(context, layout, watch)
-            if running is None and not (view.done and self._next_done(context)):
+            if running is None and view.advice and not (view.done and self._next_done(context)):
                 wrap(layout, context, view.advice, "INFO")
         body = sub_panel(layout, f"{self.step}_more", "Advanced")
         if body is not None:
             body.enabled = running is None
             self.draw_advanced(context, body)
+
+    def draw_trouble(self, context: Any, layout: Any) -> None:
+        """What keeps the step from being done at all, with the button that helps."""
+
+    def draw_always(self, context: Any, layout: Any) -> None:
+        """What stays in reach while a step runs."""
 
     def draw_settings(self, context: Any, layout: Any) -> None:
         """The settings that an artist needs."""
@@ -253,7 +259,7 @@ class _StepPanel:
             wrap(box, context, failure[0], "ERROR")
             if failure[1]:
                 wrap(box, context, failure[1], "BLANK1")
-            if job is not None:
+            if ops_jobs.log_of(watch, self.step) is not None:
                 box.operator("splannequin.open_log", text="Open Log", icon="TEXT").step = self.step
             return
         if job is not None and job.state == "cancelled" and not self._paused(context):
@@ -268,9 +274,21 @@ class _StepPanel:
         return False
 
 
+def can_load_camera(running: str | None) -> bool:
+    """True unless a step runs that makes another solve; the others leave this one as it is."""
+    return running not in ("footage", "camera")
+
+
+def can_scrub(view: View, running: str | None) -> bool:
+    """True if scrubbing may begin, and always while there is a session to be stopped."""
+    return viewport.session() is not None or (view.ready and running is None)
+
+
 def minutes(seconds: float) -> str:
-    """A duration for people: "45 s", "3 min"."""
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+    """A duration for people: "45 s", "3 min", "1.5 h"."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
@@ -291,14 +309,48 @@ class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
         span.enabled = props.use_range
         span.prop(props, "first", text="")
         span.prop(props, "last", text="")
-        if not supervisor.backend_found():
+
+    def draw_trouble(self, context: Any, layout: Any) -> None:
+        """No backend, no shot folder: what to do about it."""
+        self._backend_trouble(context, layout)
+        watch = self._watch(context)
+        if watch is not None and places.missing(context.scene, watch.state):
             box = layout.box()
             box.alert = True
-            wrap(box, context, "The backend is not set up: choose its Python in the add-on's preferences.", "ERROR")
+            name = watch.shot.name
+            wrap(box, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
+            box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
+
+    def _backend_trouble(self, context: Any, layout: Any) -> None:
+        """No backend, or one that is being set up."""
+        trouble, setup = supervisor.backend_trouble(), preferences.running_setup()
+        if setup is not None:
+            wrap(layout, context, "The backend is being set up.", "IMPORT")
+            for line in setup.said[-1:]:
+                wrap(layout, context, line)
+            layout.operator("splannequin.cancel_setup", icon=icons.of("splannequin.cancel_setup"))
+        elif trouble is not None:
+            box = layout.box()
+            column = box.column(align=True)
+            column.alert = True
+            wrap(column, context, trouble.message, "ERROR")
+            if not bpy.app.online_access:
+                wrap(
+                    column, context, "Blender may not go online: allow it in Preferences > System > Network.", "BLANK1"
+                )
+            box.operator("splannequin.set_up", icon=icons.of("splannequin.set_up"))
+            box.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = backend.PACKAGE
+
+    def _label(self, context: Any, view: View) -> str:
+        watch = self._watch(context)
+        gone = watch is not None and places.missing(context.scene, watch.state)
+        return "Import Anew" if gone else super()._label(context, view)
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
-        """Shot folder, consent to set the scene up."""
+        """Shot folder, which frames are solved, consent to set the scene up."""
         layout.prop(context.scene.splannequin, "shot_path", text="Folder")
+        layout.prop(context.scene.splannequin, "solve_step")
+        layout.prop(context.scene.splannequin, "fps")
         layout.prop(context.scene.splannequin, "set_up_scene")
 
 
@@ -316,6 +368,10 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
         watch = self._watch(context)
         if watch is None or cameras.find(context.scene, watch.shot, "EMPTY") is None:
             return
+        if not ops_align.scaled(context.scene, watch.shot):
+            layout = self.layout  # type: ignore[attr-defined]
+            wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")
+            layout.operator("splannequin.align_scale", icon=icons.of("splannequin.align_scale")).selected = False
         body = sub_panel(self.layout, "camera_alignment", "Alignment")  # type: ignore[attr-defined]
         if body is not None:
             ops_align.draw(body)
@@ -337,7 +393,7 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
         if view.done and watch and cameras.find(context.scene, watch.shot, "CAMERA") is None:
             row = layout.row()
             row.scale_y = 1.4
-            row.enabled = running is None
+            row.enabled = can_load_camera(running)
             row.operator("splannequin.load_camera", icon=icons.of("splannequin.load_camera"))
             return
         super()._button(context, layout, view, running)
@@ -354,14 +410,35 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
     def draw_settings(self, context: Any, layout: Any) -> None:
         """The preset; what the button will do to the run that is there."""
         props = context.scene.splannequin
-        layout.row().prop(props, "preset", expand=True)
         watch, plan = self._watch(context), self._plan(context)
+        self._presets(context, layout, watch.state if watch is not None else None)
         if watch is None or watch.running() is not None:
             return
         if plan.kind == "extend":
             layout.prop(props, "extend_steps")
         if plan.words:
             wrap(layout, context, plan.words, "PAUSE" if self._paused(context) else "INFO")
+
+    def _presets(self, context: Any, layout: Any, state: shots.ShotState | None) -> None:
+        """A button for each preset: how large, how many steps, how long on this machine."""
+        props, (rows, told) = context.scene.splannequin, estimates.costs(state)
+        column = layout.column(align=True)
+        head = cells(column.row(align=True), _PRESET_WIDTHS)
+        for place, text in zip(head, ("Preset", "Pixels", "Steps", "About" if told else "Time"), strict=True):
+            place.label(text=text)
+        names = {name: label for name, label, _ in PRESETS}
+        for row in rows:
+            columns = cells(column.row(align=True), _PRESET_WIDTHS)
+            columns[0].prop_enum(props, "preset", row.preset, text=names[row.preset])
+            spent = "-" if row.seconds is None else minutes(row.seconds) + ("" if row.measured else " ?")
+            for place, text in zip(columns[1:], (str(row.width), f"{row.steps / 1000:g}k", spent), strict=True):
+                place.label(text=text, translate=False)
+        if told is None:
+            words = "Preview took 150 s on two cores without a graphics card. Times here come with the first run."
+        else:
+            where = "graphics card" if told.get("device") == "cuda" else "processor"
+            words = f"As run {told.get('run', '')} took on the {where}; with a ? by pixels and steps."
+        wrap(layout, context, words)
 
     def _plan(self, context: Any) -> training.Plan:
         props, watch = context.scene.splannequin, self._watch(context)
@@ -430,13 +507,29 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         props = context.scene.splannequin
         row = layout.row(heading="Frame t*")
         row.prop(props, "choose_t_star", text="")
-        value = row.row(align=True)
-        value.enabled = props.choose_t_star
-        value.prop(props, "t_star", text="")
+        if props.choose_t_star:
+            row.prop(props, "t_star", text="")
+        else:
+            at = self._suggested(context)
+            row.label(text=tr(f"{at}, suggested") if at is not None else "as suggested")
         row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
         shown = context.scene.timeline_markers.get(markers.NAME) is not None
         row.operator("splannequin.t_star_marker", text="", icon="MARKER_HLT" if shown else "MARKER", depress=shown)
-        self._live(context, layout)
+
+    def _suggested(self, context: Any) -> int | None:
+        """The instant that is taken while none is chosen, once it is known: scrubbing asks for it, so does Freeze."""
+        session, watch, props = viewport.session(), self._watch(context), context.scene.splannequin
+        at = viewport.instant(context.scene) if session is not None and watch and session.shot == watch.shot else None
+        if at is not None:
+            return round(at)
+        take = watch.state.takes.get(props.take_name) if watch is not None and watch.state is not None else None
+        return props.t_star if take is not None and take["t_star_frame"] == props.t_star else None
+
+    def draw_always(self, context: Any, layout: Any) -> None:
+        """Scrubbing: it can be stopped whatever runs, and whatever became of the shot."""
+        watch, live = self._watch(context), layout.column()
+        live.enabled = can_scrub(self._view(context), watch.running() if watch else None)
+        self._live(context, live)
 
     def draw(self, context: Any) -> None:
         """The step's body, and the takes to compare."""
@@ -502,6 +595,7 @@ class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
     def draw_advanced(self, context: Any, layout: Any) -> None:
         """Colours, and the parts of the step one by one."""
         layout.prop(context.scene.splannequin, "keep_colours")
+        layout.prop(context.scene.splannequin, "insert_at")
         name = "splannequin.insert_freeze"
         layout.operator(name, text="Insert in Compositor Only", icon=icons.of(name))
         for name in ("splannequin.combine_cg", "splannequin.remove_shot"):

@@ -10,9 +10,14 @@ from bpy.props import EnumProperty, StringProperty
 
 from ..torch_backend import contract
 from . import backend, environment
+from .sentences import wrap
 from .translations import tr
 
 _TICK_SECONDS = 0.5
+_INSET = 150
+"""Pixels beside a sentence in the preferences: the page's margins and the boxes that it stands in."""
+_DIALOG = 640
+"""Width of the dialog in pixels."""
 _setup: environment.SetUp | None = None
 _findings: list[str] = []
 
@@ -48,15 +53,15 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         try:
             there = bool(backend.python())
             if not busy():  # a half-made one is not in use yet
-                layout.label(text=tr(f"In use: {backend.python()}"), icon="CHECKMARK")
+                self._say(layout, f"In use: {backend.python()}", "CHECKMARK")
         except contract.JobError as error:
             column = layout.column(align=True)
             column.alert = True
-            column.label(text=tr(error.message), icon="ERROR")
-            column.label(text=tr(error.hint))
+            self._say(column, error.message, "ERROR")
+            self._say(column, error.hint, "BLANK1")
             there = False
         for line in _findings:
-            layout.label(text=tr(line), icon="DOT")
+            self._say(layout, line, "DOT")
         self._draw_setup(there)
         layout.prop(self, "device")
         layout.prop(self, "backend_python")
@@ -65,7 +70,9 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         box = self.layout.box()
         row = box.row()
         row.enabled = not busy()
-        row.prop(self, "backend_folder", text=tr(f"Folder (empty: {environment.default_folder()})"))
+        row.prop(self, "backend_folder")
+        if not self.backend_folder:
+            self._say(box, f"Without a folder it goes to {environment.default_folder()}.", "INFO")
         row = box.row(align=True)
         ours = backend.venv_python(backend.folder() / ".venv").is_file()
         if busy():
@@ -77,22 +84,31 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
                 row.operator("splannequin.remove_backend", icon="TRASH")
         if _setup is not None:
             for line in _setup.said if _setup.running else []:
-                box.label(text=line)
+                self._say(box, line)
             if _setup.failure:
                 column = box.column(align=True)
                 column.alert = True
-                column.label(text=tr(_setup.failure), icon="ERROR")
-                column.label(text="Repair goes on where it stopped.")
+                self._say(column, _setup.failure, "ERROR")
+                self._say(column, "Repair goes on where it stopped.", "BLANK1")
         elif not there:
-            box.label(text=tr(f"Makes a Python environment of its own, {environment.SIZE}."), icon="INFO")
-            box.label(text=tr(f"It installs {environment.LICENCES}."))
+            self._say(box, f"Makes a Python environment of its own, {environment.SIZE}.", "INFO")
+            self._say(box, f"It installs {environment.LICENCES}.", "BLANK1")
         if not bpy.app.online_access:
-            box.label(text="Blender may not go online: allow it in Preferences > System > Network.", icon="ERROR")
+            self._say(box, "Blender may not go online: allow it in Preferences > System > Network.", "ERROR")
+
+    def _say(self, layout: Any, text: str, icon: str = "NONE") -> None:
+        """A sentence in as many lines as the page is wide for: Blender sets it in by the boxes around it."""
+        wrap(layout, bpy.context, text, icon, margin=_INSET)
 
 
 def busy() -> bool:
     """True while a set-up runs."""
     return _setup is not None and _setup.running
+
+
+def running_setup() -> environment.SetUp | None:
+    """The set-up that runs."""
+    return _setup if busy() else None
 
 
 class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
@@ -112,15 +128,18 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         """Asks first."""
-        return context.window_manager.invoke_props_dialog(self, width=640, confirm_text="Download and Install")
+        return context.window_manager.invoke_props_dialog(self, width=_DIALOG, confirm_text="Download and Install")
 
     def draw(self, context: Any) -> None:
         """What is asked."""
         column = self.layout.column(align=True)
-        column.label(text=tr(f"Makes a Python environment in {backend.folder()}"))
-        column.label(text=tr(f"Needs {environment.SIZE}, downloaded from {environment.sources()}."))
-        column.label(text=tr(f"Installs {environment.LICENCES}."))
-        column.label(text="Nothing is changed in Blender's own Python.")
+        for text in (
+            f"Makes a Python environment in {backend.folder()}",
+            f"Needs {environment.SIZE}, downloaded from {environment.sources()}.",
+            f"Installs {environment.LICENCES}.",
+            "Nothing is changed in Blender's own Python.",
+        ):
+            wrap(column, context, text, width=_DIALOG)
 
     def execute(self, context: Any) -> set[str]:
         """Starts it; headless, waits for its end."""

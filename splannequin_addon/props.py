@@ -5,16 +5,24 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 from ..torch_backend import contract
 from . import compat, made
 from .translations import tr
 
 PRESETS = [
-    ("preview", "Preview", "Small and quick: to see whether the shot holds, minutes on a laptop"),
-    ("standard", "Standard", "For most shots"),
-    ("final", "Final", "Largest pictures and most Gaussians: takes longest"),
+    ("preview", "Preview", "320 pixels wide, 3000 steps: to see whether the shot holds, minutes on a laptop"),
+    ("standard", "Standard", "640 pixels wide, 9000 steps: for most shots"),
+    ("final", "Final", "1280 pixels wide, 30000 steps, most Gaussians: takes longest"),
 ]
 
 
@@ -65,11 +73,34 @@ class ShotSettings:
         subtype="DIR_PATH",
         options=compat.PATH_OPTIONS,
     )
+    shot_seen: StringProperty(
+        name="Shot Seen",
+        description="Shot folder that was there when this file was last at work: it can be missed",
+        subtype="DIR_PATH",
+        options=compat.PATH_OPTIONS | {"HIDDEN"},
+    )
     use_range: BoolProperty(
         name="Only a Range", description="Import a part of the clip instead of all of it", default=False, options=set()
     )
     first: IntProperty(name="First", description="First frame number of the clip to import", default=1, options=set())
     last: IntProperty(name="Last", description="Last frame number to import, inclusive", default=250, options=set())
+    solve_step: IntProperty(
+        name="Solve Every",
+        description="Every how many frames the camera is solved and trained on, all are delivered; 0: chosen by the "
+        "clip's length. Smaller where a solve loses its way, 1: every frame",
+        default=0,
+        min=0,
+        soft_max=10,
+        options=set(),
+    )
+    fps: FloatProperty(
+        name="Frame Rate",
+        description="Frames per second of an image sequence; 0: what its files say, else 24. A video has its own",
+        default=0.0,
+        min=0.0,
+        soft_max=120.0,
+        options=set(),
+    )
     camera_model: EnumProperty(
         name="Lens",
         description="How the lens bends straight lines",
@@ -188,6 +219,12 @@ class ShotSettings:
 class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
     """Settings of a shot of the scene that is not the chosen one."""
 
+    scene_settings: StringProperty(
+        name="Scene Settings",
+        description="Size, rate and range of the scene while this shot was chosen",
+        options={"HIDDEN"},
+    )
+
 
 class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
     """The chosen shot of the scene, and what is the scene's own."""
@@ -206,6 +243,17 @@ class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
         default=True,
         options=set(),
     )
+    insert_at: EnumProperty(
+        name="Insert",
+        description="Where the freeze goes in a compositor that you have built",
+        items=[
+            ("AUTO", "Automatic", "As the plate where a node shows it, else before the output"),
+            ("PLATE", "As Plate", "Behind the node that shows the plate, so that your grade goes on from there"),
+            ("OUTPUT", "Before Output", "Behind everything else"),
+        ],
+        default="AUTO",
+        options=set(),
+    )
     shots: CollectionProperty(
         name="Shots",
         description="All shots of the scene if there are several",
@@ -217,6 +265,12 @@ class SPLANNEQUIN_PG_scene(ShotSettings, bpy.types.PropertyGroup):
     )
     loaded_shot: IntProperty(
         name="Loaded", description="Shot of the list whose settings are the scene's", default=0, options={"HIDDEN"}
+    )
+    camera_before: PointerProperty(
+        name="Camera Before",
+        description="Camera of the scene before a shot's was put in its place",
+        type=bpy.types.Object,
+        options={"HIDDEN"},
     )
     made: CollectionProperty(
         name="Made", description="What was put into this scene, by shot", type=made.SPLANNEQUIN_PG_made, options=set()

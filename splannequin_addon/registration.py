@@ -16,6 +16,7 @@ from . import (
     ops_steps,
     panel,
     pictures,
+    places,
     points,
     preferences,
     props,
@@ -55,6 +56,7 @@ def register() -> None:
     menu.register()
     pictures.register()
     points.register()
+    places.register()
     supervisor.register()
     cli.register()
 
@@ -67,6 +69,7 @@ def unregister() -> None:
     cli.unregister()
     stmaps.unregister()
     supervisor.unregister()
+    places.unregister()
     points.unregister()
     pictures.unregister()
     menu.unregister()

@@ -1,7 +1,8 @@
 """Several shots in one scene. The scene's settings are those of the chosen shot; the others wait in a list.
 
 The list is empty while there is one shot. The item of the chosen one is behind: its values stand in the scene's
-settings, where everything looks for them, and are put back when another is chosen.
+settings, where everything looks for them, and are put back when another is chosen. So are the scene's own size, rate
+and range, where a shot has set them.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 
 import bpy
 
-from . import cameras, compat, made, props, shots
+from . import cameras, compat, made, props, scene_setup, shots
 
 _T_STAR = "splannequin.t_star"
 """Data path of the one setting that can be keyed."""
@@ -30,7 +31,11 @@ def folder_of(one: Any) -> Path | None:
         return Path(os.path.abspath(bpy.path.abspath(one.shot_path)))
     if not one.clip:
         return None
-    clip = Path(os.path.abspath(bpy.path.abspath(one.clip)))
+    return beside(Path(os.path.abspath(bpy.path.abspath(one.clip))))
+
+
+def beside(clip: Path) -> Path:
+    """The shot folder of a clip for which none was chosen."""
     return clip.with_name(clip.stem + shots.SHOT_SUFFIX)
 
 
@@ -70,8 +75,10 @@ def choose(scene: Any, index: int) -> None:
     index, before = min(max(index, 0), len(held.shots) - 1), held.loaded_shot
     if index != before:
         _copy(held, held.shots[before])
+        held.shots[before].scene_settings = scene_setup.kept(scene)
         _copy(held.shots[index], held)
         held.loaded_shot = index
+        scene_setup.put_back(scene, held.shots[index].scene_settings)
         _rename(scene, {_T_STAR: _path(before), _path(index): _T_STAR})
         folder = folder_of(held)
         camera = cameras.find(scene, folder, "CAMERA") if folder is not None else None

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..torch_backend import contract
-from . import checkpoints, jobs
+from . import checkpoints, jobs, kept
 
 SHOT_SUFFIX = ".splannequin"
 EXR = ".exr"
@@ -28,13 +28,16 @@ class ShotState:
     """shot.json; empty if there is no shot."""
     frames: int = 0
     """Imported frames, 0 before the import."""
+    beside: str = ""
+    """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
     solve: dict[str, Any] = field(default_factory=dict)
     """solve.json; empty before the solve."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Trained runs: name -> summary.json, with `history`, `preview`, `extension` (see `checkpoints.extension`) and
+    """Trained runs: name -> summary.json, with `history`, `preview`, `extension`, `anew` (see `checkpoints`) and
     `other_cameras` added."""
     unfinished: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells."""
+    """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells, with
+    `history`, `preview`, `anew` and `other_cameras` added."""
     takes: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Frozen takes: name -> take.json, with `frame_count` added."""
     damaged: dict[str, dict[str, str]] = field(default_factory=lambda: {"run": {}, "take": {}})
@@ -74,7 +77,7 @@ def read(folder: Path) -> ShotState:
     state.info = _typed(_Info, folder / "shot.json")
     listing = folder / "frames" / "frames.json"
     if listing.is_file():
-        state.frames = len(_typed(_Listing, listing, contract.LONGEST_JSON)["frames"])
+        state.frames, state.beside = kept.of(listing, _listed)
     if (folder / "solve" / "cameras.json").is_file():
         state.solve = _typed(_Solve, folder / "solve" / "solve.json")
     state.runs = _named(_Run, folder / "runs", "summary.json", state.damaged["run"])
@@ -86,12 +89,17 @@ def read(folder: Path) -> ShotState:
         if told is not None:
             state.unfinished[name] = told
     for name, run in [*state.runs.items(), *state.unfinished.items()]:
+        run["anew"] = checkpoints.anew(folder / "runs" / name)
+        if run["anew"] is not None:
+            run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
+            run["anew"]["history"] = _history(run["anew"]["folder"] / "metrics.jsonl")
         run["other_cameras"] = checkpoints.other_cameras(folder, folder / "runs" / name)
-        run["history"] = _history(folder / "runs" / name / "metrics.jsonl")
+        metrics = folder / "runs" / name / "metrics.jsonl"
+        run["history"] = kept.of(metrics, _history) if metrics.is_file() else []
         run["preview"] = max((folder / "runs" / name / "previews").glob("*.png"), default=None)
     state.takes = _named(_Take, folder / "takes", "take.json", state.damaged["take"])
     for name, take in state.takes.items():
-        take["frame_count"] = sum(1 for p in (folder / "takes" / name).iterdir() if p.suffix == EXR)
+        take["frame_count"] = kept.of(folder / "takes" / name, _frame_count)
     return state
 
 
@@ -99,7 +107,8 @@ def stamp(folder: Path) -> tuple[float, ...]:
     """Changes when something in the shot did: cheap to ask for on every tick."""
     parts = ("shot.json", "frames/frames.json", "solve/solve.json", "runs", "takes", "jobs")
     deep = [p for name in ("runs", "takes") if (folder / name).is_dir() for p in (folder / name).iterdir()]
-    return tuple(_mtime(p) for p in [*(folder / part for part in parts), *deep])
+    anew = [p for run in deep if (run / checkpoints.NEXT).is_dir() for p in (run / checkpoints.NEXT).iterdir()]
+    return tuple(_mtime(p) for p in [*(folder / part for part in parts), *deep, *anew])
 
 
 def plate_range(folder: Path) -> tuple[int, int] | None:
@@ -107,6 +116,17 @@ def plate_range(folder: Path) -> tuple[int, int] | None:
     found = (contract.frame_number(p.stem) for p in (folder / "frames").glob("*.png"))
     numbers = [number for number in found if number is not None]
     return (min(numbers), max(numbers)) if numbers else None
+
+
+def _listed(path: Path) -> tuple[int, str]:
+    """Of frames.json: how many frames there are, and `ShotState.beside`."""
+    told = _read_typed(path, _Listing, contract.LONGEST_JSON)
+    return len(told["frames"]), told["beside"]
+
+
+def _frame_count(take: Path) -> int:
+    with os.scandir(take) as entries:
+        return sum(1 for entry in entries if entry.name.endswith(EXR))
 
 
 def _history(path: Path) -> list[tuple[float, float]]:
@@ -156,6 +176,7 @@ class _Listing:
     """Of frames.json."""
 
     frames: list[Any]
+    beside: str = ""
 
 
 @dataclass
@@ -203,11 +224,15 @@ class _Take:
             raise ValueError("margin should be two numbers, and t_star_per_frame a number per frame")
 
 
-def _typed(kind: type, path: Path, longest: int = contract.SHORT_JSON) -> dict[str, Any]:
+def _typed(kind: type, path: Path) -> dict[str, Any]:
     """A file of the shot, what the dataclass `kind` names in it checked and completed. ValueError says what is wrong.
 
     OSError if there is none.
     """
+    return dict(kept.of(path, _read_typed, kind))
+
+
+def _read_typed(path: Path, kind: type, longest: int = contract.SHORT_JSON) -> dict[str, Any]:
     data = contract.read_json(path, longest)
     contract.check_version(data, str(path))
     try:

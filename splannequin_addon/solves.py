@@ -11,7 +11,6 @@ import functools
 import os
 import re
 import subprocess
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -138,12 +137,13 @@ def begin_export(shot: Path, kind: str, folder: Path, text: bool = False) -> sub
         contract.JobError: there is no backend, or it cannot be started.
     """
     root = backend.package_root()
-    command = [backend.python(), "-m", "torch_backend", "export", str(shot), "--format", kind, "--output", str(folder)]
+    words = ["export", str(shot.absolute()), "--format", kind, "--output", str(folder.absolute())]
     if text:
-        command.append("--text")
+        words.append("--text")
+    command = contract.python_child(backend.python(), "torch_backend", *words)
     try:
         return subprocess.Popen(
-            command, cwd=tempfile.gettempdir(), env=jobs.backend_environ(root), stdin=subprocess.DEVNULL,
+            **command, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, encoding="utf-8",
         )  # fmt: skip
     except OSError as error:

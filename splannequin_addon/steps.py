@@ -6,6 +6,7 @@ The same functions serve the buttons, the timer and the command line.
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import shutil
 from collections.abc import Callable, Iterable
@@ -22,9 +23,12 @@ from . import (
     cameras,
     compat,
     compositor,
+    intact,
     jobs,
     made,
     markers,
+    places,
+    plate,
     scene_setup,
     shot_list,
     shots,
@@ -89,7 +93,7 @@ def params_of(scene: Any, step: str) -> Any:
         if not props.clip:
             raise contract.JobError("No clip is chosen.", "Choose a video or image sequence.", contract.ExitCode.USAGE)
         span = (props.first, props.last) if props.use_range else (None, None)
-        return contract.ImportParams(os.path.abspath(bpy.path.abspath(props.clip)), *span)
+        return contract.ImportParams(places.absolute(props.clip), *span, step=props.solve_step, fps=props.fps)
     if step == "camera":
         return solves.params(scene, shot_folder(scene))
     if step == "train":
@@ -150,9 +154,7 @@ def freeze_from(scene: Any, path: contract.CameraPath, step: str = "freeze") -> 
 
     A bake is about a part of the take: where the camera was not looked at now, it stays as it was.
     """
-    folder = shot_folder(scene)
-    if folder is None:
-        raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
+    folder = _needed(scene, step)
     file = folder / "paths" / f"{scene.splannequin.take_name}.json"
     if step == "bake" and file.is_file():
         path = _with_rest(path, contract.CameraPath.load(file))
@@ -182,7 +184,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         t_star_per_frame=facts.get("t_star_per_frame", {}),
         first=facts.get("first"),
         last=facts.get("last"),
-        camera_path=facts.get("camera_path", ""),
+        camera_path=_path_of(shot, facts),
         query=facts["query"],
         width=facts["width"],
         overscan=facts.get("overscan", 0.0),
@@ -219,9 +221,16 @@ def may_be_stale(shot: Path, take: str) -> bool:
     return trained.is_file() and told.is_file() and trained.stat().st_mtime > told.stat().st_mtime
 
 
+def _path_of(shot: Path, facts: dict[str, Any]) -> str:
+    """File of the camera path that a take was seen from: as it was named, or in the shot, if that was moved since."""
+    named = str(facts.get("camera_path", ""))
+    moved = shot / "paths" / f"{facts.get('take', '')}.json"
+    return str(moved) if named and not Path(named).is_file() and moved.is_file() else named
+
+
 def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
     """Frames that a take can have: those of its camera's path, or the clip's."""
-    path = facts.get("camera_path", "")
+    path = _path_of(shot, facts)
     if path and Path(path).is_file():
         return {f.frame for f in contract.CameraPath.load(path).frames}
     first, last = (facts["first"], facts["last"]) if path else shots.read(shot).frame_range
@@ -235,30 +244,48 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
         contract.JobError: nothing to work on, no backend, or the shot cannot be written.
     """
     params = params or params_of(scene, step)
-    folder = shot_folder(scene)
-    if folder is None:
-        raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
+    folder = _needed(scene, step)
     backend.python()  # before anything is written: without a backend there is nothing to start
-    jobs.refuse_second_writer(folder)
     try:
+        jobs.refuse_second_writer(folder)
         if step == "footage":
             shots.create(folder)
-        elif not (folder / "shot.json").is_file():
-            raise contract.JobError(f"{folder} is no shot folder.", STEPS[step].needs, contract.ExitCode.USAGE)
         job = jobs.new_job(folder, STEPS[step].kind, params)
         (job.folder / _STEP_FILE).write_text(step, encoding="utf-8")
     except OSError as error:
-        raise contract.JobError(
-            f"Cannot write to {folder}: {error.strerror or error}.",
-            "Choose another shot folder.",
-            contract.ExitCode.DISK,
-        ) from error
+        raise unwritable(folder, error, "Choose another shot folder.") from error
     try:
         backend.start(job)
     except contract.JobError:
         shutil.rmtree(job.folder)  # else it would pass for one that is about to start
+        give_up(job)
         raise
     return job
+
+
+def _needed(scene: Any, step: str) -> Path:
+    """The scene's shot folder, which a step needs to be there unless it makes it. JobError says what to do."""
+    folder = shot_folder(scene)
+    if folder is None:
+        raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
+    if step != "footage" and not os.path.isfile(folder / "shot.json"):
+        if places.missing(scene, None):
+            message, hint = f"The shot folder {folder} is not there any more.", "Press Locate and choose it."
+            raise contract.JobError(message, hint, contract.ExitCode.USAGE)
+        raise contract.JobError(f"{folder} is no shot folder.", STEPS[step].needs, contract.ExitCode.USAGE)
+    return folder
+
+
+def unwritable(folder: Path, error: OSError, hint: str) -> contract.JobError:
+    """What is said of a folder that cannot be written, with the exit code that the backend's command line gives it."""
+    code = contract.ExitCode.DISK if error.errno in (errno.ENOSPC, errno.EDQUOT) else contract.ExitCode.USAGE
+    return contract.JobError(f"Cannot write to {folder}: {error.strerror or error}.", hint, code)
+
+
+def give_up(job: jobs.Job) -> None:
+    """After an import that did not end well: the shot that it was to begin is not left behind empty."""
+    if job.kind == "import" and job.state != "done":
+        contract.discard_unborn(job.shot)
 
 
 def step_of(job: jobs.Job) -> str:
@@ -290,30 +317,40 @@ def imported(scene: Any, shot: Path) -> list[str]:
     """After the import: the scene takes the clip's size, rate and range if it is new or the artist consents."""
     state = shots.read(shot)
     props = scene.splannequin
+    places.see(scene, state)
     first, last = state.frame_range
     if not first <= props.t_star <= last:
         props.t_star = (first + last) // 2
-    return _fit(scene, state)
+    changes, camera = _fit(scene, state), plate.show(scene, shot)
+    if camera is not None:
+        changes.append(f"{camera.name} shows the clip until the camera is solved.")
+    return changes
 
 
 def load_camera(scene: Any, shot: Path) -> list[str]:
     """Brings the solve into the scene. FileNotFoundError if there is none."""
-    changes = _fit(scene, shots.read(shot), force_k=True)
-    camera = cameras.build(scene, shot)
+    state = shots.read(shot)
+    places.see(scene, state)
+    with intact.scene_of(scene):
+        camera = cameras.build(scene, shot)
+        changes = _fit(scene, state, force_k=True)
+    plate.remove(scene, shot)
     return [f"{camera.name} is the scene's camera, with the plate behind it.", *changes]
 
 
 def insert_freeze(scene: Any, shot: Path, take: str) -> list[str]:
     """Puts a take into the scene's compositor, and keeps the plate's colours if the artist consents."""
-    changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
-    return bake.insert(scene, shot, take) + changes
+    with intact.scene_of(scene):
+        changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
+        return bake.insert(scene, shot, take) + changes
 
 
 def combine_cg(scene: Any, shot: Path) -> list[str]:
     """Has the scene's own objects stand among the frozen. JobError if the freeze is not in the compositor."""
     compositor.may_combine_cg(scene)
-    changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
-    return compositor.combine_cg(scene) + changes
+    with intact.scene_of(scene):
+        changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
+        return compositor.combine_cg(scene) + changes
 
 
 def remove_all(scene: Any, shot: Path) -> list[str]:
@@ -328,6 +365,7 @@ def remove_all(scene: Any, shot: Path) -> list[str]:
     others = [f for f in others if f == baked or made.of(scene, f) is not None]
     if baked not in others and bake.remove(scene):
         done.append("The freeze left the compositor.")
+    plate.remove(scene, shot)
     if cameras.remove(scene, shot):
         done.append("Camera and points were removed.")
     if others:
@@ -348,16 +386,26 @@ def run(
         contract.JobError, contract.Cancelled: as the job ended.
     """
     job = begin(scene, step, params)
-    result = jobs.wait(job, on_event)
-    return result, finish(scene, step, job)
+    return wait(job, on_event), finish(scene, step, job)
+
+
+def wait(job: jobs.Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
+    """`jobs.wait`; an import that does not end well leaves no empty shot."""
+    try:
+        return jobs.wait(job, on_event)
+    except (contract.JobError, contract.Cancelled):
+        give_up(job)
+        raise
 
 
 def _fit(scene: Any, state: shots.ShotState, force_k: bool = False) -> list[str]:
-    if not (scene.splannequin.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
+    props = scene.splannequin
+    if not (props.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
         return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]
     size, k = state.size, None
     if force_k:
         path = contract.CameraPath.load(state.folder / "solve" / "cameras.json")
         size = (path.width, path.height)
         k = (path.frames[0].K[0], path.frames[0].K[1], path.frames[0].K[2], path.frames[0].K[3])
-    return scene_setup.fit_clip(scene, size, float(state.info.get("fps", 0.0)), state.frame_range, k)
+    fps = float(state.info.get("fps", 0.0))
+    return scene_setup.fit_clip(scene, size, fps, state.frame_range, k, props.set_up_scene)

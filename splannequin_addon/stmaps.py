@@ -68,10 +68,11 @@ def begin(shot: Path, width: int = 0) -> Asked:
         contract.JobError: there is no backend, or it cannot be started.
     """
     root = backend.package_root()
-    command = [backend.python(), "-m", "torch_backend", "--json", "stmaps", str(shot), "--width", str(width)]
+    words = ("--json", "stmaps", str(shot.absolute()), "--width", str(width))
+    command = contract.python_child(backend.python(), "torch_backend", *words)
     try:
         child = subprocess.Popen(
-            command, cwd=shot, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            **command, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True, encoding="utf-8", **jobs.detached(),
         )  # fmt: skip
     except OSError as error:

@@ -6,6 +6,7 @@ the jobs of a shot that is opened are found again in its folder.
 
 from __future__ import annotations
 
+import contextlib
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterator
@@ -17,7 +18,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..torch_backend import contract
-from . import backend, bake, compositor, jobs, live, made, markers, pictures, shots, steps, viewport
+from . import backend, bake, compositor, jobs, live, made, markers, pictures, places, plate, shots, steps, viewport
 from .translations import tr
 
 TICK_SECONDS = 0.25
@@ -86,8 +87,8 @@ class Watch:
 
 
 _watches: dict[Path, Watch] = {}
-_backend = (False, 0.0)
-"""Whether a backend was found, and when that was looked up, monotonic seconds."""
+_backend: tuple[contract.JobError | None, float] = (None, 0.0)
+"""Why there is no backend, and when that was looked up, monotonic seconds."""
 
 
 def watch_of(shot: Path) -> Watch:
@@ -95,17 +96,19 @@ def watch_of(shot: Path) -> Watch:
     watch = _watches.get(shot)
     if watch is None:
         watch = _watches[shot] = Watch(shot)
-        watch.jobs = {steps.step_of(job): job for job in jobs.latest(shot).values()}
+        with contextlib.suppress(OSError):  # a path that can be none: `refresh` says so
+            watch.jobs = {steps.step_of(job): job for job in jobs.latest(shot).values()}
     if watch.state is None:
         refresh(watch)
     return watch
 
 
-def backend_found() -> bool:
-    """True if there is a Python for the backend; looked up every few seconds, as drawing asks all the time."""
+def backend_trouble() -> contract.JobError | None:
+    """Why there is no Python for the backend, None if there is; looked up every few seconds, as drawing asks all the
+    time."""
     global _backend
     if not _backend[1] or time.monotonic() - _backend[1] > 5 * _LOOK_SECONDS:
-        _backend = (backend.available(), time.monotonic())
+        _backend = (backend.trouble(), time.monotonic())
     return _backend[0]
 
 
@@ -165,7 +168,8 @@ def refresh(watch: Watch) -> bool:
         watch.state = shots.read(watch.shot)
     except (OSError, ValueError, KeyError) as error:
         watch.state = shots.ShotState(watch.shot)
-        watch.failures["footage"] = (f"The shot folder cannot be read: {error}", "")
+        why = getattr(error, "strerror", None) or error
+        watch.failures["footage"] = (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one.")
     return True
 
 
@@ -194,6 +198,7 @@ def _turn(watch: Watch, until: float) -> bool:
     for scene in steps.scenes_of(watch.shot):
         changed |= markers.follow(scene)
         made.tidy(scene)
+        places.see(scene, watch.state)
     if watch.to_render:
         _render(watch)
         return True
@@ -213,6 +218,7 @@ def _turn(watch: Watch, until: float) -> bool:
             del watch.jobs[step]
             continue
         if job.ended:
+            steps.give_up(job)
             refresh(watch)
             there = steps.scenes_of(watch.shot)
             if there and step == "bake" and job.state == "done":
@@ -250,11 +256,17 @@ def redraw() -> None:
                     region.tag_redraw()
 
 
-def look_through_camera(window: Any) -> None:
-    """Turns the window's first 3D view to the scene's camera, where the plate is."""
+def look_through_camera(window: Any, camera: Any = None) -> None:
+    """Turns the window's first 3D view to the scene's camera, where the plate is; or to another one, which the view
+    alone takes, until it is turned again."""
     for area in window.screen.areas:
         if area.type == "VIEW_3D":
-            area.spaces.active.region_3d.view_perspective = "CAMERA"
+            space = area.spaces.active
+            if camera is not None:
+                space.use_local_camera, space.camera = True, camera
+            elif space.use_local_camera and space.camera is None:  # ours is gone
+                space.use_local_camera = False
+            space.region_3d.view_perspective = "CAMERA"
             return
 
 
@@ -286,8 +298,9 @@ def _change(watch: Watch, step: str, change: Callable[[Any], list[str]], only: s
             with bpy.context.temp_override(window=window, scene=scene):
                 before = scene.splannequin.t_star
                 watch.notes[step] = change(scene)
-                if step == "camera":
-                    look_through_camera(window)
+                camera = plate.find(scene, watch.shot) if step == "footage" else None
+                if step == "camera" or camera is not None:
+                    look_through_camera(window, camera)
                 if watch.notes[step] or before != scene.splannequin.t_star:
                     undo_step(step)
         except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:

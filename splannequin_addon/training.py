@@ -28,14 +28,17 @@ def plan(state: shots.ShotState | None, run: str, preset: str) -> Plan:
     told = finished or paused
     if told is None:
         return Plan("train", "Train", "")
+    if _goes_on(told, preset):
+        words = "Paused while the run was trained anew. The run is as it was until the new one is done."
+        return Plan("resume", "Resume", words)
     if told.get("other_cameras"):
         return Plan(
-            "anew", "Train Anew", "The camera was solved again: training begins anew and replaces this run. "
+            "anew", "Train Anew", "The camera was solved again: training begins anew and replaces this run when done. "
             "Give the run another name to keep it."
         )  # fmt: skip
     if told.get("preset", preset) != preset:
         return Plan(
-            "anew", "Train Anew", "This run has another preset: training begins anew and replaces it. "
+            "anew", "Train Anew", "This run has another preset: training begins anew and replaces it when done. "
             "Give the run another name to keep it."
         )  # fmt: skip
     if finished is None:
@@ -45,12 +48,19 @@ def plan(state: shots.ShotState | None, run: str, preset: str) -> Plan:
     return Plan("extend", "Train On", "Adds these steps to the run. It stays as it is until all are done.")
 
 
+def _goes_on(told: dict[str, Any], preset: str) -> bool:
+    """True if a run is being trained anew with a preset, on the cameras that the shot has."""
+    anew = told.get("anew")
+    return anew is not None and anew["preset"] == preset and not anew["other_cameras"]
+
+
 def params(state: shots.ShotState | None, run: str, preset: str, steps: int, device: str) -> contract.TrainParams:
     """What the backend is asked for; `steps` is how many are added if the run is finished."""
     kind = plan(state, run, preset).kind
     if state is not None and kind == "resume":
         # Its own settings, not the panel's: a run that was begun on the command line goes on too.
-        settings = checkpoints.params_of(state.unfinished[run]["config"])
+        told = state.runs.get(run) or state.unfinished[run]
+        settings = checkpoints.params_of((told["anew"] if _goes_on(told, preset) else told)["config"])
         return contract.TrainParams(run=run, device=device, **settings)
     extend = 0
     if state is not None and kind == "extension":
@@ -61,6 +71,7 @@ def params(state: shots.ShotState | None, run: str, preset: str, steps: int, dev
 
 
 def history(told: dict[str, Any], now: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """(seconds, dB) of a run, what a job measures `now` after what is known from before it."""
-    before = told.get("history", [])
+    """(seconds, dB) of a run, or of the one that will take its place, what a job measures `now` after what is known
+    from before it."""
+    before = (told.get("anew") or told).get("history", [])
     return [point for point in before if not now or point[0] < now[0][0]] + list(now)

@@ -97,6 +97,13 @@ def instant(scene: Any) -> float | None:
     return float(suggested[0]["frame"]) if suggested else None
 
 
+def _suggest(scene: Any) -> None:
+    """Has an instant that nobody chose be the one that is drawn: what is shown and what is set agree."""
+    at, props = instant(scene), scene.splannequin
+    if at is not None and not props.choose_t_star and props.t_star != round(at):
+        props.t_star = round(at)
+
+
 def suggestions() -> list[dict[str, Any]]:
     """Instants worth freezing, best first: frame, seen and sharpness in 0..1; empty before the backend has said."""
     return list(_session.facts.get("suggestions", [])) if _session is not None else []
@@ -143,6 +150,8 @@ def _tick() -> float | None:
     if not any(s.splannequin.run_name == _session.run for s in scenes):
         end()  # another file, another shot or another run
         return None
+    for scene in scenes:
+        _suggest(scene)
     state = (
         _session.drawn,
         (bool(_session.facts), *((instant(s), s.splannequin.live_show, s.frame_current) for s in scenes)),

@@ -1,6 +1,7 @@
 """The wall between Blender and the backend, and what no file of the project may do: read from the source."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -88,6 +89,71 @@ def dangers(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield node.lineno, "pickled arrays"
 
 
+PYTHON = re.compile(r"(.*\.)?(python|executable)(\(\))?|str\(bpy\)")
+"""Source of an expression that is the path of a Python."""
+
+
+def unsafe_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """(line, command) of Pythons that are started without -P (or -I): they take modules from where they stand."""
+    shown = {
+        id(argument)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "subprocess.list2cmdline"
+        for argument in node.args
+    }
+    for node in ast.walk(tree):
+        if not isinstance(node, (ast.List, ast.Tuple)) or len(node.elts) < 2 or id(node) in shown:
+            continue
+        words = [e.value for e in node.elts if isinstance(e, ast.Constant) and isinstance(e.value, str)]
+        first = node.elts[0]
+        python = not isinstance(first, ast.Constant) and PYTHON.fullmatch(ast.unparse(first))
+        if (python and words) or {"-m", "-c"} & set(words):
+            at = min((words.index(w) for w in ("-m", "-c") if w in words), default=len(words))
+            if not {"-P", "-I"} & set(words[:at]):
+                yield node.lineno, ast.unparse(node)
+
+
+def unplaced_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """(line, call) of processes that stand wherever this one does."""
+    for node in ast.walk(tree):
+        started = isinstance(node, ast.Call) and ast.unparse(node.func) == "subprocess.Popen"
+        if started and not {None, "cwd"} & {k.arg for k in node.keywords}:
+            yield node.lineno, ast.unparse(node)
+
+
+@pytest.mark.parametrize("folder", ["splannequin_addon", "torch_backend", "benchmarks", "splannequin.py"])
+def test_no_python_is_started_that_takes_modules_from_where_it_stands(folder: str):
+    for path in sources(folder) if (ROOT / folder).is_dir() else [ROOT / folder]:
+        wrong = list(unsafe_children(read(path)))
+        if folder in ("splannequin_addon", "torch_backend"):
+            wrong += unplaced_children(read(path))
+        assert not wrong, path
+
+
+@pytest.mark.parametrize(
+    ("source", "unsafe"),
+    [
+        ("[python, '-m', 'torch_backend', 'run-job', folder]", True),
+        ("run([sys.executable, '-m', 'pip', 'install'], cwd=shot)", True),
+        ("command = [environment.python, '-c', probe]", True),
+        ("[backend.python(), str(script), 'bake']", True),
+        ("[*command, '-m', 'pytest']", True),
+        ("[python, '-m', 'torch_backend', 'solve', '-P']", True),
+        ("[python, '-P', '-m', 'torch_backend', 'run-job', folder]", False),
+        ("[sys.executable, '-I', '-c', 'import sys']", False),
+        ("subprocess.list2cmdline(['python', '-m', 'benchmarks.bench'])", False),
+    ],
+)
+def test_the_scan_sees_an_unsafe_child(source: str, unsafe: bool):
+    assert bool(list(unsafe_children(ast.parse(source)))) == unsafe
+
+
+def test_the_scan_sees_a_child_that_stands_anywhere():
+    assert list(unplaced_children(ast.parse("subprocess.Popen(command, env=environ)")))
+    assert not list(unplaced_children(ast.parse("subprocess.Popen(**contract.python_child(python, 'torch_backend'))")))
+    assert not list(unplaced_children(ast.parse("subprocess.Popen(command, cwd=folder)")))
+
+
 def test_no_module_of_the_addon_has_both_threads_and_bpy():
     for path in sources("splannequin_addon"):
         names = {name.split(".")[0] for _, name in imports(read(path), package_of(path))}
@@ -113,7 +179,7 @@ def test_a_station_imports_only_stations_before_it(path: Path):
     station = path.relative_to(ROOT / "torch_backend").parts[0].removesuffix(".py")
     if station not in STATIONS:
         return
-    allowed = {*STATIONS[: STATIONS.index(station) + 1], "contract", "shot"}
+    allowed = {*STATIONS[: STATIONS.index(station) + 1], "contract", "shot", "cards"}
     wrong = []
     for line, name in imports(read(path), package_of(path)):
         parts = name.split(".")

@@ -15,11 +15,11 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 from . import contract
 from .contract import DEVICES, Event, ExitCode
-from .shot import SHOT_SUFFIX, Shot, disk_error, is_disk_full, write_json
+from .shot import SHOT_SUFFIX, Shot, path_error, write_json
 
 
 class Console:
@@ -77,40 +77,66 @@ def run_station(shot: Shot, kind: str, params: Any, console: Console) -> Any:
     """Runs one station as a job of `shot`; returns its result. SystemExit with the job's code if it did not finish."""
     from .job import new_job, run_job
 
+    contract.check_params(params)
     try:
         folder = new_job(shot, kind, params)
     except OSError as error:
         _give_up(error, shot.root)
     code, result = run_job(folder, console)
     if code != ExitCode.OK:
+        if kind == "import":
+            contract.discard_unborn(shot.root)
         raise SystemExit(code)
     return result
+
+
+def _begun(folder: str) -> Shot:
+    """The shot of an import, made if it is not there. Ends the command, in one sentence, if it cannot be."""
+    try:
+        return Shot.create(folder)
+    except OSError as error:
+        _give_up(error, Path(folder).absolute(), "Choose another shot folder.")
 
 
 def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     """`freeze CLIP`: import, solve, train, freeze; leaves OUTPUT/summary.json."""
     output = Path(args.output).absolute()
     started = time.perf_counter()
+    requests = _requests(args)
     try:
         shot = Shot.create(output / (args.shot_name + SHOT_SUFFIX), args.shot_name)
     except OSError as error:
         _give_up(error, output)
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
-    requests = {
-        "import": contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height),
-        "solve": contract.SolveParams(camera_model=args.camera_model),
-        "train": _train_params(args),
-        "freeze": _freeze_params(args),
-    }
     for kind, params in requests.items():
         since = time.perf_counter()
         results[kind] = run_station(shot, kind, params, console)
         stages[kind] = round(time.perf_counter() - since, 2)
+        info = shot.info()
+        if args.t_star is not None and not info.first <= args.t_star <= info.last:  # said before hours of training
+            raise ValueError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
     summary = contract.summarise(str(shot.root), shot.info().source, results, stages, time.perf_counter() - started)
     write_json(output / "summary.json", summary)
     print_summary(summary, console)
     return ExitCode.OK
+
+
+def _requests(args: argparse.Namespace) -> dict[str, Any]:
+    """Kind of job -> parameters of `freeze CLIP`. ValueError or JobError on what cannot be, before any work is done."""
+    requests = {
+        "import": _import_params(args),
+        "solve": contract.SolveParams(camera_model=args.camera_model),
+        "train": _train_params(args),
+        "freeze": _freeze_params(args),
+    }
+    for params in requests.values():
+        contract.check_params(params)
+    for name, what in ((args.run, "run"), (args.take, "take"), (args.shot_name, "shot")):
+        contract.checked_name(name, what)
+    if args.camera_path:
+        contract.CameraPath.load(args.camera_path)
+    return requests
 
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:
@@ -162,6 +188,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     facts["torch_device"] = "cuda" if torch.cuda.is_available() else "cpu"
     facts["cuda_device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     facts["trains_on"] = choose_device("auto").type
+    facts["torch_cuda"] = torch.version.cuda
     facts["cuda_refusal"] = cuda_refusal()
     facts["cores"] = os.cpu_count()
     facts["h264"] = "libx264" in av.codecs_available
@@ -186,15 +213,7 @@ def export(args: argparse.Namespace, console: Console) -> int:
     """`export SHOT --output DIR`: cameras and points for other programs; prints what was written."""
     from .solve.export import export_cameras
 
-    try:
-        written = export_cameras(Shot.open(args.shot), args.format, Path(args.output).absolute(), args.text)
-    except contract.JobError as error:
-        print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
-        return error.exit_code
-    except OSError as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        _give_up(error, Path(args.output).absolute())
+    written = export_cameras(Shot.open(args.shot), args.format, Path(args.output).absolute(), args.text)
     for path in written:
         print(json.dumps({"written": str(path)}) if console.as_json else path, file=console.stream)
     return ExitCode.OK
@@ -204,14 +223,7 @@ def stmaps(args: argparse.Namespace, console: Console) -> int:
     """`stmaps SHOT`: ST maps of the lens into SHOT/solve."""
     from .solve.stmap import write_maps
 
-    try:
-        facts = write_maps(Shot.open(args.shot), args.width)
-    except contract.JobError as error:
-        print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
-        return error.exit_code
-    except OSError as error:
-        print(f"Error: {error.strerror or error}: {error.filename or ''}", file=sys.stderr)
-        return ExitCode.DISK
+    facts = write_maps(Shot.open(args.shot), args.width)
     if console.as_json:
         print(json.dumps(facts), file=console.stream)
         return ExitCode.OK
@@ -250,7 +262,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         run=args.run,
         take=args.take,
         t_star=args.t_star,
-        camera_path=args.camera_path,
+        camera_path=str(Path(args.camera_path).absolute()) if args.camera_path else "",
         query=args.freeze_query,
         width=args.freeze_width,
         overscan=args.overscan,
@@ -260,16 +272,30 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
     )
 
 
+def _import_params(args: argparse.Namespace) -> contract.ImportParams:
+    span = (args.first, args.last)
+    return contract.ImportParams(_source(args.clip), *span, args.step, args.working_height, args.fps, args.layer)
+
+
+def _overscan(text: str) -> float:
+    """As `contract.overscan`; argparse shows the sentence of this kind of error only."""
+    try:
+        return contract.overscan(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def _source(clip: str) -> str:
     return clip if not clip or "://" in clip else str(Path(clip).absolute())
 
 
-def _give_up(error: OSError, where: Path) -> Any:
-    """Ends the command on an output folder that cannot be written, in one sentence."""
-    full = is_disk_full(error)
-    message = disk_error(where) if full else f"Cannot write to {where}: {error.strerror or error}."
-    print(f"Error: {getattr(message, 'message', message)} Choose another --output folder.", file=sys.stderr)
-    raise SystemExit(ExitCode.DISK if full else ExitCode.USAGE)
+def _give_up(error: OSError, where: Path, hint: str = "Choose another --output folder.") -> NoReturn:
+    """Ends the command on a folder that cannot be written, in one sentence."""
+    told = path_error(error) or contract.JobError(
+        f"Cannot write to {where}: {error.strerror or error}.", hint, ExitCode.USAGE
+    )
+    print(f"Error: {told.message} {told.hint}", file=sys.stderr)
+    raise SystemExit(told.exit_code)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -293,6 +319,7 @@ def parser() -> argparse.ArgumentParser:
     whole.add_argument("--output", default="output", metavar="DIR", help="folder for the shot and summary.json")
     whole.add_argument("--shot-name", default="shot", help="name of the shot folder inside it")
     _add_import_flags(whole)
+    _add_lens_flag(whole)
     _add_train_flags(whole)
     _add_freeze_flags(whole)
     _add_device_flag(whole)
@@ -309,7 +336,7 @@ def parser() -> argparse.ArgumentParser:
             one.add_argument("clip")
             _add_import_flags(one)
         elif name == "solve":
-            one.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
+            _add_lens_flag(one)
             one.add_argument(
                 "--cameras", default="", metavar="PATH",
                 help="take these cameras instead: a COLMAP folder, a transforms.json or a camera path",
@@ -342,8 +369,12 @@ def _add_import_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--last", type=int, help="last frame number, inclusive")
     to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
     to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
-    if not any(a.dest == "camera_model" for a in to._actions):
-        to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"))
+    to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
+    to.add_argument("--layer", default="", metavar="NAME", help="EXR layer or part to take (default: the picture)")
+
+
+def _add_lens_flag(to: argparse.ArgumentParser) -> None:
+    to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"), help="lens")
 
 
 def host_names() -> tuple[str, ...]:
@@ -382,7 +413,7 @@ def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"))
     to.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
     to.add_argument(
-        "--overscan", type=contract.overscan, default=0.0, metavar="PERCENT",
+        "--overscan", type=_overscan, default=0.0, metavar="PERCENT",
         help="picture beyond the frame on every side, or `lens`: what the way back through the lens needs",
     )  # fmt: skip
     to.add_argument("--no-grain", action="store_true", help="leave the plate's grain out of the files: a third smaller")
@@ -407,7 +438,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(stop.code or 0)
     except KeyboardInterrupt:
         return ExitCode.CANCELLED
-    except (ValueError, FileNotFoundError) as error:
+    except contract.JobError as error:
+        print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
+        return error.exit_code
+    except OSError as error:
+        told = path_error(error)
+        text = f"{told.message} {told.hint}" if told else str(error)
+        print(f"Error: {text}", file=sys.stderr)
+        return told.exit_code if told else ExitCode.USAGE
+    except ValueError as error:
         print(f"Error: {error}", file=sys.stderr)
         return ExitCode.USAGE
 
@@ -424,8 +463,7 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
 
         return run_live(args.shot, args.run, args.device)
     if args.command == "import":
-        params = contract.ImportParams(_source(args.clip), args.first, args.last, args.step, args.working_height)
-        run_station(Shot.create(args.shot), "import", params, console)
+        run_station(_begun(args.shot), "import", _import_params(args), console)
     elif args.command == "solve":
         given = str(Path(args.cameras).absolute()) if args.cameras else ""
         params = contract.SolveParams(camera_model=args.camera_model, cameras=given)

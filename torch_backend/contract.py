@@ -10,6 +10,7 @@ row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame number
 
 from __future__ import annotations
 
+import _thread
 import calendar
 import contextlib
 import dataclasses
@@ -20,11 +21,14 @@ import json
 import math
 import os
 import re
+import shutil
+import signal
 import socket
 import stat
 import struct
 import subprocess
 import sys
+import threading
 import time
 import typing
 from collections.abc import Generator, Mapping
@@ -47,6 +51,10 @@ JOB_COMMAND = "-m torch_backend run-job"
 
 HEARTBEAT_SECONDS = 2.0
 """How often a living job rewrites status.json."""
+GRACE_SECONDS = 30.0
+"""How long a cancelled process may take for its checkpoint before it is ended by force."""
+LAST_FRAME = 1_048_574
+"""Blender's last frame number: no scene reaches further."""
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
 SHORT_JSON = 1 << 20
@@ -121,6 +129,10 @@ class ImportParams:
     """Every how many frames are solved and trained on; 0 chooses. All frames are delivered whatever it is."""
     working_height: int = 0
     """Height in pixels of the working frames; 0: the source's, at most 720."""
+    fps: float = 0.0
+    """Frames per second of a sequence; 0: the footage's own, 24 for a sequence that says none."""
+    layer: str = ""
+    """Layer or part of a sequence's pictures to take, by its name or the end of it; empty: the picture itself."""
 
 
 @dataclass
@@ -174,6 +186,18 @@ class TrainParams:
 
 PRESET_STEPS = {"preview": 3000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
+PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
+"""Width in pixels of each preset's training images, never above the working frames'."""
+HOSTS = ("control_points", "hexplane", "mlp")
+"""Hosts of the deformation, as their files in deformation/ name themselves."""
+METHODS = ("auto", *HOSTS, "static")
+"""What `TrainParams.method` may be."""
+HOST_CONFIGS = ("default", "reference")
+"""What `TrainParams.host_config` may be."""
+SUPERVISIONS = ("support", "paper", "none")
+"""What `TrainParams.supervision` may be."""
+DETECTORS = ("weight", "grad_norm", "grad_signed")
+"""What `TrainParams.detector` may be."""
 
 
 @dataclass
@@ -213,7 +237,10 @@ class FreezeParams:
 
 def overscan(text: str) -> float:
     """`FreezeParams.overscan` as a command line gives it: 0 to 100 percent, or "lens" (-1). ValueError on else."""
-    value = -1.0 if text == "lens" else float(text)
+    try:
+        value = -1.0 if text == "lens" else float(text)
+    except ValueError:
+        value = math.nan
     if text != "lens" and not 0.0 <= value <= 100.0:
         raise ValueError(f"overscan is 0 to 100 percent, or lens, got {text!r}")
     return value
@@ -231,6 +258,67 @@ PARAMS: dict[str, type] = {
 """Kind of job -> the dataclass of its parameters."""
 
 
+@dataclass(frozen=True)
+class Limit:
+    """What a number among a job's parameters may be."""
+
+    what: str
+    """What a sentence calls it."""
+    low: float
+    """Least."""
+    high: float
+    """Most."""
+    also: Mapping[int, str] = field(default_factory=dict)
+    """Values outside of that which have a meaning -> what they are for."""
+
+
+_FRAMES = ((1 << 31) - 1) * 1.0
+_PRESET = {0: "the preset's"}
+LIMITS: dict[type, dict[str, Limit]] = {
+    ImportParams: {
+        "first": Limit("first frame", -_FRAMES, _FRAMES),
+        "last": Limit("last frame", -_FRAMES, _FRAMES),
+        "step": Limit("step between solved frames", 1, 100_000, {0: "one that is chosen"}),
+        "working_height": Limit("height of the working frames", 16, 16_384, {0: "the source's"}),
+    },
+    SolveParams: {"overlap": Limit("number of following frames that are matched", 1, 1000)},
+    TrainParams: {
+        "iterations": Limit("number of training steps (iterations)", 10, 10_000_000, _PRESET),
+        "width": Limit("width of the training images", 16, 16_384, _PRESET),
+        "max_gaussians": Limit("budget of Gaussians", 100, 20_000_000, _PRESET),
+        "holdout": Limit("distance between held-out frames", 2, 1_000_000, {0: "none", -1: "the preset's"}),
+        "seed": Limit("random seed", 0, (1 << 53) - 1),
+        "extend": Limit("number of steps to add", 1, 10_000_000, {0: "none"}),
+    },
+    FreezeParams: {
+        "t_star": Limit("t*", -_FRAMES, _FRAMES),
+        "t_star_per_frame": Limit("t* of a frame", -_FRAMES, _FRAMES),
+        "first": Limit("first frame", -_FRAMES, _FRAMES),
+        "last": Limit("last frame", -_FRAMES, _FRAMES),
+        "step": Limit("step between frozen frames", 1, 1_000_000),
+        "width": Limit("width of the frozen frames", 16, 16_384, {0: "the training's"}),
+        "overscan": Limit("overscan in percent", 0, 100, {-1: "what the lens needs"}),
+    },
+}
+"""The numbers of each kind of parameters, by field."""
+
+
+def check_params(params: Any) -> None:
+    """ValueError, in a sentence, names the first number of a job's parameters that is out of its `LIMITS`."""
+    for name, limit in LIMITS.get(type(params), {}).items():
+        given = getattr(params, name)
+        values = given.values() if isinstance(given, dict) else (given,)
+        for value in values:
+            if value is None or value in limit.also or limit.low <= value <= limit.high:  # NaN is none of them
+                continue
+            also = "".join(f", or {value} for {meaning}" for value, meaning in limit.also.items())
+            message = f"The {limit.what} is {value}: it should be {limit.low:.0f} to {limit.high:.0f}{also}."
+            raise ValueError(message)
+    odd = [key for key in getattr(params, "t_star_per_frame", {}) if not key.lstrip("-").isdecimal()]
+    if odd:
+        raise ValueError(f"t* is given for frame {odd[0]!r}: it should be the number of a frame.")
+
+
 @dataclass
 class JobRequest:
     """What Blender asks for: one station, on one shot."""
@@ -245,10 +333,12 @@ class JobRequest:
     """Version of this contract."""
 
     def typed_params(self) -> Any:
-        """The parameters as their dataclass. ValueError names an unknown kind, field or a value of the wrong type."""
+        """The parameters as their dataclass. ValueError names an unknown kind or field, or a value that cannot be."""
         if self.kind not in PARAMS:
             raise ValueError(f"unknown job kind {self.kind!r}: expected one of {', '.join(PARAMS)}")
-        return from_dict(PARAMS[self.kind], self.params)
+        params = from_dict(PARAMS[self.kind], self.params)
+        check_params(params)
+        return params
 
 
 @dataclass
@@ -430,7 +520,11 @@ class CameraPath:
     @staticmethod
     def load(path: str | Path) -> CameraPath:
         """Reads a path; FileNotFoundError or ValueError names the file."""
-        return CameraPath.from_json(read_json(path))
+        data = read_json(path)
+        try:
+            return CameraPath.from_json(data)
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(f"{path} holds no camera path: {error}") from error
 
 
 # ------------------------------------------------------------------------------------------------- live session
@@ -520,6 +614,55 @@ def _read_exactly(stream: BinaryIO, count: int) -> bytes | None:
 
 
 # ------------------------------------------------------------------------------------------------- processes
+
+
+def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]:
+    """`args` and `cwd` of the `Popen` that runs a module of ours; paths in `words` should be absolute.
+
+    Python takes modules from the folder that it stands in, and a shot folder may come from anywhere: -P says no. The
+    child stands beside its interpreter, where nobody puts files for it: a loader of libraries still looks there
+    (Windows always, Linux with an empty entry in LD_LIBRARY_PATH). It is neither the shot's folder nor the extension's:
+    Windows keeps the folder that a process stands in from being moved or removed.
+    """
+    python = os.path.abspath(python)
+    return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
+
+
+def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
+    """Stops this process, as Ctrl-C does, once its standard input closes: its starter holds that open, however it ends.
+
+    A checkpoint may take `grace_seconds`; then the process ends at once, with the group that it leads (POSIX).
+    """
+    starter = os.dup(0)
+    # Nobody else has it: on Windows a child of ours that inherits a pipe hangs at its start while we read from that.
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    watch = functools.partial(_stop_when_alone, starter, grace_seconds)
+    threading.Thread(target=watch, name="end with starter", daemon=True).start()
+
+
+def _stop_when_alone(starter: int, grace_seconds: float) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(starter, 1):
+            pass
+    if sys.platform == "win32":
+        _thread.interrupt_main()
+    else:  # a signal of its own also ends a wait of the main thread
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    time.sleep(grace_seconds)
+    if sys.platform != "win32" and os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(ExitCode.CANCELLED)
+
+
+def program(name: str) -> str | None:
+    """Absolute path of a program on the PATH; None if there is none, or if the folder we stand in has one to offer.
+
+    `shutil.which` looks into that folder first on Windows, and it may be one that came with a .blend or a clip.
+    """
+    found = shutil.which(name)
+    return found if found and os.path.isabs(found) else None
 
 
 @functools.cache
@@ -892,3 +1035,47 @@ def summarise(
 def frame_file(frame: int, suffix: str) -> str:
     """File name of a frame: its number in the clip, six digits (a minus sign for negative ones) and a suffix."""
     return f"{frame:06d}{suffix}"
+
+
+# ------------------------------------------------------------------------------------------------- unborn shots
+
+_UNBORN = {"shot.json", "jobs", "frames"}
+"""What an import that did not end well may leave in a shot folder."""
+
+
+def discard_unborn(shot: Path) -> bool:
+    """Takes away what a failed import left of a shot that it was to begin. True if it did; what cannot go stays.
+
+    A shot that has a frame, or anything else that took work, is left alone, and so are files that are not ours. Kept is
+    also the log of a job that ended without a sentence of its own.
+    """
+    try:
+        names = {p.name for p in shot.iterdir()}
+        frames = [p for p in (shot / "frames").rglob("*") if not p.is_dir()] if "frames" in names else []
+        jobs = list((shot / "jobs").iterdir()) if "jobs" in names else []
+        if "shot.json" not in names or frames or names & {"solve", "runs", "takes"} or (shot / "jobs").is_symlink():
+            return False
+        if not all("-import-" in job.name and not job.is_symlink() and _said_why(job) for job in jobs):
+            return False
+        writer = read_writer(shot)
+        if writer is not None and writer.works():
+            return False
+        for name in _UNBORN & names - {"shot.json"}:
+            shutil.rmtree(shot / name, ignore_errors=True)  # a link is left alone
+        (shot / WRITER_FILE).unlink(missing_ok=True)
+        (shot / "shot.json").unlink()
+        with contextlib.suppress(OSError):  # it holds something of the artist's
+            shot.rmdir()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _said_why(job: Path) -> bool:
+    """True if a job ended in a sentence, or was cancelled, or never wrote a word: nobody needs its log."""
+    status = from_dict(Status, read_json(job / STATUS_FILE)) if (job / STATUS_FILE).is_file() else None
+    log = job / LOG_FILE
+    if status is not None and not status.ended:
+        return False
+    named = status is not None and (status.state == "cancelled" or status.exit_code != ExitCode.INTERNAL)
+    return named or not log.is_file() or not log.stat().st_size

@@ -22,7 +22,7 @@ from typing import Any
 
 from . import contract
 from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status
-from .shot import Shot, disk_error, is_disk_full, working_on, write_json
+from .shot import Shot, disk_error, is_disk_full, path_error, working_on, write_json
 from .writer import only_writer
 
 _CANCEL_POLL_SECONDS = 0.2
@@ -210,24 +210,21 @@ def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack 
         state, code, message = "cancelled", int(ExitCode.CANCELLED), "Cancelled."
     except JobError as error:
         state, code, message, hint = "failed", error.exit_code, error.message, error.hint
-    except (ValueError, FileNotFoundError) as error:
+        _log(reporter.folder, "\n".join([message, hint, *getattr(error, "__notes__", ())]) + "\n")
+    except ValueError as error:
         state, code, message = "failed", int(ExitCode.USAGE), str(error)
-        _log_traceback(reporter.folder)
+        _log(reporter.folder, traceback.format_exc())
     except Exception as error:
-        _log_traceback(reporter.folder)
-        full = disk_error(request.shot) if isinstance(error, OSError) and is_disk_full(error) else None
-        text = str(error).lower()
-        state, code = "failed", full.exit_code if full else int(ExitCode.INTERNAL)
+        _log(reporter.folder, traceback.format_exc())
+        told, text = _about_a_path(error, request.shot), str(error).lower()
+        state, code = "failed", told.exit_code if told else int(ExitCode.INTERNAL)
         if isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
             message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."
-        elif isinstance(error, PermissionError):
-            message = f"{error.filename2 or error.filename} cannot be written: it is protected, or open elsewhere."
-            hint = "Close it, or choose another folder, then start again: finished work is kept."
         else:
-            message = full.message if full else f"The {request.kind} step broke: {type(error).__name__}: {error}"
-            hint = full.hint if full else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
+            message = told.message if told else f"The {request.kind} step broke: {type(error).__name__}: {error}"
+            hint = told.hint if told else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
     reporter.finish(state, code, message, hint, result)
-    if state == "failed" and not reporter.heard:
+    if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
         print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log goes with the shot's folder, the status does not
     return code, result
 
@@ -257,9 +254,19 @@ def _there(shot: Shot) -> bool:
     return True
 
 
-def _log_traceback(folder: Path) -> None:
+def _about_a_path(error: Exception, shot: str) -> JobError | None:
+    """The sentence for a full disk, or for a file that the system refuses; None for any other error."""
+    if not isinstance(error, OSError):
+        return None
+    if isinstance(error, FileNotFoundError) and not error.filename:
+        return JobError(str(error), "", ExitCode.USAGE)  # said in words by whoever looked for it
+    return disk_error(shot) if is_disk_full(error) else path_error(error)
+
+
+def _log(folder: Path, text: str) -> None:
+    """Adds to the job's log, which *Open Log* shows: what a sentence leaves out."""
     with contextlib.suppress(OSError), open(folder / contract.LOG_FILE, "a", encoding="utf-8") as log:
-        log.write(traceback.format_exc())
+        log.write(text)
 
 
 @contextlib.contextmanager
@@ -286,7 +293,7 @@ def _signals_cancel(reporter: JobReporter) -> Iterator[None]:
 def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
     from .footage import FootageConfig, import_footage
 
-    config = FootageConfig(params.first, params.last, params.step, params.working_height)
+    config = FootageConfig(params.first, params.last, params.step, params.working_height, params.fps, params.layer)
     return import_footage(shot, params.source, config, report)
 
 

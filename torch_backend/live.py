@@ -24,10 +24,10 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
-from .contract import NO_DEPTH, JobError, LiveView, from_dict, read_json, read_message, write_message
+from .contract import NO_DEPTH, JobError, LiveView, from_dict, read_message, write_message
 from .freeze.query import FrozenGaussians, best_instants, freeze_at, rank_instants, render_frozen
 from .freeze.take import span_of
-from .scene import load_scene
+from .scene import frame_table, load_scene
 from .shot import Shot
 from .train import choose_device, load_run
 
@@ -45,9 +45,7 @@ class LiveSession:
         self.scene = load_scene(shot)
         self._span = span_of(self.scene, self.run)
         self._frozen: OrderedDict[float, FrozenGaussians] = OrderedDict()
-        self._sharpness = {
-            row["frame"]: float(row.get("sharpness", 0.0)) for row in read_json(shot.frames / "frames.json")["frames"]
-        }
+        self._sharpness = {frame: row["sharpness"] for frame, row in frame_table(shot).items()}
 
     def facts(self) -> dict[str, Any]:
         """Header of the `ready` message."""

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .contract import CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
-from .footage.images import read_png
+from .contract import ExitCode, JobError, Reporter, frame_file
+from .footage.images import read_frame
+from .footage.importing import load_frames
 from .shot import Shot
+from .solve.stored import damaged, load_cameras, load_points
 
 
 @dataclass
@@ -74,19 +77,16 @@ def resize_intrinsics(Ks: Tensor, width: int, height: int, new_width: int, new_h
 
 
 def load_scene(shot: Shot) -> Scene:
-    """The scene of a solved shot. JobError if it is not solved, or cannot be normalised."""
-    cameras_path, points_path = shot.solve / "cameras.json", shot.solve / "points.npz"
-    if not cameras_path.is_file() or not points_path.is_file():
-        raise JobError(f"{shot.root.name} has no cameras yet.", "Run the camera step first.", ExitCode.SOLVE)
-    path = CameraPath.load(cameras_path)
-    table = {row["frame"]: row for row in read_json(shot.frames / "frames.json")["frames"]}
+    """The scene of a solved shot. JobError if it is not solved, is damaged, or cannot be normalised."""
+    path, sparse, table = load_cameras(shot), load_points(shot), frame_table(shot)
     frames = [camera.frame for camera in path.frames]
+    if not set(frames) <= set(table):
+        raise damaged(shot.solve / "cameras.json", f"frame {min(set(frames) - set(table))} was not imported")
     viewmats = np.array([camera.viewmat for camera in path.frames], dtype=np.float64).reshape(-1, 4, 4)
     solved = [i for i, c in enumerate(path.frames) if c.source == "registered" and table[c.frame]["solve"]]
     if len(solved) < 3:
         raise JobError(f"Only {len(solved)} frames have a solved camera.", "Solve the shot again.", ExitCode.SOLVE)
-    with np.load(points_path, allow_pickle=False) as stored:
-        xyz, rgb = stored["xyz"].astype(np.float64), stored["rgb"]
+    xyz, rgb = sparse["xyz"].astype(np.float64), sparse["rgb"]
     scale, centre = _normalisation(viewmats[solved], xyz)
     seconds = np.array([table[f]["seconds"] for f in frames], dtype=np.float64)
     seconds -= seconds[0]
@@ -108,6 +108,11 @@ def load_scene(shot: Shot) -> Scene:
         centre=centre,
         folder=shot.frames,
     )
+
+
+def frame_table(shot: Shot) -> dict[int, dict[str, Any]]:
+    """Frame number -> its row of frames.json. JobError if that is missing or damaged."""
+    return {int(row["frame"]): row for row in load_frames(shot)["frames"]}
 
 
 def _in_scene(viewmats: np.ndarray, scale: float, centre: np.ndarray) -> np.ndarray:
@@ -158,8 +163,8 @@ def load_images(scene: Scene, indices: list[int], width: int, height: int, repor
 
 
 def read_image(path: Path, width: int, height: int) -> Tensor:
-    """One display-referred image resized to [height, width, 3] float32 in [0, 1]. FileNotFoundError if missing."""
-    pixels = read_png(path)
+    """One display-referred image resized to [height, width, 3] float32 in [0, 1]. Raises what `read_frame` does."""
+    pixels = read_frame(path)
     limit = 65535.0 if pixels.dtype == np.uint16 else 255.0
     image = torch.from_numpy(pixels.astype(np.float32) / limit).permute(2, 0, 1)[None]
     if image.shape[-2:] != (height, width):

@@ -65,10 +65,13 @@ class Shot:
     @classmethod
     def open(cls, root: str | Path) -> Shot:
         """An existing shot. FileNotFoundError if there is none, ValueError if it is from a newer version."""
+        from .solve.replacing import settle_solve
+
         shot = cls(root)
         if not shot.info_path.is_file():
             raise FileNotFoundError(f"{shot.root} is not a shot folder: it has no shot.json")
         shot.info()
+        settle_solve(shot)
         return shot
 
     @classmethod
@@ -104,6 +107,26 @@ class Shot:
     def take(self, name: str) -> Path:
         """Folder of a take; ValueError if the name could leave it."""
         return self.root / "takes" / checked_name(name, "take")
+
+    def own(self, folder: Path) -> Path:
+        """`folder` of this shot, for those who remove or overwrite files in it.
+
+        JobError if it is no folder, or if it or a folder on the way to it is a link: what lies behind is not ours.
+        """
+        there = self.root
+        for part in folder.relative_to(self.root).parts:
+            there = there / part
+            if is_link(there):
+                raise JobError(
+                    f"{there} is a link to {os.path.realpath(there)}: what lies there is not this shot's to replace.",
+                    "Remove the link, or put a folder of that name in its place, then start again.",
+                    ExitCode.USAGE,
+                )
+            if os.path.lexists(there) and not there.is_dir():
+                raise JobError(
+                    f"{there} is not a folder.", "Move it away: the shot keeps its files there.", ExitCode.USAGE
+                )
+        return folder
 
     def info(self) -> ShotInfo:
         """shot.json as it is now."""
@@ -164,7 +187,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield beside
         with open(beside, "rb+") as handle:
             os.fsync(handle.fileno())
-        _replace(beside, path)
+        replace_file(beside, path)
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
@@ -185,8 +208,8 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     try:
         yield fresh
         if os.path.lexists(path):
-            _replace(path, aside)
-        _replace(fresh, path)
+            replace_file(path, aside)
+        replace_file(fresh, path)
     except BaseException:
         restore_folder(path)
         raise
@@ -199,7 +222,7 @@ def restore_folder(path: Path) -> None:
     """Puts back the folder that `replacing_folder` moved aside and was killed; if it was replaced, removes it."""
     aside = path.with_name(f".{path.name}.old")
     if aside.is_dir() and not os.path.lexists(path):
-        _replace(aside, path)
+        replace_file(aside, path)
     _discard(aside)
 
 
@@ -211,7 +234,7 @@ def _discard(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _replace(source: Path, target: Path) -> None:
+def replace_file(source: Path, target: Path) -> None:
     """Renames over `target`; on Windows a reader may hold it open for a moment, so that is tried for two seconds."""
     for attempt in range(40):
         try:
@@ -273,8 +296,8 @@ def content_key(*parts: Any) -> str:
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, Path):
-            stat = part.stat()
-            part = [part.name, stat.st_size, stat.st_mtime_ns]
+            found = part.stat()
+            part = [part.name, found.st_size, found.st_mtime_ns]
         elif dataclasses.is_dataclass(part) and not isinstance(part, type):
             part = dataclasses.asdict(part)
         digest.update(json.dumps(part, sort_keys=True, default=str).encode("utf-8"))
@@ -303,3 +326,28 @@ def disk_error(folder: str | Path, detail: str = "the disk is full") -> JobError
 def is_disk_full(error: OSError) -> bool:
     """True if the system refused to write for want of space or quota."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+_REFUSED = {
+    errno.ENAMETOOLONG: ("has a name that is too long for this system", "Choose a shorter one."),
+    errno.ENOTDIR: ("leads through a file where a folder is needed", "Choose another place."),
+    errno.EEXIST: ("is a file where a folder is needed", "Choose another place."),
+    errno.EISDIR: ("is a folder where a file is needed", "Choose another place."),
+    errno.ENOENT: ("does not exist", "Check the name."),
+    errno.ELOOP: ("is a link that leads to itself", "Choose another place."),
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS),
+        ("cannot be used: it is protected, or open elsewhere", "Close it, or choose another place."),
+    ),
+}
+
+
+def path_error(error: OSError) -> JobError | None:
+    """The sentence for a file or folder that the system refuses, or for a full disk; None if it is about no path."""
+    where = error.filename2 or error.filename
+    if is_disk_full(error):
+        return disk_error(where or "the output folder")
+    if not where or error.errno not in _REFUSED:
+        return None
+    what, hint = _REFUSED[error.errno]
+    return JobError(f"{where} {what}.", hint, ExitCode.USAGE)

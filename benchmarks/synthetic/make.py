@@ -108,7 +108,7 @@ def _render(folder: Path, bpy: Path, say: Say) -> None:
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
     with open(log, "ab") as errors:
         process = subprocess.Popen(
-            [str(bpy), str(RENDERER), str(folder)],
+            [str(bpy), "-P", str(RENDERER), str(folder)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_backend.contract import CameraFrame, CameraPath, Reporter, frame_file, read_json
+from torch_backend.contract import CameraFrame, CameraPath, Reporter, frame_file, python_child, read_json
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.shot import Shot, atomic_path, content_key, write_atomic, write_json
 from torch_backend.solve import SolveConfig, SolveResult, solve_shot
@@ -208,12 +208,12 @@ def _triangulated(scene: SyntheticScene, shot: Shot, names: list[str]) -> dict[s
     path = scratch / "request.json"
     path.write_text(json.dumps(request), encoding="utf-8")
     root = str(Path(__file__).resolve().parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))}
+    environment = {**os.environ, "PYTHONPATH": root, "PYTHONSAFEPATH": "1"}
     environment.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         with open(shot.solve / "colmap.log", "wb") as log:
-            command = [sys.executable, "-m", "benchmarks.synthetic.triangulate", str(path)]
-            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment) as child:
+            command = python_child(sys.executable, "benchmarks.synthetic.triangulate", str(path.absolute()))
+            with subprocess.Popen(**command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment) as child:
                 code = child.wait()
         if code != 0 or not (scratch / "points.npz").is_file():
             return None

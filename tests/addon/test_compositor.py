@@ -103,6 +103,7 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
     ) == [
         "CompositorNodeGroup",
         "CompositorNodeImage",
+        "CompositorNodeScale",
     ]
     compositor.insert(scene, take, plate)
     assert len([n for n in tree.nodes if n.bl_idname == "CompositorNodeImage"]) == 1
@@ -249,8 +250,185 @@ def test_frames_of_another_size_are_fitted(addon, scene, take, shot, tmp_path, l
             assert found[rows, columns].mean() == pytest.approx(small.mean(), abs=0.06)
 
 
+@pytest.fixture
+def graded(addon, scene, shot):
+    """graded(file): a tree of the artist's that shows a sequence, two stops brighter, and its alpha elsewhere."""
+
+    def build(file: Path, kind: str = "CompositorNodeImage"):
+        compat = addon("compat")
+        tree = compat.new_compositor_tree(scene, "Artist")
+        plate = tree.nodes.new(kind)
+        if kind == "CompositorNodeImage":
+            plate.image = bpy.data.images.load(str(file))
+            plate.image.source = "SEQUENCE"
+            addon("compositor").show_sequence(plate, plate.image, 5, 7)
+        else:
+            plate.clip = bpy.data.movieclips.load(str(file))
+        brighter = tree.nodes.new("CompositorNodeExposure")
+        brighter.inputs["Exposure"].default_value = 2.0
+        blur = tree.nodes.new("CompositorNodeBlur")
+        tree.links.new(plate.outputs["Image"], brighter.inputs["Image"])
+        tree.links.new(plate.outputs["Image"], blur.inputs["Image"])
+        tree.links.new(brighter.outputs["Image"], compat.output_socket(tree))
+        return tree, plate
+
+    return build
+
+
+def test_behind_a_plate_the_grade_goes_on_from_the_frozen_frame(addon, scene, shot, graded, tmp_path, layers, pictures):
+    tree, plate = graded(shot / "frames" / "000005.png")
+    before = snapshot(tree)
+    said = addon("bake").insert(scene, shot, "freeze")
+    assert "as the plate" in said[0]
+    compositor = addon("compositor")
+    node = compositor.group_node(tree)
+    nodes, links = snapshot(tree, compositor.GROUP_NAME)
+    assert nodes == before[0] and len(before[1] - links) == 2 and not links - before[1]
+    assert [link.to_node for link in plate.outputs["Image"].links] == [node]
+    kinds = {link.to_node.bl_idname for link in node.outputs["Image"].links}
+    assert kinds == {"CompositorNodeExposure", "CompositorNodeBlur"}
+    assert compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))[0].endswith("was updated.")
+    assert [link.to_node for link in plate.outputs["Image"].links] == [node]
+    render(addon, scene, tmp_path / "out")
+    found = pictures.read(tmp_path / "out" / "000006.png")
+    assert np.abs(found - pictures.srgb(4.0 * layers(6)["rgba"][..., :3])).max() * 255 < 1.1
+    assert addon("bake").remove(scene) and snapshot(tree) == before, "the links too"
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "behind"),
+    [
+        ("clip.####.png", "CompositorNodeImage", True),
+        ("clip.####.png", "CompositorNodeMovieClip", True),
+        ("other.####.png", "CompositorNodeImage", False),
+    ],
+)
+def test_a_plate_is_known_by_the_clips_file(addon, scene, shot, graded, tmp_path, pictures, name, kind, behind):
+    for n in (5, 6, 7):
+        pictures.write(tmp_path / name.replace("####", f"{n:04d}"), np.zeros((12, 16, 3), np.uint8))
+    tree, plate = graded(tmp_path / name.replace("####", "0005"), kind)
+    scene.splannequin.clip = str(tmp_path / "clip.####.png")
+    addon("bake").insert(scene, shot, "freeze")
+    node = addon("compositor").group_node(tree)
+    assert (plate.outputs["Image"].links[0].to_node == node) == behind
+    assert (addon("compat").output_socket(tree).links[0].from_node == node) != behind
+
+
+def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene, shot, graded, tmp_path, pictures):
+    pictures.write(tmp_path / "a 0005.png", np.zeros((12, 16, 3), np.uint8))
+    tree, plate = graded(tmp_path / "a 0005.png")
+    before, bake, props = snapshot(tree), addon("bake"), scene.splannequin
+    output = addon("compat").output_socket(tree)
+    other = tree.nodes.new("CompositorNodeImage")
+    over = tree.nodes.new("CompositorNodeAlphaOver")
+    tree.links.new(other.outputs["Image"], over.inputs[2])
+    with_other = snapshot(tree)
+    tree.nodes.active = None
+    props.insert_at = "PLATE"
+    bake.insert(scene, shot, "freeze")
+    node = addon("compositor").group_node(tree)
+    assert plate.outputs["Image"].links[0].to_node == node, "the only one that gets to the output"
+    props.insert_at, node.inputs["Mix"].default_value = "OUTPUT", 0.25
+    assert any("was moved" in line for line in bake.insert(scene, shot, "freeze"))
+    node = addon("compositor").group_node(tree)
+    assert output.links[0].from_node == node and node.inputs["Mix"].default_value == 0.25
+    assert not [link for link in plate.outputs["Image"].links if link.to_node == node]
+    bake.remove(scene)
+    assert snapshot(tree) == with_other
+    tree.nodes.remove(other)
+    tree.nodes.remove(over)
+    assert snapshot(tree) == before
+    tree.nodes.remove(plate)
+    props.insert_at, bare = "PLATE", snapshot(tree)
+    with pytest.raises(contract.JobError, match="No node of this compositor shows the plate"):
+        bake.insert(scene, shot, "freeze")
+    assert snapshot(tree) == bare and addon("compositor").group_node(tree) is None
+
+
+def test_a_plate_of_another_size_is_taken_where_it_has_the_renders(addon, scene, shot, graded):
+    compat = addon("compat")
+    tree, plate = graded(shot / "frames" / "000005.png")
+    targets = [link.to_socket for link in plate.outputs["Image"].links]
+    fit = compat.new_fit_node(tree)
+    tree.links.new(plate.outputs["Image"], fit.inputs[0])
+    for target in targets:
+        tree.links.new(fit.outputs[0], target)
+    before = snapshot(tree)
+    scene.render.resolution_x, scene.render.resolution_y = 32, 24
+    addon("bake").insert(scene, shot, "freeze")
+    node = addon("compositor").group_node(tree)
+    assert [link.to_node for link in fit.outputs[0].links] == [node] and len(node.outputs["Image"].links) == 2
+    addon("bake").remove(scene)
+    assert snapshot(tree) == before
+    scene.render.resolution_x, scene.render.resolution_y = 16, 12
+    addon("bake").insert(scene, shot, "freeze")
+    node = addon("compositor").group_node(tree)
+    assert plate.outputs["Image"].links[0].to_node == node, "a scale that the artist wants, of the frozen frame too"
+
+
+@pytest.mark.parametrize("mix", [0.0, 1.0])
+@pytest.mark.parametrize(("baked", "rendered"), [(50, 100), (100, 50), (25, 100)])
+def test_a_take_fills_the_frame_at_any_percentage(
+    addon, scene, take, shot, tmp_path, layers, pictures, mix, baked, rendered
+):
+    """Inserted at one percentage, rendered at another: half of 32 x 24 pixel by pixel, all of it to the border."""
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 32, 24, baked
+    addon("scene_setup").keep_plate_colours(scene)
+    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
+    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    node.inputs["Mix"].default_value = mix
+    render.resolution_percentage = rendered
+    scene.frame_start = scene.frame_end = 6
+    addon("bake").render(scene, tmp_path)
+    found = pictures.read(tmp_path / "000006.png")
+    plate = pictures.read(shot / "frames" / "000006.png")
+    expected = pictures.srgb(layers(6)["rgba"][..., :3]) if mix else plate
+    if rendered == 50:
+        assert np.abs(found - expected).max() * 255 < 0.6
+        return
+    assert found.shape == (24, 32, 3)
+    for rows in (slice(0, 12), slice(12, 24)):
+        for columns in (slice(0, 16), slice(16, 32)):
+            small = expected[rows.start // 2 : rows.stop // 2, columns.start // 2 : columns.stop // 2]
+            assert found[rows, columns].mean() == pytest.approx(small.mean(), abs=0.06)
+    if mix:  # the plate's border fades where Blender has no other way to scale
+        border = np.concatenate([found[0, 2:], found[-1, 2:]])
+        inner = np.concatenate([expected[0, 1:], expected[-1, 1:]])
+        assert border.mean() == pytest.approx(inner.mean(), abs=0.03), "as strong as the rest"
+
+
+def test_only_moving_leaves_cg_where_nothing_moves(addon, scene, take, shot, tmp_path, layers, pictures):
+    compositor, compat = addon("compositor"), addon("compat")
+    scene.render.resolution_x, scene.render.resolution_y = 16, 12
+    compositor.insert(scene, take, shot / "frames" / "000005.png")
+    node = compositor.group_node(compat.compositor_tree(scene))
+    green = np.array([0.0, 1.0, 0.0, 1.0])
+    node.inputs["CG"].default_value, node.inputs["CG Depth"].default_value = tuple(green), 12.0
+    data = layers(6)
+    plate = pictures.read(shot / "frames" / "000006.png")
+    linear = np.where(plate <= 0.04045, plate / 12.92, ((plate + 0.055) / 1.055) ** 2.4)
+    nearer = in_front(12.0, data["depth"])
+    frozen = nearer * green + (1.0 - nearer) * over(data["rgba"], np.broadcast_to(green, data["rgba"].shape))
+    own = nearer * green[:3] + (1.0 - nearer) * linear
+    for name, share in (("Only Moving", data["motion"]), ("Only Supported", data["support"]), ("Mix", 0.0)):
+        before = node.inputs[name].default_value
+        node.inputs[name].default_value = 0.0 if name == "Mix" else 1.0
+        render(addon, scene, tmp_path / name)
+        node.inputs[name].default_value = before
+        expected = own + np.broadcast_to(share, (12, 16))[..., None] * (frozen[..., :3] - own)
+        found = pictures.read(tmp_path / name / "000006.png")
+        assert np.abs(found - pictures.srgb(expected)).max() * 255 < 1.1, name
+
+
 def over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
     return front + (1.0 - front[..., 3:]) * back
+
+
+def in_front(cg: float | np.ndarray, frozen: np.ndarray) -> np.ndarray:
+    """[H, W, 1]: 1 for CG up to the frozen depth, 0 from a hundredth of it behind."""
+    t = np.clip(1.0 - (cg / frozen - 1.0) / 0.01, 0.0, 1.0)
+    return (t * t * (3.0 - 2.0 * t))[..., None]
 
 
 @pytest.mark.parametrize("alpha", [1.0, 0.5])
@@ -265,9 +443,9 @@ def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, la
     for frame in (5, 7):
         data = layers(frame)
         cg = np.broadcast_to(wall, data["rgba"].shape)
-        nearer = (2.0 * data["depth"] > 24.0)[..., None]
+        nearer = in_front(24.0, 2.0 * data["depth"])
         assert 0.1 < nearer.mean() < 0.9
-        expected = np.where(nearer, over(cg, data["rgba"]), over(data["rgba"], cg))
+        expected = nearer * over(cg, data["rgba"]) + (1.0 - nearer) * over(data["rgba"], cg)
         found = pictures.read(tmp_path / "out" / f"{frame:06d}.png")
         assert np.abs(found - pictures.srgb(expected[..., :3])).max() * 255 < 1.1
 
@@ -340,6 +518,52 @@ def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, sce
     assert 10 < green.sum() < 150
     steps.remove_all(scene, shot)
     assert (scene.render.film_transparent, scene.view_layers[0].use_pass_z) == settings
+
+
+EDGE = 7.7
+"""Column at which the rendered wall begins: it covers 0.3 of the pixels of column 7."""
+
+
+@pytest.mark.parametrize("far", [3.0, 12.0, 60.0])
+def test_a_half_covered_edge_of_cg_is_blended_by_its_coverage(addon, scene, shot, tmp_path, pictures, layers, far):
+    """A wall rendered in front of all that is frozen, within it and behind it, against the composite worked out."""
+    steps, cameras = addon("steps"), addon("cameras")
+    scene.splannequin.shot_path = str(shot)
+    scene.splannequin.set_up_scene = True
+    steps.load_camera(scene, shot)
+    steps.insert_freeze(scene, shot, "freeze")
+    steps.combine_cg(scene, shot)
+    scene.frame_set(6)
+    for other in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
+        bpy.data.objects.remove(other)
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.device = 256, False, "CPU"
+    scene.cycles.use_adaptive_sampling = False
+    scene.cycles.pixel_filter_type = "BOX"
+    bpy.ops.mesh.primitive_plane_add(size=400.0)
+    wall = bpy.context.object
+    glow = bpy.data.materials.new("glow")
+    glow.use_nodes = True
+    glow.node_tree.nodes.clear()
+    shine, end = (glow.node_tree.nodes.new(f"ShaderNode{kind}") for kind in ("Emission", "OutputMaterial"))
+    shine.inputs["Color"].default_value = (0.0, 1.0, 0.0, 1.0)
+    glow.node_tree.links.new(shine.outputs[0], end.inputs["Surface"])
+    wall.data.materials.append(glow)
+    camera = scene.camera.matrix_world
+    wall.rotation_mode = "QUATERNION"
+    wall.rotation_quaternion = camera.to_quaternion()
+    wall.location = camera @ Vector(((EDGE - 9.0) / 20.0 * far + 200.0, 0.0, -far))  # K: f 20, middle 9
+    scene.frame_start = scene.frame_end = 6
+    addon("bake").render(scene, tmp_path / "out")
+    covered = np.clip(np.arange(16) + 1.0 - EDGE, 0.0, 1.0)[None, :, None]
+    frozen, nearer = layers(6)["rgba"], in_front(far, layers(6)["depth"])
+    cg = np.broadcast_to(covered * np.array([0.0, 1.0, 0.0, 1.0]), frozen.shape)
+    expected = nearer * over(cg, frozen) + (1.0 - nearer) * over(frozen, cg)
+    found = pictures.read(tmp_path / "out" / "000006.png")
+    linear = np.where(found <= 0.04045, found / 12.92, ((found + 0.055) / 1.055) ** 2.4)
+    sure = np.abs(layers(6)["depth"] / far - 1.005) > 0.015  # elsewhere a millimetre decides
+    assert np.abs(linear - expected[..., :3])[sure & (np.arange(16) > 0)].max() < 0.04
+    assert cameras.find(scene, shot, "CAMERA") == scene.camera
 
 
 def make_depth(frame: int) -> np.ndarray:

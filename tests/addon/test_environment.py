@@ -17,8 +17,11 @@ def run_out(environment, setup, seconds=180.0):
     assert not setup.running
 
 
-def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(addon, root, tmp_path, monkeypatch):
+def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(
+    addon, root, tmp_path, monkeypatch, hostile
+):
     environment = addon("environment")
+    trap = hostile(tmp_path, tmp_path / "bäckend")  # modules where a child could stand: none is imported
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
@@ -31,6 +34,7 @@ def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(addo
     again = environment.start(folder, sys.executable, root)
     run_out(environment, again)
     assert "failed at installing packages" in again.failure
+    assert not trap.exists(), trap.read_text()
     assert (folder / ".venv" / "pyvenv.cfg").stat().st_mtime == made, "the retry went on in the same environment"
     assert environment.remove(folder)
     assert not (folder / ".venv").exists()

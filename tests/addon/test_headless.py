@@ -1,7 +1,11 @@
 """The command line of the Blender side, in this process: exit codes, what it leaves, and a baked file that renders."""
 
+import argparse
+import importlib
 import json
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import bpy
@@ -148,3 +152,70 @@ def test_ctrl_c_while_frames_render_ends_the_bake_with_130(run, shot, tmp_path, 
     assert code == 130 and "Cancelled" in err
     assert [p.name for p in (tmp_path / "out" / "composited").iterdir()] == ["000005.png"]
     assert (bpy.context.scene.frame_start, bpy.context.scene.frame_end) == (5, 7)
+
+
+@pytest.mark.skipif(bool(bpy.app.binary_path), reason="a Blender is no Python that runs a script")
+@pytest.mark.parametrize(("starter", "code", "baked"), [("gone", 130, False), ("there", 0, True)])
+def test_a_bake_ends_with_the_launcher_that_started_it(shot, tmp_path, root, starter, code, baked):
+    script = root / "splannequin_addon" / "run_in_bpy.py"
+    words = ["bake", "--shot", str(shot), "--take", "freeze", "--output", str(tmp_path / "out"), "--tied"]
+    bake = subprocess.Popen([sys.executable, "-P", str(script), *words], stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert bake.stdin and bake.stderr
+    if starter == "gone":
+        bake.stdin.close()
+    said = bake.stderr.read().decode()
+    assert bake.wait(120) == code, said
+    assert ("Cancelled" in said) == (not baked)
+    assert (tmp_path / "out" / "shot.blend").is_file() == baked
+    bake.stdin.close()
+    bake.stderr.close()
+
+
+def options(parser: argparse.ArgumentParser, command: str) -> dict[str, tuple]:
+    """Option -> (default, choices) of a command of a command line."""
+    chosen = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[command]
+    return {o: (a.default, a.choices and tuple(a.choices)) for a in chosen._actions for o in a.option_strings}
+
+
+@pytest.mark.parametrize("command", ["import", "solve", "train", "freeze"])
+def test_every_option_of_the_backends_command_line_is_here_too(addon, package, contract, command):
+    backend = importlib.import_module(f"{package.__name__}.torch_backend.cli")
+    ours, theirs = options(addon("headless").parser(), command), options(backend.parser(), command)
+    if command == "import":
+        theirs.pop("--camera-model", None)  # it is no option of an import
+    elif command != "solve":
+        assert theirs.pop("--device")[1] == ours.pop("--device")[1] == contract.DEVICES
+    for option, told in theirs.items():
+        assert option in ours, option
+        assert told == ours[option] or not told[1], option
+    assert backend.host_names() == contract.HOSTS
+
+
+def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tmp_path):
+    headless = addon("headless")
+    monkeypatch.setattr(addon("backend"), "device", lambda: "cpu")  # as the preferences say
+
+    def asked(*words):
+        return headless.parser().parse_args([str(w) for w in words])
+
+    train = headless._train_params(asked("train", tmp_path, "--method", "mlp", "--host", "mlp", "--host-config",
+                                         "reference", "--detector", "weight"))  # fmt: skip
+    assert (train.method, train.host, train.host_config, train.detector) == ("mlp", "mlp", "reference", "weight")
+    assert (
+        train.device == "cpu" and headless._train_params(asked("train", tmp_path, "--device", "cuda")).device == "cuda"
+    )
+    frozen = headless._freeze_params(asked("freeze", "a.mp4", "--no-grain", "--camera-path", tmp_path / "p.json"))
+    assert (frozen.grain, frozen.camera_path, frozen.device) == (False, str(tmp_path / "p.json"), "cpu")
+    assert frozen.only_missing, "frames that are finished are not rendered again"
+    assert headless._import_params(asked("import", tmp_path, "a.0001.png", "--fps", 25)).fps == 25.0
+
+
+def test_an_output_that_cannot_be_is_one_sentence(run, shot, clip, tmp_path):
+    (tmp_path / "file").touch()
+    for words in (("bake", "--shot", shot), ("freeze", clip)):
+        code, _, said = run(*words, "--output", tmp_path / "file" / "out")
+        assert code == 2 and said.startswith("Error: Cannot write to") and said.strip().count("\n") == 0
+        assert "Choose another --output folder." in said
+    for name in ("s" * 300, "file/s"):
+        code, _, said = run("status", tmp_path / name)
+        assert code in (2, 8) and said.startswith("Error: ") and said.strip().count("\n") == 0

@@ -96,8 +96,8 @@ def test_grain_at_0_leaves_every_bit(addon, scene, grainy, shot):
     clean = grainy(0.0)
     group = addon("compositor").group_node(addon("compat").compositor_tree(scene)).node_tree
     mix = group.nodes["Grain"]
-    source = next(s for s in mix.inputs if s.is_linked and s.links[0].from_socket.name == "Combined")
-    socket = source.links[0].from_socket
+    clean_picture, _ = [s for s in mix.inputs if s.is_linked and s.type == "RGBA"]
+    socket = clean_picture.links[0].from_socket
     for link in [link for link in group.links if link.from_node == mix]:
         group.links.new(socket, link.to_socket)
     np.testing.assert_array_equal(clean, grainy(0.0))

@@ -110,6 +110,44 @@ def test_two_shots_of_one_name_are_two(addon, built, shot, tmp_path):
     assert cameras.find(built, shot, "CAMERA") is None and len(built.splannequin.made) == 1
 
 
+def test_the_camera_that_was_there_before_comes_back(addon, built, shot):
+    cameras, own = addon("cameras"), bpy.data.objects["Camera"]
+    assert built.camera == cameras.find(built, shot, "CAMERA")
+    own.name = "renamed since"
+    cameras.build(built, shot)
+    cameras.remove(built, shot)
+    assert built.camera == own and built.splannequin.camera_before is None
+    cameras.build(built, shot)
+    other = built.camera = duplicate(own)["renamed since"]
+    cameras.remove(built, shot)
+    assert built.camera == other, "the artist chose another since"
+    cameras.build(built, shot)
+    bpy.data.objects.remove(other)
+    cameras.remove(built, shot)
+    assert built.camera is None, "what was deleted does not come back"
+    built.camera = own
+    cameras.build(built, shot)
+    bpy.ops.object.select_all(action="DESELECT")
+    own.select_set(True)
+    bpy.ops.object.delete()
+    addon("made").tidy(built)
+    cameras.remove(built, shot)
+    assert built.camera is None and not own.users, "the file does not keep it"
+
+
+def test_another_shots_camera_takes_the_place_of_a_removed_one(addon, built, shot, tmp_path):
+    cameras, own, other = addon("cameras"), bpy.data.objects["Camera"], tmp_path / "second.splannequin"
+    shutil.copytree(shot, other)
+    cameras.build(built, other)
+    cameras.remove(built, shot)
+    assert built.camera == cameras.find(built, other, "CAMERA")
+    cameras.build(built, shot)
+    cameras.remove(built, shot)
+    assert built.camera == cameras.find(built, other, "CAMERA")
+    cameras.remove(built, other)
+    assert built.camera == own
+
+
 def test_a_file_of_0_2_0_is_taken_over(addon, built, shot, tmp_path):
     cameras = addon("cameras")
     name = addon("made").name_of(shot)

@@ -52,7 +52,9 @@ def test_frame_and_margin_come_from_the_exr_header(addon, take, shot, tmp_path):
 def test_the_scene_takes_the_size_of_the_frame(addon, scene, shot, take):
     scene.splannequin.set_up_scene = True
     addon("bake").fit_take(scene, shot, "over")
-    assert (scene.render.resolution_x, scene.render.resolution_y) == (12, 10)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (1920, 1080), "never smaller"
+    addon("bake").fit_take(scene, shot, "over", new=True)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (12, 10), "of another shape than the plate"
 
 
 @pytest.mark.parametrize("output", ["Image", "Depth", "Support", "Motion"])

@@ -93,6 +93,51 @@ def test_headless_bakes_a_part_of_a_take_and_leaves_it_in_the_file(addon, shot, 
     assert "The last frame, 7, comes before the first, 9." in capfd.readouterr().err
 
 
+def larger_plate(shot, times: int) -> None:
+    """The shot as if its plate were that many times as large as its take."""
+    for name in ("shot.json", "solve/cameras.json"):
+        told = json.loads((shot / name).read_text())
+        told |= {"width": 16 * times, "height": 12 * times}
+        for frame in told.get("frames", []):
+            frame["K"] = [times * value for value in frame["K"]]
+        (shot / name).write_text(json.dumps(told))
+
+
+def size_of(scene) -> tuple[int, int, int]:
+    return scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage
+
+
+def test_a_new_scene_bakes_at_the_size_of_the_plate_however_small_the_take(addon, shot, tmp_path, pictures):
+    larger_plate(shot, 4)
+    out = tmp_path / "out"
+    arguments = ["bake", "--shot", str(shot), "--output", str(out), "--first", "6", "--last", "6"]
+    assert addon("headless").main(arguments) == 0
+    assert size_of(bpy.context.scene) == (64, 48, 100)
+    assert pictures.read(out / "composited" / "000006.png").shape == (48, 64, 3)
+
+
+def test_a_bake_never_lowers_the_size_of_a_scene_nor_takes_back_what_the_artist_set(addon, with_shot, shot, tmp_path):
+    larger_plate(shot, 80)
+    scene, steps = with_shot, addon("steps")
+    steps.load_camera(scene, shot)
+    assert size_of(scene) == (1280, 960, 100)
+    assert addon("bake").fit_take(scene, shot, "freeze") == [] and size_of(scene) == (1280, 960, 100)
+    scene.frame_start = 6
+    blend = str(tmp_path / "mine.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=blend)
+    arguments = ["bake", "--shot", str(shot), "--blend", blend, "--output", str(tmp_path / "out")]
+    assert addon("headless").main([*arguments, "--last", "6"]) == 0
+    scene = bpy.context.scene
+    assert size_of(scene) == (1280, 960, 100) and scene.frame_start == 6
+    scene.render.resolution_x, scene.render.resolution_percentage = 2560, 50
+    steps.load_camera(scene, shot)
+    assert size_of(scene) == (2560, 960, 50), "changed since by the artist"
+    larger_plate(shot, 1)
+    scene.splannequin.set_up_scene = True
+    steps.load_camera(scene, shot)
+    assert size_of(scene) == (16, 12, 100), "asked for with Fit Scene to Clip"
+
+
 def test_the_camera_is_looked_at_again_only_if_the_take_was_seen_from_one(addon, contract, with_shot, shot):
     steps, jobs = addon("steps"), addon("jobs")
     assert not steps.follows_camera(with_shot)

@@ -14,12 +14,13 @@ def _ours(cls) -> bool:
 
 def handlers() -> int:
     lists = (bpy.app.handlers.load_post, bpy.app.handlers.render_write, bpy.app.handlers.render_complete)
+    lists += (bpy.app.handlers.save_pre, bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail)
     return sum(_ours(h) for hooks in (*lists, bpy.app.handlers.render_cancel) for h in hooks)
 
 
 def test_unregister_leaves_nothing_and_register_twice_registers_once(package):
     before, hooks = ours(), handlers()
-    assert {"SPLANNEQUIN_OT_import_clip", "SPLANNEQUIN_PT_bake", "SPLANNEQUIN_PG_scene"} <= before and hooks == 4
+    assert {"SPLANNEQUIN_OT_import_clip", "SPLANNEQUIN_PT_bake", "SPLANNEQUIN_PG_scene"} <= before and hooks == 8
     try:
         package.unregister()
         assert ours() == set() and handlers() == 0
@@ -41,4 +42,4 @@ def test_the_panels_stand_in_order_in_one_tab(addon):
 
 def test_handlers_and_timer_survive_another_file(addon):
     bpy.ops.wm.read_homefile(use_factory_startup=True)
-    assert handlers() == 4
+    assert handlers() == 8

@@ -62,6 +62,24 @@ def test_the_button_says_what_it_will_do(addon, with_runs, shot):
     assert plan(addon, with_runs).kind == "extend", "it was begun on a run that is no longer there"
 
 
+def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, shot):
+    """The backend trains other settings in the run's folder `next`: the run is still listed as it is."""
+    props, shots = with_runs.splannequin, addon("shots")
+    config, before = {**CONFIG, "preset": "final", "seed": 9}, shots.stamp(shot)
+    work = shot / "runs" / "main" / "next" / "0123456789abcdef"
+    checkpoint(work / "checkpoint.safetensors", key="other", iteration=450, config=config)
+    (work / "metrics.jsonl").write_text('{"seconds": 3.0, "heldout_psnr_db": 20.0}\n')
+    assert shots.stamp(shot) != before, "the panel notices"
+    state = shots.read(shot)
+    assert set(state.runs) == {"main"} and set(state.unfinished) == {"better"}
+    assert addon("training").history(state.runs["main"], [(4.0, 21.0)]) == [(3.0, 20.0), (4.0, 21.0)]
+    assert plan(addon, with_runs).button == "Train On", "the run that is there is of the preset that is chosen"
+    props.preset = "final"
+    assert plan(addon, with_runs).kind == "resume" and "as it was" in plan(addon, with_runs).words
+    asked = addon("steps").params_of(with_runs, "train")
+    assert (asked.run, asked.preset, asked.seed, asked.iterations, asked.extend) == ("main", "final", 9, 900, 0)
+
+
 def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
     props, params_of = with_runs.splannequin, addon("steps").params_of
     props.extend_steps = 70

@@ -39,6 +39,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
     values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
     values |= {"cameras_from": "FILE", "cameras_path": "//model", "tracking_clip": tracked}
+    values |= {"shot_seen": "//first.splannequin", "solve_step": 2, "fps": 25.0}
     for name, value in values.items():
         setattr(props, name, value)
     assert set(shot_list.names()) == {*values, "clip", "shot_path"}, "a setting that is not tested here"
@@ -108,6 +109,66 @@ def test_the_chosen_shots_camera_is_the_scenes(addon, two, shot, other):
     cameras.remove(two, other)
     props.active_shot = 1
     assert two.camera is None, "a shot without a camera here changes nothing"
+
+
+def seen(scene) -> tuple:
+    render = scene.render
+    size = render.resolution_x, render.resolution_y, render.resolution_percentage
+    return size, round(render.fps / render.fps_base, 3), (scene.frame_start, scene.frame_end)
+
+
+def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
+    """Put back at switching, as the artist left them; the scene's own come back with the last shot."""
+    first, second = ((16, 12, 100), 12.5, (5, 7)), ((32, 24, 100), 25.0, (5, 7))
+    original = seen(scene)
+    props, steps = scene.splannequin, addon("steps")
+    for name, change in (("shot.json", {"fps": 25.0}), ("solve/cameras.json", {})):
+        told = json.loads((other / name).read_text()) | change | {"width": 32, "height": 24}
+        (other / name).write_text(json.dumps(told))
+    props.shot_path = str(shot)
+    steps.load_camera(scene, shot)
+    assert seen(scene) == first
+    bpy.ops.splannequin.shot_add()
+    assert seen(scene) == first, "nothing of the new one is known"
+    props.shot_path = str(other)
+    steps.load_camera(scene, other)
+    assert seen(scene) == second
+    props.active_shot = 0
+    assert seen(scene) == first
+    scene.frame_start, scene.render.resolution_percentage = 6, 50
+    props.active_shot = 1
+    assert seen(scene) == second
+    props.active_shot = 0
+    assert seen(scene) == ((16, 12, 50), 12.5, (6, 7))
+    bpy.ops.splannequin.shot_remove(things=True)
+    assert seen(scene) == second and scene.camera == addon("cameras").find(scene, other, "CAMERA")
+    steps.remove_all(scene, other)
+    assert seen(scene) == original and scene.camera == scene.objects["Camera"]
+
+
+def test_what_the_artist_set_for_a_shot_is_still_the_artists_after_switching(addon, two, shot, other):
+    props = two.splannequin
+    two.render.resolution_x = 4000
+    props.active_shot = 0
+    assert two.render.resolution_x == 16
+    props.active_shot = 1
+    assert two.render.resolution_x == 4000
+    for folder in (shot, other):
+        addon("steps").remove_all(two, folder)
+    assert two.render.resolution_x == 4000 and two.frame_end == 250
+
+
+def test_a_scene_that_was_left_alone_stays_so_at_switching(addon, scene, shot, other):
+    scene.render.resolution_x, scene.frame_end = 640, 99
+    props, steps = scene.splannequin, addon("steps")
+    props.shot_path = str(shot)
+    steps.load_camera(scene, shot)
+    bpy.ops.splannequin.shot_add()
+    props.shot_path = str(other)
+    steps.load_camera(scene, other)
+    scene.frame_end = 50
+    props.active_shot = 0
+    assert (scene.render.resolution_x, scene.frame_end) == (640, 50)
 
 
 def things(scene) -> set[str]:

@@ -259,9 +259,10 @@ def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path
 
 def test_a_view_that_the_colour_configuration_lacks_is_said(addon, contract, scene, monkeypatch):
     setup = addon("scene_setup")
-    monkeypatch.setitem(setup._VIEW, "view_transform", "Plain")
-    with pytest.raises(contract.JobError, match="has no view transform 'Plain'"):
+    monkeypatch.setattr(setup, "_NEUTRAL", ("Plain",))
+    with pytest.raises(contract.JobError, match=r"no view that leaves colours alone \(Plain\)"):
         setup.keep_plate_colours(scene)
+    assert scene.view_settings.view_transform == "AgX"
 
 
 def test_a_dropped_video_becomes_the_clip_and_an_earlier_shot_stays_on_disk(scene, shot, clip):

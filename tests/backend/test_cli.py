@@ -1,15 +1,17 @@
 """The whole backend on a very small real clip, by its command line: files, figures, pixels; refusals in words."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
-from torch_backend.contract import ExitCode
+from torch_backend.contract import ExitCode, python_child
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png, resize
 from torch_backend.freeze.exr import read_frozen_exr
@@ -22,8 +24,9 @@ KEYS = {
 
 
 def run(*arguments):
-    command = [sys.executable, "-m", "torch_backend", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    command = python_child(sys.executable, "torch_backend", *map(str, arguments))
+    environ = {**os.environ, "PYTHONPATH": str(CLIP.parents[1])}
+    return subprocess.run(**command, env=environ, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +119,46 @@ def test_solve_refuses_cameras_that_are_not_there(world, tmp_path):
     done = run("solve", shot, "--cameras", tmp_path / "gone")
     assert done.returncode == ExitCode.SOLVE and "gone does not exist" in done.stdout
     assert (shot / "solve" / "cameras.json").is_file()
+
+
+def test_a_sequences_rate_and_layer_come_from_the_command_line(tmp_path):
+    rng = np.random.default_rng(0)
+    wide = np.repeat(np.repeat(rng.random((12, 40, 3)), 4, axis=0), 4, axis=1).astype(np.float32)
+    for i in range(10):
+        picture = np.concatenate([np.ones((48, 64, 3), np.float32), wide[:, 2 * i : 2 * i + 64]], axis=2)
+        spec = oiio.ImageSpec(64, 48, 6, "half")
+        spec.channelnames = [f"{layer}.{c}" for layer in ("left", "right") for c in "RGB"]
+        out = oiio.ImageOutput.create(str(tmp_path / f"a.{i:03d}.exr"))
+        assert out.open(str(tmp_path / f"a.{i:03d}.exr"), spec) and out.write_image(picture) and out.close()
+    shot = tmp_path / "a.splannequin"
+    unsure = run("import", shot, tmp_path / "a.000.exr")
+    assert unsure.returncode == ExitCode.FOOTAGE
+    assert "none is named as the picture itself: left, right. Choose one by its name (--layer)" in unsure.stdout
+    done = run("import", shot, tmp_path / "a.000.exr", "--layer", "right", "--fps", 12, "--step", 1)
+    assert done.returncode == ExitCode.OK, done.stdout + done.stderr
+    info = json.loads((shot / "shot.json").read_text())
+    assert (info["fps"], info["last"]) == (12.0, 9)
+    assert np.abs(read_png(shot / "frames/raw/000000.png") / 65535 - linear_to_srgb(wide[:, :64])).max() < 2e-3
+
+
+def test_a_failed_import_leaves_no_empty_shot(tmp_path):
+    wrong = tmp_path / "text.mp4"
+    wrong.write_text("no video")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    for folder in ("s.splannequin", "mine"):
+        done = run("import", tmp_path / folder, wrong)
+        assert done.returncode == ExitCode.FOOTAGE and "text.mp4" in done.stdout
+    assert run("freeze", wrong, "--output", tmp_path / "out").returncode == ExitCode.FOOTAGE
+    assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+
+
+def test_a_shot_folder_that_cannot_be_is_one_sentence(tmp_path):
+    (tmp_path / "file").touch()
+    for where in ("file/s.splannequin", "s" * 300):
+        done = run("import", tmp_path / where, CLIP)
+        assert done.returncode == ExitCode.USAGE and "Traceback" not in done.stderr
+        assert done.stderr.startswith("Error: Cannot write to") and done.stderr.count("\n") == 1
+        done = run("train", tmp_path / where)
+        assert done.returncode != 0 and done.stderr.startswith("Error: ") and done.stderr.count("\n") == 1

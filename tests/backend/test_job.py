@@ -1,9 +1,11 @@
 """Jobs: events in order, statuses that are true, cancellation, errors in words. Real files, real processes."""
 
 import json
+import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -96,9 +98,9 @@ def test_child_process_reports_an_unreadable_clip(shot, tmp_path):
     clip = tmp_path / "notes.mp4"
     clip.write_text("not a video")
     folder = job.new_job(shot, "import", contract.ImportParams(source=str(clip)))
-    done = subprocess.run(
-        [sys.executable, "-m", "torch_backend", "run-job", str(folder)], capture_output=True, text=True, check=False
-    )
+    command = contract.python_child(sys.executable, "torch_backend", "run-job", str(folder))
+    environ = {**os.environ, "PYTHONPATH": str(Path(contract.__file__).parents[1])}
+    done = subprocess.run(**command, env=environ, capture_output=True, text=True, check=False)
     assert done.returncode == ExitCode.FOOTAGE
     assert "Traceback" not in done.stdout + done.stderr
     assert "notes.mp4" in status_of(folder).message

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_backend.contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, LiveView, read_message, write_message
+from torch_backend.contract import (
+    NO_DEPTH,
+    CameraPath,
+    ExitCode,
+    FreezeParams,
+    LiveView,
+    python_child,
+    read_message,
+    write_message,
+)
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
@@ -32,8 +42,9 @@ def session(trained):
 
 
 def start(shot, run="main"):
-    command = [sys.executable, "-m", "torch_backend", "live", str(shot), "--run", run, "--device", "cpu"]
-    return subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    command = python_child(sys.executable, "torch_backend", "live", str(shot), "--run", run, "--device", "cpu")
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(**command, env=environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
 
 def view_of(world, frame, t_star, width=64, height=48, **more):

@@ -72,3 +72,15 @@ def test_content_key_follows_files(tmp_path):
     before = content_key(path, {"a": 1})
     write_atomic(path, b"12")
     assert content_key(path, {"a": 1}) != before
+
+
+def test_a_folder_behind_a_link_is_not_the_shots_own(tmp_path):
+    shot = Shot.create(tmp_path / "a.splannequin")
+    assert shot.own(shot.take("wide") / "preview") == shot.take("wide") / "preview"
+    (tmp_path / "theirs").mkdir()
+    (shot.root / "takes").symlink_to(tmp_path / "theirs", target_is_directory=True)
+    (shot.root / "frames").write_text("")
+    with pytest.raises(JobError, match=r"takes is a link to .*theirs"):
+        shot.own(shot.take("wide") / "preview")
+    with pytest.raises(JobError, match="frames is not a folder"):
+        shot.own(shot.frames)

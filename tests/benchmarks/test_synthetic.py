@@ -187,7 +187,8 @@ def test_what_moves_are_people_and_what_stands_is_still(scene):
 
 
 def run_cli(out: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "benchmarks.synthetic", "--size", "tiny", "--seeds", str(SEED), "--out", str(out)]
+    command = [sys.executable, "-P", "-m", "benchmarks.synthetic", "--size", "tiny", "--seeds", str(SEED)]
+    command += ["--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.Popen(
         command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

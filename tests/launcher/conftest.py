@@ -2,6 +2,8 @@
 
 import base64
 import hashlib
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -52,3 +54,16 @@ def environment(tmp_path: Path, requirements: Path, write_wheel) -> splannequin.
     """An environment of one small package, not made yet."""
     (requirements / "small.txt").write_text(f"{write_wheel('smallthing', '1.0', 'value = 1')}\n")
     return splannequin.Environment("the test", tmp_path / "home" / ".venv", ("small.txt",), "import smallthing", 0.01)
+
+
+@pytest.fixture
+def made():
+    """made(folder) makes the virtual environment that a set-up would begin with, in a tenth of the time: pip is the
+    Python's own. Where that has none, the set-up makes it anew."""
+
+    def make(folder: Path) -> None:
+        command = [sys.executable, "-P", "-m", "venv", "--without-pip", "--system-site-packages", str(folder)]
+        subprocess.run(command, check=True)
+        (folder / ".splannequin").mkdir()
+
+    return make

@@ -1,7 +1,9 @@
 """Children of the launcher: exit codes passed on, Ctrl-C handed on once, nothing left running."""
 
+import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -136,3 +138,121 @@ def test_a_tied_child_learns_that_the_launcher_was_killed(tmp_path: Path):
     parent.kill()
     parent.wait()
     wait_for(tmp_path / "checkpoint")
+
+
+@pytest.fixture
+def parent(tmp_path: Path):
+    """parent(source, *words) starts a Python that can import the launcher; it is killed at the end at the latest."""
+    started = []
+
+    def start(source: str, *words: str | Path, **environ: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-P", "-c", source, *map(str, words)]
+        where = {**os.environ, "PYTHONPATH": str(ROOT), **environ}
+        with open(tmp_path / "parent.log", "wb") as log:
+            started.append(subprocess.Popen(command, env=where, stdout=log, stderr=log))
+        return started[-1]
+
+    yield start
+    for child in started:
+        child.kill()
+        child.wait()
+
+
+PATIENT = """
+import pathlib, sys, time
+from torch_backend.contract import end_with_starter
+end_with_starter()
+folder = pathlib.Path(sys.argv[1])
+try:
+    (folder / "started").touch()
+    time.sleep(600)
+except KeyboardInterrupt:
+    (folder / "checkpoint").write_text("whole")
+"""
+STUBBORN = """
+import pathlib, signal, subprocess, sys, time
+from torch_backend.contract import end_with_starter
+end_with_starter(1.0)
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+child = subprocess.Popen([sys.executable, "-P", "-c", "import time; time.sleep(600)"])
+pathlib.Path(sys.argv[1], "pid.tmp").write_text(f"{child.pid}")
+pathlib.Path(sys.argv[1], "pid.tmp").rename(pathlib.Path(sys.argv[1], "started"))
+time.sleep(600)
+"""
+TIED_SOURCE = "import sys, splannequin as s; s.run_child([sys.executable, '-P', '-c', *sys.argv[1:]], tied=True)"
+LAUNCHER = "import sys, splannequin; sys.exit(splannequin.main())"
+
+
+def gone(pid: int) -> bool:
+    """True once a process is no more (or a zombie that nobody waits for)."""
+    for _ in range(600):
+        try:
+            os.kill(pid, 0)
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except OSError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_a_killed_launcher_leaves_time_for_a_checkpoint_and_nothing_at_work(tmp_path: Path, parent):
+    launcher = parent(TIED_SOURCE, PATIENT, tmp_path)
+    wait_for(tmp_path / "started")
+    launcher.kill()
+    wait_for(tmp_path / "checkpoint")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="reads POSIX process groups")
+def test_what_does_not_end_with_a_killed_launcher_is_ended_with_its_children(tmp_path: Path, parent):
+    launcher = parent(TIED_SOURCE, STUBBORN, tmp_path)
+    wait_for(tmp_path / "started")
+    launcher.kill()
+    assert gone(int((tmp_path / "started").read_text()))
+
+
+def test_a_killed_launcher_leaves_no_backend_at_work(tmp_path: Path, parent):
+    """A whole freeze, killed while it imports the clip: cancelled as by Ctrl-C."""
+    wheels = [splannequin.bpy_environment(series) for series, _ in splannequin.choose_wheels()[:1]]
+    if not all(environment.ready() for environment in (splannequin.backend_environment(), *wheels)):
+        pytest.skip("the environments are not set up by the launcher")
+    clip = ROOT / "examples" / "sitting.mp4"
+    launcher = parent(LAUNCHER, "freeze", clip, "--output", tmp_path / "out")
+    folders = tmp_path / "out" / "shot.splannequin" / "jobs"
+    for _ in range(600):
+        running = [path for path in folders.glob("*/status.json") if json.loads(path.read_text())["fraction"] > 0]
+        if running:
+            break
+        time.sleep(0.05)
+    launcher.kill()
+    for _ in range(600):
+        status = json.loads(running[0].read_text())
+        if status["state"] != "running":
+            break
+        time.sleep(0.05)
+    assert status["state"] == "cancelled"
+    assert gone(status["pid"])
+
+
+SETTING_UP = """
+import pathlib, sys, splannequin
+splannequin.REQUIREMENTS = pathlib.Path(sys.argv[1])
+splannequin.set_up(splannequin.Environment("x", pathlib.Path(sys.argv[2]), ("small.txt",), "", 0.01), sys.executable)
+"""
+
+
+def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent, made):
+    """pip waits for an index that does not answer; that sees how long it is waited for."""
+    (requirements / "small.txt").write_text("there-is-no-such-package==1.0\n")
+    made(tmp_path / "home" / ".venv")
+    with socket.create_server(("127.0.0.1", 0)) as index:
+        index.settimeout(120)
+        address = f"http://127.0.0.1:{index.getsockname()[1]}/simple"
+        asked = {"PIP_INDEX_URL": address, "PIP_TIMEOUT": "600", "PIP_NO_INDEX": "0", "NO_PROXY": "*"}
+        launcher = parent(SETTING_UP, requirements, tmp_path / "home" / ".venv", **asked)
+        pip, _ = index.accept()
+        with pip:
+            pip.settimeout(60)
+            assert pip.recv(1 << 16)
+            launcher.kill()
+            assert pip.recv(1 << 16) == b"", "pip has hung up"

@@ -3,6 +3,7 @@
 import ast
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import splannequin
+from torch_backend.cards import Card
 
 LAUNCHER = Path(splannequin.__file__)
 
@@ -68,6 +70,74 @@ def test_an_output_that_cannot_be_a_folder_is_one_sentence(tmp_path: Path):
     assert "Choose another --output folder" in ran.stderr and "Traceback" not in ran.stderr
 
 
+@pytest.mark.parametrize("output", ["file", "file/out", "n" * 300, "made/" + "n" * 300])
+def test_an_output_that_cannot_be_written_is_refused_before_any_work(tmp_path: Path, output: str):
+    (tmp_path / "file").touch()
+    home = tmp_path / "home"
+    nothing = {"PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull, "PIP_FIND_LINKS": ""}
+    ran = launch("setup", "--backend", "--output", tmp_path / output, SPLANNEQUIN_HOME=str(home), **nothing)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert ran.stderr.startswith("Error: Cannot write to") and ran.stderr.count("\n") == 1
+    assert not home.exists()
+
+
+def on_a_disk(options: str, fill: str, folder: Path, *command: str | Path) -> subprocess.CompletedProcess[str]:
+    """Runs a command whose `folder` is a small disk of its own, after the shell command `fill` there."""
+    script = f'mount -t tmpfs -o size=64k none "$0" && cd "$0" && {{ {fill}; }} && mount -o remount,{options} "$0"'
+    words = ["unshare", "--map-root-user", "--mount", "sh", "-c", f'{script} && cd / && exec "$@"', folder, *command]
+    ran = subprocess.run(list(map(str, words)), capture_output=True, text=True)
+    if "unshare:" in ran.stderr or "mount:" in ran.stderr:
+        pytest.skip(f"no disk can be mounted here: {ran.stderr}")
+    return ran
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare")
+@pytest.mark.parametrize(
+    ("options", "fill", "code", "words"),
+    [
+        ("ro", "true", 2, "Read-only file system. Choose another --output folder."),
+        ("rw", "head -c 100000 /dev/zero > fills 2>/dev/null || true", 8, "No space left on device"),
+    ],
+)
+def test_a_disk_that_takes_nothing_is_one_sentence(tmp_path: Path, options: str, fill: str, code: int, words: str):
+    (tmp_path / "disk").mkdir()
+    output = tmp_path / "disk" / ("out" if code == 2 else "")  # a full disk takes no folder either
+    command = ("env", f"SPLANNEQUIN_HOME={tmp_path}", sys.executable, "-P", LAUNCHER, "doctor", "--output", output)
+    ran = on_a_disk(options, fill, tmp_path / "disk", *command)
+    assert ran.returncode == code, ran.stderr
+    assert ran.stderr.startswith("Error: Cannot write to") and ran.stderr.count("\n") == 1 and words in ran.stderr
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare")
+def test_a_home_on_a_disk_that_takes_nothing_is_one_sentence(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    command = ["env", f"SPLANNEQUIN_HOME={tmp_path / 'disk'}", sys.executable, "-P", LAUNCHER]
+    ran = on_a_disk("ro", "true", tmp_path / "disk", *command, "setup", "--backend", "--output", tmp_path / "told")
+    assert ran.returncode == 9
+    assert "Read-only file system" in ran.stderr and "SPLANNEQUIN_HOME" in ran.stderr and ran.stderr.count("\n") == 1
+    assert summary(tmp_path / "told")["exit_code"] == 9
+    ran = on_a_disk("ro", "true", tmp_path / "disk", *command, "doctor", "--output", tmp_path / "told")
+    assert ran.returncode == 9 and "cannot be written" in summary(tmp_path / "told")["findings"]["home"]["text"]
+
+
+def test_a_folder_that_is_gone_is_one_sentence(tmp_path: Path):
+    code = f"import os, sys; os.rmdir(os.getcwd()); sys.path.insert(0, {str(LAUNCHER.parent)!r}); import splannequin"
+    (tmp_path / "here").mkdir()
+    command = [sys.executable, "-P", "-c", f"{code}; sys.exit(splannequin.main(['doctor']))"]
+    ran = subprocess.run(command, cwd=tmp_path / "here", capture_output=True, text=True)
+    assert ran.returncode == 2 and "change to another" in ran.stderr and "Traceback" not in ran.stderr
+
+
+def test_a_broken_status_of_a_job_breaks_nothing(tmp_path: Path):
+    for number, text in enumerate(("[", "[]", '{"state": "failed"}')):
+        job = tmp_path / "shot.splannequin" / "jobs" / str(number)
+        job.mkdir(parents=True)
+        (job / "status.json").write_text(text)
+        assert splannequin.failed_job(tmp_path) == ""
+    (job / "status.json").write_text('{"state": "failed", "message": "It broke.", "hint": "Mend it."}')
+    assert splannequin.failed_job(tmp_path) == "It broke. Mend it."
+
+
 def test_unknown_options_of_the_launchers_own_commands_are_refused(tmp_path: Path):
     assert launch("doctor", "--bogus", "--output", tmp_path).returncode == 2
 
@@ -119,11 +189,11 @@ def test_a_test_run_that_leaves_no_report_counts_as_failed(tmp_path: Path):
         ("580.65.06", "9.0", "ok", "driver 580.65.06"),
         ("610.10", "7.5", "ok", "compute capability 7.5"),
         ("575.57.08", "8.9", "note", "R580"),
-        ("580.65.06", "7.0", "note", "7.5 or newer"),
+        ("580.65.06", "7.0", "note", "7.5 (Turing) or newer"),
         ("[N/A]", "8.9", "note", "not understood"),
     ],
 )
 def test_cards_are_held_against_what_warp_needs(driver: str, compute: str, state: str, says: str):
-    finding = splannequin.gpu_finding("Some card", driver, compute)
+    finding = splannequin.gpu_finding(Card("Some card", driver, compute))
     assert finding.state == state
     assert says in finding.text

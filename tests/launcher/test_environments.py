@@ -1,6 +1,7 @@
 """Set-up of an environment: once, resumed after an interruption, refused in a sentence."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -20,10 +21,14 @@ def site_packages(environment: Environment) -> Path:
     return next(environment.folder.rglob("smallthing.py")).parent
 
 
-def test_set_up_once_then_nothing_is_started(environment: Environment, monkeypatch: pytest.MonkeyPatch):
+def test_set_up_once_then_nothing_is_started(
+    environment: Environment, monkeypatch: pytest.MonkeyPatch, hostile, tmp_path: Path
+):
+    trap = hostile(tmp_path / "clips", tmp_path / "home", tmp_path)  # modules where a child could stand
     assert not environment.ready()
     assert set_up(environment, sys.executable) > 0
     assert environment.ready()
+    assert not trap.exists(), trap.read_text()
     assert value_of(environment) == "1"
 
     monkeypatch.setattr(subprocess, "Popen", None)  # any child process would now fail
@@ -157,3 +162,75 @@ def test_an_index_that_does_not_answer_is_not_asked_for_every_package(tmp_path: 
     assert splannequin._reachable(tmp_path.as_uri())
     assert not splannequin._reachable("https://packages.invalid/whl/cpu")
     assert not splannequin._reachable("http://127.0.0.1:9/simple")
+
+
+@pytest.fixture
+def offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pip that knows one index, at which nobody listens."""
+    for name, value in {"NO_INDEX": "0", "CONFIG_FILE": os.devnull, "FIND_LINKS": "", "EXTRA_INDEX_URL": ""}.items():
+        monkeypatch.setenv(f"PIP_{name}", value)
+    for name in ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv(name.lower(), raising=False)
+    monkeypatch.setenv("PIP_RETRIES", "1")
+    monkeypatch.setenv("PIP_INDEX_URL", "http://name:secret@127.0.0.1:9/simple")
+
+
+def test_an_index_that_cannot_be_reached_is_what_is_wrong(
+    environment: Environment, requirements: Path, offline, made, monkeypatch: pytest.MonkeyPatch
+):
+    made(environment.folder)
+    (requirements / "small.txt").write_text("smallthing==1.0\n")
+    with pytest.raises(LauncherError) as refused:
+        set_up(environment, sys.executable)
+    message = str(refused.value)
+    assert "127.0.0.1 cannot be reached" in message and "HTTPS_PROXY" in message and "start the same command" in message
+    assert "Python 3" not in message and "secret" not in message
+    assert refused.value.exit_code == 9
+
+    monkeypatch.setenv("PIP_INDEX_URL", "https://packages.invalid/simple")
+    monkeypatch.setenv("HTTPS_PROXY", "http://127.0.0.1:9")
+    with pytest.raises(LauncherError, match="the proxy on the way to packages.invalid cannot be used"):
+        set_up(environment, sys.executable)
+
+
+RETRYING = "WARNING: Retrying (Retry(total=0, connect=None)) after connection broken by "
+
+
+@pytest.mark.parametrize(
+    ("printed", "says"),
+    [
+        (
+            RETRYING + "'SSLError(SSLCertVerificationError(1, '[SSL: CERTIFICATE_VERIFY_FAILED]'))': /simple/torch/\n"
+            "ERROR: No matching distribution found for torch==2.13.0",
+            "the certificate of pypi.org is not accepted",
+        ),
+        (
+            "ERROR: Could not install packages due to an OSError: HTTPSConnectionPool(host='files.pythonhosted.org', "
+            "port=443): Max retries exceeded with url: /packages/x.whl",
+            "files.pythonhosted.org cannot be reached",
+        ),
+        (  # the connection broke once, but the index did answer
+            RETRYING + "'ReadTimeoutError(...)': /simple/torch/\n"
+            "ERROR: Could not find a version that satisfies torch==9 (from versions: 2.12.0, 2.13.0)\n"
+            "ERROR: No matching distribution found for torch==9",
+            "use Python 3.11",
+        ),
+        ("ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device", "free some disk"),
+    ],
+)
+def test_what_pip_prints_in_a_sentence(environment: Environment, printed: str, says: str):
+    with pytest.raises(LauncherError) as refused:
+        splannequin._refuse(environment, "installing packages", printed)
+    assert says in str(refused.value)
+
+
+@pytest.mark.parametrize("home", ["file", "file/below", "n" * 300])
+def test_a_home_that_cannot_be_is_one_sentence(environment: Environment, tmp_path: Path, home: str):
+    (tmp_path / "file").touch()
+    placed = dataclasses.replace(environment, folder=tmp_path / home / ".venv")
+    with pytest.raises(LauncherError) as refused:
+        set_up(placed, sys.executable)
+    message = str(refused.value)
+    assert "cannot be set up in" in message and "SPLANNEQUIN_HOME" in message and "Log:" not in message
+    assert refused.value.exit_code == 9

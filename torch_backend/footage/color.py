@@ -4,9 +4,14 @@ Working frames and the trained model are display-referred (what splatting blends
 first of all, is scene-linear with the Rec.709 / sRGB primaries. Transfer function: IEC 61966-2-1, exact piecewise
 form. It is odd-extended below 0 and its power segment continues above 1, so that ringing and highlights survive the
 way there and back.
+
+Footage comes in other encodings too: `InputSpace` brings each of them to display-referred sRGB.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,3 +75,185 @@ def _on_straight_colour(rgba: ArrayLike, curve) -> NDArray[np.float32]:
     alpha = rgba[..., 3:4]
     weight = np.where(alpha > 0.0, alpha, np.float32(1.0))
     return np.concatenate([curve(rgba[..., :3] / weight) * weight, alpha], axis=-1)
+
+
+# ------------------------------------------------------------------------------------------------- what footage means
+
+Chromaticities = tuple[float, float, float, float, float, float, float, float]
+"""CIE 1931 x and y of red, green, blue and white."""
+
+_D65 = (0.3127, 0.3290)
+_ACES_WHITE = (0.32168, 0.33767)
+REC709: Chromaticities = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *_D65)
+PRIMARIES: dict[str, tuple[str, Chromaticities]] = {
+    "rec709": ("Rec.709", REC709),
+    "rec2020": ("BT.2020", (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65)),
+    "p3d65": ("P3-D65", (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65)),
+    "p3dci": ("DCI-P3", (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.314, 0.351)),
+    "adobergb": ("Adobe RGB", (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65)),
+    "ap1": ("ACEScg (AP1)", (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, *_ACES_WHITE)),
+    "ap0": ("ACES2065-1 (AP0)", (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, *_ACES_WHITE)),
+    "ciexyzd65": ("CIE XYZ", (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, *_D65)),
+}
+"""Short name, as colour interop ids have it -> the name that people read, and the chromaticities."""
+
+DIFFUSE_WHITE_NITS = 203.0
+"""Luminance of white in HDR footage, which becomes 1 (ITU-R BT.2408)."""
+_HLG_PEAK_NITS, _HLG_GAMMA = 1000.0, 1.2
+_REC2020_LUMA = np.array([0.2627, 0.6780, 0.0593], np.float32)
+
+
+def rgb_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
+    """[3, 3] from linear RGB of these primaries to CIE XYZ, white at Y = 1. ValueError if they span no gamut."""
+    x, y = np.array(chromaticities, np.float64).reshape(4, 2).T
+    if not np.isfinite([*x, *y]).all() or abs(y[3]) < 1e-6:
+        raise ValueError(f"these are no chromaticities: {chromaticities}")
+    columns = np.stack([x[:3], y[:3], 1.0 - x[:3] - y[:3]])
+    if abs(np.linalg.det(columns)) < 1e-6:
+        raise ValueError(f"these primaries lie on one line: {chromaticities}")
+    white = np.array([x[3] / y[3], 1.0, (1.0 - x[3] - y[3]) / y[3]])
+    return columns * np.linalg.solve(columns, white)
+
+
+def to_rec709(chromaticities: Chromaticities) -> NDArray[np.float64]:
+    """[3, 3] from linear RGB of these primaries to Rec.709's, their white becoming D65 (Bradford)."""
+    bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+    ours, theirs = rgb_to_xyz(REC709), rgb_to_xyz(chromaticities)
+    cones = (bradford @ ours.sum(axis=1)) / (bradford @ theirs.sum(axis=1))
+    adapted = np.linalg.solve(bradford, cones[:, None] * (bradford @ theirs))
+    return np.linalg.solve(ours, adapted)
+
+
+def cineon_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Cineon log (printing density, 10 bits as 0..1) to scene-linear: black at code 95 is 0, white at 685 is 1.
+
+    Kodak's conversion: 0.002 density a code, negative gamma 0.6.
+    """
+    black = 10.0 ** ((95.0 - 685.0) * 0.002 / 0.6)
+    light = np.power(np.float32(10.0), (x * np.float32(1023.0) - np.float32(685.0)) * np.float32(0.002 / 0.6))
+    return (light - np.float32(black)) / np.float32(1.0 - black)
+
+
+def pq_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """SMPTE ST 2084 to linear light, 1 at `DIFFUSE_WHITE_NITS`."""
+    m1, m2, c1, c2, c3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
+    root = np.power(np.clip(x, 0.0, 1.0).astype(np.float64), 1.0 / m2)
+    nits = 10000.0 * np.power(np.maximum(root - c1, 0.0) / (c2 - c3 * root), 1.0 / m1)
+    return (nits / DIFFUSE_WHITE_NITS).astype(np.float32)
+
+
+def hlg_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """BT.2100 HLG [..., 3] to linear light of a display of 1000 cd/m2, 1 at `DIFFUSE_WHITE_NITS`."""
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    x = np.clip(x, 0.0, 1.0)
+    upper = np.exp((np.maximum(x, np.float32(0.5)) - np.float32(c)) / np.float32(a)) + np.float32(b)
+    scene = np.where(x <= 0.5, x * x / 3.0, upper / np.float32(12.0)).astype(np.float32)
+    luminance = np.maximum((scene @ _REC2020_LUMA)[..., None], np.float32(1e-9))
+    return scene * np.power(luminance, np.float32(_HLG_GAMMA - 1.0)) * np.float32(_HLG_PEAK_NITS / DIFFUSE_WHITE_NITS)
+
+
+def _power(exponent: float) -> Callable[[ArrayLike], NDArray[np.float32]]:
+    def curve(x: ArrayLike) -> NDArray[np.float32]:
+        x = np.asarray(x, np.float32)
+        return np.copysign(np.power(np.abs(x), np.float32(exponent)), x)
+
+    return curve
+
+
+_DISPLAY = {
+    "srgb": (srgb_to_linear, linear_to_srgb),
+    "g18": (_power(1.8), linear_to_srgb),
+    "g22": (_power(2.2), _power(1.0 / 2.2)),
+    "g24": (_power(2.4), _power(1.0 / 2.4)),
+    "g26": (_power(2.6), _power(1.0 / 2.6)),
+}
+"""Transfer function of pictures made for a display -> to light, and back. All but gamma 1.8 are taken for sRGB's as
+they stand, as players and Blender do: only their primaries are converted, in the light of their own display."""
+_SCENE: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
+    "lin": lambda x: x,
+    "cineon": cineon_to_linear,
+    "pq": pq_to_linear,
+    "hlg": hlg_to_linear,
+}
+"""Transfer function of pictures that hold light -> to light. They leave through sRGB's curve, cut at 1."""
+TRANSFERS = {
+    "srgb": "sRGB", "g18": "gamma 1.8", "g22": "gamma 2.2", "g24": "video", "g26": "gamma 2.6", "lin": "linear",
+    "cineon": "Cineon log", "pq": "PQ", "hlg": "HLG",
+}  # fmt: skip
+"""Names that people read."""
+
+
+@dataclass(frozen=True)
+class InputSpace:
+    """What the numbers in a picture mean."""
+
+    transfer: str
+    """One of `TRANSFERS`."""
+    primaries: str = "rec709"
+    """One of `PRIMARIES`, or "" for `chromaticities`."""
+    chromaticities: Chromaticities = REC709
+    """Of primaries that have no name."""
+    told: bool = True
+    """True if the footage says so, False if it was assumed."""
+
+    @property
+    def name(self) -> str:
+        """As people read it."""
+        gamut = PRIMARIES[self.primaries][0] if self.primaries else "primaries of its own"
+        return f"{TRANSFERS[self.transfer]}, {gamut}"
+
+    @property
+    def is_light(self) -> bool:
+        """True if the numbers are light or a code for it, not made for a display."""
+        return self.transfer in _SCENE
+
+    @property
+    def as_it_stands(self) -> bool:
+        """True if pictures are taken for sRGB without a change."""
+        return self.transfer in _DISPLAY and self.transfer != "g18" and self._wide is None
+
+    @property
+    def _wide(self) -> Chromaticities | None:
+        found = PRIMARIES[self.primaries][1] if self.primaries else self.chromaticities
+        return None if found == REC709 else found
+
+    def to_srgb(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+        """[H, W, 3] as read to display-referred sRGB in [0, 1], and the share of pixels with light above 1, cut there.
+
+        NaN becomes 0.
+        """
+        pixels = np.nan_to_num(pixels, nan=0.0, posinf=65504.0, neginf=0.0)
+        if self.as_it_stands:
+            return np.clip(pixels, 0.0, 1.0), 0.0
+        decode, encode = _DISPLAY.get(self.transfer) or (_SCENE[self.transfer], linear_to_srgb)
+        light = decode(pixels)
+        if self._wide is not None:
+            light = light @ to_rec709(self._wide).T.astype(np.float32)
+        clipped = float((light > 1.0 + 1e-6).any(axis=-1).mean()) if self.is_light else 0.0
+        return encode(np.clip(light, 0.0, 1.0)), clipped
+
+
+def named_space(name: str) -> InputSpace | None:
+    """The space that a file names: a colour interop id (lin_ap1_scene) or what older files say; None if unknown."""
+    short = _ALIASES.get(name.lower(), name.lower())
+    transfer, _, rest = short.partition("_")
+    primaries = rest.partition("_")[0]
+    if transfer in TRANSFERS and primaries in PRIMARIES:
+        return InputSpace(transfer, primaries)
+    return None
+
+
+def space_of_chromaticities(values: Chromaticities) -> InputSpace:
+    """Linear light of these primaries, by name if they have one. ValueError if they span no gamut."""
+    for short, (_, known) in PRIMARIES.items():
+        if np.allclose(values, known, atol=2e-3):
+            return InputSpace("lin", short)
+    to_rec709(values)
+    return InputSpace("lin", "", values)
+
+
+_ALIASES = {
+    "srgb": "srgb_rec709", "rec709": "g24_rec709", "linear": "lin_rec709", "scene_linear": "lin_rec709",
+    "lin_srgb": "lin_rec709", "acescg": "lin_ap1", "aces2065-1": "lin_ap0", "kodaklog": "cineon_rec709",
+    "cineon": "cineon_rec709", "adobergb": "g22_adobergb", "display p3": "srgb_p3d65",
+}  # fmt: skip

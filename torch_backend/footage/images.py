@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import errno
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import av
@@ -17,12 +19,18 @@ import OpenImageIO as oiio
 from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
+from ..contract import ExitCode, JobError, open_regular
 from ..shot import atomic_path
 
 PNG_COMPRESSION = 2
 """zlib level: three times faster than the default for files 7 % larger (640x480 video frames)."""
 
 _FULL_BYTES = 4 << 20
+_MADE_BY = {
+    "raw": ("Import the clip again.", ExitCode.FOOTAGE),
+    "frames": ("Solve the camera again.", ExitCode.SOLVE),
+}
+"""Folder of working frames -> what makes them anew, and the exit code."""
 
 
 def write_png(path: str | Path, pixels: NDArray) -> None:
@@ -33,9 +41,17 @@ def write_png(path: str | Path, pixels: NDArray) -> None:
     buffer.specmod().attribute("png:compressionLevel", PNG_COMPRESSION)
     buffer.specmod().attribute("oiio:ColorSpace", "sRGB")
     with atomic_path(path) as beside:
-        if not buffer.write(str(beside)):
+        # OpenImageIO's writer says nothing when the disk is full.
+        if not (buffer.write(str(beside)) and _has_end(beside)):
             full = shutil.disk_usage(beside.parent).free < max(_FULL_BYTES, pixels.nbytes)
             raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot write picture: {buffer.geterror()}", str(path))
+
+
+def _has_end(png: Path) -> bool:
+    """True if the last part of a PNG is there."""
+    with open(png, "rb") as written:
+        written.seek(max(0, png.stat().st_size - 8))
+        return written.read(4) == b"IEND"
 
 
 def read_png(path: str | Path) -> NDArray:
@@ -50,6 +66,32 @@ def read_png(path: str | Path) -> NDArray:
         raise ValueError(f"picture {path} cannot be read: {buffer.geterror()}")
     pixels = np.asarray(pixels)
     return pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+
+
+def read_frame(path: Path) -> NDArray:
+    """A working frame of a shot, as `read_png`. JobError names it and the step that makes it anew."""
+    try:
+        return read_png(path)
+    except (ValueError, FileNotFoundError) as error:
+        again = _MADE_BY.get(path.parent.name)
+        if again is None:
+            raise
+        raise JobError(f"Frame {int(path.stem)} is damaged or missing: {path}.", *again) from error
+
+
+def is_whole_png(path: Path) -> bool:
+    """True if each part of a PNG is there and right by its own checksum: ten times quicker than to decode it."""
+    try:
+        with open_regular(path) as handle:
+            whole = handle.read(8) == b"\x89PNG\r\n\x1a\n"
+            kind = b""
+            while whole and kind != b"IEND":
+                size, kind = struct.unpack(">I4s", handle.read(8))
+                part = handle.read(size + 4)
+                whole = len(part) == size + 4 and zlib.crc32(part[:-4], zlib.crc32(kind)) == int.from_bytes(part[-4:])
+            return whole
+    except (OSError, ValueError, struct.error):
+        return False
 
 
 def resize(pixels: NDArray, width: int, height: int) -> NDArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -11,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import Reporter, frame_file, read_json
-from ..shot import Shot, content_key, need_disk, write_json
+from ..contract import LAST_FRAME, JobError, Reporter, frame_file, read_json
+from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
-from .images import resize, working_size, write_png
-from .sources import Source, SourceFrame, footage_error, frame_words, open_source
+from .images import is_whole_png, resize, working_size, write_png
+from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, footage_error, frame_words, open_source
 
 FRAMES_VERSION = 1
 FRAMES_FILE = "frames.json"
@@ -23,6 +25,10 @@ LEAST_FRAMES = 8
 MANY_FRAMES = 1500
 EXPOSURE_DRIFT_STOPS = 1.0
 CLIPPED_SHARE = 0.01
+_PARTIAL = "raw.partial"
+"""What a killed import of an earlier version left."""
+_BESIDE = re.compile(r"\..+\.\d+\.tmp\.(png|json)")
+"""What a killed process leaves of a file that it was writing, see `shot.atomic_path`."""
 _WRITERS = 2
 _DISK_CHECK_FRAMES = 16
 
@@ -41,6 +47,8 @@ class FootageConfig:
     """Height in pixels of the working frames; 0: the source's, at most 720. Frames are never enlarged."""
     fps: float = 0.0
     """Rate of an image sequence, frames per second; 0: what its files say, else 24. Videos have their own clock."""
+    layer: str = ""
+    """Layer of the pictures of a sequence, by its name or the last part of it; empty: the picture itself."""
 
 
 @dataclass
@@ -59,46 +67,60 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
 
     Frames are frames/raw/NNNNNN.png, 8-bit sRGB, or 16-bit where the source is deeper; `seconds` in frames.json count
     from the first frame of the range. A finished import of the same source and configuration is left alone. Another
-    one replaces it, and the solve made from it is removed.
+    one takes its place once it is whole, and the solve made from it is removed; files that are not ours stay.
 
     Returns {frames, solved_frames, first, last, step, width, height, fps, colour, source}.
     Raises JobError (FOOTAGE, DISK) in one sentence, and Cancelled; either leaves no half import behind.
     """
     _check(config)
-    opened = open_source(source, config.fps)
+    opened = open_source(source, config.fps, config.layer)
     _check_range(opened, config)
-    key = content_key(FRAMES_VERSION, opened.info.key, config)
+    asked = {name: value for name, value in asdict(config).items() if name != "layer" or value}
+    key = content_key(FRAMES_VERSION, opened.info.key, asked)
+    restore_folder(shot.frames)
+    for folder in (shot.frames / "raw", shot.solve):
+        shot.own(folder)
     done = _finished(shot, key)
     if done is not None:
         report.progress("import", 1, 1, "already imported")
         return _result(shot, done)
-    partial = shot.frames / "raw.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        extracted = _extract(shot, opened, config, partial, report)
+    with replacing_folder(shot.frames) as fresh:
+        extracted = _extract(shot, opened, config, fresh / "raw", report)
         _refuse_unusable(extracted.measures)
         for message, hint in opened.warnings + _remarks(extracted):
             report.warning(message, hint)
         record = _record(opened, config, extracted, key)
-        _publish(shot, partial, record, source)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        record["beside"] = _beside(shot, source)
+        write_json(fresh / FRAMES_FILE, record)
+        _keep_strangers(shot.frames, fresh, record)
+    _publish(shot, record, source)
     return _result(shot, record)
 
 
 def load_frames(shot: Shot) -> dict[str, Any]:
-    """frames.json of a finished import. JobError says to import first."""
+    """frames.json of a finished import. JobError says to import first, or again if it is damaged."""
     path = shot.frames / FRAMES_FILE
     if not path.is_file():
         raise footage_error(f"The shot {shot.root.name} has no frames yet.", "Import footage first.")
-    return read_json(path)
+    try:
+        record = read_json(path)
+        rows = [(int(f["frame"]), float(f["seconds"]), str(f["file"]), bool(f["solve"])) for f in record["frames"]]
+        for row in record["frames"]:
+            row["sharpness"] = float(row.get("sharpness", 0.0))
+        numbers = [number for number, *_ in rows]
+        whole = bool(rows) and numbers == sorted(set(numbers)) and int(record["width"]) * int(record["height"]) > 0
+    except (ValueError, TypeError, KeyError, OverflowError):
+        whole = False
+    if not whole:
+        raise footage_error(f"{path} is damaged.", "Import the clip again.")
+    return record
 
 
 def _check(config: FootageConfig) -> None:
-    if config.step < 0 or config.working_height < 0 or config.fps < 0:
-        raise ValueError(
-            f"step, working_height and fps cannot be negative: {config.step}, {config.working_height}, {config.fps}"
-        )
+    if config.step < 0 or config.working_height < 0:
+        raise ValueError(f"step and working_height cannot be negative: {config.step}, {config.working_height}")
+    if config.fps and not SLOWEST_FPS <= config.fps <= FASTEST_FPS:  # NaN is neither
+        raise ValueError(f"fps is {config.fps}: it should be {SLOWEST_FPS} to {FASTEST_FPS:g}, or 0: the footage's own")
     if config.first is not None and config.last is not None and config.last - config.first + 1 < LEAST_FRAMES:
         raise footage_error(
             f"Frames {config.first} to {config.last} are too few: a freeze needs at least {LEAST_FRAMES}.",
@@ -114,14 +136,20 @@ def _check_range(opened: Source, config: FootageConfig) -> None:
     last = info.last if config.last is None else config.last
     if first > info.last or last < info.first:
         raise footage_error(f"Frames {first} to {last} lie outside of the clip, which has {info.first} to {info.last}.")
+    first, last = max(first, info.first), min(last, info.last)
+    if last > LAST_FRAME or first < -LAST_FRAME:
+        raise footage_error(
+            f"The frames are numbered {first} to {last}: Blender's frames end at {LAST_FRAME}.",
+            "Renumber the files from 1, or from 1001, or choose a range below that.",
+        )
 
 
 def _finished(shot: Shot, key: str) -> dict[str, Any] | None:
-    path = shot.frames / FRAMES_FILE
-    if not path.is_file():
+    try:
+        record = load_frames(shot)
+    except JobError:  # none yet, or damaged: it is imported anew
         return None
-    record = read_json(path)
-    whole = record.get("key") == key and all((shot.frames / f["file"]).is_file() for f in record["frames"])
+    whole = record.get("key") == key and all(is_whole_png(shot.frames / f["file"]) for f in record["frames"])
     return record if whole else None
 
 
@@ -135,7 +163,7 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
     frame_bytes = width * height * (5.0 if info.deep else 2.0)
     # Twice: the solve writes the undistorted frames beside these.
     need_disk(shot.root, 2.0 * total * frame_bytes + (64 << 20), "The import of this clip")
-    into.mkdir(parents=True)
+    make_folder(into)
     measures: list[FrameMeasures] = []
     seconds: list[float] = []
     clipped, distinct = 0.0, None
@@ -276,6 +304,7 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "height": extracted.height,
         "fps": info.fps,
         "colour": info.colour,
+        "reading": info.reading,
         "bits": 16 if info.deep else 8,
         "step": step,
         "config": asdict(config),
@@ -284,15 +313,43 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
     }
 
 
-def _publish(shot: Shot, partial: Path, record: dict[str, Any], source: str) -> None:
-    """Puts the new frames in the place of the old. frames.json goes first and comes back last: it says "whole"."""
-    (shot.frames / FRAMES_FILE).unlink(missing_ok=True)
-    for stale in shot.frames.glob("*.png"):
-        stale.unlink()
+def _keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:
+    """Takes over what lies in the frames folder and is not ours, under its own name or, where we need that, another.
+
+    Ours are the listing, the frames that it names, and their undistorted copies beside raw/.
+    """
+    ours, needed = _listed(old / FRAMES_FILE), _names(record)
+    for found in sorted(p for p in old.rglob("*") if p.is_symlink() or not p.is_dir()):
+        name = found.relative_to(old)
+        if name in ours or name.parts[0] == _PARTIAL or _BESIDE.fullmatch(name.name):
+            continue
+        while name in needed or os.path.lexists(fresh / name):
+            name = name.with_name(f"{name.stem}.kept{name.suffix}")
+        target = fresh / name
+        make_folder(target.parent)
+        try:
+            os.link(found, target, follow_symlinks=False)
+        except (OSError, NotImplementedError):  # no hard links there: a network share, a memory card
+            shutil.copy2(found, target, follow_symlinks=False)
+
+
+def _listed(listing: Path) -> set[Path]:
+    """Our files in a folder with this frames.json; the listing alone if it cannot be read: no other is known to be."""
+    try:
+        return _names(read_json(listing))
+    except (OSError, ValueError, KeyError, TypeError):
+        return {Path(FRAMES_FILE)}
+
+
+def _names(record: dict[str, Any]) -> set[Path]:
+    """Files of an import, relative to the frames folder, and the undistorted ones that a solve writes beside raw/."""
+    files = [Path(str(row["file"])) for row in record["frames"]]
+    return {Path(FRAMES_FILE), *files, *(Path(file.name) for file in files)}
+
+
+def _publish(shot: Shot, record: dict[str, Any], source: str) -> None:
+    """Removes the solve of the frames that were replaced, and tells shot.json of the new ones."""
     shutil.rmtree(shot.solve, ignore_errors=True)
-    shutil.rmtree(shot.frames / "raw", ignore_errors=True)
-    partial.rename(shot.frames / "raw")
-    write_json(shot.frames / FRAMES_FILE, record)
     frames = record["frames"]
     shot.update(
         source=str(source),
@@ -304,6 +361,14 @@ def _publish(shot: Shot, partial: Path, record: dict[str, Any], source: str) -> 
         height=record["height"],
         colour=record["colour"],
     )
+
+
+def _beside(shot: Shot, source: str) -> str:
+    """Where the footage lies seen from the shot folder, with slashes: it holds where both were moved together."""
+    try:
+        return Path(os.path.relpath(source, shot.root)).as_posix()
+    except ValueError:  # another drive on Windows
+        return ""
 
 
 def _result(shot: Shot, record: dict[str, Any]) -> dict[str, Any]:

@@ -1,8 +1,13 @@
-"""Frames of a numbered image sequence through OpenImageIO; scene-linear ones become 16-bit sRGB."""
+"""Frames of a numbered image sequence through OpenImageIO: one layer, straight colour, square pixels, sRGB.
+
+What is not 8-bit sRGB already becomes 16-bit sRGB.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +16,23 @@ from fileseq.exceptions import FileSeqException
 from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
-from .color import linear_to_srgb
-from .sources import SourceFrame, SourceInfo, footage_error, frame_words
+from .color import InputSpace, named_space, space_of_chromaticities
+from .images import resize
+from .layers import Layer, find_layer, shown
+from .sources import (
+    FASTEST_FPS,
+    SLOWEST_FPS,
+    SourceFrame,
+    SourceInfo,
+    believable_aspect,
+    footage_error,
+    frame_words,
+    square_size,
+)
 
-PICTURES = {".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd"}
+PICTURES = {
+    ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
+}  # fmt: skip
 DEFAULT_FPS = 24.0
 FEW = 2
 
@@ -66,7 +84,7 @@ def _sequence_of_file(path: Path) -> FileSequence:
 class SequenceSource:
     """A numbered sequence. Frame numbers are those of the files; missing and unreadable ones are left out."""
 
-    def __init__(self, sequence: FileSequence, fps: float = 0.0) -> None:
+    def __init__(self, sequence: FileSequence, fps: float = 0.0, layer: str = "") -> None:
         self.warnings: list[tuple[str, str]] = []
         frame_set = sequence.frameSet()
         numbers = sorted(int(n) for n in frame_set) if frame_set else []
@@ -74,21 +92,43 @@ class SequenceSource:
         self._files = {n: file for n, file in self._files.items() if file.is_file()}
         if len(self._files) < FEW:
             raise footage_error(f"{sequence} holds fewer than {FEW} pictures.", "Choose a longer sequence.")
-        first, spec = self._first_readable()
-        linear = _is_linear(first, spec)
+        first, self._layer, names = self._first_readable(layer)
+        spec = _open(first, self._layer.part).spec()
+        self._channels = spec.channelnames
+        self._space = _input_space(first, spec, self.warnings)
+        self._aspect = believable_aspect(_pixel_aspect(spec), self.warnings)
+        self._stored = spec.full_width, spec.full_height
+        width, height = square_size(*self._stored, self._aspect)
+        self._describe(names, layer, (width, height))
         rate = spec.getattribute("framesPerSecond") or spec.getattribute("FramesPerSecond")
         if isinstance(rate, tuple):  # a rational, as OpenEXR stores it
             rate = rate[0] / rate[1] if rate[1] else 0.0
+        rate = rate if isinstance(rate, (int, float)) and SLOWEST_FPS <= rate <= FASTEST_FPS else 0.0
+        space, light = self._space, self._space.is_light
+        told = [space.name, self._layer.name, float(self._aspect), "straight"]
+        ordinary = space.as_it_stands or space == InputSpace("lin", told=space.told)
+        ordinary = ordinary and self._aspect == 1 and self._layer.alpha is None and len(names) == 1
         stats = [f.stat() for f in self._files.values()]
         self.info = SourceInfo(
-            width=spec.full_width,
-            height=spec.full_height,
+            width=width,
+            height=height,
             fps=float(fps or rate or DEFAULT_FPS),
             first=min(self._files),
             last=max(self._files),
-            deep=linear or str(spec.format) not in ("uint8", "int8"),
-            colour="linear" if linear else "srgb",
-            key=[str(sequence), len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)],
+            deep=light or not space.as_it_stands or str(spec.format) not in ("uint8", "int8"),
+            colour="linear" if light else "srgb",
+            # What is read otherwise than it used to be is imported again; all else keeps its key.
+            key=[str(sequence), len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)]
+            + ([] if ordinary else told),
+            reading={
+                "colour": space.name,
+                "colour_told": space.told,
+                "layer": self._layer.name,
+                "layers": names,
+                "alpha": self._layer.alpha is not None,
+                "pixel_aspect": float(self._aspect),
+                "fps_told": bool(fps or rate),
+            },
         )
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
@@ -102,10 +142,10 @@ class SequenceSource:
             self.warnings.append(
                 (f"The sequence lacks {frame_words(missing)}.", "Those frames are left out of the shot.")
             )
-        unreadable = []
+        unreadable, met = [], _Met()
         for number in sorted(n for n in self._files if first <= n <= last):
             try:
-                pixels, clipped = self._read(self._files[number])
+                pixels, clipped = self._read(self._files[number], met)
             except OSError:
                 unreadable.append(number)
                 continue
@@ -113,65 +153,175 @@ class SequenceSource:
         if unreadable:
             words = frame_words(unreadable).capitalize()
             self.warnings.append((f"{words} cannot be read: left out of the shot.", "Render or copy it again."))
+        if met.transparent:
+            self.warnings.append(
+                ("The pictures are transparent in places: their colour is taken, their alpha is not.", "")
+            )
+        if met.cropped:
+            self.warnings.append(("Pictures fill only a part of their frame: the rest of it is black.", ""))
 
-    def _first_readable(self) -> tuple[Path, oiio.ImageSpec]:
+    def _describe(self, names: list[str], wanted: str, size: tuple[int, int]) -> None:
+        """Warns of what is taken otherwise than it stands in the files."""
+        if len(names) > 1 and not wanted:
+            others = ", ".join(shown(n) for n in names if n != self._layer.name)
+            taken = f"The pictures have {len(names)} layers: {shown(self._layer.name)} is taken."
+            self.warnings.append((taken, f"The others: {others}."))
+        if self._aspect != 1:
+            self.warnings.append(
+                (
+                    f"The pictures have pixels {float(self._aspect):g} times as wide as high: "
+                    f"{self._stored[0]}x{self._stored[1]} becomes {size[0]}x{size[1]}.",
+                    "",
+                )
+            )
+        if self._space.primaries != "rec709":
+            self.warnings.append((f"The pictures are {self._space.name}: converted to Rec.709.", ""))
+
+    def _first_readable(self, layer: str) -> tuple[Path, Layer, list[str]]:
         for file in self._files.values():
-            buffer = oiio.ImageBuf(str(file))
-            if not buffer.has_error and buffer.spec().width > 0:
-                return file, buffer.spec()
-            buffer.geterror()
+            try:
+                return file, *find_layer(file, layer)
+            except OSError:
+                continue
         raise footage_error(
             f"No picture of the sequence in {file.parent} can be read.",
             "Open one in Blender to see whether it is whole.",
         )
 
-    def _read(self, file: Path) -> tuple[NDArray, float]:
+    def _read(self, file: Path, met: _Met) -> tuple[NDArray, float]:
         """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels. OSError if unreadable."""
-        buffer = oiio.ImageBuf(str(file))
+        buffer, layer = _open(file, self._layer.part), self._layer
+        if buffer.has_error or buffer.spec().channelnames != self._channels:
+            layer = self._same_layer(file)
+            buffer = _open(file, layer.part)
         spec = buffer.spec()
-        size, begun = (spec.full_width, spec.full_height), (self.info.width, self.info.height)
-        if not buffer.has_error and size != begun:
+        size = spec.full_width, spec.full_height
+        if not buffer.has_error and size != self._stored:
             raise footage_error(
-                f"{file.name} is {size[0]}x{size[1]}, the sequence began with {begun[0]}x{begun[1]}.",
+                f"{file.name} is {size[0]}x{size[1]}, the sequence began with {self._stored[0]}x{self._stored[1]}.",
                 "All pictures of a sequence need one size.",
             )
-        roi = oiio.ROI(
-            spec.full_x,
-            spec.full_x + spec.full_width,
-            spec.full_y,
-            spec.full_y + spec.full_height,
-            0,
-            1,
-            0,
-            spec.nchannels,
-        )
+        wanted = [*layer.channels] if layer.alpha is None else [*layer.channels, layer.alpha]
+        first, beyond = min(wanted), max(wanted) + 1
+        x, y = spec.full_x, spec.full_y
+        roi = oiio.ROI(x, x + size[0], y, y + size[1], 0, 1, first, beyond)
         kind = oiio.FLOAT if self.info.deep else oiio.UINT8
         pixels = None if buffer.has_error else buffer.get_pixels(kind, roi)
         if pixels is None or buffer.has_error:
             raise OSError(f"{file}: {buffer.geterror()}")
-        rgb = np.asarray(pixels)[..., _rgb_channels(spec)]
-        if not self.info.deep:
-            return np.ascontiguousarray(rgb), 0.0
-        rgb = np.nan_to_num(rgb, nan=0.0, posinf=65504.0, neginf=0.0)
+        pixels = np.asarray(pixels)
+        rgb = pixels[..., [c - first for c in layer.channels]]
+        inner = _data_window(spec)
+        met.cropped |= inner != (slice(0, size[1]), slice(0, size[0]))
+        if layer.alpha is not None:
+            alpha = pixels[..., layer.alpha - first]
+            opaque = 1.0 if self.info.deep else 255
+            met.transparent |= bool((alpha[inner] < opaque).any())
+            if not spec.get_int_attribute("oiio:UnassociatedAlpha"):
+                rgb = _straight(rgb, alpha, opaque)
         clipped = 0.0
-        if self.info.colour == "linear":
-            clipped = float((rgb > 1.0).any(axis=-1).mean())
-            rgb = linear_to_srgb(rgb)
-        return np.rint(np.clip(rgb, 0.0, 1.0) * 65535.0).astype(np.uint16), clipped
+        if self.info.deep:
+            rgb, clipped = self._space.to_srgb(rgb)
+            rgb = np.rint(rgb * np.float32(65535.0)).astype(np.uint16)
+        return resize(np.ascontiguousarray(rgb), self.info.width, self.info.height), clipped
+
+    def _same_layer(self, file: Path) -> Layer:
+        """Where the sequence's layer lies in a file whose channels are others than the first one's."""
+        layer = find_layer(file, self._layer.name)[0]
+        if layer.name != self._layer.name:
+            raise footage_error(
+                f"{file.name} has no layer {shown(self._layer.name)}, with which the sequence began.",
+                "All pictures of a sequence need the same layers.",
+            )
+        return layer
 
 
-def _is_linear(file: Path, spec: oiio.ImageSpec) -> bool:
-    space = str(spec.getattribute("oiio:ColorSpace") or "").lower()
-    if space.startswith("srgb") or ("rec709" in space and "lin" not in space):
-        return False
-    return "lin" in space or str(spec.format) in ("half", "float", "double") or file.suffix.lower() in (".exr", ".hdr")
+@dataclass
+class _Met:
+    """What the pictures read so far had that is not taken."""
+
+    transparent: bool = False
+    cropped: bool = False
 
 
-def _rgb_channels(spec: oiio.ImageSpec) -> list[int]:
-    """Indices of red, green and blue, whatever the order and the layer; one channel is taken three times."""
-    names = list(spec.channelnames)
-    for prefix in ("", *dict.fromkeys(n.rpartition(".")[0] + "." for n in names if "." in n)):
-        wanted = [prefix + c for c in "RGB"]
-        if all(w in names for w in wanted):
-            return [names.index(w) for w in wanted]
-    return [0, 1, 2] if spec.nchannels >= 3 else [0, 0, 0]
+_AS_STORED = oiio.ImageSpec()
+_AS_STORED.attribute("oiio:UnassociatedAlpha", 1)
+"""Colour is not to be multiplied by alpha where the file has not done so."""
+
+
+def _open(file: Path, part: int) -> oiio.ImageBuf:
+    return oiio.ImageBuf(str(file), part, 0, _AS_STORED)
+
+
+def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:
+    """Rows and columns of the picture's frame that the file holds."""
+    left, top = spec.x - spec.full_x, spec.y - spec.full_y
+    rows = slice(min(max(0, top), spec.full_height), max(0, min(spec.full_height, top + spec.height)))
+    return rows, slice(min(max(0, left), spec.full_width), max(0, min(spec.full_width, left + spec.width)))
+
+
+def _straight(rgb: NDArray, alpha: NDArray, opaque: float) -> NDArray:
+    """Colour [H, W, 3] that was multiplied by alpha [H, W] without it; as it stands where alpha is 0 (pure light)."""
+    covered = (alpha > 0) & (alpha < opaque)
+    if not covered.any():
+        return rgb
+    weight = np.where(covered, alpha / np.float32(opaque), np.float32(1.0)).astype(np.float32)[..., None]
+    colour = rgb / weight
+    return colour if rgb.dtype == np.float32 else np.rint(np.clip(colour, 0, opaque)).astype(rgb.dtype)
+
+
+def _pixel_aspect(spec: oiio.ImageSpec) -> Fraction:
+    """Width of a pixel over its height; 1 where the file does not say."""
+    value = spec.getattribute("PixelAspectRatio")
+    if not isinstance(value, (int, float)) or not np.isfinite(value) or value <= 0 or abs(value - 1.0) < 1e-3:
+        return Fraction(1)
+    return Fraction(value).limit_denominator(10_000)
+
+
+def _input_space(file: Path, spec: oiio.ImageSpec, warnings: list[tuple[str, str]]) -> InputSpace:
+    """What the numbers of a picture mean, as its file says or, if it does not, as such files mostly mean it."""
+    suffix, name = file.suffix.lower(), str(spec.getattribute("oiio:ColorSpace") or "")
+    if suffix in (".dpx", ".cin"):
+        return _film_space(suffix, str(spec.getattribute("dpx:Transfer") or ""), warnings)
+    named = named_space(name)
+    primaries = spec.getattribute("chromaticities")
+    if isinstance(primaries, tuple) and len(primaries) == 8 and (named is None or named.transfer == "lin"):
+        try:
+            return space_of_chromaticities(primaries)
+        except ValueError:
+            warnings.append((f"The chromaticities in {file.name} are impossible: Rec.709 is assumed.", ""))
+    if named is not None:
+        return named
+    is_light = str(spec.format) in ("half", "float", "double") or suffix in (".exr", ".hdr")
+    assumed = InputSpace("lin" if is_light or "lin" in name.lower() else "srgb", told=False)
+    if name and name.lower() not in ("unknown", "data"):
+        warnings.append(
+            (
+                f"The pictures' colour space {name!r} is not known here: taken as {assumed.name}.",
+                "Convert them to sRGB or scene-linear Rec.709 if the picture looks wrong.",
+            )
+        )
+    return assumed
+
+
+def _film_space(suffix: str, transfer: str, warnings: list[tuple[str, str]]) -> InputSpace:
+    """Of DPX and Cineon files, which hold anything from a film scan to video."""
+    if suffix == ".cin" or transfer in ("Printing density", "Logarithmic"):
+        warnings.append(
+            (
+                "The pictures are Cineon log: read with black at code 95, white at 685 and Rec.709 primaries.",
+                "Convert them to scene-linear EXR if they are another log.",
+            )
+        )
+        return InputSpace("cineon")
+    if transfer == "Linear":
+        return InputSpace("lin")
+    if transfer.startswith(("SMPTE", "ITU", "Composite")):
+        return InputSpace("g24")
+    warnings.append(
+        (
+            "The pictures do not say how their colour is encoded: taken as Rec.709 video, not as log.",
+            "Convert them to scene-linear EXR if they look flat.",
+        )
+    )
+    return InputSpace("g24", told=False)

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
 from ..contract import ExitCode, JobError
+
+LONGEST_PIXEL = 4
+"""Anamorphic pixels are at most about 2 times as wide as high."""
+
+
+SLOWEST_FPS, FASTEST_FPS = 0.1, 1000.0
+"""Rates of image sequences that are believed: what else a file or a person says is a slip."""
 
 
 @dataclass
@@ -45,9 +54,11 @@ class SourceInfo:
     deep: bool
     """True if working frames keep 16 bits."""
     colour: str
-    """srgb, or linear for scene-linear pictures."""
+    """srgb, or linear for pictures that hold light: scene-linear, log, HDR."""
     key: list
     """What tells this footage from another: names, sizes, modification times."""
+    reading: dict[str, Any] = field(default_factory=dict)
+    """How it is read, and what of that was assumed: the record in frames.json says so."""
 
 
 class Source(Protocol):
@@ -79,8 +90,25 @@ def frame_words(numbers: Sequence[int]) -> str:
     return ("frame " if len(numbers) == 1 else "frames ") + ", ".join(listed[:8]) + more
 
 
-def open_source(source: str, fps: float = 0.0) -> Source:
-    """Opens a video file, a folder or file or pattern of a numbered sequence. `fps` overrides a sequence's rate.
+def believable_aspect(aspect: Fraction, warnings: list[tuple[str, str]]) -> Fraction:
+    """Width of a pixel over its height; 1, with a warning, if no camera or lens has such pixels."""
+    if 1 / LONGEST_PIXEL <= aspect <= LONGEST_PIXEL:
+        return aspect
+    warnings.append((f"The footage claims pixels {float(aspect):g} times as wide as high: taken as square.", ""))
+    return Fraction(1)
+
+
+def square_size(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
+    """Size of a picture once its pixels, `aspect` times as wide as high, are square; neither side shrinks."""
+    if aspect >= 1:
+        return max(1, round(width * aspect)), height
+    return width, max(1, round(height / aspect))
+
+
+def open_source(source: str, fps: float = 0.0, layer: str = "") -> Source:
+    """Opens a video file, a folder or file or pattern of a numbered sequence.
+
+    `fps` overrides a sequence's rate, `layer` names the layer of its pictures to take.
 
     JobError in one sentence for what is missing, empty, or no footage at all.
     """
@@ -92,11 +120,24 @@ def open_source(source: str, fps: float = 0.0) -> Source:
             "No footage was given.", "Choose a video file, a picture of a numbered sequence, or a folder."
         )
     path = Path(source)
-    is_pattern = not path.exists() and any(mark in path.name for mark in ("#", "%", "@", "*"))
-    if is_pattern or path.is_dir() or path.suffix.lower() in PICTURES:
-        return SequenceSource(find_sequence(path), fps)
+    try:
+        is_pattern = not path.exists() and any(mark in path.name for mark in ("#", "%", "@", "*"))
+        if path.is_dir():
+            os.listdir(path)
+    except (OSError, ValueError) as error:  # no permission, too long a name, a zero byte in it
+        reason = getattr(error, "strerror", None) or error
+        raise footage_error(f"The footage {source!r} cannot be opened: {reason}.", "Check the path.") from error
+    special = path.exists() and not path.is_file() and not path.is_dir()
+    if is_pattern or path.is_dir() or (path.suffix.lower() in PICTURES and not special):
+        return SequenceSource(find_sequence(path), fps, layer)
+    if special:
+        raise footage_error(f"{source} is neither a file nor a folder.", "Choose a video file or an image sequence.")
     if not path.is_file():
         raise footage_error(
             f"The footage {source} does not exist.", "Check the path; a clip on a server must be mounted."
         )
-    return VideoSource(path)
+    video = VideoSource(path)
+    for value, what, own in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
+        if value:
+            video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {own}.", ""))
+    return video

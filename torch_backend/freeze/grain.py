@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..footage.color import srgb_to_linear
-from ..footage.images import read_png
+from ..footage.images import read_frame
 
 BINS = 8
 """Brightness levels that grain is measured at."""
@@ -66,9 +66,9 @@ class Grain:
 
 
 def measure_plate(files: Sequence[Path]) -> Grain:
-    """Grain of a plate from up to `SAMPLED` of its PNG frames, spread over it. ValueError if one cannot be read."""
+    """Grain of a plate from up to `SAMPLED` of its PNG frames, spread over it. JobError if one cannot be read."""
     picked = np.unique(np.linspace(0, len(files) - 1, SAMPLED).round().astype(int)) if files else ()
-    return measure([read_png(files[i]) for i in picked])
+    return measure([read_frame(files[i]) for i in picked])
 
 
 def measure(frames: Sequence[NDArray]) -> Grain:

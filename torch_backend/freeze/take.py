@@ -16,8 +16,8 @@ from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, R
 from ..footage.color import premultiplied_srgb_to_linear
 from ..footage.images import read_png
 from ..gaussians.ply import write_ply
-from ..scene import Scene, load_scene
-from ..shot import Shot, content_key, disk_error, is_disk_full, need_disk, write_json
+from ..scene import Scene, frame_table, load_scene
+from ..shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, write_json
 from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
 from ..train.run import save_png
@@ -59,7 +59,9 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     width, height = output_size(scene, run, params)
     whole = plan(scene, params, t_star, width, height)
     frames = in_range(whole, params)
-    folder = shot.take(params.take)
+    folder = shot.own(shot.take(params.take))
+    for inner in ("preview", TAKE_REDISTORT.parent):
+        shot.own(folder / inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
     grain = plate_grain(shot, scene) if params.grain else None
     # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
@@ -73,9 +75,14 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     try:
         _render_all(folder, frames, done, scene, look, keys, report)
         there = done | {f.frame for f in frames}
-        return _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, report)
+        facts = _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, report)
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
+    if run.stale:
+        report.warning(
+            "The run was trained while it was frozen: the take shows what it was before.", "Freeze it again."
+        )
+    return facts
 
 
 @dataclass
@@ -110,7 +117,7 @@ class Look:
         """Identifies what a frame shows and from what, to tell stale frames from good ones."""
         return content_key(
             TAKE_VERSION,
-            self.run.folder / "checkpoint.safetensors",
+            self.run.stamp,
             self.query,
             self.size,
             None if self.grain is None else [self.grain.to_json(), self.grain_size],
@@ -132,8 +139,8 @@ def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams
     """The frame to freeze at, snapped to a trained one: a time that no frame constrains is a guess."""
     trained = np.array(run.train_frames)
     if params.t_star is None:
-        table = {row["frame"]: row for row in read_json(shot.frames / "frames.json")["frames"]}
-        sharpness = np.array([float(table[int(f)].get("sharpness", 0.0)) for f in trained])
+        table = frame_table(shot)
+        sharpness = np.array([table[int(f)]["sharpness"] if int(f) in table else 0.0 for f in trained])
         times = np.array([scene.time_of_frame(f) for f in trained])
         return int(trained[suggest_t_star(run.model, times, sharpness)])
     if not scene.frames[0] <= params.t_star <= scene.frames[-1]:
@@ -178,7 +185,7 @@ def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFram
     numbers = [f.frame for f in frames]
     first = numbers[0] if params.first is None else params.first
     last = numbers[-1] if params.last is None else params.last
-    asked = set(range(first, last + 1, max(1, params.step)))
+    asked = range(first, last + 1, max(1, params.step))
     chosen = [f for f in frames if f.frame in asked]
     if not chosen:
         raise JobError(
@@ -211,7 +218,7 @@ def take_key(
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
         TAKE_VERSION,
-        run.folder / "checkpoint.safetensors",
+        run.stamp,
         t_star,
         params.t_star_per_frame,
         params.query,
@@ -227,8 +234,14 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams)
 
     A frame that is not asked for now stays if it is right: a part of the range does not undo the rest of the take.
     """
-    (folder / "preview").mkdir(parents=True, exist_ok=True)
     state = folder / "state.json"
+    if not state.is_file() and frames_in([*folder.glob("*.exr"), *(folder / "preview").glob("*.png")]):
+        raise JobError(
+            f"{folder} holds numbered pictures that were not made here.",
+            "Name another take, or move them away.",
+            ExitCode.FREEZE,
+        )
+    make_folder(folder / "preview")
     # Frames without a key of their own are of before grain, too.
     old_are_right = not params.grain and state.is_file() and read_json(state).get("key") == key
     done = set()

@@ -3,7 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .solving import SolveConfig, SolveResult, load_points, solve_shot
+    from .solving import SolveConfig, SolveResult, solve_shot
+    from .stored import load_points
 
 __all__ = ["SolveConfig", "SolveResult", "load_points", "solve_shot"]
 

@@ -12,7 +12,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from ..contract import ExitCode, JobError, Reporter
+from ..contract import ExitCode, JobError, Reporter, python_child
 from ..shot import need_disk
 
 _POLL_SECONDS = 0.2
@@ -30,14 +30,18 @@ def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
     that is full) if it dies by itself, with the end of COLMAP's log, which is kept in `log`.
     """
     package_root = Path(__file__).resolve().parents[2]
-    environment = dict(os.environ)
-    # A caller's folder must be found by the child as well, whatever this process was started from.
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(package_root), environment.get("PYTHONPATH", "")]))
+    environment = {**os.environ, "PYTHONSAFEPATH": "1"}
+    # This package must be found by the child as well, whatever this process was started from. An empty or relative
+    # entry would be the folder that the child stands in.
+    inherited = [p for p in environment.get("PYTHONPATH", "").split(os.pathsep) if os.path.isabs(p)]
+    environment["PYTHONPATH"] = os.pathsep.join([str(package_root), *inherited])
     # Threads that spin while they wait take the core from whoever shares it.
     environment.setdefault("OMP_WAIT_POLICY", "passive")
+    command = python_child(sys.executable, "torch_backend.solve.worker", str(request.absolute()))
     with open(log, "wb") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "torch_backend.solve.worker", str(request)],
+            command["args"],
+            cwd=command["cwd"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,

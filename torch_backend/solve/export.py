@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..contract import CameraPath, ExitCode, JobError, frame_file
 from ..shot import Shot, write_atomic, write_json
 from .colmap_files import PARTS, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints, write_model
+from .stored import load_cameras, load_points
 
 FORMATS = ("colmap", "nerfstudio")
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -39,11 +40,7 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False) -> l
     """
     if kind not in FORMATS:
         raise ValueError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
-    if not (shot.solve / "cameras.json").is_file() or not (shot.solve / "points.npz").is_file():
-        raise JobError(f"{shot.root.name} has no cameras yet.", "Solve the camera first.", ExitCode.SOLVE)
-    path = CameraPath.load(shot.solve / "cameras.json")
-    with np.load(shot.solve / "points.npz", allow_pickle=False) as stored:
-        points = {name: stored[name] for name in ("xyz", "rgb", "error")}
+    path, points = load_cameras(shot), load_points(shot)
     if kind == "nerfstudio":
         return _write_transforms(shot, path, points, folder)
     other = [folder / (part + (".bin" if text else ".txt")) for part in PARTS]

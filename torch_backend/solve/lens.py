@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraPath, ExitCode, JobError, read_json
+from ..contract import ExitCode, JobError
 from ..shot import Shot
+from .stored import load_cameras, load_record
 
 _EXTRA = {
     "SIMPLE_PINHOLE": (),
@@ -30,6 +31,44 @@ _DONE_PX = 1e-9
 _WRONG_PX = 1e-6
 _ALONG = 24
 """Points on each line from the middle to the border at which the picture is tested for a fold."""
+
+
+NARROWEST_DEG, WIDEST_DEG = 12.0, 130.0
+"""Angle of view along the longer side that a clip's lens is believed to have: 171 mm to 8.4 mm on full frame. A focal
+length that nothing in the clip holds runs off beyond them."""
+LEAST_DEG, MOST_DEG = 5.0, 150.0
+"""Beyond these it is refused: 412 mm, 4.8 mm."""
+_MOST_STRETCH = 2.0
+"""How much farther from the middle than straight lines have it a corner may lie, or how much less far."""
+
+
+def view_deg(width: int, height: int, focal: float) -> float:
+    """Angle of view in degrees along the longer side of a pinhole camera; 0 or 180 where there is no focal length."""
+    if not np.isfinite(focal) or focal <= 0:
+        return 0.0
+    return float(np.degrees(2.0 * np.arctan(0.5 * max(width, height) / focal)))
+
+
+def doubtful(width: int, height: int, focal: tuple[float, float], k1: float, k2: float = 0.0) -> str:
+    """Why a lens that a solve found cannot be right: "narrow", "wide", "bent", or "" if it can.
+
+    `focal` is fx, fy in pixels. A lens is bent if its radial terms fold the picture over before its corner, or stretch
+    the corner out of all measure, or if its pixels are far from square.
+    """
+    angle = view_deg(width, height, 0.5 * (focal[0] + focal[1]))
+    if not angle >= NARROWEST_DEG:
+        return "narrow"
+    if angle > WIDEST_DEG:
+        return "wide"
+    corner = float(np.hypot(0.5 * width / focal[0], 0.5 * height / focal[1]))
+    ideal = np.linspace(0.0, _MOST_STRETCH * corner, 1024)
+    at = ideal * (1.0 + k1 * ideal**2 + k2 * ideal**4)
+    falls = np.flatnonzero(np.diff(at) <= 0.0)
+    reached = np.flatnonzero(at >= corner)
+    folds = not len(reached) or (len(falls) > 0 and falls[0] < reached[0])
+    if folds or ideal[reached[0]] * _MOST_STRETCH < corner or not 0.8 < focal[0] / focal[1] < 1.25:
+        return "bent"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -139,12 +178,9 @@ class Lens:
 
 def load_lens(shot: Shot) -> Lens:
     """The lens of a solved shot, from solve.json and cameras.json. JobError (SOLVE) if they do not tell it."""
-    record, cameras = shot.solve / "solve.json", shot.solve / "cameras.json"
-    if not (record.is_file() and cameras.is_file()):
-        raise JobError(f"{shot.root.name} has no cameras yet.", "Run the camera step first.", ExitCode.SOLVE)
-    told, path = read_json(record), CameraPath.load(cameras)
+    told, path = load_record(shot), load_cameras(shot)
     model, extra, focal = told.get("camera_model"), told.get("distortion"), told.get("focal_px")
-    if model is None or extra is None or not focal or not path.frames:
+    if model is None or extra is None or not focal:
         raise JobError(
             f"The solve of {shot.root.name} does not tell its lens.", "Solve the camera again.", ExitCode.SOLVE
         )

@@ -13,17 +13,20 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, read_json
+from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, open_regular
 from ..footage import load_frames
-from ..footage.images import read_png, write_png
+from ..footage.images import is_whole_png, read_frame, write_png
 from ..footage.sources import frame_words
-from ..shot import Shot, atomic_path, content_key, need_disk, write_json
+from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, write_json
 from . import foreign
 from .child import run_worker
 from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
+from .lens import LEAST_DEG, MOST_DEG, view_deg
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
+from .replacing import Staged, replacing_solve, settle_solve
+from .stored import load_cameras, load_points, load_record
 from .undistort import Undistorter
 
 SOLVE_VERSION = 1
@@ -32,6 +35,7 @@ LEAST_REGISTERED = 8
 REFUSED_SHARE = 0.5
 GOOD_SHARE, GOOD_ERROR_PX = 0.95, 1.2
 _WRITERS = 2
+_LOG_END_BYTES = 16_384
 
 
 @dataclass
@@ -78,7 +82,8 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 
     Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
     contract.CameraPath in COLMAP's world ("solve units"), OpenCV axes, world-to-camera, pinhole of the undistorted
-    frames. A shot already solved from the same frames with the same configuration is left alone.
+    frames. They take the place of a solve of before when all of them are written; until then, and if this one fails,
+    that one stays. A shot already solved from the same frames with the same configuration is left alone.
 
     With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
     its world, frames without one interpolated.
@@ -86,41 +91,50 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
     _check(config)
+    for folder in (shot.frames, shot.solve / "colmap"):  # where files of before are replaced
+        shot.own(folder)
+    settle_solve(shot)
     frames = load_frames(shot)
     source = [foreign.fingerprint(cameras)] if cameras else []
-    key = content_key(SOLVE_VERSION, config, frames["key"], *source)
+    key = content_key(SOLVE_VERSION, config, frames.get("key"), *source)
     done = _finished(shot, frames, key)
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
         return done["result"]
-    taken = prepare(frames, cameras, report) if cameras else None  # before anything is thrown away
-    for name in ("solve.json", "cameras.json"):
-        (shot.solve / name).unlink(missing_ok=True)
+    _refuse_damaged(shot, frames)
+    taken = prepare(frames, cameras, report) if cameras else None
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
     size = sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
     need_disk(shot.root, 1.2 * size + (len(frames["frames"]) << 20), "The camera solve")
     scratch = shot.solve / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
+    make_folder(scratch)
     try:
         if taken is None:
             answer = _ask_worker(shot, frames, config, scratch, report)
         else:
             options = {"overlap": config.overlap, "features": config.features}
             answer = take_over(shot, frames, taken, options, scratch, report)
-        result = _finish(shot, frames, answer, scratch, config, key, report)
+        with replacing_solve(shot) as staged:
+            result = _finish(shot, frames, answer, scratch, staged, key, report)
+    except JobError as error:
+        error.add_note(_log_end(shot.solve / "colmap.log"))
+        raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    report.metric("solve", dict(result))
     return result
 
 
-def load_points(shot: Shot) -> dict[str, NDArray]:
-    """points.npz: xyz float32 [P, 3] solve units, rgb uint8 [P, 3], error float32 [P] px, track uint16 [P]."""
-    path = shot.solve / "points.npz"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: solve the shot first")
-    with np.load(path, allow_pickle=False) as data:
-        return {name: data[name] for name in ("xyz", "rgb", "error", "track")}
+def _log_end(log: Path) -> str:
+    """What COLMAP said last, for the job's own log."""
+    try:
+        with open_regular(log) as handle:
+            handle.seek(max(0, os.fstat(handle.fileno()).st_size - _LOG_END_BYTES))
+            end = handle.read().decode("utf-8", errors="replace")
+    except (OSError, ValueError):
+        return ""
+    return f"The end of {log}:\n{end}"
 
 
 def _check(config: SolveConfig) -> None:
@@ -134,13 +148,28 @@ def _check(config: SolveConfig) -> None:
 
 
 def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | None:
-    path = shot.solve / "solve.json"
-    if not path.is_file():
+    """solve.json if it is of this key and the solve is whole: to solve again is how a damaged one is mended."""
+    try:
+        record = load_record(shot)
+        if record.get("key") != key or not isinstance(record.get("result"), dict):
+            return None
+        load_cameras(shot)
+        load_points(shot)
+    except (JobError, ValueError):
         return None
-    record = read_json(path)
-    needed = [shot.solve / "cameras.json", shot.solve / "points.npz"]
-    needed += [shot.frames / frame_file(f["frame"], ".png") for f in frames["frames"]]
-    return record if record.get("key") == key and all(p.is_file() for p in needed) else None
+    plates = [shot.frames / frame_file(f["frame"], ".png") for f in frames["frames"]]
+    return record if all(is_whole_png(p) for p in plates) else None
+
+
+def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
+    """JobError (FOOTAGE) if a frame cannot be read: COLMAP would leave it out, and say so in its log alone."""
+    bad = [f["frame"] for f in frames["frames"] if not is_whole_png(shot.frames / f["file"])]
+    if bad:
+        raise JobError(
+            f"Damaged or missing in {shot.frames / 'raw'}: {frame_words(bad)}.",
+            "Import the clip again.",
+            ExitCode.FOOTAGE,
+        )
 
 
 def _ask_worker(
@@ -181,17 +210,20 @@ def _failure(answer: dict[str, Any]) -> JobError:
     )
 
 
-def refuse_poor(answer: dict[str, Any], solved: int) -> None:
-    """JobError for a model that nothing could be trained on."""
+def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
+    """JobError for a model that nothing could be trained on; `frames` is frames.json, whose solved frames it is of."""
+    solved = [f["frame"] for f in frames["frames"] if f["solve"]]
     registered, angle = answer["registered"], answer["triangulation_angle_deg"]
-    if registered < min(LEAST_REGISTERED, solved) or registered < REFUSED_SHARE * solved:
-        sizes = [size for size in answer["model_sizes"] if size >= LEAST_REGISTERED]
-        parts = f" (it falls into {len(sizes)} parts that do not connect)" if len(sizes) > 1 else ""
+    if registered < min(LEAST_REGISTERED, len(solved)) or registered < REFUSED_SHARE * len(solved):
+        parts = [_spans(solved, part) for part in answer["parts"] if len(part) >= LEAST_REGISTERED]
+        apart = f"; {len(parts)} parts of the clip do not connect" if len(parts) > 1 else ""
+        worked = f": {_span_words(parts[0])}" if parts else ""
         raise JobError(
-            f"Cameras were found for only {registered} of {solved} frames{parts}.",
-            "Choose a range without fast pans or blur, or a smaller step.",
+            f"Cameras were found for only {registered} of {len(solved)} frames{worked}{apart}.",
+            _range_hint(parts, solved, frames["step"]),
             ExitCode.SOLVE,
         )
+    _refuse_lens(answer)
     refuse_narrow(angle)
     if answer["points"] < LEAST_POINTS:
         raise JobError(
@@ -201,19 +233,88 @@ def refuse_poor(answer: dict[str, Any], solved: int) -> None:
         )
 
 
+def _refuse_lens(answer: dict[str, Any]) -> None:
+    """JobError for a lens that no camera has."""
+    lens = answer["lens"]
+    angle = view_deg(lens["width"], lens["height"], answer["focal_px"])
+    if not LEAST_DEG <= angle <= MOST_DEG:
+        raise JobError(
+            f"The solve found a lens that no camera has: {angle:.1f} degrees wide ({answer['focal_px']:.0f} px).",
+            "Choose a longer range, in which the camera travels more and less of the picture moves by itself.",
+            ExitCode.SOLVE,
+        )
+
+
+def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
+    """(sentence, hint) for a lens that is doubtful, or was put in the place of one that is."""
+    lens = answer["lens"]
+    found, taken = (view_deg(lens["width"], lens["height"], px) for px in (lens["found_px"], answer["focal_px"]))
+    if lens["held"]:
+        off = "found one that folds the picture over" if lens["doubt"] == "bent" else f"ran off to {found:.0f} degrees"
+        return [
+            (
+                f"The clip does not tell its lens (the solve {off}): a usual one of {taken:.0f} degrees was taken.",
+                "Depth may look stretched; a range in which the camera travels more tells the lens.",
+            )
+        ]
+    if lens["doubt"] == "bent":
+        return [
+            (
+                "The lens that the solve found bends the picture more than lenses do, or folds it over at its corners.",
+                "Try the other camera model; a range in which the camera travels more tells the lens.",
+            )
+        ]
+    if lens["doubt"]:
+        return [
+            (
+                f"The lens that the solve found is unusual: {taken:.0f} degrees wide.",
+                "If yours is not, choose a range in which the camera travels more.",
+            )
+        ]
+    return []
+
+
+def _spans(solved: list[int], names: list[str]) -> list[tuple[int, int, int]]:
+    """(first, last, how many) of each unbroken row of `solved` frames whose pictures are among `names`."""
+    placed = {int(Path(name).stem) for name in names}
+    spans: list[tuple[int, int, int]] = []
+    before = False
+    for frame in solved:
+        if frame in placed:
+            first, count = (spans[-1][0], spans[-1][2]) if before else (frame, 0)
+            spans[-1 if before else len(spans) :] = [(first, frame, count + 1)]
+        before = frame in placed
+    return spans
+
+
+def _span_words(spans: list[tuple[int, int, int]]) -> str:
+    """'12 to 41, 60 to 74', the longest four of them, in the clip's order."""
+    longest = sorted(sorted(spans, key=lambda span: span[2], reverse=True)[:4])
+    return ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last, _ in longest)
+
+
+def _range_hint(parts: list[list[tuple[int, int, int]]], solved: list[int], step: int) -> str:
+    """What can help: a range that worked, and a smaller step only where there is one."""
+    best = max((span for part in parts for span in part), key=lambda span: span[2], default=(0, 0, 0))
+    smaller = " A smaller step shows more of each to the next." if step > 1 else ""
+    if best[2] < LEAST_REGISTERED or best[2] == len(solved):
+        return f"Choose a range without fast pans or blur.{smaller}"
+    return f"Frames {best[0]} to {best[1]} worked: import that range, or one without fast pans or blur.{smaller}"
+
+
 def _finish(
     shot: Shot,
     frames: dict[str, Any],
     answer: dict[str, Any],
     scratch: Path,
-    config: SolveConfig,
+    staged: Staged,
     key: str,
     report: Reporter,
 ) -> SolveResult:
-    """Checks the worker's answer and writes the solve's files, solve.json last."""
+    """Checks the worker's answer and writes the solve's files to where they wait until they are whole."""
     solved = sum(f["solve"] for f in frames["frames"])
     if "given" not in answer:
-        refuse_poor(answer, solved)
+        refuse_poor(answer, frames)
     poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
     maps = [scratch / f"undistort_{n}.npz" for n in range(1 + max(p.get("lens", 0) for p in poses.values()))]
     path, lenses = _camera_path(frames, poses, [_pinhole(file) for file in maps])
@@ -221,14 +322,14 @@ def _finish(
         points = filter_points({name: data[name] for name in data.files}, _centres(path))
     if "given" in answer:
         refuse_misfit(answer, len(points["xyz"]))
-    _undistort_all(shot, frames, lenses, maps, report)
-    with atomic_path(shot.solve / "points.npz") as beside:
+    _undistort_all(shot, frames, lenses, maps, staged.frames, report)
+    with atomic_path(staged.solve / "points.npz") as beside:
         np.savez(beside, **points)  # pyright: ignore[reportArgumentType]
-    shutil.rmtree(shot.solve / "colmap", ignore_errors=True)
-    (scratch / "model").rename(shot.solve / "colmap")
-    write_json(shot.solve / "cameras.json", path.to_json())
+    (scratch / "model").rename(staged.solve / "colmap")
+    write_json(staged.solve / "cameras.json", path.to_json())
     result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
-    warnings = _warnings(frames, path, result, "given" in answer) + doubts(answer)
+    warnings = _warnings(frames, path, result, "given" in answer)
+    warnings += doubts(answer) if "given" in answer else lens_remarks(answer)
     for message, hint in warnings:
         report.warning(message, hint)
     record = {
@@ -250,8 +351,7 @@ def _finish(
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,
     }
-    write_json(shot.solve / "solve.json", record)
-    report.metric("solve", dict(result))
+    write_json(staged.solve / "solve.json", record)
     return result
 
 
@@ -271,7 +371,7 @@ def _camera_path(
     names = [Path(f["file"]).name for f in listed]
     known = {i: np.array(poses[name]["pose"]) for i, name in enumerate(names) if name in poses}
     filled = fill_poses(np.array([f["seconds"] for f in listed]), known)
-    nearest = [min(known, key=lambda k: abs(k - i)) for i in range(len(names))]
+    nearest = _nearest(sorted(known), len(names))
     lenses = [int(poses[names[k]].get("lens", 0)) for k in nearest]
     cameras = []
     for frame, name, pose, lens in zip(listed, names, filled, lenses, strict=True):
@@ -281,27 +381,42 @@ def _camera_path(
     return CameraPath(frames["width"], frames["height"], cameras), lenses
 
 
+def _nearest(known: list[int], count: int) -> list[int]:
+    """The nearest of some ascending indices to each of 0 to `count` - 1; of two as near the lower."""
+    spots = np.array(known)
+    every = np.arange(count)
+    above = np.searchsorted(spots, every).clip(0, len(spots) - 1)
+    below = (above - 1).clip(0)
+    return np.where(every - spots[below] <= spots[above] - every, spots[below], spots[above]).tolist()
+
+
 def _centres(path: CameraPath) -> NDArray[np.float64]:
     return np.array([camera_centre(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
 
 
-def _undistort_all(shot: Shot, frames: dict[str, Any], lenses: list[int], maps: list[Path], report: Reporter) -> None:
-    """Writes the undistorted frames, lens by lens: a map takes 128 bytes per pixel."""
+def _undistort_all(
+    shot: Shot, frames: dict[str, Any], lenses: list[int], maps: list[Path], into: Path, report: Reporter
+) -> None:
+    """Writes the undistorted frames to a folder, lens by lens: a map takes 128 bytes per pixel."""
     done = 0
     for number, file in enumerate(maps):
         rows = [frame for frame, lens in zip(frames["frames"], lenses, strict=True) if lens == number]
         if rows:
-            _undistort(shot, rows, file, done, len(lenses), report)
+            _undistort(shot, rows, file, into, (done, len(lenses)), report)
         done += len(rows)
 
 
-def _undistort(shot: Shot, listed: list[dict[str, Any]], file: Path, before: int, total: int, report: Reporter) -> None:
+def _undistort(
+    shot: Shot, listed: list[dict[str, Any]], file: Path, into: Path, counts: tuple[int, int], report: Reporter
+) -> None:
+    """Frames of one lens; `counts` are the frames done before these, and all there are."""
+    before, total = counts
     with np.load(file, allow_pickle=False) as data:
         undistort = Undistorter(data["where"])
 
     def one(frame: dict[str, Any]) -> int:
-        pixels = read_png(shot.frames / frame["file"])
-        write_png(shot.frames / frame_file(frame["frame"], ".png"), undistort(pixels))
+        pixels = read_frame(shot.frames / frame["file"])
+        write_png(into / frame_file(frame["frame"], ".png"), undistort(pixels))
         return frame["frame"]
 
     with ThreadPoolExecutor(_WRITERS) as pool:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +18,39 @@ from ..contract import ExitCode, JobError, check_version
 from ..shot import atomic_path
 
 CHECKPOINT_VERSION = 1
+CHECKPOINT_FILE = "checkpoint.safetensors"
+"""Of a run, in its folder."""
+
+
+_DAMAGED = (SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError)
+"""What reading a file that is no checkpoint of ours raises."""
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-    """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then."""
+    """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then.
+
+    OSError if it cannot be written (errno ENOSPC when the disk is full).
+    """
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"version": CHECKPOINT_VERSION, **meta}, allow_nan=False)
     with atomic_path(path) as beside:
-        save_file(contiguous, str(beside), metadata={"splannequin": text})
+        try:
+            save_file(contiguous, str(beside), metadata={"splannequin": text})
+        except SafetensorError as error:  # it hands the system's reason on in words: "... (os error 28)"
+            code = int(told[1]) if (told := re.search(r"os error (\d+)", str(error))) else errno.EIO
+            windows = (code,) if os.name == "nt" else ()
+            raise OSError(code, f"checkpoint not written: {error}", str(path), *windows) from error
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """(tensors, facts). JobError in words if the file is damaged or from a newer version."""
     try:
         with safe_open(str(path), framework="pt", device="cpu") as stored:
-            meta = json.loads((stored.metadata() or {})["splannequin"])
+            meta = _facts(stored)
             check_version(meta, str(path), CHECKPOINT_VERSION)
             # Copies: views of the mapped file would keep Windows from replacing it at the next save.
             return {name: stored.get_tensor(name).clone() for name in stored.keys()}, meta  # noqa: SIM118 - not a dict
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+    except _DAMAGED as error:
         raise JobError(
             f"The checkpoint {path} cannot be read ({type(error).__name__}).",
             "Train the run again with --restart.",
@@ -45,9 +62,17 @@ def read_meta(path: Path) -> dict[str, Any]:
     """The facts of a checkpoint without its tensors; empty if the file is damaged."""
     try:
         with safe_open(str(path), framework="pt", device="cpu") as stored:
-            return json.loads((stored.metadata() or {})["splannequin"])
-    except (SafetensorError, KeyError, json.JSONDecodeError):
+            return _facts(stored)
+    except _DAMAGED:
         return {}
+
+
+def _facts(stored: Any) -> dict[str, Any]:
+    """What an open file says of itself. One of `_DAMAGED` if that is no object of JSON."""
+    facts = json.loads((stored.metadata() or {})["splannequin"])
+    if not isinstance(facts, dict):
+        raise TypeError(f"the facts are a {type(facts).__name__}")
+    return facts
 
 
 def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -60,9 +85,17 @@ def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) 
 
 
 def restore_optimizer(named: dict[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Inverse of `optimizer_state`."""
+    """Inverse of `optimizer_state`: moments lie where their parameter does, in its type and order, counts beside them.
+
+    Gaussians may be cloned and dropped, moments with them, before the optimiser makes another step.
+    """
     for name, parameter in named.items():
         keys = ("step", "exp_avg", "exp_avg_sq")
         stored = {key: tensors.get(f"adam.{key}.{name}") for key in keys}
-        if all(value is not None for value in stored.values()):
-            optimizer.state[parameter] = {key: value.clone() for key, value in stored.items() if value is not None}
+        state = {}
+        for key, value in stored.items():
+            if value is not None:
+                like = torch.zeros((), device=parameter.device) if key == "step" else parameter.detach()
+                state[key] = torch.empty_like(like).copy_(value)
+        if len(state) == len(keys):
+            optimizer.state[parameter] = state

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from ..cards import why_unused
 from ..contract import DEVICES, ExitCode, JobError
 from ..native import initialised_warp
 
@@ -25,9 +26,18 @@ def cuda_refusal() -> str:
     if torch.version.hip is not None:
         return "This PyTorch is built for AMD GPUs, which the rasteriser has no body for."
     if not torch.cuda.is_available():
-        return "PyTorch sees no NVIDIA GPU."
+        told = why_unused(torch.version.cuda)
+        return told[0] if told else "PyTorch sees no NVIDIA GPU."
     if not initialised_warp().is_cuda_available():
         return "PyTorch sees the NVIDIA GPU, but Warp does not: update the NVIDIA driver to version 580 or newer."
     if torch.cuda.get_device_capability() < (7, 5):
         return "The NVIDIA GPU is too old: it must be of the Turing generation (compute capability 7.5) or later."
     return ""
+
+
+def unused_card() -> tuple[str, str] | None:
+    """Why the NVIDIA card of this machine is not used, and what to do about it; None if it is, or there is none."""
+    refusal = cuda_refusal()
+    if not refusal or torch.version.hip is not None:
+        return None
+    return (refusal, "") if torch.cuda.is_available() else why_unused(torch.version.cuda)

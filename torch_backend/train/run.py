@@ -18,16 +18,21 @@ from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
-from ..shot import Shot, content_key, write_atomic, write_json
+from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
 from . import adam
-from .checkpoint import load_checkpoint, read_meta
+from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
+from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
-from .device import choose_device
+from .device import choose_device, unused_card
 from .extend import EXTENSION_FILE, pending
 from .model import DynamicModel
 from .needs import modelled
 from .trainer import Trainer, restore_model
 
+_ATTEMPTS = 5
+"""A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
+_FIELD_BYTES = 8e6
+"""Of a field with its moments, and of a run's small things (a preview's HexPlane: 4.4 MB)."""
 _TOO_MUCH_MOTION = 0.25
 """Share of open Gaussians above which the artist is told (holding still left 0.03 to 0.21 open: docs/benchmarks.md)."""
 
@@ -48,31 +53,49 @@ class LoadedRun:
     """Height of them."""
     train_frames: list[int]
     """Frame numbers it was trained on."""
+    stamp: list[Any]
+    """Name, bytes and time (ns) of the checkpoint that the model is from: what is made of it is known by them."""
+
+    @property
+    def stale(self) -> bool:
+        """True if the run has been trained since it was loaded."""
+        return _stamp(self.folder / CHECKPOINT_FILE)[1:] != self.stamp
 
 
 def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
     """Trains one run; resumes its checkpoint if asked to and the settings are the same; or extends a finished one.
 
+    A run of other settings, or one that is to begin anew, stays as it is until this one is done (see `anew`).
     Returns the run's figures, also written to runs/<name>/summary.json. JobError in words if it cannot be done.
     """
     if params.extend:
         return extend_run(shot, params, report)
-    config, device = config_from_params(params), _prepared_device(params)
-    folder = shot.run(params.run)
+    config, device = config_from_params(params), _prepared_device(params, report)
+    run = shot.own(shot.run(params.run))
+    shot.own(run / "previews")
+    settle(run)
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     key = content_key(config_to_json(config), solve_key(shot), train, test)
-    done = finished(folder, key)
+    done = finished(run, key)
     if done is not None and params.resume:
+        forget(run, key)
         report.progress("training", 1, 1, "already trained")
         return done
+    folder = place_for(run, key, params.resume)
+    need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
+    if folder != run and params.resume:
+        report.warning(
+            "The run's settings or cameras changed: it is trained anew.",
+            "The run that is there stays until the new one is done.",
+        )
     images = place_images(load_images(scene, train + test, width, height, report), device)
     identity = {"key": key, "solve": solve_key(shot)}
     trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
-    checkpoint = folder / "checkpoint.safetensors"
+    checkpoint = folder / CHECKPOINT_FILE
     resumed = _resume(trainer, checkpoint, params.resume, report)
-    for name in ("summary.json", EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
+    for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
         (folder / name).unlink(missing_ok=True)
     write_json(folder / "config.json", {"version": 1, **identity, "config": config_to_json(config)})
     metrics = Metrics(folder, report, trainer.iteration if resumed else -1)
@@ -83,7 +106,9 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
 
     trainer.run(checkpoint, evaluate)
     summary = summarise(trainer, params.run, test, held_out, key)
-    write_json(folder / "summary.json", summary)
+    write_json(folder / SUMMARY_FILE, summary)
+    if folder != run:
+        take_place(run, folder)
     report.metric("train", summary)
     if config.method == "auto" and summary["moving_share"] > _TOO_MUCH_MOTION:
         report.warning(
@@ -101,21 +126,24 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     """
     if params.extend < 0:
         raise ValueError(f"extend is {params.extend}: it is a number of steps to add")
-    folder, again = shot.run(params.run), "Train it without --extend first."
-    checkpoint, beside = folder / "checkpoint.safetensors", folder / EXTENSION_FILE
+    folder, again = shot.own(shot.run(params.run)), "Train it without --extend first."
+    shot.own(folder / "previews")
+    settle(folder)
+    checkpoint, beside = folder / CHECKPOINT_FILE, folder / EXTENSION_FILE
     facts = read_meta(checkpoint) if checkpoint.is_file() else {}
     if not facts:
         raise JobError(f"{shot.root.name} has no trained run {params.run!r} to extend.", again, ExitCode.TRAIN)
-    before = read_json(folder / "summary.json") if (folder / "summary.json").is_file() else {}
+    before = read_json(folder / SUMMARY_FILE) if (folder / SUMMARY_FILE).is_file() else {}
     if before.get("key") != facts["key"]:
         raise JobError(f"The run {params.run!r} is not finished: it cannot be extended yet.", again, ExitCode.TRAIN)
     if facts["solve"] != solve_key(shot):
         message = f"The run {params.run!r} was trained on other cameras than the shot has now: it cannot be extended."
         raise JobError(message, "Remove the run or name another one, then train.", ExitCode.TRAIN)
-    config, device, scene = config_from_json(facts["config"]), _prepared_device(params), load_scene(shot)
+    config, device, scene = config_from_json(facts["config"]), _prepared_device(params, report), load_scene(shot)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     images = place_images(load_images(scene, train + test, *training_size(scene, config.width), report), device)
     held_out = images[len(train) :]
+    need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     identity = {"key": facts["key"], "solve": facts["solve"]}
     trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
     begun = pending(folder, facts) if params.resume else None
@@ -134,14 +162,17 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     trainer.run(beside, lambda t: metrics.add(t, test, held_out))
     summary = summarise(trainer, params.run, test, held_out, facts["key"])
     trainer.save(checkpoint)
-    write_json(folder / "summary.json", summary)
+    write_json(folder / SUMMARY_FILE, summary)
     beside.unlink(missing_ok=True)
     report.metric("train", summary)
     return summary
 
 
-def _prepared_device(params: TrainParams) -> torch.device:
+def _prepared_device(params: TrainParams, report: Reporter) -> torch.device:
     device = choose_device(params.device)
+    unused = unused_card() if params.device == "auto" and device.type == "cpu" else None
+    if unused is not None:
+        report.warning(f"Training uses the processor, not the graphics card: {unused[0]}", unused[1])
     torch.set_num_threads(default_threads())
     if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
         for module in (raster_cpu, ssim, adam, planes):
@@ -163,10 +194,16 @@ def training_size(scene: Scene, wanted: int) -> tuple[int, int]:
     return width, max(16, round(scene.height * width / scene.width))
 
 
+def checkpoint_bytes(config: TrainConfig) -> float:
+    """Bytes that a run's checkpoints may need on disk, at most: one is written while the one before is still there."""
+    numbers = 11 + 3 * (config.sh_degree + 1) ** 2  # of a Gaussian; with two moments each, and what saw it
+    return 2.0 * (config.densify.budget * (3 * 4 * numbers + 40) + _FIELD_BYTES)
+
+
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
     """The summary of a run that was finished with the same settings on the same solve, extended or not; or None."""
-    path = folder / "summary.json"
-    checkpoint = folder / "checkpoint.safetensors"
+    path = folder / SUMMARY_FILE
+    checkpoint = folder / CHECKPOINT_FILE
     if not path.is_file() or not checkpoint.is_file():
         return None
     summary, facts = read_json(path), read_meta(checkpoint)
@@ -183,7 +220,6 @@ def _resume(trainer: Trainer, checkpoint: Path, wanted: bool, report: Reporter) 
     if not (wanted and checkpoint.is_file()):
         return False
     if read_meta(checkpoint).get("key") != trainer.identity["key"]:
-        report.warning("The run's settings or cameras changed: it is trained anew.")
         return False
     trainer.restore(checkpoint)
     report.progress("training", trainer.iteration, trainer.config.iterations, f"resumed at step {trainer.iteration}")
@@ -199,7 +235,7 @@ class Metrics:
     def __init__(self, folder: Path, report: Reporter, iteration: int) -> None:
         self.folder, self.report = folder, report
         self.path = folder / "metrics.jsonl"
-        (folder / "previews").mkdir(parents=True, exist_ok=True)
+        make_folder(folder / "previews")
         for picture in (folder / "previews").glob("*.png"):
             if picture.stem.isdigit() and int(picture.stem) > iteration:
                 picture.unlink()
@@ -278,14 +314,35 @@ def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, ke
 def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> LoadedRun:
     """A run as it stands in its checkpoint, on `device`. JobError if there is none."""
     folder = shot.run(name)
-    checkpoint = folder / "checkpoint.safetensors"
+    checkpoint = folder / CHECKPOINT_FILE
     if not checkpoint.is_file():
         message = f"{shot.root.name} has no trained run named {name!r}."
         raise JobError(message, "Run the training step first.", ExitCode.FREEZE)
-    tensors, meta = load_checkpoint(checkpoint)
-    config = config_from_json(meta["config"])
-    if meta["solve"] != solve_key(shot):
+    for _ in range(_ATTEMPTS):
+        inode, *stamp = _stamp(checkpoint)
+        tensors, meta = load_checkpoint(checkpoint)
+        if [inode, *stamp] == _stamp(checkpoint):  # else it was replaced meanwhile: which one was read cannot be told
+            break
+    else:
+        message = f"The run {name!r} is written again and again while it is read."
+        raise JobError(message, "Wait for its training to end.", ExitCode.FREEZE)
+    if meta.get("solve") != solve_key(shot):
         message = f"The run {name!r} was trained on other cameras than the shot has now."
         raise JobError(message, "Train it again.", ExitCode.FREEZE)
-    model = restore_model(tensors, meta, config, device)
-    return LoadedRun(folder, config, model, int(meta["width"]), int(meta["height"]), list(meta["train_frames"]))
+    try:
+        config = config_from_json(meta["config"])
+        model = restore_model(tensors, meta, config, device)
+        size = int(meta["width"]), int(meta["height"])
+        return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp)
+    except (KeyError, TypeError, IndexError, AttributeError) as error:  # whole, but not as `save` wrote it
+        message = f"The checkpoint {checkpoint} does not fit this version ({type(error).__name__}: {error})."
+        raise JobError(message, "Train the run again with --restart.", ExitCode.FREEZE) from error
+
+
+def _stamp(checkpoint: Path) -> list[Any]:
+    """[inode, name, bytes, time in ns] of a file, all None if it is gone. A replaced file has another inode."""
+    try:
+        told = checkpoint.stat()
+    except FileNotFoundError:
+        return [None] * 4
+    return [told.st_ino, checkpoint.name, told.st_size, told.st_mtime_ns]

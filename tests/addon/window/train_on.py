@@ -41,12 +41,13 @@ def main() -> int:
     output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="splannequin-train-on-") as name:
         shot = Path(name) / "tiny.splannequin"
-        subprocess.run([args.backend, "-c", WORLD.format(name)], cwd=ROOT, check=True)
+        safe = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1"}
+        subprocess.run([args.backend, "-P", "-c", WORLD.format(name)], cwd=ROOT, env=safe, check=True)
         (shot / "solve" / "solve.json").write_text('{"version": 1, "quality": "Known by construction."}')
         for run in ("main", "static"):
             flags = ["--iterations", "150", "--max-gaussians", "1500", "--method", "auto" if run == "main" else run]
-            command = [args.backend, "-m", "torch_backend", "train", str(shot), "--run", run, *flags]
-            subprocess.run(command, cwd=ROOT, check=True)
+            command = [args.backend, "-P", "-m", "torch_backend", "train", str(shot), "--run", run, *flags]
+            subprocess.run(command, cwd=ROOT, env=safe, check=True)
         environ = {**os.environ, "DISPLAY": args.display, PLAN: name, "SPLANNEQUIN_BACKEND_PYTHON": args.backend}
         with press.screen(args.display):
             blender = subprocess.Popen([*press.command(args.blender, __file__), "--factory-startup"], env=environ)

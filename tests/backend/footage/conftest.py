@@ -58,8 +58,12 @@ def pan():
 def write_video():
     """write_video(path, frames, ...): a lossless H.264 file in YCbCr 4:4:4."""
 
-    def write(path, frames, rate=24, rotation=None, aspect=None, milliseconds=None, codec="libx264", **context):
-        with av.open(str(path), "w") as container:
+    def write(
+        path, frames, rate=24, rotation=None, aspect=None, milliseconds=None, codec="libx264", faststart=False,
+        **context,
+    ):  # fmt: skip
+        options = {"movflags": "faststart"} if faststart else {}
+        with av.open(str(path), "w", options=options) as container:
             stream = container.add_stream(codec, rate=rate)
             stream.height, stream.width = frames[0].shape[:2]
             stream.pix_fmt = context.pop("pix_fmt", "yuv444p")

@@ -9,7 +9,7 @@ import pytest
 from torch_backend import shot as shot_module
 from torch_backend.contract import Cancelled, ExitCode, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
-from torch_backend.footage.images import read_png
+from torch_backend.footage.images import read_png, write_png
 from torch_backend.shot import Shot
 
 
@@ -72,6 +72,47 @@ def test_another_import_replaces_frames_and_the_solve_made_from_them(shot, clip,
     expected = ["frames.json", *(f"raw/{n:06d}.png" for n in range(6, 16))]
     assert files(shot.frames) == sorted(expected)
     assert not shot.solve.exists()
+
+
+def test_files_of_the_artist_in_the_frames_folder_outlive_an_import(shot, clip, recorder):
+    import_footage(shot, clip, FootageConfig(first=1, last=12), recorder())
+    theirs = {"notes.png": b"a", "000016.png": b"b", "raw/000017.png": b"c", "ours/000002.png": b"d"}
+    for name, content in theirs.items():
+        (shot.frames / name).parent.mkdir(exist_ok=True)
+        (shot.frames / name).write_bytes(content)
+    import_footage(shot, clip, FootageConfig(first=6, last=15), recorder())
+    expected = ["frames.json", *(f"raw/{n:06d}.png" for n in range(6, 16))]
+    assert files(shot.frames) == sorted([*expected, *theirs])
+    import_footage(shot, clip, FootageConfig(), recorder())
+    kept = {"notes.png": b"a", "000016.kept.png": b"b", "raw/000017.kept.png": b"c", "ours/000002.png": b"d"}
+    expected = ["frames.json", *(f"raw/{n:06d}.png" for n in range(1, 21))]
+    assert files(shot.frames) == sorted([*expected, *kept])
+    assert all((shot.frames / name).read_bytes() == content for name, content in kept.items())
+
+
+@pytest.mark.parametrize("linked", ["frames", "frames/raw", "solve"])
+def test_nothing_is_removed_through_a_link(shot, clip, tmp_path, recorder, linked):
+    import_footage(shot, clip, FootageConfig(), recorder())
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "000001.png").write_bytes(b"mine")
+    shutil.rmtree(shot.root / linked, ignore_errors=True)
+    (shot.root / linked).symlink_to(theirs, target_is_directory=True)
+    with pytest.raises(JobError, match="is a link to .*theirs") as error:
+        import_footage(shot, clip, FootageConfig(first=2), recorder())
+    assert (error.value.exit_code, bool(error.value.hint)) == (ExitCode.USAGE, True)
+    assert files(theirs) == ["000001.png"]
+
+
+def test_a_killed_import_leaves_what_was_there(shot, clip, recorder):
+    """At the worst moment: the old frames were moved aside, the new ones not yet put in their place."""
+    import_footage(shot, clip, FootageConfig(), recorder())
+    before = files(shot.frames)
+    shot.frames.rename(shot.root / ".frames.old")
+    report = recorder()
+    import_footage(shot, clip, FootageConfig(), report)
+    assert report.steps == [("import", 1, 1)]
+    assert files(shot.frames) == before
 
 
 def test_a_lost_frame_is_imported_again(shot, clip, recorder):
@@ -170,6 +211,66 @@ def test_a_step_that_leaves_too_few_is_refused(shot, clip, recorder):
 def test_negative_settings_name_their_values(shot, clip, recorder):
     with pytest.raises(ValueError, match="-2"):
         import_footage(shot, clip, FootageConfig(step=-2), recorder())
+
+
+@pytest.fixture
+def sequence(tmp_path, pan):
+    """sequence(first): twelve numbered PNG of a pan, from that number on, alone in their folder."""
+
+    def make(first):
+        folder = tmp_path / f"from_{first}"
+        folder.mkdir()
+        for i, pixels in enumerate(pan(12)):
+            write_png(folder / f"shot.{first + i:04d}.png", pixels)
+        return folder
+
+    return make
+
+
+def test_numbers_beyond_blenders_last_frame_are_refused(shot, sequence, recorder):
+    error = refused(shot, recorder, sequence(86_400_000))
+    assert error.message == "The frames are numbered 86400000 to 86400011: Blender's frames end at 1048574."
+    assert (error.exit_code, bool(error.hint)) == (ExitCode.FOOTAGE, True)
+    last = sequence(1_048_566)
+    assert "1048566 to 1048577" in refused(shot, recorder, last).message
+    import_footage(shot, str(last), FootageConfig(last=1_048_574, step=1), recorder())
+    assert shot.info().last == 1_048_574
+
+
+def test_a_sequence_has_the_rate_that_is_asked_for(shot, sequence, recorder):
+    folder = str(sequence(1))
+    assert import_footage(shot, folder, FootageConfig(step=1), recorder())["fps"] == 24.0
+    report = recorder()
+    assert import_footage(shot, folder, FootageConfig(step=1, fps=12.5), report)["fps"] == 12.5
+    assert [f["seconds"] for f in load_frames(shot)["frames"]] == pytest.approx(np.arange(12) / 12.5)
+    assert report.warnings == []
+
+
+def test_a_rate_or_a_layer_for_a_video_is_told_to_be_passed_over(shot, clip, recorder):
+    report = recorder()
+    assert import_footage(shot, clip, FootageConfig(fps=50.0, layer="rgba"), report)["fps"] == 10.0
+    assert report.warnings == [
+        "The rate 50.0 is passed over: a video has its own, 10 frames per second.",
+        "The layer 'rgba' is passed over: a video has its own, a single one.",
+    ]
+
+
+@pytest.mark.parametrize("fps", [-1.0, float("nan"), float("inf"), 1e9])
+def test_a_rate_that_is_none_is_refused(shot, clip, recorder, fps):
+    with pytest.raises(ValueError, match="fps is"):
+        import_footage(shot, clip, FootageConfig(fps=fps), recorder())
+
+
+def test_the_listing_says_how_the_footage_was_read(shot, clip, sequence, recorder):
+    import_footage(shot, clip, FootageConfig(), recorder())
+    reading = load_frames(shot)["reading"]
+    assert (reading["colour"], reading["colour_told"]) == ("video, Rec.709", False)
+    assert (reading["matrix"], reading["matrix_told"], reading["range"]) == ("ITU601", False, "video")
+    import_footage(shot, str(sequence(1)), FootageConfig(step=1), recorder())
+    reading = load_frames(shot)["reading"]
+    assert (reading["colour"], reading["layers"], reading["alpha"], reading["fps_told"]) == (
+        "sRGB, Rec.709", [""], False, False,
+    )  # fmt: skip
 
 
 def test_a_full_disk_is_told_before_the_work(shot, clip, recorder, monkeypatch):

@@ -1,5 +1,7 @@
 """Image sequences: real EXR and PNG files, their numbers, depth and colour."""
 
+import struct
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -9,19 +11,50 @@ from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.sources import open_source
 
 
-def write(path, pixels, names=None, window=None, full=None, **attributes):
-    spec = oiio.ImageSpec(
-        pixels.shape[1], pixels.shape[0], pixels.shape[2], str(pixels.dtype).replace("float16", "half")
-    )
+def spec_of(pixels, names=None, window=None, full=None, **attributes):
+    kind = {"float16": "half", "float32": "float"}.get(str(pixels.dtype), str(pixels.dtype))
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     if names:
         spec.channelnames = names
     if full:
         spec.full_x, spec.full_y, spec.full_width, spec.full_height = full
         spec.x, spec.y = window
     for name, value in attributes.items():
-        spec.attribute(name, value)
+        name = name.replace("__", ":")
+        spec.attribute(name, f"float[{len(value)}]", value) if isinstance(value, tuple) else spec.attribute(name, value)
+    return spec
+
+
+def write(path, pixels, names=None, window=None, full=None, **attributes):
+    spec = spec_of(pixels, names, window, full, **attributes)
     out = oiio.ImageOutput.create(str(path))
     assert out and out.open(str(path), spec) and out.write_image(pixels) and out.close(), oiio.geterror()
+
+
+def write_parts(path, parts):
+    """`parts`: (name of the part, names of its channels, pixels), one after the other."""
+    specs = [spec_of(pixels, names, oiio__subimagename=part) for part, names, pixels in parts]
+    out = oiio.ImageOutput.create(str(path))
+    assert out.open(str(path), specs), out.geterror()
+    for i, (_, _, pixels) in enumerate(parts):
+        assert i == 0 or out.open(str(path), specs[i], "AppendSubimage"), out.geterror()
+        assert out.write_image(pixels), out.geterror()
+    assert out.close()
+
+
+def flat(*values, kind=np.float32):
+    return np.tile(np.array(values, kind), (8, 8, 1))
+
+
+def first_of(folder, **options):
+    """The source in `folder`, after a full reading, and its first frame's pixel in the middle, as linear light."""
+    source = open_source(str(folder), **options)
+    frames = list(source.frames(None, None))
+    return source, srgb_to_linear(frames[0].pixels[4, 4] / (65535.0 if source.info.deep else 255.0))
+
+
+def said(source):
+    return [message for message, _ in source.warnings]
 
 
 @pytest.fixture
@@ -135,3 +168,228 @@ def test_what_is_no_sequence_is_refused(tmp_path, name):
     assert error.value.exit_code == ExitCode.FOOTAGE
     assert error.value.message.count(".") <= 3
     assert error.value.hint
+
+
+@pytest.mark.parametrize(
+    ("names", "taken"),
+    [
+        (("depth.Z", "ViewLayer.DiffCol.R", "ViewLayer.DiffCol.G", "ViewLayer.DiffCol.B", "ViewLayer.Combined.R",
+          "ViewLayer.Combined.G", "ViewLayer.Combined.B"), "ViewLayer.Combined"),
+        (("N.X", "diffuse.R", "diffuse.G", "diffuse.B", "R", "G", "B"), "RGB without a name"),
+        (("a.Z", "spec.R", "spec.G", "spec.B", "rgba.R", "rgba.G", "rgba.B"), "rgba"),
+    ],
+)  # fmt: skip
+def test_the_picture_itself_is_found_among_layers_and_named(tmp_path, names, taken):
+    values = [0.9] * (len(names) - 3) + [0.3, 0.2, 0.1]
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(*values), names=names)
+    source, pixel = first_of(tmp_path)
+    assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
+    assert said(source) == [f"The pictures have 3 layers: {taken} is taken."]
+    assert source.info.reading["layer"] == ("" if taken.startswith("RGB") else taken)
+
+
+def test_a_part_with_depth_before_the_picture_is_not_taken_for_it(tmp_path):
+    for i in range(3):
+        parts = [("depth", ("Z",), flat(7.0)), ("beauty", ("R", "G", "B", "A"), flat(0.3, 0.2, 0.1, 1.0))]
+        write_parts(tmp_path / f"a.{i}.exr", parts)
+    source, pixel = first_of(tmp_path)
+    assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
+    assert said(source) == ["The pictures have 2 layers: beauty is taken."]
+
+
+def test_layers_of_which_none_is_surely_the_picture_are_listed_and_can_be_chosen(tmp_path):
+    names = ("left.R", "left.G", "left.B", "right.R", "right.G", "right.B")
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(0.9, 0.9, 0.9, 0.3, 0.2, 0.1), names=names)
+    with pytest.raises(JobError, match=r"none is named as the picture itself: left, right\.") as error:
+        open_source(str(tmp_path))
+    assert error.value.exit_code == ExitCode.FOOTAGE and "--layer" in error.value.hint
+    source, pixel = first_of(tmp_path, layer="Right")
+    assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
+    assert said(source) == []
+    with pytest.raises(JobError, match="has no colour layer 'middle'"):
+        open_source(str(tmp_path), layer="middle")
+
+
+def test_passes_without_a_picture_are_refused(tmp_path):
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(1.0, 0.5), names=("depth.Z", "motion.X"))
+    with pytest.raises(JobError, match="no layer with red, green and blue: it has depth, motion"):
+        open_source(str(tmp_path))
+
+
+def test_a_file_with_the_layer_elsewhere_is_read_there_and_one_without_it_refused(tmp_path):
+    names = ("rgba.R", "rgba.G", "rgba.B", "spec.R", "spec.G", "spec.B")
+    write(tmp_path / "a.0.exr", flat(0.3, 0.2, 0.1, 0.9, 0.9, 0.9), names=names)
+    write(tmp_path / "a.1.exr", flat(0.9, 0.9, 0.9, 0.3, 0.2, 0.1), names=names[3:] + names[:3])
+    frames = list(open_source(str(tmp_path)).frames(None, None))
+    assert (frames[0].pixels == frames[1].pixels).all()
+    write(tmp_path / "a.2.exr", flat(0.3, 0.2, 0.1), names=("spec.R", "spec.G", "spec.B"))
+    with pytest.raises(JobError, match=r"a\.2\.exr has no layer rgba|has no colour layer 'rgba'"):
+        list(open_source(str(tmp_path)).frames(None, None))
+
+
+def test_transparent_pictures_keep_their_colour_and_say_that_alpha_is_not_taken(tmp_path):
+    pixels = flat(0.3, 0.2, 0.1, 1.0)
+    pixels[4] = [0.15, 0.1, 0.05, 0.5]  # the same colour, half covered
+    pixels[5] = [0.2, 0.1, 0.0, 0.0]  # pure light
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", pixels)
+    source, pixel = first_of(tmp_path)
+    assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
+    glow = next(iter(source.frames(None, None))).pixels[5, 0]
+    assert srgb_to_linear(glow / 65535.0) == pytest.approx([0.2, 0.1, 0.0], abs=1e-4)
+    assert said(source)[0] == "The pictures are transparent in places: their colour is taken, their alpha is not."
+
+
+@pytest.mark.parametrize(("suffix", "associated"), [("png", False), ("tif", False), ("tif", True)])
+def test_eight_bit_alpha_does_not_darken_either(tmp_path, suffix, associated):
+    stored = flat(100, 50, 25, 128, kind=np.uint8) if associated else flat(200, 100, 50, 128, kind=np.uint8)
+    for i in range(3):
+        write(tmp_path / f"a.{i}.{suffix}", stored, oiio__UnassociatedAlpha=0 if associated else 1)
+    source = open_source(str(tmp_path))
+    got = next(iter(source.frames(None, None))).pixels[4, 4]
+    expected = np.array([200, 100, 50])
+    if suffix == "png":  # OpenImageIO divides when it writes a PNG
+        expected = oiio.ImageInput.open(str(tmp_path / "a.0.png"), spec_of(stored, oiio__UnassociatedAlpha=1))
+        expected = expected.read_image(oiio.UINT8)[4, 4, :3]
+    assert np.abs(got.astype(int) - expected).max() <= 1
+
+
+def test_opaque_pictures_say_nothing_of_alpha(tmp_path):
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(0.3, 0.2, 0.1, 1.0))
+    assert said(first_of(tmp_path)[0]) == []
+
+
+@pytest.mark.parametrize(("aspect", "size"), [(2.0, (16, 8)), (0.5, (8, 16))])
+def test_pixels_that_are_not_square_become_so(tmp_path, aspect, size):
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(0.3, 0.2, 0.1), PixelAspectRatio=aspect)
+    source, pixel = first_of(tmp_path)
+    assert (source.info.width, source.info.height) == size
+    assert next(iter(source.frames(None, None))).pixels.shape == (size[1], size[0], 3)
+    assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
+    assert said(source)[0].startswith(f"The pictures have pixels {aspect:g} times as wide as high: 8x8 becomes")
+
+
+def test_a_crop_window_is_told(tmp_path):
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(1.0, 1.0, 1.0, 1.0), window=(-2, 3), full=(0, 0, 20, 20))
+    source, _ = first_of(tmp_path)
+    assert said(source) == ["Pictures fill only a part of their frame: the rest of it is black."]
+    row = next(iter(source.frames(None, None))).pixels[5, :, 0]
+    assert (row == np.where(np.arange(20) < 6, 65535, 0)).all()
+
+
+# ------------------------------------------------------------------------------------------------- colour
+
+WHITE = {"D65": (0.3127, 0.3290), "ACES": (0.32168, 0.33767)}
+PRIMARIES = {
+    "Rec.709": ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06), WHITE["D65"]),
+    "ACEScg (AP1)": ((0.713, 0.293), (0.165, 0.830), (0.128, 0.044), WHITE["ACES"]),
+    "BT.2020": ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046), WHITE["D65"]),
+    "primaries of its own": ((0.70, 0.30), (0.20, 0.75), (0.14, 0.05), (0.3457, 0.3585)),
+}
+
+
+def to_rec709(name):
+    """The matrix from these primaries to Rec.709's by their definition, white adapted after Bradford, in float64."""
+
+    def to_xyz(corners):
+        columns = np.array([[x / y, 1.0, (1.0 - x - y) / y] for x, y in corners]).T
+        return columns[:, :3] * (np.linalg.inv(columns[:, :3]) @ columns[:, 3])
+
+    bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+    theirs, ours = to_xyz(PRIMARIES[name]), to_xyz(PRIMARIES["Rec.709"])
+    gain = np.diag((bradford @ ours @ np.ones(3)) / (bradford @ theirs @ np.ones(3)))
+    return np.linalg.inv(ours) @ np.linalg.inv(bradford) @ gain @ bradford @ theirs
+
+
+def test_the_matrix_of_acescg_is_the_published_one():
+    published = [[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]]
+    assert np.allclose(to_rec709("ACEScg (AP1)"), published, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", [n for n in PRIMARIES if n != "Rec.709"])
+def test_chromaticities_are_converted_and_named(tmp_path, name):
+    colour = np.array([0.30, 0.25, 0.20])
+    values = tuple(float(v) for corner in PRIMARIES[name] for v in corner)
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(*colour), chromaticities=values)
+    source, pixel = first_of(tmp_path)
+    assert pixel == pytest.approx(to_rec709(name) @ colour, abs=5e-5)
+    assert said(source) == [f"The pictures are linear, {name}: converted to Rec.709."]
+    assert source.info.reading["colour"] == f"linear, {name}"
+    assert source.info.reading["colour_told"]
+
+
+def test_a_named_colour_space_is_converted(tmp_path):
+    colour = np.array([0.30, 0.25, 0.20])
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(*colour), oiio__ColorSpace="ACEScg")
+    assert first_of(tmp_path)[1] == pytest.approx(to_rec709("ACEScg (AP1)") @ colour, abs=5e-5)
+
+
+def test_rec709_light_needs_no_words_and_what_was_assumed_is_recorded(tmp_path):
+    values = tuple(float(v) for corner in PRIMARIES["Rec.709"] for v in corner)
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(0.3, 0.2, 0.1))
+        write(tmp_path / f"b.{i}.exr", flat(0.3, 0.2, 0.1), chromaticities=values)
+    for name, told in (("a.0.exr", False), ("b.0.exr", True)):
+        source, pixel = first_of(tmp_path / name)
+        assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=5e-5)
+        assert (said(source), source.info.reading["colour_told"]) == ([], told)
+
+
+def test_impossible_chromaticities_are_told(tmp_path):
+    for i in range(3):
+        write(tmp_path / f"a.{i}.exr", flat(0.3, 0.2, 0.1), chromaticities=(0.0,) * 8)
+    source, pixel = first_of(tmp_path)
+    assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=5e-5)
+    assert said(source) == ["The chromaticities in a.0.exr are impossible: Rec.709 is assumed."]
+
+
+@pytest.mark.parametrize("transfer", ["Printing density", "Logarithmic"])
+def test_film_log_becomes_light(tmp_path, transfer):
+    codes = np.array([95.0, 470.0, 685.0])
+    for i in range(3):
+        write(tmp_path / f"a.{i}.dpx", flat(*np.rint(codes / 1023 * 65535), kind=np.uint16), dpx__Transfer=transfer)
+    source, pixel = first_of(tmp_path)
+    black = 10 ** ((95 - 685) * 0.002 / 0.6)
+    assert pixel == pytest.approx((10 ** ((codes - 685) * 0.002 / 0.6) - black) / (1 - black), abs=2e-4)
+    assert said(source)[0].startswith("The pictures are Cineon log: read with black at code 95")
+    assert source.info.colour == "linear"
+
+
+def write_cineon(path, codes):
+    """8 x 8 pixels of one colour in ten bits, by Kodak's description of the format: OpenImageIO only reads it."""
+    head = struct.pack(">6I8s100s12s12s36x", 0x802A5FD7, 2048, 1024, 1024, 0, 2304, b"V4.5", b"", b"", b"")
+    head += struct.pack(">BB2x", 0, 3)
+    for i in range(8):
+        sides = (10, 8, 8) if i < 3 else (0, 0, 0)
+        head += struct.pack(">BBBxII4f", 0, i + 1 if i < 3 else 0, *sides, 0, 0, 1023, 2.046)
+    head += bytes(260) + struct.pack(">4B2I20x", 0, 5, 0, 0, 0, 0)
+    red, green, blue = codes
+    path.write_bytes(head.ljust(2048, b"\0") + struct.pack(">I", red << 22 | green << 12 | blue << 2) * 64)
+
+
+def test_cineon_files_are_read_as_film_log(tmp_path):
+    codes = np.array([95, 470, 685])
+    for i in range(3):
+        write_cineon(tmp_path / f"a.{i}.cin", codes.tolist())
+    source, pixel = first_of(tmp_path)
+    black = 10 ** ((95 - 685) * 0.002 / 0.6)
+    assert pixel == pytest.approx((10 ** ((codes - 685) * 0.002 / 0.6) - black) / (1 - black), abs=2e-4)
+    assert said(source)[0].startswith("The pictures are Cineon log")
+
+
+def test_a_dpx_that_does_not_say_what_it_is_is_told(tmp_path):
+    for i in range(3):
+        write(tmp_path / f"a.{i}.dpx", flat(30000, 20000, 10000, kind=np.uint16))
+        write(tmp_path / f"b.{i}.dpx", flat(30000, 20000, 10000, kind=np.uint16), dpx__Transfer="SMPTE 274M")
+    for name, words in (("a.0.dpx", ["The pictures do not say how their colour is encoded"]), ("b.0.dpx", [])):
+        source = open_source(str(tmp_path / name))
+        assert (next(iter(source.frames(None, None))).pixels[4, 4] == [30000, 20000, 10000]).all()
+        assert [w.partition(":")[0] for w in said(source)] == words

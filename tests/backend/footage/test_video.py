@@ -1,5 +1,6 @@
 """Videos: real files written by the tests, decoded to the pixels and times that went in."""
 
+import os
 from fractions import Fraction
 
 import av
@@ -117,12 +118,59 @@ def test_damaged_packets_are_skipped_with_a_warning_and_keep_their_numbers(tmp_p
     assert source.warnings[0][0] == "Frame 6 cannot be decoded: left out of the shot."
 
 
-def test_a_file_that_breaks_off_gives_what_it_has(tmp_path, pan, write_video):
-    write_video(tmp_path / "a.mkv", pan(24), codec="ffv1", pix_fmt="yuv444p")
-    whole = (tmp_path / "a.mkv").read_bytes()
-    (tmp_path / "b.mkv").write_bytes(whole[: len(whole) * 2 // 3])
-    _, got = decoded(tmp_path / "b.mkv")
-    assert 8 <= len(got) < 24
+@pytest.fixture
+def broken_off(tmp_path, pan, write_video):
+    """broken_off(suffix, share): the first part of a clip of 24 frames, whose header stands at its beginning."""
+
+    def make(suffix, share):
+        whole = tmp_path / f"whole.{suffix}"
+        options = {"codec": "mjpeg", "pix_fmt": "yuvj444p"} if suffix == "mov" else {}
+        write_video(whole, pan(24), faststart=True, **options)
+        content = whole.read_bytes()
+        broken = tmp_path / f"broken.{suffix}"
+        broken.write_bytes(content[: int(len(content) * share)])
+        return broken
+
+    return make
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
+def test_a_file_that_breaks_off_says_how_much_of_it_there_is(broken_off, suffix):
+    source, got = decoded(broken_off(suffix, 0.75))
+    assert 12 <= len(got) < 24
+    assert [f.number for f in got] == list(range(1, len(got) + 1))
+    assert [w[0] for w in source.warnings] == [f"broken.{suffix} breaks off after frame {len(got)}: it announces 24."]
+    asked, got = decoded(broken_off(suffix, 0.75), 2, 10)  # before it breaks off: nothing to say
+    assert ([f.number for f in got], asked.warnings) == (list(range(2, 11)), [])
+
+
+@pytest.mark.parametrize(("suffix", "share"), [("mp4", 0.6), ("mov", 0.45), ("mkv", 0.45)])
+def test_less_than_half_of_a_file_is_refused(broken_off, suffix, share):
+    with pytest.raises(JobError, match=r"breaks off after frame \d+: it announces 24\.") as error:
+        decoded(broken_off(suffix, share))
+    assert error.value.exit_code == ExitCode.FOOTAGE
+
+
+def test_a_clip_that_changes_its_size_ends_there_and_says_so(tmp_path, pan, write_video):
+    """Motion JPEG, whose pictures carry their own size."""
+    write_video(tmp_path / "a.mkv", pan(12), codec="mjpeg", pix_fmt="yuvj444p")
+    write_video(tmp_path / "b.mkv", pan(12, height=64, width=48), codec="mjpeg", pix_fmt="yuvj444p")
+    with av.open(str(tmp_path / "both.mkv"), "w") as target:
+        stream = None
+        for part in ("a.mkv", "b.mkv"):
+            with av.open(str(tmp_path / part)) as source:
+                stream = stream or target.add_stream_from_template(source.streams.video[0])
+                for packet in (p for p in source.demux(video=0) if p.size):
+                    packet.pts = packet.dts = packet.pts + (500 if part == "b.mkv" else 0)
+                    packet.stream = stream
+                    target.mux(packet)
+    source, got = decoded(tmp_path / "both.mkv")
+    assert [f.number for f in got] == list(range(1, 13))
+    assert [w[0] for w in source.warnings] == [
+        "From frame 13 on the clip is 48x64 pixels instead of 64x48: the shot ends before it."
+    ]
+    with pytest.raises(JobError, match="changes its size before the range begins: from frame 13 on it is 48x64"):
+        decoded(tmp_path / "both.mkv", 14, 24)
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "noise.mp4", "empty.mov", "list.m3u8"])
@@ -141,6 +189,39 @@ def test_what_is_no_video_is_refused_in_one_sentence(tmp_path, name):
     assert error.value.hint
 
 
+@pytest.mark.parametrize("name", ["clip.mp4", "shot.0001.exr", "clip"])
+def test_a_pipe_is_refused_without_waiting_for_it(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(JobError, match="is neither a file nor a folder") as error:
+        open_source(str(tmp_path / name))
+    assert error.value.exit_code == ExitCode.FOOTAGE
+
+
+def test_a_name_that_no_system_takes_is_refused_in_a_sentence(tmp_path):
+    with pytest.raises(JobError, match="cannot be opened") as error:
+        open_source(str(tmp_path / ("a" * 300 + ".mp4")))
+    assert error.value.exit_code == ExitCode.FOOTAGE
+
+
+def test_damaged_headers_get_a_sentence(tmp_path, pan, write_video):
+    write_video(tmp_path / "a.mp4", pan(12))
+    content = (tmp_path / "a.mp4").read_bytes()
+    (tmp_path / "codec.mp4").write_bytes(content.replace(b"avc1", b"zzzz"))
+    (tmp_path / "moov.mp4").write_bytes(content[: content.index(b"moov") - 4])
+    with pytest.raises(JobError, match=r"codec\.mp4 is encoded in a way that cannot be decoded here") as error:
+        open_source(str(tmp_path / "codec.mp4"))
+    assert error.value.exit_code == ExitCode.FOOTAGE
+    with pytest.raises(JobError, match=r"moov\.mp4 is not a video that can be read"):
+        open_source(str(tmp_path / "moov.mp4"))
+
+
+def test_pixels_that_no_lens_makes_are_taken_as_square(tmp_path, pan, write_video):
+    write_video(tmp_path / "a.mp4", pan(8), aspect=Fraction(5, 1))
+    source, got = decoded(tmp_path / "a.mp4")
+    assert got[0].pixels.shape == (48, 64, 3)
+    assert source.warnings[0][0] == "The footage claims pixels 5 times as wide as high: taken as square."
+
+
 def test_sound_alone_is_no_video(tmp_path):
     with av.open(str(tmp_path / "a.wav"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
@@ -155,3 +236,136 @@ def test_frames_in_words():
     assert frame_words([7]) == "frame 7"
     assert frame_words([3, 4, 5, 9, 11, 12]) == "frames 3-5, 9, 11-12"
     assert frame_words(range(1, 40, 2)).endswith(", 13, 15 and 12 more spans")
+
+
+# ------------------------------------------------------------------------------------------------- colour
+
+PATCHES = np.array([[0.2, 0.2, 0.2], [0.5, 0.4, 0.3], [0.35, 0.5, 0.45], [0.3, 0.35, 0.55]])
+"""R'G'B' of four upright stripes."""
+D65 = (0.3127, 0.3290)
+CORNERS = {
+    1: ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06), D65),
+    9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046), D65),
+    12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060), D65),
+}
+"""Primaries by their number in ITU-T H.273."""
+
+
+LUMA = {1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
+"""Shares of red and blue in luma, by matrix."""
+
+
+def ten_bits(rgb, kr, kb):
+    """Y, Cb and Cr of R'G'B' as a ten-bit file holds them."""
+    y = rgb @ [kr, 1 - kr - kb, kb]
+    return np.rint([64 + 876 * y, *(512 + 448 * (rgb[:, i] - y) / (1 - k) for i, k in ((2, kb), (0, kr)))])
+
+
+def from_ten_bits(codes, kr, kb):
+    y, cb, cr = (codes[0] - 64) / 876, (codes[1] - 512) / 448, (codes[2] - 512) / 448
+    red, blue = y + (1 - kr) * cr, y + (1 - kb) * cb
+    return np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], axis=-1)
+
+
+@pytest.fixture
+def write_patches(tmp_path):
+    """write_patches(transfer, primaries, matrix): ten-bit YCbCr 4:4:4, lossless, tagged so."""
+
+    def write(transfer, primaries, matrix, patches=PATCHES):
+        kr, kb = LUMA[matrix]
+        codes = ten_bits(patches, kr, kb)
+        path = tmp_path / f"{transfer}_{primaries}.mkv"
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("ffv1", rate=24)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p10le"
+            context = stream.codec_context
+            context.color_trc, context.color_primaries, context.colorspace = transfer, primaries, matrix
+            context.color_range = 1
+            for _ in range(3):
+                frame = av.VideoFrame(64, 48, "yuv444p10le")
+                for plane, values in zip(frame.planes, codes):
+                    row = np.zeros(plane.line_size // 2, np.uint16)
+                    row[:64] = np.repeat(values.astype(np.uint16), 16)
+                    plane.update(np.tile(row, 48).tobytes())
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+        source, got = decoded(path)
+        return source, got[0].pixels[24, 8::16] / 65535.0
+
+    return write
+
+
+def to_rec709(primaries):
+    """The matrix between two gamuts of one white by their definition, in float64."""
+
+    def to_xyz(corners):
+        columns = np.array([[x / y, 1.0, (1.0 - x - y) / y] for x, y in corners]).T
+        return columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3])
+
+    return np.linalg.solve(to_xyz(CORNERS[1]), to_xyz(CORNERS[primaries]))
+
+
+def srgb(light):
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def srgb_light(x):
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def pq_light(x):
+    m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 4096 * 128, 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
+    return 10000 * (np.maximum(x ** (1 / m2) - c1, 0) / (c2 - c3 * x ** (1 / m2))) ** (1 / m1) / 203
+
+
+def hlg_light(x):
+    a = 0.17883277
+    scene = np.where(x <= 0.5, x**2 / 3, (np.exp((x - (0.5 - a * np.log(4 * a))) / a) + 1 - 4 * a) / 12)
+    return 1000 / 203 * scene * (scene @ [0.2627, 0.6780, 0.0593])[:, None] ** 0.2
+
+
+def video(x):
+    return x**2.4
+
+
+CASES = {
+    "BT.2020 SDR": (14, 9, 9, lambda x, m: (video(x) @ m.T) ** (1 / 2.4)),
+    "P3 video": (1, 12, 1, lambda x, m: (video(x) @ m.T) ** (1 / 2.4)),
+    "Display P3": (13, 12, 1, lambda x, m: srgb(srgb_light(x) @ m.T)),
+    "linear": (8, 1, 1, lambda x, m: srgb(x)),
+    "PQ": (16, 9, 9, lambda x, m: srgb(pq_light(x) @ m.T)),
+    "HLG": (18, 9, 9, lambda x, m: srgb(hlg_light(x) @ m.T)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_wide_linear_and_hdr_video_becomes_rec709(write_patches, name):
+    transfer, primaries, matrix, reference = CASES[name]
+    stored = from_ten_bits(ten_bits(PATCHES, *LUMA[matrix]), *LUMA[matrix])
+    expected = np.clip(reference(stored, to_rec709(primaries)), 0, 1)
+    assert np.abs(expected - PATCHES).max() > 8 / 255, "the case should show whether it is converted"
+    source, got = write_patches(transfer, primaries, matrix)
+    assert np.abs(got - expected).max() < 1 / 1023
+    assert len(source.warnings) == 1
+    assert source.info.reading["colour"] in source.warnings[0][0]
+    assert source.info.reading["colour_told"] and source.info.reading["matrix_told"]
+
+
+def test_rec709_video_is_taken_as_it_stands_without_words(write_patches):
+    source, got = write_patches(1, 1, 1)
+    assert np.abs(got - PATCHES).max() < 1.2 / 255
+    assert (source.warnings, source.info.colour, len(source.info.key)) == ([], "srgb", 3)
+
+
+def test_hdr_highlights_are_counted(write_patches):
+    source, got = write_patches(16, 9, 9, np.array([[0.9, 0.9, 0.9], *PATCHES[1:]]))
+    assert (got[0] == 1.0).all()
+    assert next(iter(source.frames(None, None))).clipped == pytest.approx(0.25)
+
+
+def test_a_transfer_function_that_is_not_known_is_told(write_patches):
+    source, _ = write_patches(9, 1, 1)
+    assert source.warnings[0][0] == (
+        "The clip's transfer function (number 9 of ITU-T H.273) is not known here: taken as video."
+    )
+    assert not source.info.reading["colour_told"]

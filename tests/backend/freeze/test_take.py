@@ -1,19 +1,21 @@
 """Frozen frames of the tiny world against its truth: pixels, mattes, depth, stale frames, cancellation."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 import torch
 
-from torch_backend.contract import NO_DEPTH, CameraFrame, CameraPath, Cancelled, FreezeParams, JobError
+from torch_backend.contract import NO_DEPTH, CameraFrame, CameraPath, Cancelled, FreezeParams, JobError, TrainParams
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.gaussians.ply import read_ply
 from torch_backend.shot import write_json
-from torch_backend.train import load_run
+from torch_backend.train import load_run, train_shot
+from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +53,29 @@ def test_two_instants_differ_where_the_patch_moved_and_nowhere_else(trained, tak
     assert difference[moved].mean() > 0.05
     assert difference[still].mean() < 0.012
     assert early.motion[moved].mean() > 0.35 > 0.15 > early.motion[still].mean()
+
+
+def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(trained, quiet):
+    """They are the old model's: the key of the new one would keep them for good."""
+    world, _ = trained
+    run = shutil.copytree(world.shot.run("main"), world.shot.run("trained meanwhile"))
+    tensors, meta = load_checkpoint(run / "checkpoint.safetensors")
+    tensors["gaussians.sh0"] = -tensors["gaussians.sh0"]
+
+    class TrainsMeanwhile(quiet):
+        def warning(self, message, hint=""):
+            super().warning(message, hint)
+            if "was not trained on" in message:  # said between the loading of the model and the first frame
+                save_checkpoint(run / "checkpoint.safetensors", tensors, meta)
+
+    asked = FreezeParams(run=run.name, take="meanwhile", t_star=109, first=105, last=105, only_missing=True)
+    frame, report = world.shot.take("meanwhile") / "000105.exr", TrainsMeanwhile()
+    freeze_shot(world.shot, asked, report)
+    old, again = read_frozen_exr(frame), quiet()
+    freeze_shot(world.shot, asked, again)
+    assert np.abs(read_frozen_exr(frame).rgba - old.rgba).mean() > 0.1, "rendered again, from the new model"
+    told = ["trained while it was frozen" in "".join(str(e) for e in r.events) for r in (report, again)]
+    assert told == [True, False]
 
 
 def test_depth_is_in_solve_units_and_empty_is_1e10(trained, takes):
@@ -158,3 +183,25 @@ def test_t_star_snaps_to_a_trained_frame_and_says_so(trained, quiet):
     report = quiet()
     assert freeze_shot(world.shot, FreezeParams(take="snap", t_star=109), report)["t_star_frame"] in (108, 110)
     assert any(e[0] == "warning" and "109" in e[1] for e in report.events)
+
+
+def test_pictures_of_the_artist_outlive_a_take_and_a_run_of_that_name(trained, quiet, tmp_path):
+    world, _ = trained
+    (tmp_path / "preview").mkdir()
+    mine = [tmp_path / "000105.exr", tmp_path / "preview" / "000105.png"]
+    for picture in mine:
+        picture.write_bytes(b"mine")
+    for link in (world.shot.take("linked"), world.shot.run("linked"), world.shot.take("inner") / "preview"):
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(tmp_path, target_is_directory=True)
+    for name in ("linked", "inner"):
+        with pytest.raises(JobError, match="is a link to"):
+            freeze_shot(world.shot, FreezeParams(take=name, t_star=105), quiet())
+    with pytest.raises(JobError, match="is a link to"):
+        train_shot(world.shot, TrainParams(run="linked"), quiet())
+    world.shot.take("theirs").mkdir()
+    mine.append(world.shot.take("theirs") / "000101.exr")
+    mine[-1].write_bytes(b"mine")
+    with pytest.raises(JobError, match="theirs holds numbered pictures that were not made here"):
+        freeze_shot(world.shot, FreezeParams(take="theirs", t_star=105), quiet())
+    assert [picture.read_bytes() for picture in mine] == [b"mine"] * 3

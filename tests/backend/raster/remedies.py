@@ -327,7 +327,7 @@ def _either(bodies: set[str]) -> str:
 def _run(folder: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "WARP_CACHE_PATH": str(folder / "kernels"), "PYTHONPATH": str(folder),
                    "SPLANNEQUIN_NO_SHRINK": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--tb=line", *arguments]
+    command = [sys.executable, "-P", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--tb=line", *arguments]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=900)
 
 

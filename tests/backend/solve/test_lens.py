@@ -12,7 +12,7 @@ import pytest
 from torch_backend.cli import main, parser
 from torch_backend.contract import CameraFrame, CameraPath, ExitCode, FreezeParams, JobError
 from torch_backend.shot import Shot, write_json
-from torch_backend.solve.lens import Lens, load_lens
+from torch_backend.solve.lens import Lens, doubtful, load_lens
 from torch_backend.solve.stmap import (
     margin,
     needed_margin,
@@ -299,3 +299,27 @@ def test_overscan_out_of_range_is_refused(text, capsys):
     with pytest.raises(SystemExit):
         parser().parse_args(["take", "shot", f"--overscan={text}"])
     assert "invalid overscan value" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("size", "focal", "radial", "expected"),
+    [
+        ((1280, 720), (7526.0, 7526.0), (4.08,), "narrow"),
+        ((720, 1280), (7526.0, 7526.0), (4.08,), "narrow"),
+        ((640, 480), (100.0, 100.0), (0.0,), "wide"),
+        ((640, 480), (float("nan"), float("nan")), (0.0,), "narrow"),
+        ((640, 480), (-500.0, -500.0), (0.0,), "narrow"),
+        ((1280, 720), (700.0, 700.0), (-0.6,), "bent"),
+        ((1280, 720), (700.0, 700.0), (9.0,), "bent"),
+        ((1280, 720), (700.0, 300.0), (0.0,), "bent"),
+        # examples/sitting.mp4; a phone; a phone's tele; an action camera; a 135 mm lens; a rendered pinhole.
+        ((640, 480), (541.0, 541.0), (0.03,), ""),
+        ((1280, 720), (940.0, 940.0), (0.05,), ""),
+        ((720, 1280), (4300.0, 4300.0), (0.4,), ""),
+        ((1280, 720), (700.0, 705.0), (-0.24, 0.05), ""),
+        ((1920, 1080), (7200.0, 7200.0), (0.0,), ""),
+        ((320, 240), (300.0, 300.0), (-0.06,), ""),
+    ],
+)
+def test_a_lens_is_doubted_if_no_camera_has_it(size, focal, radial, expected):
+    assert doubtful(*size, focal, *radial) == expected

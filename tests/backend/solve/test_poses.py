@@ -14,6 +14,7 @@ from torch_backend.solve.poses import (
     rotation_to_quat,
     slerp,
 )
+from torch_backend.solve.solving import _nearest
 
 vectors = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 shares = st.floats(0.0, 1.0)
@@ -89,3 +90,8 @@ def test_gaps_are_filled_by_time_and_ends_held():
 def test_nothing_known_is_an_error():
     with pytest.raises(ValueError, match="no pose is known"):
         fill_poses(np.arange(3.0), {})
+
+
+@pytest.mark.parametrize("known", [[0], [7], [3, 4], [0, 10], [2, 5, 6, 11], list(range(12))])
+def test_the_nearest_of_known_frames_is_the_lower_of_two_as_near(known):
+    assert _nearest(known, 12) == [min(known, key=lambda k: (abs(k - i), k)) for i in range(12)]

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_backend.contract import CameraPath, Cancelled, ExitCode, JobError, read_json
+from torch_backend.contract import CameraPath, Cancelled, ExitCode, JobError, SolveParams, read_json
 from torch_backend.footage import FootageConfig, import_footage
-from torch_backend.footage.images import read_png
-from torch_backend.shot import Shot
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.job import new_job, run_job
+from torch_backend.shot import Shot, write_json
 from torch_backend.solve import SolveConfig, load_points, solve_shot
 from torch_backend.solve.child import run_worker
 from torch_backend.solve.floor import floor_of
 from torch_backend.solve.poses import camera_centre
-from torch_backend.solve.solving import filter_points, quality_words, refuse_poor
+from torch_backend.solve.solving import filter_points, lens_remarks, quality_words, refuse_poor
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -132,22 +133,18 @@ def test_a_solved_shot_is_left_alone(solved, tools):
 
 
 def test_the_same_frames_give_the_same_cameras(solved, tools, tmp_path):
-    """The seeds are fixed; two threads may still add in another order, so equal up to a thousandth of the path."""
+    """To the last bit: seeds are fixed, and nothing that adds or matches does so in two threads."""
     shot = Shot.create(tmp_path / "again.splannequin")
     import_footage(shot, solved.shot.info().source, FootageConfig(step=2), tools.recorder())
     solve_shot(shot, SolveConfig(features=1500), tools.recorder())
-    one, two = (CameraPath.load(s.solve / "cameras.json") for s in (solved.shot, shot))
-    assert [(f.frame, f.source) for f in one.frames] == [(f.frame, f.source) for f in two.frames]
-    np.testing.assert_allclose([f.K for f in one.frames], [f.K for f in two.frames], rtol=2e-3)
-    np.testing.assert_allclose(path_shape(one), path_shape(two), atol=1e-3)
+    for name in ("cameras.json", "points.npz"):
+        assert (shot.solve / name).read_bytes() == (solved.shot.solve / name).read_bytes()
 
 
-def path_shape(path):
-    """[F, F] distances between the cameras over the longest: what is left of a path without its gauge."""
-    viewmats = np.array([f.viewmat for f in path.frames]).reshape(-1, 4, 4)
-    centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    return distances / distances.max()
+def test_pairs_are_matched_by_one_thread():
+    """Two get wrong products of OpenBLAS now and then: too seldom for a test to meet."""
+    code = "from torch_backend.solve.worker import _matching\nassert _matching()[0].num_threads == 1"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def imported(tmp_path, tools, poses, **options):
@@ -177,14 +174,18 @@ def test_frames_that_cannot_be_placed_are_filled_in_and_said(tmp_path, tools):
     ]
 
 
+def listed(count, step=1):
+    """frames.json of frames 1 to `count`, every `step`-th solved."""
+    return {"step": step, "frames": [{"frame": n, "solve": (n - 1) % step == 0} for n in range(1, count + 1)]}
+
+
+def names(*frames):
+    return [f"{n:06d}.png" for n in frames]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"registered": 20}, "Cameras were found for only 20 of 74 frames."),
-        (
-            {"registered": 30, "model_sizes": [30, 25, 3]},
-            "Cameras were found for only 30 of 74 frames (it falls into 2 parts that do not connect).",
-        ),
         (
             {"triangulation_angle_deg": 1.6},
             "The camera moves too little for depth: half of the points are seen under 1.6 degrees or less.",
@@ -193,11 +194,104 @@ def test_frames_that_cannot_be_placed_are_filled_in_and_said(tmp_path, tools):
     ],
 )
 def test_models_that_nothing_could_be_trained_on_are_refused(changes, message):
-    good = {"registered": 74, "model_sizes": [74], "triangulation_angle_deg": 12.0, "points": 5000}
-    refuse_poor(good, 74)
+    good = {"registered": 74, "parts": [names(*range(1, 75))], "triangulation_angle_deg": 12.0, "points": 5000}
+    good |= {"focal_px": 500.0, "lens": {"width": 640, "height": 480}}
+    refuse_poor(good, listed(74))
     with pytest.raises(JobError) as error:
-        refuse_poor({**good, **changes}, 74)
+        refuse_poor({**good, **changes}, listed(74))
     assert (error.value.message, error.value.exit_code) == (message, ExitCode.SOLVE)
+
+
+@pytest.mark.parametrize(
+    ("step", "parts", "message", "hint"),
+    [
+        (
+            1,
+            [names(*range(12, 42))],
+            "Cameras were found for only 30 of 74 frames: 12 to 41.",
+            "Frames 12 to 41 worked: import that range, or one without fast pans or blur.",
+        ),
+        (
+            1,
+            [names(*range(1, 13), *range(20, 35)), names(*range(50, 75)), names(36, 37, 38)],
+            "Cameras were found for only 27 of 74 frames: 1 to 12, 20 to 34; 2 parts of the clip do not connect.",
+            "Frames 50 to 74 worked: import that range, or one without fast pans or blur.",
+        ),
+        (
+            3,
+            [names(*range(13, 38, 3))],
+            "Cameras were found for only 9 of 25 frames: 13 to 37.",
+            "Frames 13 to 37 worked: import that range, or one without fast pans or blur. A smaller step shows more of "
+            "each to the next.",
+        ),
+        (
+            1,
+            [names(5, 6, 7)],
+            "Cameras were found for only 3 of 74 frames.",
+            "Choose a range without fast pans or blur.",
+        ),
+    ],
+)
+def test_a_poor_solve_says_which_frames_worked_and_only_what_can_help(step, parts, message, hint):
+    answer = {"registered": len(parts[0]), "parts": parts, "triangulation_angle_deg": 12.0, "points": 5000}
+    with pytest.raises(JobError) as error:
+        refuse_poor(answer, listed(74, step))
+    assert (error.value.message, error.value.hint, error.value.exit_code) == (message, hint, ExitCode.SOLVE)
+
+
+def test_a_failed_solve_leaves_colmaps_last_words_in_the_job_s_log(tmp_path, tools):
+    shot = imported(tmp_path, tools, [tools.look([0.1 * i - 0.8, 0.02 * i, 0.0], yaw=-0.03 * i) for i in range(17)])
+    for n in range(109, 118):  # a whole clip of it would not have been imported
+        noise = np.random.default_rng(n).integers(0, 256, (240, 320, 3), np.uint8)
+        write_png(shot.frames / f"raw/{n:06d}.png", noise)
+    folder = new_job(shot, "solve", SolveParams())
+    assert run_job(folder)[0] == ExitCode.SOLVE
+    status, log = read_json(folder / "status.json"), (folder / "log.txt").read_text()
+    assert status["message"].startswith("Cameras were found for only 8 of 17 frames: 101 to 108")
+    assert status["hint"].startswith("Frames 101 to 108 worked: import that range")
+    assert status["message"] in log and "colmap.log:" in log and "Registering image" in log
+    assert "Traceback" not in log
+
+
+@pytest.mark.parametrize(
+    ("focal", "message"),
+    [
+        (13_000.0, "The solve found a lens that no camera has: 2.8 degrees wide (13000 px)."),
+        (60.0, "The solve found a lens that no camera has: 158.8 degrees wide (60 px)."),
+    ],
+)
+def test_a_lens_that_no_camera_has_is_refused(focal, message):
+    answer = {"registered": 74, "parts": [], "triangulation_angle_deg": 12.0, "points": 5000, "focal_px": focal}
+    with pytest.raises(JobError) as error:
+        refuse_poor({**answer, "lens": {"width": 640, "height": 480}}, listed(74))
+    assert (error.value.message, error.value.exit_code) == (message, ExitCode.SOLVE)
+
+
+def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
+    """A wall seen straight on: far away through a long lens looks like near by through a short one."""
+    poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(10)]
+    shot, report = imported(tmp_path, tools, poses), tools.recorder()
+    solve_shot(shot, SolveConfig(features=1000), report)
+    record = read_json(shot.solve / "solve.json")
+    assert (record["focal_px"], record["distortion"]) == (1.2 * 320, [0.0])
+    assert record["registered"] == 10 and record["triangulation_angle_deg"] > 8
+    assert report.warnings[0].startswith("The clip does not tell its lens (the solve ran off to ")
+    assert report.warnings[0].endswith("a usual one of 45 degrees was taken.")
+
+
+@pytest.mark.parametrize(
+    ("lens", "words"),
+    [
+        ({"doubt": "", "held": False}, []),
+        ({"doubt": "narrow", "held": False}, ["is unusual: 10 degrees wide."]),
+        ({"doubt": "bent", "held": False}, ["folds it over at its corners."]),
+        ({"doubt": "narrow", "held": True}, ["(the solve ran off to 3 degrees): a usual one of 10 degrees was taken."]),
+    ],
+)
+def test_a_doubtful_lens_is_said(lens, words):
+    told = {"focal_px": 7526.0, "lens": {**lens, "found_px": 24_000.0, "width": 1280, "height": 720}}
+    found = [message for message, _ in lens_remarks(told)]
+    assert len(found) == len(words) and all(a.endswith(b) for a, b in zip(found, words, strict=True))
 
 
 def refused(shot, tools):
@@ -286,3 +380,17 @@ import sys, torch_backend.solve.worker
 assert "pycolmap" in sys.modules and "OpenImageIO" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_worker_takes_no_module_from_where_the_request_lies(hostile, tmp_path, tools):
+    scratch = tmp_path / "scratch"
+    marker = hostile(scratch)
+    request = {"images": str(tmp_path / "none"), "solved": [], "others": [], "camera_model": "SIMPLE_RADIAL"}
+    request |= {"overlap": 1, "features": 128, "neighbours": 1, "threads": 1}
+    write_json(scratch / "request.json", request)
+    try:
+        told = run_worker(scratch / "request.json", scratch / "log.txt", tools.recorder())
+    except JobError as error:
+        told = error.message
+    assert "COLMAP" in str(told) or "failure" in told, "the worker itself answered"
+    assert not marker.exists(), marker.read_text()

@@ -204,3 +204,17 @@ def test_wrong_calls_are_named():
         FusedAdam([p]).step()
     with pytest.raises(ValueError, match="closure"):
         FusedAdam([torch.nn.Parameter(torch.zeros(1))]).step(closure=lambda: 0.0)  # type: ignore[arg-type]
+
+
+def test_restored_moments_lie_where_their_parameter_does():
+    """A checkpoint is read to the CPU; torch's `meta` device stands for a card here."""
+    stored = {f"adam.{name}.a": torch.ones(5, 3) for name in ("exp_avg", "exp_avg_sq")}
+    stored["adam.step.a"] = torch.tensor(7.0)
+    for device, dtype in (("meta", torch.float32), ("cpu", torch.float64)):
+        a = torch.zeros(3, 5, device=device, dtype=dtype).T.requires_grad_()
+        optimizer = torch.optim.Adam([a])
+        restore_optimizer({"a": a}, optimizer, stored)
+        state = optimizer.state[a]
+        for name in ("exp_avg", "exp_avg_sq"):
+            assert (state[name].device, state[name].dtype, state[name].stride()) == (a.device, dtype, a.stride())
+        assert (state["step"].device.type, state["step"].dtype, state["step"].shape) == (device, torch.float32, ())

@@ -13,7 +13,7 @@ from torch_backend.contract import FreezeParams, JobError, TrainParams
 from torch_backend.freeze import freeze_shot
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import choose_device, config_from_params, load_run, train_shot
-from torch_backend.train.device import cuda_refusal
+from torch_backend.train.device import cuda_refusal, unused_card
 from torch_backend.train.trainer import Trainer
 
 ROOT = Path(torch_backend.__file__).parent
@@ -71,6 +71,19 @@ def test_choice_of_device():
 def test_cuda_without_a_gpu_is_refused_in_words(world, quiet):
     with pytest.raises(JobError, match="GPU"):
         train_shot(world.shot, TrainParams(run="gpu", device="cuda"), quiet())
+
+
+@pytest.mark.skipif(not cuda_refusal() or sys.platform == "win32", reason="there is a GPU, or no shell")
+def test_a_card_that_is_not_used_is_said_at_the_start_of_training(world, quiet, nvidia_smi):
+    nvidia_smi("NVIDIA GeForce RTX 3090, 535.183.01, 8.6")
+    assert unused_card() is not None and cuda_refusal() == unused_card()[0]
+    report = quiet()
+    train_shot(world.shot, TrainParams(run="unused-card", iterations=20, max_gaussians=1500), report)
+    said = [event for event in report.events if event[0] == "warning" and "RTX 3090" in event[1]]
+    assert len(said) == 1 and "driver 535.183.01, and R580" in said[0][1] and "Update" in said[0][2]
+    silent = quiet()
+    train_shot(world.shot, TrainParams(run="by-wish", iterations=20, max_gaussians=1500, device="cpu"), silent)
+    assert not [event for event in silent.events if event[0] == "warning" and "RTX 3090" in event[1]]
 
 
 @needs_gpu

@@ -1,7 +1,9 @@
 """A run on a tiny world with truth: it learns, it opens the gate where things move, it resumes exactly."""
 
+import hashlib
 import json
 import math
+import shutil
 
 import pytest
 import torch
@@ -9,8 +11,9 @@ import torch
 from torch_backend.contract import Cancelled, JobError, TrainParams
 from torch_backend.gaussians import PARAM_NAMES
 from torch_backend.scene import load_images, load_scene
+from torch_backend.shot import Shot
 from torch_backend.train import PRESETS, config_from_params, load_run, train_shot
-from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
+from torch_backend.train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from torch_backend.train.config import config_from_json, config_to_json
 from torch_backend.train.trainer import Trainer, inside_frustum
 
@@ -184,14 +187,95 @@ def test_config_round_trip():
             assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config
 
 
-def test_a_run_of_other_settings_is_not_taken_for_this_one(world, quiet):
-    """Finish one, cancel another under the same name, ask for the first again: the checkpoint is no longer its own."""
+def iteration_of(folder):
+    return read_meta(folder / "checkpoint.safetensors")["iteration"]
+
+
+def files_of(run):
+    """Name -> hash of every file of a run, without what is trained to take its place."""
+    files = [p for p in run.rglob("*") if p.is_file() and "next" not in p.parts]
+    return {str(p.relative_to(run)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def begun_in(run):
+    """The folders in which trainings that will take the run's place are at work."""
+    return sorted(p.parent for p in run.glob("next/*/checkpoint.safetensors"))
+
+
+def test_a_finished_run_stays_until_one_of_other_settings_is_done(world, quiet):
     train_shot(world.shot, short(world, "mixed"), quiet())
+    run = world.shot.run("mixed")
+    before = files_of(run)
+    report = quiet(cancel_at=("training", 0.5))
     with pytest.raises(Cancelled):
-        train_shot(world.shot, short(world, "mixed", seed=5), quiet(cancel_at=("training", 0.3)))
+        train_shot(world.shot, short(world, "mixed", seed=5), report)
+    assert files_of(run) == before
+    assert any(e[0] == "warning" and "trained anew" in e[1] and "stays" in e[2] for e in report.events)
+    assert load_run(world.shot, "mixed").config.seed == 0
+    (work,) = begun_in(run)
+    stopped = iteration_of(work)
+    assert 30 <= stopped < 60
     report = quiet()
-    train_shot(world.shot, short(world, "mixed"), report)
-    assert ("progress", "training", 1, 1, "already trained") not in report.events
+    assert train_shot(world.shot, short(world, "mixed"), report)["iterations"] == 60
+    assert ("progress", "training", 1, 1, "already trained") in report.events
+    report = quiet()
+    train_shot(world.shot, short(world, "mixed", seed=5), report)
+    assert ("progress", "training", stopped, 60, f"resumed at step {stopped}") in report.events
+    assert load_run(world.shot, "mixed").config.seed == 5
+    assert not (run / "next").exists()
+    assert files_of(run).keys() == before.keys()
+    rows = [json.loads(line)["iteration"] for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert rows == list(range(6, 61, 6))
+
+
+def test_a_finished_run_that_begins_anew_stays_too(world, quiet):
+    train_shot(world.shot, short(world, "restarted"), quiet())
+    run = world.shot.run("restarted")
+    before = files_of(run)
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, short(world, "restarted", resume=False), quiet(cancel_at=("training", 0.5)))
+    assert files_of(run) == before
+    train_shot(world.shot, short(world, "restarted"), quiet())
+    assert not begun_in(run), "the finished run is what it could only come to"
+
+
+def test_paused_runs_of_one_name_wait_side_by_side(world, quiet):
+    """Hours of a paused run are not lost because somebody tried other settings for a minute."""
+    for seed in (1, 2, 3):
+        with pytest.raises(Cancelled):
+            train_shot(world.shot, short(world, "paused", seed=seed), quiet(cancel_at=("training", 0.5)))
+    run = world.shot.run("paused")
+    assert load_run(world.shot, "paused").config.seed == 1
+    assert len(begun_in(run)) == 2
+    report = quiet()
+    train_shot(world.shot, short(world, "paused", seed=2), report)
+    assert any(e[0] == "progress" and "resumed" in e[4] for e in report.events)
+    assert load_run(world.shot, "paused").config.seed == 2
+    assert not (run / "next").exists()
+
+
+def test_a_kill_while_the_new_run_takes_its_place_is_made_up_for(world, quiet, tmp_path):
+    """The files are replaced one after the other; the state after each is built by hand."""
+    shot = Shot(shutil.copytree(world.shot.root, tmp_path / "s.splannequin", ignore=shutil.ignore_patterns("runs")))
+    run, old, new = shot.run("main"), tmp_path / "old", tmp_path / "new"
+    for seed, folder in ((0, old), (5, new)):
+        train_shot(shot, short(world, "main", seed=seed), quiet())
+        run.rename(folder)
+    key, expected = json.loads((new / "summary.json").read_text())["key"], files_of(new)
+    for moved in range(5):
+        shutil.copytree(old, run)
+        shutil.copytree(new, run / "next" / key)
+        for name in ("checkpoint.safetensors", "config.json", "metrics.jsonl", "previews")[:moved]:
+            if name == "previews":
+                shutil.rmtree(run / name)
+            (run / "next" / key / name).replace(run / name)
+        assert load_run(shot, "main").config.seed == (5 if moved else 0), "it can be frozen from meanwhile"
+        report = quiet()
+        train_shot(shot, short(world, "main", seed=5), report)
+        assert ("progress", "training", 1, 1, "already trained") in report.events
+        assert files_of(run) == expected
+        assert not (run / "next").exists()
+        shutil.rmtree(run)
 
 
 def test_cancelling_at_once_keeps_the_finished_checkpoint(world, quiet):

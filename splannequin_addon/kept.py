@@ -1,0 +1,39 @@
+"""What was read of a shot's files, kept until they change: the panel asks every second while a shot grows, and the
+files of a long one are long. No bpy."""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+_MOST = 512
+"""Files that are remembered: the runs and takes of a few shots."""
+_known: OrderedDict[tuple[Any, ...], tuple[tuple[int, ...], Any]] = OrderedDict()
+
+
+def of(path: Path, read: Callable[..., T], *words: Any) -> T:
+    """`read(path, *words)`, remembered while file or folder is what it was: same file, same length, same times.
+
+    The value is given out again and again: nobody may change it. What `read` raises is not remembered.
+
+    Args:
+        path: a file, or a folder if only the names in it count.
+        read: a function of a module, called with the path and `words`, which can be hashed.
+    """
+    told = os.stat(path)
+    stamp = (told.st_ino, told.st_size, told.st_mtime_ns, told.st_ctime_ns)
+    key = (os.fspath(path), read, *words)
+    found = _known.get(key)
+    if found is not None and found[0] == stamp:
+        _known.move_to_end(key)
+        return found[1]
+    value = read(path, *words)
+    _known[key] = (stamp, value)
+    _known.move_to_end(key)
+    while len(_known) > _MOST:
+        _known.popitem(last=False)
+    return value

@@ -1,0 +1,85 @@
+"""Runs in a Blender of its own that was started with another colour configuration; tests/addon/test_ocio.py starts it.
+
+    OCIO=config.ocio PYTHON tests/addon/data/in_ocio.py -- SHOT FOLDER      (or BLENDER --python ...)
+
+Builds the camera, puts the take in, renders frame 6 twice (plate, frozen) into FOLDER, and writes FOLDER/told.json.
+"""
+
+import importlib
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import bpy
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def add_on(name: str):
+    return importlib.import_module(f"bl_ext.user_default.splannequin.splannequin_addon.{name}")
+
+
+def there(scene) -> dict:
+    """All that a step could leave in the file."""
+    kinds = ("objects", "cameras", "meshes", "collections", "node_groups", "actions", "images", "textures")
+    render, view = scene.render, scene.view_settings
+    return {
+        **{kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds},
+        "camera": scene.camera.name if scene.camera else None,
+        "size": [render.resolution_x, render.resolution_y, render.fps, scene.frame_start, scene.frame_end],
+        "colours": [view.view_transform, view.look, round(render.dither_intensity, 3), render.use_compositing],
+        "markers": [marker.name for marker in scene.timeline_markers],
+        "made": [one.name for one in scene.splannequin.made],
+        "own": sorted(key for key in scene.keys() if key.startswith("splannequin_")),  # noqa: SIM118
+    }
+
+
+def tried(scene, change) -> dict:
+    """What a change said, or how it failed, and what of the file is different since."""
+    before = there(scene)
+    try:
+        said = {"said": change()}
+    except Exception as error:
+        said = {"error": f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()}
+    after = there(scene)
+    return said | {"changed": {k: (before[k], after[k]) for k in before if before[k] != after[k]}}
+
+
+def main() -> None:
+    shot, out = (Path(name) for name in sys.argv[sys.argv.index("--") + 1 :][:2])
+    spec = importlib.util.spec_from_file_location("run_in_bpy", ROOT / "splannequin_addon" / "run_in_bpy.py")
+    runner = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(runner)
+    package = runner.load_package()
+    package.register()
+    scene, steps, compat = bpy.context.scene, add_on("steps"), add_on("compat")
+    scene.splannequin.shot_path = str(shot)
+    told = {"blender": bpy.app.version_string}
+    told["first"] = tried(scene, lambda: steps.load_camera(scene, shot))
+    if "error" in told["first"]:  # without a plate nothing has to be shown: a camera that a second try must spare
+        (shot / "frames").rename(shot / "away")
+        told["without a plate"] = tried(scene, lambda: steps.load_camera(scene, shot))
+        (shot / "away").rename(shot / "frames")
+        told["again"] = tried(scene, lambda: steps.load_camera(scene, shot))
+    told["freeze"] = tried(scene, lambda: steps.insert_freeze(scene, shot, "freeze"))
+    if "error" in told["freeze"]:
+        scene.splannequin.keep_colours = False
+        told["as they come"] = tried(scene, lambda: steps.insert_freeze(scene, shot, "freeze"))
+    else:
+        told["combined"] = tried(scene, lambda: steps.combine_cg(scene, shot))
+        node = add_on("compositor").group_node(compat.compositor_tree(scene))
+        node.inputs["CG"].links[0].from_node.mute = True
+        scene.frame_start = scene.frame_end = 6
+        for name, mix in (("plate", 0.0), ("frozen", 1.0)):
+            node.inputs["Mix"].default_value = mix
+            add_on("bake").render(scene, out / name)
+    told["removed"] = tried(scene, lambda: steps.remove_all(scene, shot))
+    told["end"] = there(scene)
+    (out / "told.json").write_text(json.dumps(told))
+    package.unregister()
+
+
+if __name__ == "__main__":
+    main()
+    sys.stdout.flush()

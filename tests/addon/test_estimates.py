@@ -1,0 +1,68 @@
+"""What the presets say of themselves, and what the panel asks for after a solve."""
+
+import bpy
+import numpy as np
+import pytest
+
+
+def run(**figures):
+    return {"run": "main", "preset": "preview", "width_px": 320, "iterations": 3000, "train_seconds": 150.0} | figures
+
+
+@pytest.fixture
+def costs(addon, tmp_path):
+    """costs(runs, width) is {preset: cost} for a shot of that width, and the run that tells it."""
+
+    def call(runs, width=1280):
+        state = addon("shots").ShotState(tmp_path, {"width": width, "height": 720}, runs=runs)
+        rows, told = addon("estimates").costs(state)
+        return {row.preset: row for row in rows}, told
+
+    return call
+
+
+def test_without_a_timed_run_nothing_is_promised(costs, addon, contract):
+    for runs in ({}, {"a": run(train_seconds=None)}, {"a": run(train_seconds="x")}, {"a": run(iterations=0)}):
+        rows, told = costs(runs)
+        assert told is None and all(row.seconds is None and not row.measured for row in rows.values())
+    assert {n: (r.steps, r.width) for n, r in rows.items()} == {
+        n: (contract.PRESET_STEPS[n], contract.PRESET_WIDTHS[n]) for n in ("preview", "standard", "final")
+    }
+    assert addon("estimates").costs(None)[1] is None
+
+
+def test_a_preset_that_was_run_takes_as_long_again_and_others_by_pixels_and_steps(costs):
+    rows, told = costs({"main": run(iterations=1500, train_seconds=100.0)})
+    assert told["run"] == "main"
+    assert (rows["preview"].seconds, rows["preview"].measured) == (200.0, True)
+    assert (rows["standard"].seconds, rows["standard"].measured) == (pytest.approx(200.0 * 3 * 4), False)
+    assert rows["final"].seconds == pytest.approx(200.0 * 10 * 16)
+
+
+def test_a_small_clip_is_not_enlarged(costs):
+    rows, _ = costs({"main": run(width_px=320)}, width=640)
+    assert (rows["standard"].width, rows["final"].width) == (640, 640)
+
+
+def test_a_tooltip_tells_what_the_preset_is(addon, contract):
+    for name, _, words in addon("props").PRESETS:
+        assert words.startswith(f"{contract.PRESET_WIDTHS[name]} pixels wide, {contract.PRESET_STEPS[name]} steps")
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_the_scale_is_asked_for_until_it_was_set(addon, scene, shot, by_hand):
+    scene.splannequin.shot_path = str(shot)
+    bpy.ops.splannequin.load_camera()
+    scaled = addon("ops_align").scaled
+    assert not scaled(scene, shot)
+    bpy.ops.splannequin.align_origin(places=(0.5, 0, 0))
+    assert not scaled(scene, shot)
+    if by_hand:
+        addon("cameras").find(scene, shot, "EMPTY").scale = (2.0, 2.0, 2.0)
+        bpy.context.view_layer.update()
+    else:
+        places = np.array([[0, 0, 0], [1, 0, 0]], dtype=float)
+        bpy.ops.splannequin.align_scale(places=places.ravel().tolist(), distance=1.0)
+    assert scaled(scene, shot), "also where it happened to be right"
+    bpy.ops.splannequin.load_camera()
+    assert scaled(scene, shot), "a second solve keeps it"

@@ -1,0 +1,74 @@
+"""A shot that came with Python modules in its folders: no button runs them. Real backends in and around it."""
+
+import os
+import time
+
+import pytest
+
+
+@pytest.fixture
+def trap(hostile, shot, tmp_path, monkeypatch):
+    """The shot with modules in every folder that a child could stand in, and the file that they write if imported."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    return hostile(shot, tmp_path / "temporary", shot / "jobs", shot / "frames", shot / "solve", shot / "runs" / "main")
+
+
+def ended(job, jobs):
+    until = time.monotonic() + 120
+    while not job.ended and time.monotonic() < until:
+        jobs.poll(job)
+        time.sleep(0.05)
+    return job.status
+
+
+def test_scrubbing(addon, trap, shot, root):
+    session = addon("live").open_session(shot, "nothing", addon("backend").python(), root)
+    until = time.monotonic() + 120
+    while session.open and time.monotonic() < until:
+        time.sleep(0.05)
+    assert "nothing" in session.failure[0], "it is our backend that answered"
+    assert not trap.exists(), trap.read_text()
+
+
+def test_st_maps(addon, contract, trap, shot):
+    asked = addon("stmaps").begin(shot)
+    asked.wait()
+    with pytest.raises(contract.JobError):  # the shot has no lens
+        asked.answer()
+    assert not trap.exists(), trap.read_text()
+
+
+def test_exported_cameras(addon, trap, shot):
+    solves = addon("solves")
+    process = solves.begin_export(shot, "nerfstudio", shot / "out")
+    assert str(shot / "out") in solves.finish_export(process, shot / "out")
+    assert (shot / "out" / "transforms.json").is_file()
+    assert not trap.exists(), trap.read_text()
+
+
+def test_a_job(addon, contract, trap, hostile, shot, root):
+    jobs = addon("jobs")
+    job = jobs.new_job(shot, "import", contract.ImportParams(str(shot / "no clip.mp4")))
+    hostile(job.folder, shot)
+    jobs.start(job, addon("backend").python(), root)
+    status = ended(job, jobs)
+    assert (status.state, status.exit_code) == ("failed", contract.ExitCode.FOOTAGE)
+    assert not trap.exists(), trap.read_text()
+
+
+def test_a_child_stands_beside_its_interpreter(addon, contract):
+    """Windows looks for libraries where it stands, and keeps that folder from being moved."""
+    python = addon("backend").python()
+    child = contract.python_child(python, "torch_backend", "doctor")
+    assert child["cwd"] == os.path.dirname(os.path.abspath(python))
+
+
+def test_a_program_beside_the_blend_file_is_none_of_the_path(contract, tmp_path, monkeypatch):
+    fake = tmp_path / "nvidia-smi"
+    fake.write_text("#!/bin/sh\n")
+    fake.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", os.pathsep.join([".", ""]))
+    assert contract.program("nvidia-smi") is None
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert contract.program("nvidia-smi") == str(fake)

@@ -1,0 +1,87 @@
+"""A shot that is looked at every second: files that did not change are not opened again, and what did is seen."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+_opened: list[str] = []
+_listening = [False]
+
+
+def _note(event: str, arguments: tuple) -> None:
+    if _listening[0] and event == "open" and isinstance(arguments[0], str | bytes | os.PathLike):
+        _opened.append(os.fsdecode(arguments[0]))
+
+
+@pytest.fixture
+def opened():
+    """opened(call) is (what it gives, the files it opened); an audit hook cannot be taken away, so there is one."""
+    if "hooked" not in sys.modules[__name__].__dict__:
+        sys.addaudithook(_note)
+        sys.modules[__name__].__dict__["hooked"] = True
+
+    def call(function, *arguments):
+        _opened.clear()
+        _listening[0] = True
+        try:
+            return function(*arguments), [Path(name).name for name in _opened]
+        finally:
+            _listening[0] = False
+
+    return call
+
+
+@pytest.fixture
+def long_shot(shot) -> Path:
+    """The shot with all that is read of one: a run with a history, solved again since."""
+    run = shot / "runs" / "main"
+    (run / "metrics.jsonl").write_text('{"seconds": 1.0, "heldout_psnr_db": 20.0}\n')
+    (run / "config.json").write_text('{"solve": "another"}')
+    (run / "checkpoint.safetensors").write_bytes(b"\0" * 16)
+    os.utime(run / "checkpoint.safetensors", (1, 1))
+    return shot
+
+
+def test_what_did_not_change_is_not_opened_again(addon, long_shot, opened):
+    read = addon("shots").read
+    first, names = opened(read, long_shot)
+    assert {"shot.json", "frames.json", "cameras.json", "solve.json", "summary.json", "take.json"} <= set(names)
+    again, names = opened(read, long_shot)
+    assert names == [] and again == first
+    assert first.runs["main"]["other_cameras"] and first.runs["main"]["history"] == [(1.0, 20.0)]
+
+
+def test_what_changed_is_read_again_and_only_that(addon, long_shot, opened):
+    read = addon("shots").read
+    read(long_shot)
+    (long_shot / "takes" / "freeze" / "000008.exr").touch()
+    grown, names = opened(read, long_shot)
+    assert grown.takes["freeze"]["frame_count"] == 4 and names == []
+    info = json.loads((long_shot / "shot.json").read_text())
+    addon("jobs").write_json(long_shot / "shot.json", info | {"name": "renamed"})
+    with open(long_shot / "runs" / "main" / "metrics.jsonl", "a") as more:
+        more.write('{"seconds": 2.0, "heldout_psnr_db": 21.0}\n')
+    changed, names = opened(read, long_shot)
+    assert changed.info["name"] == "renamed" and changed.runs["main"]["history"][-1] == (2.0, 21.0)
+    assert sorted(names) == ["metrics.jsonl", "shot.json"]
+
+
+def test_what_a_reader_adds_is_not_remembered(addon, long_shot):
+    shots = addon("shots")
+    shots.read(long_shot).takes["freeze"]["mine"] = True
+    shots.read(long_shot).info["mine"] = True
+    assert "mine" not in shots.read(long_shot).takes["freeze"] and "mine" not in shots.read(long_shot).info
+
+
+def test_only_so_much_is_remembered(addon, tmp_path, monkeypatch):
+    kept = addon("kept")
+    monkeypatch.setattr(kept, "_MOST", 3)
+    for n in range(6):
+        (tmp_path / str(n)).write_text(str(n))
+        assert kept.of(tmp_path / str(n), Path.read_text) == str(n)
+    assert len(kept._known) == 3
+    with pytest.raises(FileNotFoundError):
+        kept.of(tmp_path / "gone", Path.read_text)

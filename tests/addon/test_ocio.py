@@ -1,0 +1,126 @@
+"""Colour configurations of other studios (OCIO): the camera and the take come in, or the scene stays as it was."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+FROM_AP0 = (
+    "!<MatrixTransform> {matrix: [2.52168618674388, -1.13413098823972, -0.387555198504164, 0, -0.276479914229922, "
+    "1.37271908766826, -0.096239173438334, 0, -0.0153780649660342, -0.152975335867399, 1.16835340083343, 0, 0, 0, 0, "
+    "1]}"
+)
+"""ACES2065-1 to linear Rec.709, as the ACES configurations have it."""
+CURVE = "!<ExponentWithLinearTransform> {gamma: 2.4, offset: 0.055, direction: inverse}"
+CONFIG = """ocio_profile_version: 2
+search_path: ""
+roles:
+  aces_interchange: ACES2065-1
+  cie_xyz_d65_interchange: CIE XYZ-D65 - Display-referred
+  color_picking: {paint}
+  data: Raw
+  matte_paint: {paint}
+  scene_linear: ACEScg
+  texture_paint: {paint}
+file_rules:
+  - !<Rule> {{name: Default, colorspace: ACES2065-1}}
+shared_views:
+  - !<View> {{name: {view}, view_transform: Un-tone-mapped, display_colorspace: <USE_DISPLAY_NAME>}}
+  - !<View> {{name: Raw, colorspace: Raw}}
+displays:
+  sRGB - Display:
+    - !<Views> [Raw, {view}]
+view_transforms:
+  - !<ViewTransform>
+    name: Un-tone-mapped
+    from_scene_reference: !<BuiltinTransform> {{style: UTILITY - ACES-AP0_to_CIE-XYZ-D65_BFD}}
+display_colorspaces:
+  - !<ColorSpace>
+    name: CIE XYZ-D65 - Display-referred
+  - !<ColorSpace>
+    name: sRGB - Display
+    from_display_reference: !<BuiltinTransform> {{style: DISPLAY - CIE-XYZ-D65_to_{display}}}
+colorspaces:
+  - !<ColorSpace>
+    name: ACES2065-1
+  - !<ColorSpace>
+    name: ACEScg
+    to_scene_reference: !<BuiltinTransform> {{style: ACEScg_to_ACES2065-1}}
+  - !<ColorSpace>
+    name: Raw
+    isdata: true
+"""
+SPACES = """  - !<ColorSpace>
+    name: {linear}
+    from_scene_reference: {matrix}
+  - !<ColorSpace>
+    name: {srgb}
+    from_scene_reference: !<GroupTransform> {{children: [{matrix}, {curve}]}}
+"""
+
+
+def configuration(folder: Path, linear: str, srgb: str, view: str = "Un-tone-mapped") -> Path:
+    """An ACES configuration in small, whose spaces for linear Rec.709 and sRGB have these names."""
+    text = CONFIG.format(paint=srgb, view=view, display="sRGB")
+    text += SPACES.format(linear=linear, srgb=srgb, matrix=FROM_AP0, curve=CURVE)
+    (folder / "config.ocio").write_text(text)
+    return folder / "config.ocio"
+
+
+def blender(config: Path, root: Path, shot: Path, out: Path) -> dict:
+    """Runs data/in_ocio.py in another Blender with a colour configuration; returns what it told."""
+    script = str(root / "tests" / "addon" / "data" / "in_ocio.py")
+    command = [bpy.app.binary_path, "--background", "--factory-startup", "--python", script]
+    command = command if bpy.app.binary_path else [sys.executable, script]
+    done = subprocess.run(
+        [*command, "--", str(shot), str(out)],
+        env={**os.environ, "OCIO": str(config)},
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=120,
+        check=False,
+    )
+    assert (out / "told.json").is_file(), done.stdout + done.stderr
+    return json.loads((out / "told.json").read_text())
+
+
+def test_camera_and_take_come_in_whole_under_an_aces_configuration(root, shot, tmp_path, pictures, layers):
+    """Names of the ACES studio configuration; pixels leave as they came in, through ACEScg."""
+    config = configuration(tmp_path, "Linear Rec.709 (sRGB)", "sRGB Encoded Rec.709 (sRGB)")
+    told = blender(config, root, shot, tmp_path)
+    assert "my shot é camera is the scene's camera, with the plate behind it." in told["first"]["said"]
+    said = "View transform set from Raw to Un-tone-mapped, so that the plate keeps its colours."
+    assert said in told["freeze"]["said"]
+    assert "said" in told["combined"]
+    plate = pictures.read(tmp_path / "plate" / "000006.png")
+    assert np.abs(plate - pictures.read(shot / "frames" / "000006.png")).max() * 255 < 1.1
+    frozen = pictures.read(tmp_path / "frozen" / "000006.png")
+    expected = pictures.srgb(layers(6)["rgba"][..., :3])
+    assert np.abs(frozen - expected)[:, 1:].max() * 255 < 1.6
+    assert not told["end"]["made"] and not told["end"]["own"] and told["end"]["colours"][0] == "Raw"
+
+
+def test_colour_spaces_are_known_by_what_they_do(root, shot, tmp_path):
+    told = blender(configuration(tmp_path, "Licht", "Bildschirm"), root, shot, tmp_path)
+    assert "said" in told["first"] and "said" in told["freeze"]
+
+
+def test_where_nothing_fits_a_sentence_says_so_and_the_scene_stays_as_it_was(root, shot, tmp_path):
+    text = CONFIG.format(paint="ACEScg", view="Film", display="REC.1886-REC.709")
+    (tmp_path / "config.ocio").write_text(text)
+    told = blender(tmp_path / "config.ocio", root, shot, tmp_path)
+    for step in ("first", "again"):
+        assert told[step]["error"] == (
+            "The colour configuration that Blender was started with (OCIO) has no colour space for sRGB. "
+            "Start Blender without it, or add one to it."
+        )
+        assert told[step]["changed"] == {}, f"{step}: a build that failed left something behind"
+    assert told["without a plate"]["changed"]["made"] == [[], ["my shot é"]]
+    assert "no view that leaves colours alone" in told["freeze"]["error"] and told["freeze"]["changed"] == {}
+    assert "no colour space for scene-linear Rec.709" in told["as they come"]["error"]
+    assert told["as they come"]["changed"] == {}

@@ -1,0 +1,100 @@
+"""A solve over a finished one: the old one stays until the new one is whole, wherever the process is killed."""
+
+import hashlib
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torch_backend.contract import CameraPath, Cancelled
+from torch_backend.scene import load_scene
+from torch_backend.shot import Shot
+from torch_backend.solve import SolveConfig, load_points, solve_shot
+
+ROOT = Path(__file__).resolve().parents[3]
+AGAIN = """
+import os, signal, sys
+from torch_backend.shot import Shot
+from torch_backend.solve import SolveConfig, solve_shot
+
+shot, at_stage, at_rename = Shot(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+renames = 0
+
+class Report:
+    def progress(self, stage, done, total, message=""):
+        if stage == at_stage and done >= 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+    def warning(self, message, hint=""): pass
+    def metric(self, stage, values): pass
+    def check_cancelled(self): pass
+
+def hook(event, args):
+    global renames
+    if event == "os.rename" and os.sep + "next" + os.sep in os.fspath(args[0]):
+        renames += 1
+        if renames == at_rename:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+sys.addaudithook(hook)
+solve_shot(shot, SolveConfig(), Report(), sys.argv[4])
+"""
+
+
+def contents(shot):
+    """{name: hash} of what readers of a solved shot read."""
+    files = [p for folder in (shot.frames, shot.solve) for p in folder.rglob("*") if p.is_file()]
+    read = [p for p in files if p.name != "colmap.log" and "scratch" not in p.parts]
+    return {p.relative_to(shot.root).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in read}
+
+
+def of_old(shot, before):
+    """True if all that readers read is as it was; what a killed process left beside it is not read."""
+    now = contents(shot)
+    return {name: now.get(name) for name in before} == before
+
+
+def killed(shot, cameras, stage="", rename=0):
+    done = subprocess.run([sys.executable, "-c", AGAIN, shot.root, stage, str(rename), cameras], cwd=ROOT, check=False)
+    assert done.returncode == -signal.SIGKILL
+
+
+def test_a_cancelled_solve_leaves_the_one_before_it(again, tools):
+    shot, cameras = again
+    before = contents(shot)
+    for stage in ("solve: lens", "solve: undistort"):
+        with pytest.raises(Cancelled):
+            solve_shot(shot, SolveConfig(), tools.recorder(cancel_at=stage), cameras)
+        assert contents(shot) == before
+
+
+def test_a_solve_killed_while_it_writes_leaves_the_one_before_it(again, tools):
+    shot, cameras = again
+    before = contents(shot)
+    killed(shot, cameras, stage="solve: undistort")
+    assert of_old(Shot.open(shot.root), before)
+    assert len(load_scene(shot).solved) == 11
+    solve_shot(shot, SolveConfig(), tools.recorder(), cameras)
+    assert not list(shot.solve.glob("next*")) and not (shot.solve / "scratch").exists()
+
+
+@pytest.mark.parametrize("rename", [9, 26])
+def test_a_solve_killed_while_it_takes_its_place_is_whole_when_the_shot_is_opened_next(again, tools, rename):
+    shot, cameras = again
+    whole = Shot(shutil.copytree(shot.root, shot.root.with_name("whole.splannequin")))
+    solve_shot(whole, SolveConfig(), tools.recorder(), cameras)
+    before = contents(shot)
+    killed(shot, cameras, rename=rename)
+    assert not of_old(shot, before)
+    assert contents(Shot.open(shot.root)) == contents(whole) != before
+    path = CameraPath.load(shot.solve / "cameras.json")
+    assert len(path.frames) == 21 and len(load_points(shot)["xyz"]) > 300
+
+
+def test_a_model_of_fewer_files_leaves_none_of_the_one_before_it(again, tools):
+    shot, cameras = again
+    (shot.solve / "colmap" / "rigs.bin").write_bytes(b"of a solve of before")
+    solve_shot(shot, SolveConfig(), tools.recorder(), cameras)
+    assert {p.name for p in (shot.solve / "colmap").iterdir()} == {"cameras.bin", "images.bin", "points3D.bin"}

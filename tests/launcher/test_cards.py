@@ -1,0 +1,87 @@
+"""What the launcher makes of NVIDIA's tool, for which a script stands in that prints what the real one prints."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+import splannequin
+from torch_backend.cards import Card, nvidia_cards, why_unused
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="the stand-in is a shell script")
+
+GOOD = "NVIDIA GeForce RTX 3090, 580.65.06, 8.6"
+OLD_DRIVER = "NVIDIA GeForce RTX 3090, 535.183.01, 8.6"
+OLD_CARD = "Tesla P100-PCIE-16GB, 580.65.06, 6.0"
+ON_CPU = {"torch_device": "cpu", "trains_on": "cpu", "cuda_refusal": "PyTorch sees no NVIDIA GPU."}
+CUDA, CPU_BUILD = {**ON_CPU, "torch_cuda": "13.0"}, {**ON_CPU, "torch_cuda": None}
+
+
+def told(facts: dict) -> dict[str, str]:
+    return {finding.what: finding.text for finding in splannequin.gpu_findings(facts)}
+
+
+@pytest.mark.parametrize("facts", [CUDA, CPU_BUILD, {}])
+def test_an_old_driver_is_what_is_wrong(nvidia_smi, facts: dict):
+    nvidia_smi(OLD_DRIVER)
+    found = told(facts)
+    assert "driver 535.183.01, and R580 or newer is needed" in found["gpu"] and "Update" in found["gpu"]
+    assert "torch on gpu" not in found, "torch is not to blame"
+
+
+def test_a_driver_that_does_not_know_the_compute_capability_is_old(nvidia_smi):
+    nvidia_smi("GeForce GTX 1080 Ti, 470.57.02, 6.1", old=True)
+    assert nvidia_cards() == ([Card("GeForce GTX 1080 Ti", "470.57.02", "")], "")
+    assert "driver 470.57.02" in told(CUDA)["gpu"]
+
+
+def test_an_old_card_is_what_is_wrong(nvidia_smi):
+    nvidia_smi(OLD_CARD)
+    found = told(CPU_BUILD)
+    assert "compute capability 6.0, and 7.5" in found["gpu"] and "driver" not in found["gpu"]
+    assert "torch on gpu" not in found
+
+
+def test_torch_without_cuda_is_what_is_wrong(nvidia_smi):
+    nvidia_smi(OLD_CARD, GOOD)
+    found = told(CPU_BUILD)
+    assert "without CUDA" in found["torch on gpu"] and "set it up again" in found["torch on gpu"]
+
+
+def test_a_torch_with_cuda_that_sees_no_card_is_not_said_to_be_without(nvidia_smi):
+    nvidia_smi(GOOD)
+    assert "does not see NVIDIA GeForce RTX 3090, though" in told(CUDA)["torch on gpu"]
+    used = {"torch_device": "cuda", "trains_on": "cuda", "torch_cuda": "13.0", "cuda_refusal": ""}
+    assert list(told(used)) == ["gpu"]
+    warp = {**used, "trains_on": "cpu", "cuda_refusal": "PyTorch sees the NVIDIA GPU, but Warp does not."}
+    assert told(warp)["torch on gpu"] == warp["cuda_refusal"]
+
+
+def test_a_driver_that_does_not_answer(nvidia_smi):
+    nvidia_smi("Failed to initialize NVML: Driver/library version mismatch", code=18)
+    assert "version mismatch" in told(CUDA)["gpu"] and "restart" in told(CUDA)["gpu"]
+
+
+def test_no_card_is_nothing_to_mend(nvidia_smi, tmp_path: Path, monkeypatch):
+    nvidia_smi("No devices were found", code=6)
+    assert "nothing is missing" in told(CUDA)["gpu"]
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "nothing is missing" in told(CUDA)["gpu"]
+    assert why_unused(None) is None
+
+
+def test_a_card_that_somebody_hid_is_not_missed(nvidia_smi, monkeypatch):
+    nvidia_smi(GOOD)
+    assert why_unused(None) is not None
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert why_unused(None) is None
+
+
+def test_windows_gets_torch_with_cuda_where_a_card_can_use_it(nvidia_smi, monkeypatch):
+    monkeypatch.delenv("SPLANNEQUIN_TORCH_INDEX", raising=False)
+    for row, index in ((OLD_DRIVER, ""), (OLD_CARD, ""), (GOOD, splannequin.CUDA_INDEX)):
+        nvidia_smi(row)
+        assert splannequin.torch_index(windows=True) == index
+        assert splannequin.torch_index(windows=False) == "", "PyPI's has CUDA"
+    monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "")
+    assert splannequin.torch_index(windows=True) == "", "somebody's wish"

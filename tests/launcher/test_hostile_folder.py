@@ -1,0 +1,38 @@
+"""The launcher, started in a folder that holds Python modules: none of them is run."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import splannequin
+
+
+@pytest.fixture
+def trap(hostile, tmp_path: Path) -> Path:
+    return hostile(tmp_path / "clips", tmp_path / "home", tmp_path)
+
+
+def test_the_backend_runs_without_it(trap: Path, tmp_path: Path):
+    """In the folder that the user stands in, whose relative paths it is given."""
+    command = [sys.executable, "-P", "-m", "torch_backend", "freeze", "absent.mp4", "--output", "out"]
+    assert splannequin.run_child(command, cwd=splannequin.HERE) == 3
+    assert (tmp_path / "clips" / "out" / "shot.splannequin").is_dir()
+    assert not trap.exists(), trap.read_text()
+
+
+def test_what_a_child_starts_in_turn_is_safe_too(trap: Path):
+    grandchild = f"import subprocess; raise SystemExit(subprocess.call([{sys.executable!r}, '-m', 'json.tool', '-h']))"
+    assert splannequin.run_child([sys.executable, "-P", "-c", grandchild], cwd=splannequin.HERE) == 0
+    assert not trap.exists(), trap.read_text()
+
+
+@pytest.mark.parametrize("flags", [[], ["-P"]])
+def test_the_launcher_itself_runs_without_it(trap: Path, tmp_path: Path, flags: list[str], monkeypatch):
+    """Also under -P, which leaves a script's own folder out."""
+    monkeypatch.setenv("SPLANNEQUIN_HOME", str(tmp_path / "nothing yet"))
+    command = [sys.executable, *flags, splannequin.__file__, "doctor", "--output", str(tmp_path / "told")]
+    ran = subprocess.run(command, capture_output=True, text=True)
+    assert "Traceback" not in ran.stderr and (tmp_path / "told" / "summary.json").is_file(), ran.stderr
+    assert not trap.exists(), trap.read_text()

@@ -1,0 +1,123 @@
+"""The NVIDIA cards of this machine, as nvidia-smi lists them, and what keeps one from being used.
+
+Standard library only: the launcher asks before there is a backend.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+from dataclasses import dataclass
+
+from .contract import program
+
+NEEDED_DRIVER = 580
+"""Oldest NVIDIA driver branch for the CUDA 13 builds of Warp and torch pinned here."""
+NEEDED_COMPUTE = 7.5
+"""Oldest CUDA compute capability of the same."""
+_ANSWER_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class Card:
+    """A card as its driver tells it."""
+
+    name: str
+    """What NVIDIA calls it."""
+    driver: str
+    """Version of the driver, such as 580.65.06."""
+    compute: str
+    """Compute capability, such as 9.0; empty if the driver is too old to say."""
+
+    @property
+    def old_driver(self) -> bool:
+        """True if the driver is older than what is needed. ValueError if its version is no number."""
+        return int(self.driver.split(".")[0]) < NEEDED_DRIVER
+
+    @property
+    def old(self) -> bool:
+        """True if no driver makes it usable. ValueError if its compute capability is no number."""
+        return bool(self.compute) and float(self.compute) < NEEDED_COMPUTE
+
+    @property
+    def fits(self) -> bool:
+        """True if it and its driver are what is needed."""
+        try:
+            return not self.old_driver and not self.old
+        except ValueError:
+            return False
+
+
+def nvidia_cards() -> tuple[list[Card], str]:
+    """The cards of this machine, and what nvidia-smi complains of if it lists none; nothing where it is not installed.
+
+    Asked once per process.
+    """
+    tool = program("nvidia-smi")
+    return _listed(tool) if tool else ([], "")
+
+
+@functools.cache
+def _listed(tool: str) -> tuple[list[Card], str]:
+    said = ""
+    for fields in ("name,driver_version,compute_cap", "name,driver_version"):  # old drivers do not know the third
+        command = [tool, f"--query-gpu={fields}", "--format=csv,noheader"]
+        try:
+            ran = subprocess.run(command, capture_output=True, text=True, timeout=_ANSWER_SECONDS)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return [], str(error)
+        said = ran.stdout.strip() or ran.stderr.strip()
+        count = fields.count(",")
+        rows = [row.rsplit(",", count) for row in ran.stdout.splitlines() if row.count(",") >= count]
+        if ran.returncode == 0:
+            return [Card(*(field.strip() for field in [*row, ""][:3])) for row in rows], ""
+        if "compute_cap" not in said:
+            break
+    return [], "" if "No devices were found" in said else (said.splitlines() or ["it gave no reason"])[0].strip()
+
+
+def why_unused(torch_cuda: str | None) -> tuple[str, str] | None:
+    """What keeps the machine's NVIDIA card from being used by a torch that sees none, and what to do about it.
+
+    None without a card, or where CUDA_VISIBLE_DEVICES hides it: that was somebody's wish.
+
+    Args:
+        torch_cuda: CUDA version that torch was built for; None for its CPU build.
+    """
+    cards, trouble = nvidia_cards()
+    if os.environ.get("CUDA_VISIBLE_DEVICES", "0") in ("", "-1"):
+        return None
+    if trouble:
+        sentence = f"The NVIDIA driver does not answer: {trouble}"
+        return sentence, "Restart the machine; if it stays, install the driver anew."
+    if not cards:
+        return None
+    card = next((card for card in cards if card.fits), cards[0])
+    fault = why_unfit(card)
+    if fault is not None:
+        return fault
+    if torch_cuda is None:
+        return (
+            "PyTorch was installed without CUDA.",
+            "Remove the backend's environment and set it up again: with such a card it takes PyTorch for CUDA, unless "
+            "SPLANNEQUIN_TORCH_INDEX names an index without.",
+        )
+    return (
+        f"PyTorch does not see {card.name}, though card and driver fit.",
+        "Restart the machine, if the driver was updated; or another program has the card to itself.",
+    )
+
+
+def why_unfit(card: Card) -> tuple[str, str] | None:
+    """What is wrong with a card or its driver, and what to do about it; None if nothing is."""
+    try:
+        if card.old:
+            needed = f"{NEEDED_COMPUTE} (Turing) or newer is needed"
+            return f"{card.name} has compute capability {card.compute}, and {needed}.", "The processor is used."
+        if card.old_driver:
+            told = f"{card.name} has driver {card.driver}, and R{NEEDED_DRIVER} or newer is needed."
+            return told, "Update the NVIDIA driver and restart the machine."
+    except ValueError:
+        return f"{card.name} with driver {card.driver} and compute capability {card.compute} is not understood.", ""
+    return None

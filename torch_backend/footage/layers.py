@@ -1,0 +1,117 @@
+"""Which of the layers and parts of a picture is the one to freeze."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import OpenImageIO as oiio
+
+from .sources import footage_error
+
+BEAUTY = ("", "rgba", "rgb", "beauty", "combined", "c", "composite", "color", "colour", "final", "main", "master")
+"""Names of the layer that is the picture itself, the surest first."""
+_COLOURS = (("R", "G", "B", "A"), ("r", "g", "b", "a"), ("red", "green", "blue", "alpha"))
+_NO_PICTURE = ("crypto", "depth", "normal", "position", "motion", "vector", "uv", "mist", "index")
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Where a picture's colour lies in its file."""
+
+    name: str
+    """As the file has it; empty for the channels R, G, B without a layer."""
+    part: int
+    """Subimage."""
+    channels: tuple[int, int, int]
+    """Of red, green and blue in that subimage; one channel thrice if it is grey."""
+    alpha: int | None
+    """Of its alpha, if it has one."""
+
+
+def find_layer(file: Path, wanted: str = "") -> tuple[Layer, list[str]]:
+    """The layer `wanted`, or the one that is the picture itself, and the names of all layers in the file.
+
+    JobError lists the layers if there is none of that name, or none that is sure to be the picture. OSError if the
+    file cannot be read.
+    """
+    found, names = _layers(file)
+    if wanted:
+        named = [x for x in found if wanted.lower() in (x.name.lower(), x.name.rpartition(".")[2].lower())]
+        exact = [x for x in named if x.name.lower() == wanted.lower()]
+        if len(exact or named) != 1:
+            raise footage_error(
+                f"{file.name} has no colour layer {wanted!r}.",
+                f"It has: {_listed([x.name for x in found] or names)}.",
+            )
+        return (exact or named)[0], names
+    pictures = [x for x in found if not any(part in x.name.lower() for part in _NO_PICTURE)]
+    ranked = sorted(pictures, key=_rank)
+    if not ranked:
+        raise footage_error(
+            f"{file.name} has no layer with red, green and blue: it has {_listed(names)}.",
+            "Choose the picture itself, not one of its passes.",
+        )
+    if len(ranked) > 1 and (_rank(ranked[0]) == _rank(ranked[1]) or _rank(ranked[0])[0] == len(BEAUTY)):
+        raise footage_error(
+            f"{file.name} has several layers and none is named as the picture itself: {_listed(names)}.",
+            "Choose one by its name (--layer), or write the picture to a file of its own.",
+        )
+    return ranked[0], names
+
+
+def shown(name: str) -> str:
+    """A layer's name as people read it."""
+    return name or "RGB without a name"
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(shown(name) for name in names[:12]) + (" and more" if len(names) > 12 else "")
+
+
+def _rank(layer: Layer) -> tuple[int, int]:
+    words = layer.name.lower().split(".")
+    best = min((BEAUTY.index(word) for word in words if word in BEAUTY), default=len(BEAUTY))
+    return best, 0 if words[0] in ("", "composite") else 1
+
+
+def _layers(file: Path) -> tuple[list[Layer], list[str]]:
+    """Layers with colour, and the names of all, in the order of the file."""
+    image = oiio.ImageInput.open(str(file))
+    if image is None:
+        raise OSError(f"{file}: {oiio.geterror()}")
+    found: list[Layer] = []
+    names: list[str] = []
+    try:
+        part = 0
+        # Only OpenEXR's parts are layers: those of a TIFF are pages, of a PSD the pieces of its first.
+        while image.seek_subimage(part, 0) and (part == 0 or image.format_name() == "openexr"):
+            spec = image.spec()
+            if spec.deep:
+                raise footage_error(f"{file.name} holds deep data.", "Flatten it before import.")
+            several = spec.get_int_attribute("oiio:subimages") > 1
+            title = str(spec.getattribute("oiio:subimagename") or "") if several else ""
+            for prefix in dict.fromkeys(name.rpartition(".")[0] for name in spec.channelnames):
+                layer = _colour(spec, part, prefix, title, image.format_name() == "openexr")
+                names.append(prefix or title or ("" if layer else "/".join(spec.channelnames)))
+                found += [layer] if layer else []
+            part += 1
+    finally:
+        image.close()
+    return found, names
+
+
+def _colour(spec: oiio.ImageSpec, part: int, prefix: str, title: str, is_exr: bool) -> Layer | None:
+    names = list(spec.channelnames)
+    dot = prefix + "." if prefix else ""
+    for colours in _COLOURS:
+        red, green, blue, alpha = (names.index(dot + c) if dot + c in names else None for c in colours)
+        if red is not None and green is not None and blue is not None:
+            return Layer(prefix or title, part, (red, green, blue), alpha)
+    if is_exr:
+        if dot + "Y" in names and dot + "RY" not in names:
+            y = names.index(dot + "Y")
+            return Layer(prefix or title, part, (y, y, y), names.index(dot + "A") if dot + "A" in names else None)
+        return None
+    alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
+    return Layer("", part, (0, 1, 2) if spec.nchannels >= 3 else (0, 0, 0), alpha)

@@ -1,0 +1,93 @@
+"""A new solve in the place of the old one: prepared beside it, then moved in file by file.
+
+Until all of the new solve is written, nothing of the old one is touched. Then one rename, of `solve/next.partial` to
+`solve/next`, says that the new one holds, and its files are moved to where readers look for them. Between the first of
+these renames and the last (a millisecond for a clip of 75 frames) a reader may see new frames with old cameras; a
+process that is killed just there leaves `solve/next`, and whoever opens the shot next moves what remains.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..shot import Shot, make_folder, replace_file
+
+_NEXT, _PARTIAL = "next", "next.partial"
+_LAST = ("solve.json", "cameras.json", "points.npz")
+"""What is moved after all others, the last one first here: they tell a reader that there is a solve."""
+
+
+@dataclass
+class Staged:
+    """Where the files of a new solve are written: below these as below the shot's own folders."""
+
+    frames: Path
+    """Takes NNNNNN.png."""
+    solve: Path
+    """Takes cameras.json, points.npz, solve.json and colmap/."""
+
+
+@contextlib.contextmanager
+def replacing_solve(shot: Shot) -> Iterator[Staged]:
+    """Yields folders for the files of a whole new solve, which take the place of the old one's if the block ends well.
+
+    If it fails or is killed, the old solve stays as it was. OSError if a file cannot be moved (on Windows: it is held
+    open elsewhere): the new solve is kept, and moved when the shot is opened again.
+    """
+    partial = shot.solve / _PARTIAL
+    staged = Staged(partial / "frames", partial / "solve")
+    shutil.rmtree(partial, ignore_errors=True)
+    for folder in (staged.frames, staged.solve):
+        make_folder(folder)
+    try:
+        yield staged
+        _drop_stale(shot.solve / "colmap", staged.solve / "colmap")
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    partial.rename(shot.solve / _NEXT)
+    settle_solve(shot)
+
+
+def settle_solve(shot: Shot) -> None:
+    """Moves what `replacing_solve` had finished, but not moved, to its place. Does nothing if there is none.
+
+    Two processes may do so at once: each file is moved by one of them.
+    """
+    ready = shot.solve / _NEXT
+    if not ready.is_dir() or ready.is_symlink():
+        return
+    for source in sorted(_files(ready), key=_turn):
+        target = shot.root / source.relative_to(ready)
+        with contextlib.suppress(FileNotFoundError):  # moved by another process meanwhile
+            if source.stat().st_size:
+                make_folder(target.parent)
+                replace_file(source, target)
+            else:
+                target.unlink(missing_ok=True)
+                source.unlink()
+    shutil.rmtree(ready, ignore_errors=True)
+
+
+def _drop_stale(old: Path, new: Path) -> None:
+    """An empty file in `new` for each in `old` that it has not got: that one goes when the others come."""
+    if old.is_dir():
+        for name in {p.name for p in old.iterdir() if p.is_file()}:
+            if not (new / name).exists():
+                new.mkdir(exist_ok=True)
+                (new / name).touch()
+
+
+def _files(folder: Path) -> list[Path]:
+    """Regular files below a folder; links are not followed."""
+    found = [Path(top) / name for top, _, names in os.walk(folder) for name in names]
+    return [path for path in found if path.is_file() and not path.is_symlink()]
+
+
+def _turn(path: Path) -> tuple[int, str]:
+    return (-_LAST.index(path.name) if path.name in _LAST else -len(_LAST), str(path))

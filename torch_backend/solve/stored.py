@@ -1,0 +1,75 @@
+"""What a solve left in the shot, read again: a file that is damaged is named, with the step that makes it anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contract import CameraPath, ExitCode, JobError, check_version, open_regular, read_json
+from ..shot import Shot
+
+_POINTS = {"xyz": ("f", (3,)), "rgb": ("u", (3,)), "error": ("f", ()), "track": ("iu", ())}
+"""Kinds of numbers, as numpy calls them, and shape of a row."""
+
+
+def load_cameras(shot: Shot) -> CameraPath:
+    """cameras.json. JobError (SOLVE) if the shot is not solved or the file is damaged, ValueError if it is too new."""
+    path = _there(shot, "cameras.json")
+    data = _object(path)
+    check_version(data, path.name)
+    try:
+        cameras = CameraPath.from_json(data)
+        poses = np.array([[*frame.viewmat, *frame.K] for frame in cameras.frames], np.float64)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise damaged(path, error) from error
+    if poses.ndim != 2 or poses.shape[1] != 20 or not np.isfinite(poses).all() or not (poses[:, 16:18] > 0).all():
+        raise damaged(path, "a frame's viewmat and K should be 16 and 4 finite numbers, its focal lengths above 0")
+    return cameras
+
+
+def load_record(shot: Shot) -> dict[str, Any]:
+    """solve.json. JobError (SOLVE) if the shot is not solved or the file is damaged."""
+    return _object(_there(shot, "solve.json"))
+
+
+def load_points(shot: Shot) -> dict[str, NDArray]:
+    """points.npz: xyz float32 [P, 3] solve units, rgb uint8 [P, 3], error float32 [P] px, track uint16 [P].
+
+    JobError (SOLVE) if the shot is not solved or the file is damaged.
+    """
+    path = _there(shot, "points.npz")
+    try:
+        with open_regular(path) as handle, np.load(handle, allow_pickle=False) as data:
+            points = {name: data[name] for name in _POINTS}
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds
+        raise damaged(path, error) from error
+    count = len(points["xyz"]) if points["xyz"].ndim else 0
+    for name, (kinds, shape) in _POINTS.items():
+        if points[name].dtype.kind not in kinds or points[name].shape != (count, *shape):
+            raise damaged(path, f"{name} is {points[name].dtype} {points[name].shape}")
+    if not np.isfinite(points["xyz"]).all():
+        raise damaged(path, "a point is not finite")
+    return points
+
+
+def damaged(path: Path, why: Exception | str) -> JobError:
+    """The sentence for a file of the solve that is not as it was written."""
+    told = " ".join(str(why).split()) or type(why).__name__
+    return JobError(f"{path} is damaged ({told[:200]}).", "Solve the camera again.", ExitCode.SOLVE)
+
+
+def _there(shot: Shot, name: str) -> Path:
+    path = shot.solve / name
+    if not path.is_file():
+        raise JobError(f"{shot.root.name} has no cameras yet.", "Run the camera step first.", ExitCode.SOLVE)
+    return path
+
+
+def _object(path: Path) -> dict[str, Any]:
+    try:
+        return read_json(path)
+    except ValueError as error:
+        raise damaged(path, error) from error

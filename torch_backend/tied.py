@@ -1,0 +1,17 @@
+"""`python -m torch_backend.tied MODULE ARGUMENTS...`: `python -m MODULE` that ends when whoever started it does.
+
+The launcher starts the backend, venv and pip so: killed in a way that it cannot pass on, it leaves none of them at
+work. What Blender starts is not tied to it. Standard library only: any Python of the machine may run it.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+
+from .contract import end_with_starter
+
+if __name__ == "__main__":
+    end_with_starter()
+    sys.argv = sys.argv[1:]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

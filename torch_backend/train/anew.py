@@ -1,0 +1,65 @@
+"""A run trained anew in the name of one that is there: beside it, and in its place only when it is done.
+
+runs/<name>/next/<key>/ holds what a run's folder holds, one folder for each set of settings that was begun, so neither
+a finished run nor hours of a paused one go before there is another. Inside of the run's own folder it is part of the
+run: who lists runs does not see it, who removes the run removes it.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from ..contract import is_link, remove_link
+from ..shot import replace_file
+from .checkpoint import CHECKPOINT_FILE, read_meta
+from .extend import EXTENSION_FILE
+
+NEXT_FOLDER = "next"
+"""In a run's folder: trainings that will take the run's place."""
+SUMMARY_FILE = "summary.json"
+"""A run's figures. It is written last: a folder of `NEXT_FOLDER` that has it is done."""
+
+
+def place_for(run: Path, key: str, resume: bool) -> Path:
+    """The folder in which settings of a key are trained: the run's own if it holds nothing else, or has begun them."""
+    beside = run / NEXT_FOLDER / key
+    if resume:
+        for place in (run, beside):
+            checkpoint = place / CHECKPOINT_FILE
+            if checkpoint.is_file() and read_meta(checkpoint).get("key") == key:
+                return place
+    return beside if (run / CHECKPOINT_FILE).is_file() else run
+
+
+def take_place(run: Path, done: Path) -> None:
+    """Moves what was trained in `done`, a folder of `place_for`, to the run's own; nothing else that was begun stays.
+
+    Every file is replaced at once, the checkpoint first: whoever freezes has the one or the other. `settle` goes on
+    where a killed process stopped.
+    """
+    for name in (CHECKPOINT_FILE, "config.json", "metrics.jsonl"):
+        if (done / name).is_file():
+            replace_file(done / name, run / name)
+    if (done / "previews").is_dir():
+        shutil.rmtree(run / "previews", ignore_errors=True)
+        replace_file(done / "previews", run / "previews")
+    (run / EXTENSION_FILE).unlink(missing_ok=True)
+    replace_file(done / SUMMARY_FILE, run / SUMMARY_FILE)
+    shutil.rmtree(run / NEXT_FOLDER, ignore_errors=True)
+
+
+def settle(run: Path) -> None:
+    """Goes on with a `take_place` that was killed halfway."""
+    if is_link(run / NEXT_FOLDER):  # none of ours: a shot folder may come from anywhere
+        remove_link(run / NEXT_FOLDER)
+    for summary in sorted((run / NEXT_FOLDER).glob(f"*/{SUMMARY_FILE}")):
+        if is_link(summary.parent):
+            remove_link(summary.parent)
+        else:
+            take_place(run, summary.parent)
+
+
+def forget(run: Path, key: str) -> None:
+    """Drops what was begun of settings that the run itself is finished with: it could only come to the same."""
+    shutil.rmtree(run / NEXT_FOLDER / key, ignore_errors=True)
