@@ -61,6 +61,8 @@ class Job:
     """Latest picture by label: path."""
     result: Any = None
     """What the job answered in its `done` event."""
+    end: tuple[str, _Words] | None = None
+    """State and last words of the job, as its events tell them."""
     beat: tuple[float, float] | None = None
     """Last sign of life of a job of another computer, and when it was first seen, monotonic seconds."""
 
@@ -85,7 +87,8 @@ def new_job(shot: Path, kind: str, params: Any) -> Job:
     if not isinstance(params, contract.PARAMS[kind]):
         raise ValueError(f"a {kind} job takes {contract.PARAMS[kind].__name__}, not {type(params).__name__}")
     folder = shot / "jobs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
-    folder.mkdir(parents=True)
+    folder.parent.mkdir(exist_ok=True)
+    folder.mkdir()
     values = dataclasses.asdict(params)
     request = contract.JobRequest(kind=kind, shot=str(shot), params=values)
     write_json(folder / contract.REQUEST_FILE, dataclasses.asdict(request))
@@ -155,12 +158,23 @@ def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
         return events  # ended, but not told yet: the next poll reads the rest
     if (status is None or not status.ended) and not is_alive(job, status):
         status = _read_status(job.folder) or status  # it may have ended between the two reads above
+        events += _read_events(job, until + 1.0)[0]
         if status is None or not status.ended:
             status = _declare_dead(job, status)
-        else:
-            events += _read_events(job, until + 1.0)[0]
     job.status = status
     return events
+
+
+def _last_words(job: Job, status: contract.Status | None) -> contract.Status | None:
+    """The end that a job told in its events and could not write into its status: its shot was moved or deleted."""
+    if job.end is None:
+        return None
+    now = time.time()
+    status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
+    state, words = job.end
+    status.state = state if state in ("done", "failed", "cancelled") else "failed"
+    status.message, status.hint, status.exit_code, status.eta_seconds = words.message, words.hint, words.exit_code, None
+    return status
 
 
 def is_alive(job: Job, status: contract.Status | None) -> bool:
@@ -303,8 +317,11 @@ def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Writes a JSON object beside `path`, fsyncs, renames over it: a reader never sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Writes a JSON object beside `path`, fsyncs, renames over it: a reader never sees half a file.
+
+    Makes its folder, but not what that is in: FileNotFoundError in a shot that was moved or deleted.
+    """
+    path.parent.mkdir(exist_ok=True)
     beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     beside.unlink(missing_ok=True)  # a link that another hand left there would be followed
     try:
@@ -404,13 +421,25 @@ def _take_in(job: Job, event: contract.Event) -> None:
             job.history.append(point)
     elif event.type == "image":
         job.images[event.data["label"]] = event.data["path"]
+    elif event.type == "error":
+        words = _Words(**event.data)
+        words.message, words.hint = contract.printable(words.message), contract.printable(words.hint)
+        job.end = ("failed", words)
     elif event.type == "done":
         job.result = event.data.get("result")
+        job.end = (_End(**event.data).state, job.end[1] if job.end else _Words("", exit_code=0))
 
 
 def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
+    told = _last_words(job, status)
+    if told is not None:
+        return _keep(job, told)
     now = time.time()
     status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
+    if not job.folder.is_dir():
+        lost = contract.gone(job.shot, job.kind)
+        status.state, status.message, status.hint, status.exit_code = "failed", lost.message, lost.hint, lost.exit_code
+        return status
     code = job.process.returncode if job.process else None
     how = f" (exit code {code})" if code is not None else ""
     last = log_tail(job.folder, 1)
@@ -425,7 +454,12 @@ def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
         if killed
         else f"Start it again: finished work is kept. Its whole log is {job.folder / contract.LOG_FILE}"
     )
-    if status.host in ("", contract.host_name()):  # what another computer writes is not ours to correct
+    return _keep(job, status)
+
+
+def _keep(job: Job, status: contract.Status) -> contract.Status:
+    """Writes the status of a job that can no longer do so; what another computer writes is not ours to correct."""
+    if status.host in ("", contract.host_name()):
         write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
     return status
 

@@ -428,6 +428,15 @@ WORK = {"import": "The import", "solve": "The camera solve", "train": "The train
 """Kind of job -> what a sentence calls it."""
 
 
+def gone(shot: Path, kind: str) -> JobError:
+    """What is told of a job whose shot was moved or deleted while it ran."""
+    return JobError(
+        f"{WORK.get(kind, 'A step')} ended: the shot folder {shot} was moved or deleted meanwhile.",
+        "Finished work is in the folder, wherever it is now: choose it there and start again.",
+        ExitCode.USAGE,
+    )
+
+
 def read_writer(shot: Path) -> Writer | None:
     """Who writes into a shot, as its lock says, dead or alive; None without a lock. ValueError on a damaged one."""
     path = shot / WRITER_FILE
@@ -1048,8 +1057,12 @@ def discard_unborn(shot: Path) -> bool:
             return False
         if not all("-import-" in job.name and not job.is_symlink() and _said_why(job) for job in jobs):
             return False
+        writer = read_writer(shot)
+        if writer is not None and writer.works():
+            return False
         for name in _UNBORN & names - {"shot.json"}:
             shutil.rmtree(shot / name, ignore_errors=True)  # a link is left alone
+        (shot / WRITER_FILE).unlink(missing_ok=True)
         (shot / "shot.json").unlink()
         with contextlib.suppress(OSError):  # it holds something of the artist's
             shot.rmdir()

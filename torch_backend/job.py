@@ -22,11 +22,13 @@ from typing import Any
 
 from . import contract
 from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status
-from .shot import Shot, disk_error, is_disk_full, path_error, write_json
+from .shot import Shot, disk_error, is_disk_full, path_error, working_on, write_json
 from .writer import only_writer
 
 _CANCEL_POLL_SECONDS = 0.2
 _PROGRESS_SECONDS = 0.1
+_MISSED_BEATS = 3
+"""A job ends when its shot's folder was not there for this many beats: a network disk may be away for a moment."""
 
 Listener = Callable[[Event], None]
 
@@ -41,6 +43,7 @@ class JobReporter:
         self._seq = 0
         self._cancelled = False
         self._last_poll = 0.0
+        self._missed = 0
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
         now = time.time()
@@ -79,12 +82,19 @@ class JobReporter:
         self._emit("warning", message=message, hint=hint)
 
     def check_cancelled(self) -> None:
+        if self._missed >= _MISSED_BEATS:
+            raise FileNotFoundError(f"{self.folder} is gone")
         now = time.monotonic()
         if not self._cancelled and now - self._last_poll >= _CANCEL_POLL_SECONDS:
             self._last_poll = now
             self._cancelled = (self.folder / contract.CANCEL_FILE).exists()
         if self._cancelled:
             raise Cancelled
+
+    @property
+    def heard(self) -> bool:
+        """True if somebody listens to the events as they come."""
+        return self._listener is not None
 
     # -- the job's own end
 
@@ -139,14 +149,20 @@ class JobReporter:
         with self._lock:
             self.status.heartbeat = time.time()
             # A full disk, or a reader that holds the file open (Windows), must not end the job: the next beat retries.
-            with contextlib.suppress(OSError):
+            try:
                 write_json(self.folder / contract.STATUS_FILE, dataclasses.asdict(self.status))
+                self._missed = 0
+            except FileNotFoundError:
+                self._missed += 1  # the shot was moved or deleted
+            except OSError:
+                pass
 
 
 def new_job(shot: Shot, kind: str, params: Any) -> Path:
     """Makes a job folder with its request; returns it."""
     folder = shot.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
-    folder.mkdir(parents=True)
+    shot.jobs.mkdir(exist_ok=True)
+    folder.mkdir()
     values: dict[str, Any] = params if isinstance(params, dict) else dataclasses.asdict(params)
     request = JobRequest(kind=kind, shot=str(shot.root), params=values)
     write_json(folder / contract.REQUEST_FILE, dataclasses.asdict(request))
@@ -170,9 +186,10 @@ def run_job(folder: str | Path, listener: Listener | None = None, alone: bool = 
     except (OSError, ValueError, KeyError) as error:
         print(f"{folder} holds no job that can be run: {error}", file=sys.stderr)
         return ExitCode.USAGE, None
-    reporter = JobReporter(folder, request.kind, listener)
-    with contextlib.ExitStack() as held, _signals_cancel(reporter):  # held until the last status is written
-        return _run(request, reporter, held if alone else None)
+    with working_on(Path(request.shot).absolute(), folder.parent.parent):
+        reporter = JobReporter(folder, request.kind, listener)
+        with contextlib.ExitStack() as held, _signals_cancel(reporter):  # held until the last status is written
+            return _run(request, reporter, held if alone else None)
 
 
 def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack | None) -> tuple[int, Any]:
@@ -184,7 +201,8 @@ def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack 
         if held is not None:
             held.enter_context(only_writer(shot.root, request.kind, reporter.folder.name))
         reporter.check_cancelled()
-        result = STATIONS[request.kind](shot, params, reporter)
+        with _kept_in_place(shot, request.kind):
+            result = STATIONS[request.kind](shot, params, reporter)
     except Cancelled:
         state, code = "cancelled", int(ExitCode.CANCELLED)
         message, hint = "Cancelled.", "Start it again to go on: finished work is kept."
@@ -206,7 +224,34 @@ def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack 
             message = told.message if told else f"The {request.kind} step broke: {type(error).__name__}: {error}"
             hint = told.hint if told else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
     reporter.finish(state, code, message, hint, result)
+    if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
+        print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log goes with the shot's folder, the status does not
     return code, result
+
+
+@contextlib.contextmanager
+def _kept_in_place(shot: Shot, kind: str) -> Iterator[None]:
+    """JobError, whatever else was wrong, if the shot's folder was moved or deleted in the meantime."""
+    try:
+        yield
+    except (Cancelled, KeyboardInterrupt):
+        raise
+    except Exception as error:
+        if not _there(shot):
+            raise contract.gone(shot.root, kind) from error
+        raise
+    if not _there(shot):
+        raise contract.gone(shot.root, kind)
+
+
+def _there(shot: Shot) -> bool:
+    try:
+        os.lstat(shot.info_path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        pass  # a disk that does not answer: the shot may be there
+    return True
 
 
 def _about_a_path(error: Exception, shot: str) -> JobError | None:

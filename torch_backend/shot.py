@@ -145,12 +145,44 @@ class Shot:
         return info
 
 
+_worked_on: list[Path] = []
+"""Shot folders that jobs of this process work on."""
+
+
+@contextlib.contextmanager
+def working_on(*roots: Path) -> Iterator[None]:
+    """While it lasts, `make_folder` makes nothing of a shot whose own folder was moved or deleted."""
+    _worked_on.extend(roots)
+    try:
+        yield
+    finally:
+        for root in roots:
+            _worked_on.remove(root)
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder and those above it, if they are not there.
+
+    FileNotFoundError if it belongs to a shot that a job works on and whose own folder is gone: what is written under
+    its old name would look like a shot, and hold next to nothing of it.
+    """
+    root = next((root for root in _worked_on if root == path or root in path.parents), None)
+    if root is None:
+        path.mkdir(parents=True, exist_ok=True)
+        return
+    if root == path:
+        root.stat()
+    for part in reversed([path, *path.parents][: len(path.relative_to(root).parts)]):
+        part.mkdir(exist_ok=True)  # one by one: the system refuses the first without the shot's folder
+
+
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A path beside `path`, with the same suffix, to write to; fsynced and renamed over `path` if all went well."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    beside.unlink(missing_ok=True)  # a link that another hand left there would be followed
     try:
         yield beside
         with open(beside, "rb+") as handle:
@@ -172,7 +204,7 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     fresh, aside = path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
     restore_folder(path)
     _discard(fresh)
-    fresh.mkdir(parents=True)
+    make_folder(fresh)
     try:
         yield fresh
         if os.path.lexists(path):

@@ -520,6 +520,8 @@ BACKEND: dict[str, str] = {
     "Finishing the take": "Take abschließen",
     "already imported": "schon importiert",
     "{} of {} has been running on {} since {}.": "{0!t} von {1} läuft seit {3} auf {2}.",
+    "{} ended: the shot folder {} was moved or deleted meanwhile.": "{!t} hörte auf: der Shot-Ordner {} wurde inzwischen verschoben oder gelöscht.",
+    "Finished work is in the folder, wherever it is now: choose it there and start again.": "Fertiges liegt in dem Ordner, wo immer er jetzt ist: ihn dort wählen und neu starten.",
     "The import": "Der Import",
     "The camera solve": "Die Kameralösung",
     "The training": "Das Training",

@@ -331,3 +331,26 @@ def test_cancel_follows_no_link(addon, contract, empty_shot, tmp_path):
     (job.folder / "cancel").symlink_to(tmp_path / "elsewhere")
     jobs.cancel(job)
     assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_job_whose_shot_goes_ends_in_a_sentence_and_makes_nothing(
+    addon, contract, empty_shot, start_import, clip, told
+):
+    if sys.platform == "win32":
+        pytest.skip("Windows keeps a folder that a process works in where it is")
+    jobs, away = addon("jobs"), empty_shot.with_name("away.splannequin")
+    job = start_import(clip)
+    while jobs.poll(job, 0.5) == [] and not job.ended:
+        time.sleep(0.02)
+    empty_shot.rename(away)
+    if not told:
+        job.process.kill()
+    with pytest.raises(contract.JobError, match="^The import ended: the shot folder .* was moved or deleted") as caught:
+        jobs.wait(job)
+    assert caught.value.exit_code == contract.ExitCode.USAGE and "where" in caught.value.hint
+    assert not empty_shot.exists()
+    with pytest.raises(FileNotFoundError):
+        jobs.new_job(empty_shot, "import", contract.ImportParams())
+    found = jobs.latest(away)["import"]
+    assert found.state == "failed" and ("was moved or deleted" in found.status.message) == told

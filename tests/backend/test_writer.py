@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 
 from torch_backend import contract, job
 from torch_backend.contract import ExitCode, JobError, Writer
-from torch_backend.shot import Shot
+from torch_backend.shot import Shot, atomic_path, make_folder, working_on
 from torch_backend.writer import only_writer
 
 CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
@@ -33,6 +34,10 @@ def begin_import(shot, last: int = 8) -> tuple[subprocess.Popen[bytes], Path]:
     folder = job.new_job(shot, "import", contract.ImportParams(source=str(CLIP), first=1, last=last))
     command = [sys.executable, "-P", "-m", "torch_backend", "run-job", str(folder)]
     return subprocess.Popen(command, stderr=subprocess.PIPE), folder
+
+
+def read(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
 
 
 def status_of(folder: Path) -> contract.Status:
@@ -60,7 +65,7 @@ def put_lock(shot, writer: Writer) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP is POSIX")
 def test_the_second_job_is_refused_in_words_and_the_first_goes_on(shot):
-    first, one = begin_import(shot, 60)
+    first, one = begin_import(shot, 24)
     try:
         writer = wait_for_lock(shot, first)
         os.kill(first.pid, signal.SIGSTOP)  # it works on for as long as we look
@@ -77,12 +82,12 @@ def test_the_second_job_is_refused_in_words_and_the_first_goes_on(shot):
         os.kill(first.pid, signal.SIGCONT)
         first.communicate()
     assert first.returncode == ExitCode.OK and not lock_of(shot).exists()
-    assert len(list(shot.frames.glob("raw/*.png"))) == 60
+    assert len(list(shot.frames.glob("raw/*.png"))) == 24
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")
 def test_what_a_killed_job_holds_is_taken_over(shot):
-    first, _ = begin_import(shot, 60)
+    first, _ = begin_import(shot, 24)
     wait_for_lock(shot, first)
     first.kill()
     first.communicate()
@@ -189,3 +194,52 @@ def test_of_all_who_take_a_dead_ones_place_one_gets_it(shot, tmp_path):
     (tmp_path / "go").touch()
     told = [child.communicate() for child in crowd]
     assert [errors for _, errors in told] == [""] * 4 and [held for held, _ in told] == ["60\n"] * 4
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps a folder that a process works in where it is")
+def test_a_shot_that_is_moved_ends_its_training_in_a_sentence(world, tmp_path):
+    root, away = tmp_path / "a.splannequin", tmp_path / "b.splannequin"
+    shutil.copytree(world.shot.root, root)
+    folder = job.new_job(Shot(root), "train", contract.TrainParams(iterations=100_000, max_gaussians=500, device="cpu"))
+    command = [sys.executable, "-P", "-m", "torch_backend", "run-job", str(folder)]
+    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    while child.poll() is None and '"stage": "training"' not in read(folder / contract.EVENTS_FILE):
+        time.sleep(0.01)
+    os.rename(root, away)
+    _, errors = child.communicate()
+    assert child.returncode == ExitCode.USAGE
+    assert f"The training ended: the shot folder {root} was moved or deleted meanwhile." in errors
+    assert not root.exists(), [str(p) for p in root.rglob("*")]
+    events = [json.loads(line) for line in (away / "jobs" / folder.name / "events.jsonl").read_text().splitlines()]
+    assert [e["type"] for e in events[-2:]] == ["error", "done"] and "was moved" in events[-2]["data"]["message"]
+    assert not (away / contract.WRITER_FILE).exists(), "the shot is free where it is now"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps a folder that a process works in where it is")
+def test_an_import_into_a_shot_that_goes_leaves_nothing_in_its_place(shot, tmp_path, monkeypatch):
+    class Goes(job.JobReporter):
+        def progress(self, stage, done, total, message=""):
+            if shot.root.exists():
+                os.rename(shot.root, tmp_path / "b.splannequin")
+            super().progress(stage, done, total, message)
+
+    monkeypatch.setattr(job, "JobReporter", Goes)
+    folder = job.new_job(shot, "import", contract.ImportParams(source=str(CLIP), first=1, last=8))
+    heard = []
+    assert job.run_job(folder, heard.append) == (ExitCode.USAGE, None)
+    assert heard[-2].data["message"].startswith("The import ended: the shot folder") and not shot.root.exists()
+
+
+def test_folders_of_a_shot_that_is_worked_on_are_made_only_inside_it(tmp_path):
+    root = tmp_path / "a"
+    with working_on(root), pytest.raises(FileNotFoundError):
+        make_folder(root / "runs" / "main")
+    with working_on(root), pytest.raises(FileNotFoundError), atomic_path(root / "shot.json"):
+        raise AssertionError("it may be written")
+    assert not root.exists()
+    root.mkdir()
+    with working_on(root):
+        make_folder(root / "runs" / "main")
+        make_folder(tmp_path / "elsewhere" / "deep")
+    make_folder(tmp_path / "b" / "runs")
+    assert (root / "runs" / "main").is_dir() and (tmp_path / "b" / "runs").is_dir()

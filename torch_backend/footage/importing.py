@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..contract import LAST_FRAME, JobError, Reporter, frame_file, read_json
-from ..shot import Shot, content_key, need_disk, replacing_folder, restore_folder, write_json
+from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import is_whole_png, resize, working_size, write_png
 from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, footage_error, frame_words, open_source
@@ -164,7 +164,7 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
     frame_bytes = width * height * (5.0 if info.deep else 2.0)
     # Twice: the solve writes the undistorted frames beside these.
     need_disk(shot.root, 2.0 * total * frame_bytes + (64 << 20), "The import of this clip")
-    into.mkdir(parents=True)
+    make_folder(into)
     measures: list[FrameMeasures] = []
     seconds: list[float] = []
     clipped, distinct = 0.0, None
@@ -327,7 +327,7 @@ def _keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:
         while name in needed or os.path.lexists(fresh / name):
             name = name.with_name(f"{name.stem}.kept{name.suffix}")
         target = fresh / name
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         try:
             os.link(found, target, follow_symlinks=False)
         except (OSError, NotImplementedError):  # no hard links there: a network share, a memory card

@@ -17,7 +17,7 @@ from ..footage.color import premultiplied_srgb_to_linear
 from ..footage.images import read_png
 from ..gaussians.ply import write_ply
 from ..scene import Scene, frame_table, load_scene
-from ..shot import Shot, content_key, disk_error, is_disk_full, need_disk, write_json
+from ..shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, write_json
 from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
 from ..train.run import save_png
@@ -241,7 +241,7 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams)
             "Name another take, or move them away.",
             ExitCode.FREEZE,
         )
-    (folder / "preview").mkdir(parents=True, exist_ok=True)
+    make_folder(folder / "preview")
     # Frames without a key of their own are of before grain, too.
     old_are_right = not params.grain and state.is_file() and read_json(state).get("key") == key
     done = set()

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..shot import Shot, replace_file
+from ..shot import Shot, make_folder, replace_file
 
 _NEXT, _PARTIAL = "next", "next.partial"
 _LAST = ("solve.json", "cameras.json", "points.npz")
@@ -43,7 +43,7 @@ def replacing_solve(shot: Shot) -> Iterator[Staged]:
     staged = Staged(partial / "frames", partial / "solve")
     shutil.rmtree(partial, ignore_errors=True)
     for folder in (staged.frames, staged.solve):
-        folder.mkdir(parents=True)
+        make_folder(folder)
     try:
         yield staged
         _drop_stale(shot.solve / "colmap", staged.solve / "colmap")
@@ -70,7 +70,7 @@ def settle_solve(shot: Shot) -> None:
         target = shot.root / source.relative_to(ready)
         with contextlib.suppress(FileNotFoundError):  # moved by another process meanwhile
             if source.stat().st_size:
-                target.parent.mkdir(parents=True, exist_ok=True)
+                make_folder(target.parent)
                 replace_file(source, target)
             else:
                 target.unlink(missing_ok=True)

@@ -17,7 +17,7 @@ from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, fr
 from ..footage import load_frames
 from ..footage.images import is_whole_png, read_frame, write_png
 from ..footage.sources import frame_words
-from ..shot import Shot, atomic_path, content_key, need_disk, write_json
+from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, write_json
 from . import foreign
 from .child import run_worker
 from .floor import floor_of
@@ -108,7 +108,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     need_disk(shot.root, 1.2 * size + (len(frames["frames"]) << 20), "The camera solve")
     scratch = shot.solve / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
+    make_folder(scratch)
     try:
         if taken is None:
             answer = _ask_worker(shot, frames, config, scratch, report)

@@ -18,7 +18,7 @@ from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
-from ..shot import Shot, content_key, need_disk, write_atomic, write_json
+from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
 from . import adam
 from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
@@ -235,7 +235,7 @@ class Metrics:
     def __init__(self, folder: Path, report: Reporter, iteration: int) -> None:
         self.folder, self.report = folder, report
         self.path = folder / "metrics.jsonl"
-        (folder / "previews").mkdir(parents=True, exist_ok=True)
+        make_folder(folder / "previews")
         for picture in (folder / "previews").glob("*.png"):
             if picture.stem.isdigit() and int(picture.stem) > iteration:
                 picture.unlink()
