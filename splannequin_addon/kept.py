@@ -16,7 +16,7 @@ _known: OrderedDict[tuple[str, Callable[..., Any]], tuple[tuple[int, ...], Any]]
 
 
 def of(path: Path, read: Callable[[Path], T]) -> T:
-    """`read(path)`, remembered while file or folder is the one that it was: the same, as long, changed at no other time.
+    """`read(path)`, remembered while the file or folder is the one that it was: as long, and changed at no other time.
 
     The value is given out again and again: nobody may change it. What `read` raises is not remembered.
 
