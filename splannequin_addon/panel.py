@@ -505,13 +505,14 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
     def draw_settings(self, context: Any, layout: Any) -> None:
         """The instant."""
         props = context.scene.splannequin
-        row = layout.row(heading="Frame t*")
-        row.prop(props, "choose_t_star", text="")
+        row = layout.row()
         if props.choose_t_star:
+            row.prop(props, "choose_t_star", text="t*")
             row.prop(props, "t_star", text="")
         else:
             at = self._suggested(context)
-            row.label(text=tr(f"{at}, suggested") if at is not None else "as suggested")
+            words = tr(f"t*: {at}, suggested") if at is not None else tr("t* as suggested")
+            row.prop(props, "choose_t_star", text=words, translate=False)
         row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
         shown = context.scene.timeline_markers.get(markers.NAME) is not None
         row.operator("splannequin.t_star_marker", text="", icon="MARKER_HLT" if shown else "MARKER", depress=shown)

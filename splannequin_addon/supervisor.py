@@ -264,7 +264,7 @@ def look_through_camera(window: Any, camera: Any = None) -> None:
             space = area.spaces.active
             if camera is not None:
                 space.use_local_camera, space.camera = True, camera
-            elif space.use_local_camera and space.camera is None:  # ours is gone
+            elif space.use_local_camera and (space.camera is None or plate.is_one(space.camera)):  # or it is gone
                 space.use_local_camera = False
             space.region_3d.view_perspective = "CAMERA"
             return

@@ -1,0 +1,299 @@
+"""Where artists stood before grey buttons and cut words, in a real Blender window; pictures of each.
+
+    python tests/addon/window/stuck.py --blender BLENDER --backend PYTHON [--output docs/images]
+
+BLENDER is any Blender: the extension is built from this checkout and installed into a home folder of its own. PYTHON is
+the backend's. In this order: no backend, and the button that sets it up; the preferences at the width Blender gives
+them; the clip seen after its import; presets with pixels and minutes, the scale that is asked for; t* suggested;
+scrubbing stopped while a training runs; a project folder moved as a whole; a shot folder renamed, missed and located.
+Exit status 0 if all of it held. Needs what press_steps.py needs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import press_steps as press
+
+PLAN = "SPLANNEQUIN_STUCK_PLAN"
+ROOT = Path(__file__).resolve().parents[3]
+WORLD = "from pathlib import Path; from tests.backend.conftest import build_world; build_world(Path({!r}))"
+HELD = {
+    "set_up_offered", "plate_seen", "scene_camera_kept", "scale_asked_for", "scale_known", "suggested",
+    "stopped_at_work", "moved", "missed", "located",
+}  # fmt: skip
+"""What has to be told as true."""
+
+
+def main() -> int:
+    """The host's side: a trained tiny world, an installed extension, Blender on a display."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--blender", required=True)
+    parser.add_argument("--backend", required=True, help="Python of the backend's environment")
+    parser.add_argument("--output", default=str(ROOT / "docs" / "images"))
+    parser.add_argument("--display", default=":93")
+    parser.add_argument("--limit", type=float, default=900.0)
+    args = parser.parse_args()
+    output = Path(args.output).absolute()
+    output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="splannequin-stuck-") as name:
+        work = Path(name)
+        _prepare(work, args.backend)
+        environ = {k: v for k, v in os.environ.items() if not k.startswith("SPLANNEQUIN_")}
+        environ |= {"HOME": str(work / "home"), "DISPLAY": args.display}
+        _install(args.blender, work, environ)
+        plan = {"work": name, "backend": args.backend}
+        with press.screen(args.display):
+            command = press.command(args.blender, __file__)
+            blender = subprocess.Popen(command, env={**environ, PLAN: json.dumps(plan)})
+            press._serve(blender, work, output, environ, args.limit)
+        told = work / "told.json"
+        results = json.loads(told.read_text()) if told.is_file() else {"error": "Blender told nothing"}
+    print(json.dumps(results, indent=1))
+    lacking = sorted(name for name in HELD if results.get(name) is not True)
+    print("did not hold: " + ", ".join(lacking) if lacking else "all of it held")
+    return 1 if lacking or "error" in results else 0
+
+
+def _prepare(work: Path, backend: str) -> None:
+    """A project with a clip to import, and one with a shot that is solved and trained."""
+    (work / "home").mkdir()
+    (work / "clip").mkdir()
+    shutil.copy(ROOT / "examples" / "sitting.mp4", work / "clip" / "people.mp4")
+    (work / "project").mkdir()
+    shot = work / "project" / "tiny.splannequin"
+    subprocess.run([backend, "-P", "-c", WORLD.format(str(shot.parent))], cwd=ROOT, check=True,
+                   env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    (shot / "solve" / "solve.json").write_text('{"version": 1, "quality": "Known by construction."}')
+    flags = ["--iterations", "150", "--max-gaussians", "1500"]
+    subprocess.run([backend, "-m", "torch_backend", "train", str(shot), *flags], cwd=ROOT, check=True)
+
+
+def _install(blender: str, work: Path, environ: dict[str, str]) -> None:
+    """Builds the extension and installs it as an artist does."""
+    run = [blender, "--background", "--command", "extension"]
+    subprocess.run([*run, "build", "--output-dir", str(work)], cwd=ROOT, env=environ, check=True)
+    zips = [str(path) for path in work.glob("*.zip")]
+    subprocess.run([*run, "install-file", "-r", "user_default", "-e", *zips], cwd=ROOT, env=environ, check=True)
+
+
+# ------------------------------------------------------------------------------------------------- inside Blender
+
+
+def inside() -> None:
+    """Starts the script as a timer."""
+    import bpy
+
+    plan = json.loads(os.environ[PLAN])
+    told: dict[str, Any] = {"blender": bpy.app.version_string}
+    press.act(_play(plan, told), Path(plan["work"]), told)
+
+
+def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+    """The artist: yields seconds to wait between what it does."""
+    import bpy
+
+    work = Path(plan["work"])
+    yield from press._arrange()
+    bpy.context.preferences.view.filebrowser_display_type = "SCREEN"
+    bpy.context.preferences.system.use_online_access = True
+    yield from _no_backend(work, told)
+    os.environ["SPLANNEQUIN_BACKEND_PYTHON"] = plan["backend"]
+    press._supervisor()._backend = (None, 0.0)
+    yield from _imported(work, told)
+    yield from _solved(work, told)
+    yield from _scrubbed(work, told)
+    yield from _moved(work, told)
+    yield from _renamed(work, told)
+    yield from _preferences(work)
+
+
+def _no_backend(work: Path, told: dict[str, Any]) -> Iterator[float]:
+    """The red box has the button that helps; it asks before it downloads."""
+    import bpy
+
+    yield from press._shoot(work, "11-no-backend")
+    yield from press._click("splannequin.set_up")
+    told["set_up_offered"] = True
+    window = bpy.context.window_manager.windows[0]
+    for value in ("PRESS", "RELEASE"):
+        window.event_simulate(type="ESC", value=value, x=300, y=500)
+    yield 1.0
+
+
+def _imported(work: Path, told: dict[str, Any]) -> Iterator[float]:
+    """The clip is seen once it is in; the cube and the scene's camera are where they were."""
+    import bpy
+
+    bpy.ops.mesh.primitive_cube_add()
+    scene, mine = bpy.context.scene, bpy.context.scene.camera
+    props = scene.splannequin
+    props.clip, props.use_range, props.first, props.last = str(work / "clip" / "people.mp4"), True, 1, 12
+    yield 0.5
+    yield from press._click("splannequin.import_clip")
+    shot = work / "clip" / "people.splannequin"
+    yield from _ended(shot)
+    camera = press.addon_module("plate").find(scene, shot)
+    space = press._view(bpy.context.window_manager.windows[0]).spaces.active
+    told["plate_seen"] = camera is not None and space.camera == camera and space.region_3d.view_perspective == "CAMERA"
+    told["scene_camera_kept"] = scene.camera == mine
+    yield from press._shoot(work, "11-imported", settle=0)
+
+
+def _solved(work: Path, told: dict[str, Any]) -> Iterator[float]:
+    """A solved and trained shot: what the presets cost, the scale that is asked for."""
+    import bpy
+
+    shot, scene = work / "project" / "tiny.splannequin", bpy.context.scene
+    scene.splannequin.clip, scene.splannequin.shot_path = "", str(shot)
+    yield 1.0
+    yield from press._click("splannequin.load_camera")
+    yield 1.0
+    scaled = press.addon_module("ops_align").scaled
+    told["scale_asked_for"] = not scaled(scene, shot)
+    yield from press._shoot(work, "11-presets-and-scale", settle=0)
+    for name, x in (("one", 0.0), ("other", 1.0)):
+        bpy.context.view_layer.objects.active = None
+        empty = bpy.data.objects.new(name, None)
+        empty.location = (x, 0.0, 0.0)
+        scene.collection.objects.link(empty)
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+        bpy.ops.splannequin.align_scale(places=(0, 0, 0, 1, 0, 0), distance=1.0)
+    yield 1.0
+    told["scale_known"] = scaled(scene, shot)
+
+
+def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
+    """t* that nobody chose is the suggested one, and says so; scrubbing stops while a training runs."""
+    import bpy
+
+    shot, scene = work / "project" / "tiny.splannequin", bpy.context.scene
+    props, viewport = scene.splannequin, press.addon_module("viewport")
+    yield from press._click("splannequin.live")
+    yield from _until(lambda: viewport.session() is not None and viewport.session().facts, 90, "the session")
+    yield 2.0
+    told["suggested"] = not props.choose_t_star and props.t_star == viewport.instant(scene)
+    told["t_star"] = props.t_star
+    yield from press._scroll_down()
+    yield from press._shoot(work, "11-suggested")
+    props.extend_steps = 3000
+    yield from press._click("splannequin.train")
+    watch = press._supervisor().watch_of(shot)
+    yield from _until(lambda: (watch.jobs["train"].status or None) is not None, 60, "the training")
+    yield 2.0
+    yield from press._shoot(work, "11-stop-scrubbing", settle=0)
+    yield from press._click("splannequin.live")
+    yield 1.0
+    told["stopped_at_work"] = viewport.session() is None and watch.running() == "train"
+    yield from press._click("splannequin.cancel")
+    press._move(bpy.context.window_manager.windows[0], 400, 300)  # the sidebar lays itself out with nobody over it
+    yield from _ended(shot, failed=True)
+    yield from press._shoot(work, "11-laid-out", settle=0)
+
+
+def _moved(work: Path, told: dict[str, Any]) -> Iterator[float]:
+    """The project folder moves with everything in it."""
+    import bpy
+
+    bpy.ops.wm.save_as_mainfile(filepath=str(work / "project" / "work.blend"))
+    yield 0.5
+    there = (work / "project").rename(work / "moved")
+    yield from _opened(there / "work.blend")
+    scene = bpy.context.scene
+    folder = press.addon_module("steps").shot_folder(scene)
+    camera = press.addon_module("cameras").find(scene, folder, "CAMERA")
+    told["moved"] = folder == there / "tiny.splannequin" and camera is not None and scene.camera == camera
+    yield from press._shoot(work, "11-moved")
+
+
+def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
+    """The shot folder alone is renamed: the panel misses it, Locate takes its new place."""
+    import bpy
+
+    before, there = work / "moved" / "tiny.splannequin", work / "moved" / "renamed.splannequin"
+    before.rename(there)
+    places, watch = press.addon_module("places"), press._supervisor().watch_of(before)
+    yield from _until(lambda: places.missing(bpy.context.scene, watch.state), 10, "the shot to be missed")
+    yield 1.0
+    told["missed"] = not before.exists()
+    yield from press._shoot(work, "11-missing")
+    yield from press._click("splannequin.locate_shot")
+    yield 1.5
+    window = bpy.context.window_manager.windows[0]
+    area = next(a for a in window.screen.areas if a.type == "FILE_BROWSER")
+    area.spaces.active.params.directory = os.fsencode(f"{there}/")
+    yield 1.5
+    region = next(r for r in area.regions if r.type == "WINDOW")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.file.execute("INVOKE_DEFAULT")
+    yield 2.0
+    scene = bpy.context.scene
+    camera = press.addon_module("cameras").find(scene, there, "CAMERA")
+    told["located"] = press.addon_module("steps").shot_folder(scene) == there and camera == scene.camera
+    yield from press._shoot(work, "11-located")
+
+
+def _preferences(work: Path) -> Iterator[float]:
+    """The add-on's page in the window that Blender opens for its preferences, as large as that is."""
+    import bpy
+
+    module = press._supervisor().__name__.rpartition(".splannequin_addon")[0]
+    bpy.context.preferences.active_section = "ADDONS"
+    bpy.context.window_manager.addon_search = "Splannequin"
+    bpy.ops.screen.userpref_show()
+    yield 2.0
+    bpy.ops.preferences.addon_expand(module=module)
+    yield 2.0
+    yield from press._shoot(work, "11-preferences", settle=0)
+
+
+def _opened(file: Path) -> Iterator[float]:
+    """Another file, with the sidebar on our tab."""
+    import bpy
+
+    bpy.ops.wm.open_mainfile(filepath=str(file))
+    yield 2.0
+    area = press._view(bpy.context.window_manager.windows[0])
+    area.spaces.active.show_region_ui = True
+    yield 0.5
+    press._sidebar(area).active_panel_category = "Splannequin"
+    yield 1.5
+
+
+def _ended(shot: Path, failed: bool = False) -> Iterator[float]:
+    """Waits for the shot's step. RuntimeError with its sentence if it failed."""
+    watch = press._supervisor().watch_of(shot)
+    yield 1.0
+    while watch.running() is not None:
+        yield 0.2
+    yield 1.5
+    bad = [j.status.message for j in watch.jobs.values() if j.state == "failed" and j.status is not None]
+    if (bad or watch.failures) and not failed:
+        raise RuntimeError(" ".join([*bad, *(sentence for sentence, _ in watch.failures.values())]))
+
+
+def _until(there: Callable[[], Any], seconds: float, what: str) -> Iterator[float]:
+    until = time.monotonic() + seconds
+    while not there():
+        if time.monotonic() > until:
+            raise RuntimeError(f"waited {seconds:.0f} s for {what}")
+        yield 0.2
+
+
+if __name__ == "__main__":
+    if PLAN in os.environ and "bpy" in sys.modules:
+        inside()
+    else:
+        sys.exit(main())
