@@ -1,4 +1,4 @@
-"""Is a trained run any good? A word about what it leaves unexplained of the frames, from figures that real clips gave."""
+"""Is a trained run any good? A word about what it leaves unexplained of its frames, from figures of real clips."""
 
 from __future__ import annotations
 
