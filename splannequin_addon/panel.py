@@ -92,7 +92,10 @@ def view_train(scene: Any, state: shots.ShotState | None) -> View:
     psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
     quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
     size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % move"
-    return View(True, True, [f"Run {scene.splannequin.run_name}: {quality}", size], "Next: freeze an instant.")
+    lines = [f"Run {scene.splannequin.run_name}: {quality}", size]
+    if run.get("quality") == "Poor":
+        lines.append("It is poor: take a range in which nobody walks, or solve the camera again.")
+    return View(True, True, lines, "Next: freeze an instant.")
 
 
 def view_freeze(scene: Any, state: shots.ShotState | None) -> View:

@@ -145,6 +145,7 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
         return
     psnr = summary["heldout_psnr_db"]
     quality = f"{psnr:.2f} dB on held-out frames" if psnr is not None else "no frames held out"
+    quality = f"{summary['quality']}: {quality}" if summary.get("quality") else quality
     print(
         f"\nFrozen at frame {summary['t_star_frame']}: {summary['frames']} frames, "
         f"{summary['registered']} of {summary['solved_frames']} solved frames registered.\n"

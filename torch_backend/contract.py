@@ -1025,6 +1025,7 @@ def summarise(
         **{k: train[k] for k in ("gaussians", "moving_share", "train_seconds", "iterations", "heldout_psnr_db")},
         "train_width_px": train["width_px"],
         "modelled": train.get("modelled", []),
+        "quality": train.get("quality", ""),
         **{k: freeze[k] for k in ("t_star_frame", "exr_dir", "contact_sheet", "video", "ply", "take")},
         "run": train["run"],
         "wall_seconds_by_stage": dict(stages),

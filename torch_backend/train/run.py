@@ -28,6 +28,7 @@ from .extend import EXTENSION_FILE, pending
 from .model import DynamicModel
 from .needs import modelled
 from .trainer import Trainer, restore_model
+from .verdict import judge, tell
 
 _ATTEMPTS = 5
 """A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
@@ -110,6 +111,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if folder != run:
         take_place(run, folder)
     report.metric("train", summary)
+    tell(summary, report)
     if config.method == "auto" and summary["moving_share"] > _TOO_MUCH_MOTION:
         report.warning(
             f"Too much motion: {100 * summary['moving_share']:.0f} % of the Gaussians had to move.",
@@ -165,6 +167,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     write_json(folder / SUMMARY_FILE, summary)
     beside.unlink(missing_ok=True)
     report.metric("train", summary)
+    tell(summary, report)
     return summary
 
 
@@ -301,6 +304,7 @@ def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, ke
         "train_frames": len(trainer.train_ids),
         "heldout_frames": len(test),
         "heldout_psnr_db": None if value is None else round(value, 3),
+        **judge(trainer, test, held_out),
         "gaussians": len(model.gaussians),
         "moving_gaussians": len(model.open_rows()),
         "moving_share": round(moving_share(model), 5),

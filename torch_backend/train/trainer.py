@@ -580,15 +580,18 @@ class Trainer:
         )  # fmt: skip
         return self.model.exposure.apply(out.colors[0], float(self.scene.times[index]))
 
-    def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
-        """Mean PSNR in dB over held-out frames at their own times; None if there are none."""
-        if not indices:
-            return None
+    def frame_psnrs(self, indices: list[int], images: Tensor) -> list[float]:
+        """PSNR in dB of each frame `indices` of the scene at its own time against images [I, H, W, 3]."""
         values = []
         for n, i in enumerate(indices):
             self.report.check_cancelled()
             values.append(psnr(self.render_frame(i), images[n].to(self.device, torch.float32)))
-        return sum(values) / len(values)
+        return values
+
+    def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
+        """Mean PSNR in dB over held-out frames at their own times; None if there are none."""
+        values = self.frame_psnrs(indices, images)
+        return sum(values) / len(values) if values else None
 
     # ------------------------------------------------------------------ checkpoints
 
