@@ -179,7 +179,7 @@ def test_a_station_imports_only_stations_before_it(path: Path):
     station = path.relative_to(ROOT / "torch_backend").parts[0].removesuffix(".py")
     if station not in STATIONS:
         return
-    allowed = {*STATIONS[: STATIONS.index(station) + 1], "contract", "shot", "cards"}
+    allowed = {*STATIONS[: STATIONS.index(station) + 1], "contract", "shot", "replacing", "cards"}
     wrong = []
     for line, name in imports(read(path), package_of(path)):
         parts = name.split(".")

@@ -65,7 +65,7 @@ class Shot:
     @classmethod
     def open(cls, root: str | Path) -> Shot:
         """An existing shot. FileNotFoundError if there is none, ValueError if it is from a newer version."""
-        from .solve.replacing import settle_solve
+        from .replacing import settle_solve  # it stands on this module
 
         shot = cls(root)
         if not shot.info_path.is_file():

@@ -17,6 +17,7 @@ from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, fr
 from ..footage import load_frames
 from ..footage.images import is_whole_png, read_frame, write_png
 from ..footage.sources import frame_words
+from ..replacing import Staged, replacing_solve, settle_solve
 from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, write_json
 from . import foreign
 from .child import run_worker
@@ -25,7 +26,6 @@ from .given import doubts, prepare, refuse_misfit, take_over
 from .lens import LEAST_DEG, MOST_DEG, view_deg
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
-from .replacing import Staged, replacing_solve, settle_solve
 from .stored import load_cameras, load_points, load_record
 from .undistort import Undistorter
 

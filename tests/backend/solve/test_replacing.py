@@ -100,16 +100,16 @@ def test_a_model_of_fewer_files_leaves_none_of_the_one_before_it(again, tools):
     assert {p.name for p in (shot.solve / "colmap").iterdir()} == {"cameras.bin", "images.bin", "points3D.bin"}
 
 
-@pytest.mark.parametrize("linked", ["frames", "solve/colmap", "solve/next"])
+@pytest.mark.parametrize("linked", ["frames", "solve/colmap", "solve/next", "solve/next/frames", "takes"])
 def test_opening_a_shot_moves_nothing_through_a_link(tmp_path, linked):
     shot, mine = Shot.create(tmp_path / "a.splannequin"), tmp_path / "mine"
     for name in ("frames/000001.png", "colmap/cameras.bin", "solve/colmap/cameras.bin", "000001.png", "cameras.bin"):
         (mine / name).parent.mkdir(parents=True, exist_ok=True)
         (mine / name).write_text("mine")
-    for name in ("frames/000001.png", "solve/colmap/cameras.bin"):
+    for name in ("frames/000001.png", "solve/colmap/cameras.bin", "takes/000001.png"):
         (shot.solve / "next" / name).parent.mkdir(parents=True, exist_ok=True)
         (shot.solve / "next" / name).write_text("theirs")
-    if linked == "solve/next":
+    if linked.startswith("solve/next"):
         shutil.rmtree(shot.root / linked)
     (shot.root / linked).symlink_to(mine)
     Shot.open(shot.root)

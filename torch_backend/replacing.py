@@ -3,23 +3,25 @@
 Until all of the new solve is written, nothing of the old one is touched. Then one rename, of `solve/next.partial` to
 `solve/next`, says that the new one holds, and its files are moved to where readers look for them. Between the first of
 these renames and the last (a millisecond for a clip of 75 frames) a reader may see new frames with old cameras; a
-process that is killed just there leaves `solve/next`, and whoever opens the shot next moves what remains.
+process that is killed just there leaves `solve/next`, and whoever opens the shot next moves what remains. That is why
+this stands beside `shot` and not in the solve's own folder.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..shot import Shot, make_folder, replace_file
+from .shot import Shot, make_folder, replace_file
 
 _NEXT, _PARTIAL = "next", "next.partial"
 _LAST = ("solve.json", "cameras.json", "points.npz")
 """What is moved after all others, the last one first here: they tell a reader that there is a solve."""
+_TARGETS = (Path("frames"), Path("solve"), Path("solve", "colmap"))
+"""Folders of the shot that a solve has files in; to no other one anything is moved."""
 
 
 @dataclass
@@ -61,10 +63,10 @@ def settle_solve(shot: Shot) -> None:
     elsewhere could have it replace any file.
     """
     ready, root = shot.solve / _NEXT, shot.root.resolve()
+    within = ready.relative_to(shot.root)
     if not ready.is_dir():
         return
-    inside = (Path("solve") / _NEXT, Path("frames"), Path("solve", "colmap"))
-    if any((root / part).resolve() != root / part for part in inside):
+    if any((root / part).resolve() != root / part for part in (*_TARGETS, *(within / target for target in _TARGETS))):
         return
     for source in sorted(_files(ready), key=_turn):
         target = shot.root / source.relative_to(ready)
@@ -87,9 +89,9 @@ def _drop_stale(old: Path, new: Path) -> None:
                 (new / name).touch()
 
 
-def _files(folder: Path) -> list[Path]:
-    """Regular files below a folder; links are not followed."""
-    found = [Path(top) / name for top, _, names in os.walk(folder) for name in names]
+def _files(ready: Path) -> list[Path]:
+    """The files that wait to be moved; links are not followed."""
+    found = [path for target in _TARGETS if (ready / target).is_dir() for path in (ready / target).iterdir()]
     return [path for path in found if path.is_file() and not path.is_symlink()]
 
 
