@@ -376,6 +376,7 @@ def _edit(operator: Any, context: Any, step: str, change: Any) -> set[str]:
         operator.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
         return {"CANCELLED"}
     supervisor.watch_of(folder).notes[step] = notes
+    supervisor.redraw()
     for note in notes:
         operator.report({"INFO"}, tr(note))
     return {"FINISHED"}

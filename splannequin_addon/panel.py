@@ -319,9 +319,10 @@ class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
         watch = self._watch(context)
         if watch is not None and places.missing(context.scene, watch.state):
             box = layout.box()
-            box.alert = True
+            column = box.column(align=True)
+            column.alert = True
             name = watch.shot.name
-            wrap(box, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
+            wrap(column, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
             box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
 
     def _backend_trouble(self, context: Any, layout: Any) -> None:

@@ -252,6 +252,7 @@ MESSAGES: dict[str, str] = {
     "There is no trained run {}.": "Es gibt keinen trainierten Lauf {}.",
     "The job in {} cannot be read: {}": "Der Auftrag in {} kann nicht gelesen werden: {}",
     "Locate the shot first.": "Zuerst den Shot suchen.",
+    "An empty panel that comes and goes, so that Blender puts the others in their places": "Ein leeres Feld, das kommt und geht, damit Blender die anderen an ihre Plätze setzt",
     "The scale is arbitrary: a clip does not tell it.": "Der Maßstab ist willkürlich: ein Clip verrät ihn nicht.",
     "Preview took 150 s on two cores without a graphics card. Times here come with the first run.": "Vorschau brauchte 150 s auf zwei Kernen ohne Grafikkarte. Zeiten von hier kommen mit dem ersten Lauf.",
     "As run {} took on the {}; with a ? by pixels and steps.": "Wie Lauf {} brauchte ({!t}); mit ? nach Pixeln und Schritten.",

@@ -153,3 +153,14 @@ def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
     trouble = supervisor.backend_trouble()
     assert trouble is None or "is not set up" in trouble.message
     monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
+
+
+def test_the_sidebar_is_laid_out_once_after_each_change(addon):
+    supervisor = addon("supervisor")
+    supervisor.redraw()
+    supervisor.redraw()
+    first = supervisor.lay_out()
+    assert supervisor.lay_out() == first, "drawn again without a change, panels stay"
+    supervisor.redraw()
+    assert supervisor.lay_out() is not first
+    assert bpy.types.SPLANNEQUIN_PT_layout.bl_category == bpy.types.SPLANNEQUIN_PT_footage.bl_category

@@ -189,6 +189,7 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield from press._scroll_down()
     yield from press._shoot(work, "11-suggested")
     props.extend_steps = 3000
+    yield from _scroll_up()
     yield from press._click("splannequin.train")
     watch = press._supervisor().watch_of(shot)
     yield from _until(lambda: (watch.jobs["train"].status or None) is not None, 60, "the training")
@@ -197,6 +198,7 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield from press._click("splannequin.live")
     yield 1.0
     told["stopped_at_work"] = viewport.session() is None and watch.running() == "train"
+    yield from _scroll_up()
     yield from press._click("splannequin.cancel")
     press._move(bpy.context.window_manager.windows[0], 400, 300)  # the sidebar lays itself out with nobody over it
     yield from _ended(shot, failed=True)
@@ -255,6 +257,9 @@ def _preferences(work: Path) -> Iterator[float]:
     bpy.ops.screen.userpref_show()
     yield 2.0
     bpy.ops.preferences.addon_expand(module=module)
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            area.tag_redraw()
     yield 2.0
     yield from press._shoot(work, "11-preferences", settle=0)
 
@@ -282,6 +287,20 @@ def _ended(shot: Path, failed: bool = False) -> Iterator[float]:
     bad = [j.status.message for j in watch.jobs.values() if j.state == "failed" and j.status is not None]
     if (bad or watch.failures) and not failed:
         raise RuntimeError(" ".join([*bad, *(sentence for sentence, _ in watch.failures.values())]))
+
+
+def _scroll_up() -> Iterator[float]:
+    """Turns the wheel over the sidebar until its first button is seen."""
+    import bpy
+
+    window = bpy.context.window_manager.windows[0]
+    region = press._sidebar(press._view(window))
+    x, y = region.x + region.width // 3, region.y + region.height // 2
+    press._move(window, x, y)
+    yield 0.1
+    for _ in range(40):
+        window.event_simulate(type="WHEELUPMOUSE", value="PRESS", x=x, y=y)
+    yield 0.5
 
 
 def _until(there: Callable[[], Any], seconds: float, what: str) -> Iterator[float]:
