@@ -116,8 +116,9 @@ class SequenceSource:
             last=max(self._files),
             deep=light or not space.as_it_stands or str(spec.format) not in ("uint8", "int8"),
             colour="linear" if light else "srgb",
-            # What is read otherwise than it used to be is imported again; all else keeps its key.
-            key=[str(sequence), len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)]
+            # Without the folder: footage and shot may have been moved together. What is read otherwise than it used to
+            # be is imported again.
+            key=[Path(str(sequence)).name, len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)]
             + ([] if ordinary else told),
             reading={
                 "colour": space.name,

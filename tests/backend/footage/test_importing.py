@@ -246,6 +246,17 @@ def test_a_sequence_has_the_rate_that_is_asked_for(shot, sequence, recorder):
     assert report.warnings == []
 
 
+def test_a_sequence_that_was_moved_is_the_same_footage(shot, sequence, recorder):
+    import_footage(shot, str(sequence(1)), FootageConfig(step=1), recorder())
+    (shot.solve / "of these frames").mkdir(parents=True)
+    moved = sequence(1001).parent / "from_1"
+    moved = moved.rename(moved.with_name("elsewhere"))
+    import_footage(shot, str(moved), FootageConfig(step=1), recorder())
+    assert (shot.solve / "of these frames").is_dir()
+    import_footage(shot, str(moved.with_name("from_1001")), FootageConfig(step=1), recorder())
+    assert not (shot.solve / "of these frames").exists()
+
+
 def test_a_rate_or_a_layer_for_a_video_is_told_to_be_passed_over(shot, clip, recorder):
     report = recorder()
     assert import_footage(shot, clip, FootageConfig(fps=50.0, layer="rgba"), report)["fps"] == 10.0
