@@ -138,7 +138,7 @@ def test_damaged_points_are_named(capsys, place, tmp_path, kind):
         arrays["xyz"] = arrays["xyz"][:5] if kind == "shape" else arrays["xyz"] * np.nan
         np.savez(points, **arrays)
     code, text = said(capsys, tmp_path, "train", "{}/d", *SMALL, "--run", "other")
-    assert code == ExitCode.SOLVE and "points.npz cannot be read" in text and "Solve the shot again." in text
+    assert code == ExitCode.SOLVE and "points.npz is damaged" in text and "Solve the camera again." in text
 
 
 @pytest.mark.parametrize("content", ["[" * 200_000, "{}", '{"frames": [3]}', '{"frames": [{"frame": 101}]}'])
@@ -146,7 +146,7 @@ def test_a_damaged_listing_is_named(capsys, place, tmp_path, content):
     shot = shutil.copytree(place / "s", tmp_path / "d")
     (shot / "frames" / "frames.json").write_text(content)
     code, text = said(capsys, tmp_path, "train", "{}/d", *SMALL, "--run", "other")
-    assert code == ExitCode.FOOTAGE and "frames.json cannot be read" in text and "Traceback" not in text
+    assert code == ExitCode.FOOTAGE and "frames.json is damaged" in text and "Traceback" not in text
 
 
 @pytest.mark.parametrize(

@@ -44,8 +44,8 @@ def load_points(shot: Shot) -> dict[str, NDArray]:
     try:
         with open_regular(path) as handle, np.load(handle, allow_pickle=False) as data:
             points = {name: data[name] for name in _POINTS}
-    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds
-        raise damaged(path, error) from error
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds, in words for programmers
+        raise damaged(path, "it cannot be read") from error
     count = len(points["xyz"]) if points["xyz"].ndim else 0
     for name, (kinds, shape) in _POINTS.items():
         if points[name].dtype.kind not in kinds or points[name].shape != (count, *shape):

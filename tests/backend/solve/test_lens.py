@@ -298,7 +298,7 @@ def test_overscan_on_the_command_line(text, value):
 def test_overscan_out_of_range_is_refused(text, capsys):
     with pytest.raises(SystemExit):
         parser().parse_args(["take", "shot", f"--overscan={text}"])
-    assert "invalid overscan value" in capsys.readouterr().err
+    assert "overscan is 0 to 100 percent, or lens" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
