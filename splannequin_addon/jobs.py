@@ -200,7 +200,7 @@ def refuse_second_writer(shot: Path) -> None:
         writer = contract.read_writer(shot)
     except (OSError, ValueError):
         writer = None  # a damaged lock: the backend says so
-    if writer is not None and writer.works():
+    if writer is not None and writer.works() and not contract.gives_back(shot, writer):
         raise contract.busy(shot, writer)
     for job in latest(shot).values():
         here = job.status is None or job.status.host in ("", contract.host_name())  # others have the lock

@@ -448,6 +448,15 @@ def read_writer(shot: Path) -> Writer | None:
     return from_dict(Writer, data)
 
 
+def gives_back(shot: Path, writer: Writer) -> bool:
+    """True if the job that holds the shot has told its end: it lets go of the lock in a moment."""
+    try:
+        status = read_json(shot / "jobs" / checked_name(writer.job, "job") / STATUS_FILE, SHORT_JSON)
+    except (OSError, ValueError):
+        return False
+    return status.get("state") in ("done", "failed", "cancelled") and status.get("pid") == writer.pid
+
+
 def busy(shot: Path, writer: Writer) -> JobError:
     """What the second one who would write into a shot is told: who does, since when, where, and what to do."""
     try:

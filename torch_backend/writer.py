@@ -63,7 +63,10 @@ def _take(root: Path, mine: Writer) -> None:
         if there is None:
             continue  # given back in between
         if there.works():
-            raise contract.busy(root, there)
+            if not contract.gives_back(root, there) or time.monotonic() > until:
+                raise contract.busy(root, there)
+            time.sleep(0.01)
+            continue
         if _take_over(path, there, mine):
             return
         if time.monotonic() > until:

@@ -298,6 +298,11 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     with pytest.raises(contract.JobError, match="on elsewhere since") as told:
         steps.begin(scene, "footage")
     assert str(empty_shot / "lock.json") in told.value.hint
+    ending = jobs.new_job(empty_shot, "train", contract.TrainParams())
+    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name)))
+    told = contract.Status("train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.host_name())
+    jobs.write_json(ending.folder / "status.json", dataclasses.asdict(told))
+    jobs.refuse_second_writer(empty_shot)  # its process has told its end, and lets go in a moment
     worker.kill()
     worker.wait()
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 
 from torch_backend import contract, job
 from torch_backend.contract import ExitCode, JobError, Writer
-from torch_backend.shot import Shot, atomic_path, make_folder, working_on
+from torch_backend.shot import Shot, atomic_path, make_folder, working_on, write_json
 from torch_backend.writer import only_writer
 
 CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
@@ -61,6 +62,21 @@ def dead_writer() -> Writer:
 
 def put_lock(shot, writer: Writer) -> None:
     lock_of(shot).write_text(json.dumps(dataclasses.asdict(writer)))
+
+
+def test_a_job_begun_as_soon_as_the_one_before_told_its_end_waits_for_its_lock(shot):
+    """A status is written before the lock is given back: whoever reads it may begin the next step in between."""
+    folder = job.new_job(shot, "import", contract.ImportParams())
+    now, pid = time.time(), os.getpid()
+    status = contract.Status("import", "running", pid, now, 0.0, now, host=contract.host_name())
+    put_lock(shot, Writer(contract.host_name(), pid, contract.process_start(pid), "import", folder.name, now))
+    write_json(folder / contract.STATUS_FILE, dataclasses.asdict(status))
+    with pytest.raises(JobError, match="has been running"), only_writer(shot.root, "solve", "next"):
+        pass
+    write_json(folder / contract.STATUS_FILE, dataclasses.asdict(dataclasses.replace(status, state="done")))
+    threading.Timer(0.3, lock_of(shot).unlink).start()
+    with only_writer(shot.root, "solve", "next") as mine:
+        assert mine.job == "next"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP is POSIX")
