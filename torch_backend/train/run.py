@@ -84,7 +84,8 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         forget(run, key)
         report.progress("training", 1, 1, "already trained")
         return done
-    folder = place_for(run, key, params.resume)
+    folder = shot.own(place_for(run, key, params.resume))
+    shot.own(folder / "previews")
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     if folder != run and params.resume:
         report.warning(

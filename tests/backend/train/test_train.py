@@ -239,6 +239,20 @@ def test_a_finished_run_that_begins_anew_stays_too(world, quiet):
     assert not begun_in(run), "the finished run is what it could only come to"
 
 
+def test_a_training_that_was_begun_behind_a_link_is_not_gone_on_with(world, quiet, tmp_path):
+    """A shot folder may come from anywhere, and a link in it lead to somebody else's run."""
+    train_shot(world.shot, short(world, "linked"), quiet())
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, short(world, "linked", seed=5), quiet(cancel_at=("training", 0.5)))
+    (work,) = begun_in(world.shot.run("linked"))
+    theirs = work.rename(tmp_path / "theirs")
+    before = files_of(theirs)
+    work.symlink_to(theirs)
+    with pytest.raises(JobError, match="is a link to"):
+        train_shot(world.shot, short(world, "linked", seed=5), quiet())
+    assert files_of(theirs) == before
+
+
 def test_paused_runs_of_one_name_wait_side_by_side(world, quiet):
     """Hours of a paused run are not lost because somebody tried other settings for a minute."""
     for seed in (1, 2, 3):
