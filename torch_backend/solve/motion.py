@@ -47,6 +47,7 @@ class _Clip:
         points = load_points(shot)["xyz"].astype(np.float64)
         self.depths = [_typical_depth(points, self.viewmats[i]) for i in range(len(self.frames))]
         self._grey: dict[int, NDArray[np.uint8]] = {}
+        self._looks: dict[int, flow.Look] = {}
 
     def plate(self, index: int) -> NDArray[np.uint8]:
         """The working frame [H, W, 3] in 8 bits."""
@@ -61,9 +62,15 @@ class _Clip:
             self._grey[index] = cv2.resize(grey, self.flow_size, interpolation=how)
         return self._grey[index]
 
+    def look(self, index: int) -> flow.Look:
+        if index not in self._looks:
+            self._looks[index] = flow.Look(self.grey(index))
+        return self._looks[index]
+
     def forget(self, before: int) -> None:
-        for index in [i for i in self._grey if i < before]:
-            del self._grey[index]
+        for store in (self._grey, self._looks):
+            for index in [i for i in store if i < before]:
+                del store[index]
 
 
 def _keys(seconds: list[float]) -> list[int]:
@@ -136,17 +143,8 @@ def _own_score(clip: _Clip, matches: flow.Matches, key: int, config: FlowConfig)
     """Share of a key frame's matches that tell of motion, and how sure that is."""
     keys = clip.keys
     seen = flow.neighbours(matches, key, len(keys), config)
-    found = flow.evidence(
-        lambda k: clip.grey(keys[k]),
-        key,
-        seen,
-        matches.grid,
-        clip.viewmats[keys],
-        clip.Ks[keys],
-        clip.depths[keys[key]],
-        config,
-        clip.unit,
-    )
+    scene = flow.Scene(lambda k: clip.look(keys[k]), clip.viewmats[keys], clip.Ks[keys], matches.grid, clip.unit)
+    found = flow.evidence(scene, key, seen, clip.depths[keys[key]], config)
     count = found.on + found.off
     return np.clip(found.off / np.maximum(count, 1) * 2.5, 0, 1), np.clip(count / 6, 0, 1) * (count >= 2)
 
