@@ -29,6 +29,10 @@ SAME_DEPTH = 0.03
 """Two views see the same point if its depths differ by less than this share."""
 FLOW_WIDTH = 640
 """Pixels of width at which flow is computed."""
+LEVEL_WINDOW, LEVEL_FLOOR = 31, 8 / 255
+"""Pixels over which pictures are levelled before flow is taken, and the contrast below which there is none."""
+TEXTURE_WINDOW, TEXTURE = 9, 4 / 255
+"""Pixels over which structure is looked for, and the least of it: grain of 1 or 2 / 255 is none."""
 
 
 def widened(mask: Tensor, by: int) -> Tensor:
@@ -112,32 +116,59 @@ def seen_again(places: Tensor, there: Tensor, depth: Tensor) -> Tensor:
 
 
 class Flow:
-    """Dense optical flow between two pictures (DIS)."""
+    """Dense optical flow between two pictures (DIS), of structure alone: brightness may drift between them."""
 
     def __init__(self) -> None:
         if importlib.util.find_spec("cv2") is None:
             raise ModuleNotFoundError("optical flow needs opencv-python-headless (requirements/bench.txt)")
         import cv2
 
-        self._cv2: Any = cv2
-        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._dis: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
         """[H, W, 2] from pixels of `a` to their places in `b`, less the pixels; x, y."""
-        grey = [
-            self._cv2.cvtColor((v.clamp(0.0, 1.0) * 255.0).round().byte().numpy(), self._cv2.COLOR_RGB2GRAY)
-            for v in (a, b)
-        ]
-        return torch.from_numpy(np.asarray(self._dis.calc(grey[0], grey[1], None)))
+        levels = [(_levelled(v) * 255.0).round().byte().numpy() for v in (a, b)]
+        return torch.from_numpy(np.asarray(self._dis.calc(levels[0], levels[1], None)))
 
 
-def unexplained_flow(flow: Flow, a: Tensor, b: Tensor, places: Tensor) -> Tensor:
+def _luma(image: Tensor) -> Tensor:
+    return image.clamp(0.0, 1.0).float() @ torch.tensor([0.2126, 0.7152, 0.0722])
+
+
+def _box(values: Tensor, width: int) -> Tensor:
+    """Mean over a window of `width` pixels, cut at the border."""
+    return F.avg_pool2d(values[None, None], width, 1, width // 2, count_include_pad=False)[0, 0]
+
+
+def _levelled(image: Tensor) -> Tensor:
+    """Luma with local mean and contrast taken out, [H, W] in 0..1. Flow takes an exposure that drifts for motion."""
+    luma = _luma(image)
+    mean = _box(luma, LEVEL_WINDOW)
+    deviation = (_box(luma.square(), LEVEL_WINDOW) - mean.square()).clamp_min(0.0).sqrt()
+    return (0.5 + 0.2 * (luma - mean) / (deviation + LEVEL_FLOOR)).clamp(0.0, 1.0)
+
+
+def textured(image: Tensor) -> Tensor:
+    """Where a picture has structure in two directions, bool [H, W]: elsewhere flow is a guess.
+
+    The smaller eigenvalue of the structure tensor over `TEXTURE_WINDOW` pixels; its root is a difference per pixel.
+    """
+    luma = _luma(image)
+    x = F.pad(luma[:, 2:] - luma[:, :-2], (1, 1)) / 2.0
+    y = F.pad(luma[2:] - luma[:-2], (0, 0, 1, 1)) / 2.0
+    xx, xy, yy = (_box(v, TEXTURE_WINDOW) for v in (x * x, x * y, y * y))
+    smaller = (xx + yy) / 2.0 - (((xx - yy) / 2.0).square() + xy.square()).sqrt()
+    return smaller.clamp_min(0.0).sqrt() >= TEXTURE
+
+
+def unexplained_flow(flow: Flow, a: Tensor, b: Tensor, places: Tensor, both: Tensor) -> Tensor:
     """How far, in pixels [H, W], picture `b` is from where the camera's motion puts the points of `a`.
 
     `b` is brought to `a` by `places` first, so that what is measured is near nothing where nothing moves: flow of whole
-    pixels is off at every edge in depth.
+    pixels is off at every edge in depth. What only `a` sees (not `both`) is filled with `a` itself, lest it disturb.
     """
-    return flow(a, sampled(b, places)).norm(dim=2)
+    brought = torch.where(both[..., None], sampled(b, places), a)
+    return flow(a, brought).norm(dim=2)
 
 
 def unsteadiness(a: Tensor, b: Tensor, places: Tensor) -> Tensor:
