@@ -196,10 +196,9 @@ def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: in
 
 def table(name: str, freezes: Sequence[dict[str, Any]]) -> list[str]:
     """The clip's figures in Markdown, a row per t* and what was looked at."""
-    lines = [
-        f"| {name} | flow left, moving, px | still, px | more | frames over {ALLOWED} | worst frame | difference, moving, / 255 | still |",
-        "|---|" + "---:|" * 7,
-    ]
+    header = [name, "flow left, moving, px", "still, px", "more", f"frames over {ALLOWED}", "worst frame"]
+    header += ["difference, moving, / 255", "still, / 255"]
+    lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
     for freeze in freezes:
         for what in WHAT:
             of = freeze["clip"][what]
