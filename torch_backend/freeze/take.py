@@ -24,28 +24,12 @@ from ..train.run import save_png
 from .contact_sheet import write_contact_sheet
 from .exr import FrameMetadata, read_key, write_frozen_exr
 from .grain import Grain, draw, measure_plate
-from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen, suggest_t_star
+from .query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, suggest_t_star
 from .video import write_video
 
 TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
 _FRAME = re.compile(r"-?\d+")
-
-
-@dataclass
-class OutputFrame:
-    """One frame to render."""
-
-    frame: int
-    """Number in the clip."""
-    viewmat: Tensor
-    """[4, 4] world-to-camera, scene units."""
-    K: Tensor
-    """[3, 3] pixels of the output size, without overscan."""
-    t_star: float
-    """Frame number at which time stands still."""
-    exposed_like: float
-    """Frame number whose exposure the camera has: its own on the clip's poses, t* on a path of its own."""
 
 
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
