@@ -76,6 +76,8 @@ class DetailedFrame:
     """[H, W] in 0..1."""
     splat: Tensor
     """[H, W, 3] premultiplied, display-referred: the splats alone."""
+    splat_alpha: Tensor
+    """[H, W] in 0..1: how much of the pixel they cover."""
     plate: Tensor
     """[H, W] in 0..1: share of the pixel that is plate; 0: invented by splats."""
     source: Tensor
@@ -173,7 +175,7 @@ class Detailer:
             width, height: pixels of the frame without overscan.
             withheld: frames whose plates are not to be used.
         """
-        splat = image.color
+        splat = image
         frozen, image = self._joined(output, frozen, image, width, height)
         shot = self._shot(output, frozen, image, width, height)
         usable = [frame for frame in self.seen.frames if frame not in withheld]
@@ -391,7 +393,7 @@ class Detailer:
     # ------------------------------------------------------------------------------------------------- the mix
 
     def _mixed(
-        self, shot: _Shot, splat: Tensor, leading: int, matte: Tensor, st: Tensor, own: bool, rest: _Rest
+        self, shot: _Shot, splat: FrozenImage, leading: int, matte: Tensor, st: Tensor, own: bool, rest: _Rest
     ) -> DetailedFrame:
         image = shot.image
         rows, columns = image.alpha.shape
@@ -416,7 +418,7 @@ class Detailer:
         source[share <= 0.0] = 0.0
         motion = resized(shot.motion, columns, rows)
         return DetailedFrame(
-            to_display(linear), linear, alpha, splat, share, source, image.depth, image.support, motion, leading, st,
+            to_display(linear), linear, alpha, splat.color, splat.alpha, share, source, image.depth, image.support, motion, leading, st,
             matte, fill,
         )  # fmt: skip
 
