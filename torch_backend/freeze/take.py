@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, Reporter, frame_file, read_json
+from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, Reporter, Verdict, frame_file, read_json
 from ..footage.color import premultiplied_srgb_to_linear
 from ..footage.images import read_png
 from ..gaussians.ply import write_ply
@@ -25,6 +25,7 @@ from .contact_sheet import write_contact_sheet
 from .exr import FrameMetadata, read_key, write_frozen_exr
 from .grain import Grain, draw, measure_plate
 from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen, suggest_t_star
+from .verdict import judge_take, unsure
 from .video import write_video
 
 TAKE_VERSION = 1
@@ -338,9 +339,9 @@ def _finish(
     numbers = [f.frame for f in frames]
     report.progress("finishing the take", 0, 3, "contact sheet")
     previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
-    sheet = _contact_sheet(
-        shot, params, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}", t_star
-    )
+    verdict = judge_take({"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path})
+    title = f"{shot.info().name}: t* = frame {t_star}, run {params.run}"
+    sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
     report.check_cancelled()
     report.progress("finishing the take", 1, 3, "video")
     note = write_video(folder / "video.mp4", (read_png(p) for p in previews), shot.info().fps or 24.0)
@@ -374,6 +375,7 @@ def _finish(
         "contact_sheet": str(sheet),
         "video": str(folder / "video.mp4"),
         "ply": str(folder / "frozen.ply"),
+        **({} if verdict is None else {"verdict": vars(verdict)}),
     }
     write_json(folder / "take.json", facts)
     shot.update(t_star=t_star)
@@ -399,12 +401,16 @@ def _redistort(
 
 
 def _contact_sheet(
-    shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int
-) -> Path:
+    shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int,
+    verdict: Verdict | None,
+) -> Path:  # fmt: skip
     plates = [shot.frames / frame_file(n, ".png") for n in numbers]
     own_poses = not params.camera_path and all(p.is_file() for p in plates)
     path = shot.take(params.take) / "contact_sheet.png"
-    write_contact_sheet(path, plates if own_poses else None, previews, numbers, title, mark=t_star)
+    note, doubt = ("", set()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
+    write_contact_sheet(
+        path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt
+    )
     return path
 
 
