@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 from ..scene import Scene, resize_intrinsics
-from ..solve.motion import load_motion
 from ..shot import Shot
+from ..solve.motion import load_motion
 from ..train import LoadedRun
 from ..train.model import render
 from .instant import InstantLayer, instant_layer, join

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, Reporter, frame_file, read_json
+from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, Reporter, Verdict, frame_file, read_json
 from ..footage.color import premultiplied_srgb_to_linear
 from ..footage.images import read_png
 from ..footage.plates import Plates
@@ -30,6 +30,7 @@ from .exr import DetailLayers, FrameMetadata, read_frozen_exr, read_key, write_f
 from .grain import Grain, draw, measure_plate
 from .query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, suggest_t_star
 from .reproject import resized
+from .verdict import judge_take, unsure
 from .video import write_video
 from .warp import FOLDER as WARPS
 from .warp import WarpMetadata, write_warp
@@ -70,7 +71,9 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     try:
         shares = _render_all(folder, frames, done, scene, look, keys, report)
         there = done | {f.frame for f in frames}
-        facts = _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, shares, report)
+        facts = _finish(
+            shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, shares, report
+        )
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
     if run.stale:
@@ -437,9 +440,11 @@ def _finish(
     numbers = [f.frame for f in frames]
     report.progress("finishing the take", 0, 3, "contact sheet")
     previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
-    sheet = _contact_sheet(
-        shot, params, numbers, previews, f"{shot.info().name}: t* = frame {t_star}, run {params.run}", t_star
-    )
+    made_of = _made_of(folder, numbers, look, shares)
+    asked = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
+    verdict = judge_take({"t_star_frame": t_star, **asked, "detail": made_of.get("detail")})
+    title = f"{shot.info().name}: t* = frame {t_star}, run {params.run}"
+    sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
     report.check_cancelled()
     report.progress("finishing the take", 1, 3, "video")
     note = write_video(folder / "video.mp4", (read_png(p) for p in previews), shot.info().fps or 24.0)
@@ -473,18 +478,25 @@ def _finish(
         "contact_sheet": str(sheet),
         "video": str(folder / "video.mp4"),
         "ply": str(folder / "frozen.ply"),
+        **made_of,
+        **({} if verdict is None else {"verdict": vars(verdict)}),
     }
-    if look.detail is not None:
-        for n in (n for n in numbers if n not in shares):  # rendered by an earlier job
-            layers = read_frozen_exr(folder / frame_file(n, ".exr")).detail
-            shares[n] = small_share(torch.from_numpy(np.asarray(layers.plate, np.float32)))
-        facts["detail"] = detail_facts(shares)
-        facts["warp_dir"] = str(folder / WARPS)
     write_json(folder / "take.json", facts)
     shot.update(t_star=t_star)
     report.image("contact sheet", sheet)
     report.progress("finishing the take", 3, 3, "done")
     return facts
+
+
+def _made_of(folder: Path, numbers: list[int], look: Look, shares: dict[int, Tensor]) -> dict[str, Any]:
+    """What take.json says of plate detail; {} without it. `shares` are of the frames that this job rendered."""
+    if look.detail is None:
+        return {}
+    for n in (n for n in numbers if n not in shares):
+        layers = read_frozen_exr(folder / frame_file(n, ".exr")).detail
+        if layers is not None:
+            shares[n] = small_share(torch.from_numpy(np.asarray(layers.plate, np.float32)))
+    return {"detail": detail_facts(shares), "warp_dir": str(folder / WARPS)}
 
 
 def _redistort(
@@ -504,12 +516,16 @@ def _redistort(
 
 
 def _contact_sheet(
-    shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int
-) -> Path:
+    shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int,
+    verdict: Verdict | None,
+) -> Path:  # fmt: skip
     plates = [shot.frames / frame_file(n, ".png") for n in numbers]
     own_poses = not params.camera_path and all(p.is_file() for p in plates)
     path = shot.take(params.take) / "contact_sheet.png"
-    write_contact_sheet(path, plates if own_poses else None, previews, numbers, title, mark=t_star)
+    note, doubt = ("", set()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
+    write_contact_sheet(
+        path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt
+    )
     return path
 
 
