@@ -288,7 +288,7 @@ class Detailer:
         return snap(st, (self.plates.width, self.plates.height)), within
 
     def _parallax(self, shot: _Shot, frame: int, depth: Tensor) -> Tensor:
-        """Pixels (of decisions) by which a wrong depth moves points at `depth` in plate `frame`, against this camera."""
+        """Pixels of decisions by which a wrong depth moves points at `depth`, against this camera, in a plate."""
         travel = (self.seen.centres[self.seen.index[frame]] - shot.centre).norm()
         focal = shot.K[0, 0] * shot.per_pixel
         return focal * travel / depth.clamp_min(1e-6) * self.config.depth_error
@@ -418,8 +418,8 @@ class Detailer:
         source[share <= 0.0] = 0.0
         motion = resized(shot.motion, columns, rows)
         return DetailedFrame(
-            to_display(linear), linear, alpha, splat.color, splat.alpha, share, source, image.depth, image.support, motion, leading, st,
-            matte, fill,
+            to_display(linear), linear, alpha, splat.color, splat.alpha, share, source, image.depth, image.support,
+            motion, leading, st, matte, fill,
         )  # fmt: skip
 
 
