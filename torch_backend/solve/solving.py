@@ -343,6 +343,8 @@ def _finish(
         "camera_model": answer["camera_model"],
         "distortion": answer["distortion"],
         "focal_px": answer["focal_px"],
+        "lenses": [_lens(file) for file in maps],
+        "lens_of_frame": lenses,
         "triangulation_angle_deg": answer["triangulation_angle_deg"],
         "quality": result["quality"],
         "cameras_from": answer.get("given", "solve"),
@@ -358,6 +360,12 @@ def _finish(
 def _pinhole(file: Path) -> NDArray[np.float64]:
     with np.load(file, allow_pickle=False) as data:
         return data["pinhole"]
+
+
+def _lens(file: Path) -> dict[str, Any]:
+    """A lens of the working frames, as COLMAP names and orders it."""
+    with np.load(file, allow_pickle=False) as data:
+        return {"model": str(data["model"]), "params": data["params"].tolist()}
 
 
 def _camera_path(
