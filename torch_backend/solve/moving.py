@@ -71,9 +71,11 @@ class Clip:
         """Grey picture of any frame, as `picture`."""
         pixels = read_frame(self._shot.frames / frame_file(self.frames[index], ".png"))
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
-        grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+        grey = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+        if grey.shape == self.flow_size[::-1]:
+            return grey
         how = cv2.INTER_AREA if self.flow_size[0] < grey.shape[1] else cv2.INTER_CUBIC
-        return grey if grey.shape == self.flow_size[::-1] else cv2.resize(grey, self.flow_size, interpolation=how)
+        return np.asarray(cv2.resize(grey, self.flow_size, interpolation=how), np.uint8)
 
     def forget(self, before: int) -> None:
         """Drops the pictures of keys below `before`."""
