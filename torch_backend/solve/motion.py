@@ -7,6 +7,7 @@ SHOT/motion_paint/NNNNNN.png, which no solve touches.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from pathlib import Path
 from typing import Any, TypedDict
@@ -17,10 +18,11 @@ from numpy.typing import NDArray
 
 from ..contract import ExitCode, JobError, Reporter, frame_file, open_regular, read_json
 from ..footage.images import is_whole_png
+from ..footage.importing import FRAMES_FILE
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
 from .flow import FlowConfig
 from .moving import Clip, mattes
-from .stored import load_cameras, load_record
+from .stored import load_cameras
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
@@ -90,13 +92,12 @@ def _shares(labels: NDArray[np.uint8]) -> tuple[float, float, float]:
 
 
 def _solve_key(shot: Shot, config: FlowConfig) -> str:
-    """Identifies the cameras and frames that a matte is made from."""
-    solved = load_record(shot).get("key")
-    try:
-        cameras = hashlib.sha256((shot.solve / "cameras.json").read_bytes()).hexdigest()
-    except OSError:
-        cameras = ""
-    return content_key(MOTION_VERSION, config, solved, cameras)
+    """Identifies the cameras and frames that a matte is made from; of a shot without them, what it has."""
+    digests = []
+    for file in (shot.solve / "cameras.json", shot.frames / FRAMES_FILE):
+        with contextlib.suppress(OSError, ValueError), open_regular(file) as handle:
+            digests.append(hashlib.sha256(handle.read()).hexdigest())
+    return content_key(MOTION_VERSION, config, digests)
 
 
 def _record(path: Path) -> dict[str, Any]:
@@ -115,11 +116,7 @@ def _record(path: Path) -> dict[str, Any]:
 
 def is_found(shot: Shot, config: FlowConfig | None = None) -> bool:
     """True if the shot has mattes of the solve that it has now."""
-    try:
-        key = _solve_key(shot, config or FlowConfig())
-    except JobError:
-        return False
-    return _record(shot.solve / FOLDER / _RECORD).get("key") == key
+    return _record(shot.solve / FOLDER / _RECORD).get("key") == _solve_key(shot, config or FlowConfig())
 
 
 def motion_key(shot: Shot) -> str:
