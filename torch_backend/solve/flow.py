@@ -38,6 +38,8 @@ class FlowConfig:
     """So much more for each further link of a chain."""
     noise: float = 2.5
     """The tolerance of a pair is at least this many times the median distance in it: blur, shutter, a poor pose."""
+    most_noise: float = 2.5
+    """But at most this many times what it is otherwise, unless a pose was guessed: what moves may fill the picture."""
     round_trip: float = 1.2
     """Greatest distance between a pixel and where the flow there and back ends; above it the pixel is hidden there."""
     contrast: float = 4.0

@@ -49,6 +49,8 @@ class Clip:
         Ks *= np.array([width / path.width, height / path.height, 1.0])[None, :, None]
         self.viewmats, self.Ks = viewmats[self.keys], Ks[self.keys]
         """Of the keys: [K, 4, 4] world-to-camera, solve units, and [K, 3, 3] in flow pixels."""
+        self.guessed = [path.frames[i].source == "interpolated" for i in self.keys]
+        """Keys whose pose was not solved."""
         points = load_points(shot)["xyz"].astype(np.float64)
         self.depths = [_typical_depth(points, viewmat) for viewmat in self.viewmats]
         """Of the keys: median depth of the sparse points before the camera."""
@@ -133,7 +135,7 @@ def mattes(
 def _own_score(clip: Clip, matches: Matches, key: int, config: FlowConfig) -> tuple[Map, Map]:
     """How much of what a key frame's points are matched with says that they move, 0 to 1, and how sure that is."""
     seen = neighbours(matches, key, len(clip.keys), config)
-    test = StillTest(clip.look, clip.viewmats, clip.Ks, matches.grid, clip.unit)
+    test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
     on, off = evidence(test, key, seen, clip.depths[key], config)
     count = on + off
     score = np.clip(off / np.maximum(count, 1.0) / config.share, 0.0, 1.0)

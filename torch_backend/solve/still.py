@@ -121,6 +121,8 @@ class StillTest:
     """[K, 4, 4] world-to-camera of the keys, solve units."""
     Ks: NDArray
     """[K, 3, 3] in flow pixels."""
+    guessed: list[bool]
+    """Keys whose pose was not solved."""
     grid: tuple[Map, Map]
     """Positions of the grid's points."""
     unit: float
@@ -137,16 +139,20 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
     limits = [unit * (config.tolerance + config.per_link * (s.links - 1)) for s in seen]
     inverse = still_points(rays, seen, limits, depth, unit)
     on = np.zeros_like(inverse)
+    xx, xy, yy = _tensor(look.grid)
+    telling = 0.5 * (xx + yy) * (unit * config.tolerance) ** 2 > config.contrast**2
     gains = []
     for n, (ray, s) in enumerate(zip(rays, seen, strict=True)):
         at, _ = ray.project(inverse)
         length = np.hypot(s.at[0] - at[0], s.at[1] - at[1])
-        if s.found.any():
-            limits[n] = max(limits[n], config.noise * float(np.median(length[s.found])))
+        told = s.found & telling
+        if np.count_nonzero(told) > 50:
+            usual = config.noise * float(np.median(length[told]))
+            most = np.inf if test.guessed[key] or test.guessed[s.key] else config.most_noise * limits[n]
+            limits[n] = max(limits[n], min(usual, most))
         on += s.found & (length <= limits[n])
         gains.append(_gain(look.grid, sample(test.look(s.key).grid, s.at), s.found))
     inverse = _best_depth(test, look, rays, seen, gains, _surroundings(inverse, on >= 3))
-    xx, xy, yy = _tensor(look.grid)
     on, off = np.zeros_like(inverse), np.zeros_like(inverse)
     gone: dict[int, Mask] = {}
     for ray, s, limit, gain in zip(rays, seen, limits, gains, strict=True):
@@ -156,9 +162,8 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
         there = test.look(s.key)
         unlike = there.unlike(look.grid, at, gain)
         inside = _inside(at, look.grid.shape)
-        usual = float(np.median(unlike[s.found])) if s.found.any() else 0.0
-        alike = inside & (unlike < max(config.likeness**2, config.noise**2 * usual))
         away = s.found & (length > limit)
+        alike = inside & (unlike < _like(unlike, s.found & ~away & telling, config))
         shorter = np.square(np.minimum(1.0, 3.0 * unit / np.maximum(length, 1e-6)))
         change = shorter * (xx * x * x + 2 * xy * x * y + yy * y * y)
         told = away & (change > config.contrast**2) & ~alike
@@ -170,6 +175,12 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
         if step in gone and -step in gone:
             off += gone[step] & gone[-step]
     return on, off
+
+
+def _like(unlike: Map, still: Mask, config: FlowConfig) -> float:
+    """Below how much pictures show the same: what is `still` tells how unlike a sharp and a blurred one are."""
+    usual = float(np.median(unlike[still])) if np.count_nonzero(still) > 50 else 0.0
+    return max(config.likeness**2, config.noise**2 * usual)
 
 
 def _best_depth(
