@@ -59,6 +59,12 @@ class DetailClip:
         self._frozen: dict[int, FrozenGaussians] = {}
 
     @property
+    def motion_from(self) -> str:
+        """Which mattes say what moves."""
+        found = self.matte(self.frames[0]) is not None
+        return "the shot's motion mattes" if found else "the gate, which misses movers: the shot has no motion mattes"
+
+    @property
     def frames(self) -> list[int]:
         """Numbers of the clip's frames."""
         return self.scene.frames

@@ -254,8 +254,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"Error: {error}", file=sys.stderr)
         return 1
     result = {"version": 1, "shot": str(args.shot), "run": args.run, "freezes": freezes}
+    result["motion_from"] = clip.motion_from
     write_json(args.results / f"flow-{name}.json", result | {"seconds": time.perf_counter() - since})
-    print("\n".join(["", *table(name, freezes), "", *verdicts(freezes)]))
+    print("\n".join(["", *table(name, freezes), "", *verdicts(freezes), f"What moves: {clip.motion_from}."]))
     return 0
 
 
