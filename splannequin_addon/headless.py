@@ -166,6 +166,8 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
     source = str(shots.read(shot).info.get("source", args.clip))
     summary = contract.summarise(str(shot), source, results, stages, time.perf_counter() - began)
     jobs.write_json(output / "summary.json", {**summary, **baked})
+    for line in summary["verdict"]:
+        console.say(line)
     console.say(f"Composited frames: {baked['composited_dir']}")
     return ExitCode.OK
 
@@ -250,6 +252,9 @@ def _one_step(args: argparse.Namespace, console: Console, step: str, params: Any
     result = steps.wait(job, console)
     if console.as_json:
         print(json.dumps({"result": result}))
+    elif isinstance(result, dict):
+        for line in contract.verdict_lines(result):
+            console.say(line)
     return ExitCode.OK
 
 
@@ -359,6 +364,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         width=args.freeze_width,
         overscan=args.overscan,
         grain=not args.no_grain,
+        detail=args.detail,
         only_missing=True,
         device=_device(args),
     )
@@ -434,7 +440,10 @@ def parser() -> argparse.ArgumentParser:
     text = "JSON camera path to render from (default: the clip's poses)"
     whole.add_argument("--camera-path", default="", metavar="FILE", help=text)
     whole.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"), help="see the user guide")
-    whole.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
+    text = "width of the frozen frames in pixels (0: the source's own)"
+    whole.add_argument("--freeze-width", type=int, default=0, help=text)
+    text = "on: frozen frames are made of the plates, where they can be believed; off: of the splats alone"
+    whole.add_argument("--detail", default="on", choices=contract.DETAILS, help=text)
     whole.add_argument(
         "--overscan", type=contract.overscan, default=0.0, metavar="PERCENT", help="beyond the frame, or: lens"
     )

@@ -11,6 +11,7 @@ from typing import Any
 
 import bpy
 
+from ..torch_backend import contract
 from . import (
     backend,
     bake,
@@ -92,9 +93,10 @@ def view_train(scene: Any, state: shots.ShotState | None) -> View:
     psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
     quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
     size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % move"
-    lines = [f"Run {scene.splannequin.run_name}: {quality}", size]
-    if run.get("quality") == "Poor":
-        lines.append("It is poor: take a range in which nobody walks, or solve the camera again.")
+    verdict = contract.verdict_lines(run)
+    if run.get("quality") == "Poor" and not verdict:  # trained by an older version
+        verdict = ["It is poor: take a range in which nobody walks, or solve the camera again."]
+    lines = [f"Run {scene.splannequin.run_name}: {quality}", size, *verdict]
     return View(True, True, lines, "Next: freeze an instant.")
 
 
@@ -109,7 +111,8 @@ def view_freeze(scene: Any, state: shots.ShotState | None) -> View:
     instant = f"Time stands still at frame {take['t_star_frame']}"
     across, down = take.get("margin", (0, 0))
     beyond = [f"Overscan: {across} pixels on each side, {down} above and below"] if across or down else []
-    return View(True, True, [frames, *beyond, instant], "Next: bake it into your compositor.")
+    lines = [frames, *beyond, instant, *contract.verdict_lines(take)]
+    return View(True, True, lines, "Next: bake it into your compositor.")
 
 
 def view_bake(scene: Any, state: shots.ShotState | None) -> View:
@@ -124,12 +127,18 @@ def view_bake(scene: Any, state: shots.ShotState | None) -> View:
         shown = f"take {take}" if take else f"another shot, {made.name_of(there[0].parent.parent)}"
         lines = [f"Your compositor shows {shown}: the one that was baked last."]
         return View(False, True, lines, "Baking puts this take in its place.")
-    lines = ["The freeze is in your compositor."]
+    lines = ["The freeze is in your compositor.", *unsure(state.takes[scene.splannequin.take_name])]
     if bake.stale_scale(scene, state.folder):
         lines.append("The shot was scaled since: its depth is stale until you bake again.")
     if not scene_setup.keeps_plate_colours(scene):
         lines.append(f"The view transform {scene.view_settings.view_transform} changes the plate's colours.")
     return View(True, True, lines, f"Frames go to {scene.render.filepath}")
+
+
+def unsure(take: dict[str, Any]) -> list[str]:
+    """What a take's verdict says, if that is not that all is well: there is no need to hear it again."""
+    verdict = contract.verdict_of(take)
+    return [] if verdict is None or verdict.word == "good" else verdict.lines()
 
 
 VIEWS = {"footage": view_footage, "camera": view_camera, "train": view_train, "freeze": view_freeze, "bake": view_bake}
@@ -192,7 +201,7 @@ class _StepPanel:
             self._progress(context, watch)
         else:
             self._button(context, layout, view, running)
-            self._outcome(context, layout, watch)
+            self._outcome(context, layout, watch, view.state)
             if running is None and view.advice and not (view.done and self._next_done(context)):
                 wrap(layout, context, view.advice, "INFO")
         body = sub_panel(layout, f"{self.step}_more", "Advanced")
@@ -248,8 +257,8 @@ class _StepPanel:
             detail.append(f"about {minutes(status.eta_seconds)} left")
         wrap(layout, context, ", ".join(tr(part) for part in detail) if detail else "The backend is starting.", "INFO")
 
-    def _outcome(self, context: Any, layout: Any, watch: supervisor.Watch | None) -> None:
-        """What went wrong, or what was changed."""
+    def _outcome(self, context: Any, layout: Any, watch: supervisor.Watch | None, said: list[str]) -> None:
+        """What went wrong, or what was changed, unless it was `said` above."""
         if watch is None:
             return
         job = watch.jobs.get(self.step)
@@ -268,7 +277,8 @@ class _StepPanel:
         if job is not None and job.state == "cancelled" and not self._paused(context):
             wrap(layout, context, "Cancelled. Finished work is kept: start it again to go on.", "CANCEL")
         for message, hint in job.warnings if job is not None else []:
-            wrap(layout, context, f"{message} {hint}".strip(), "ERROR")
+            if message not in said:
+                wrap(layout, context, f"{message} {hint}".strip(), "ERROR")
         for note in watch.notes.get(self.step, []):
             wrap(layout, context, note, "DOT")
 
@@ -566,8 +576,9 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         wrap(layout, context, viewport.reason(context.scene), "INFO")
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
-        """The take's name, its size, and where it is seen from."""
+        """The take's name, what it is made of, its size, and where it is seen from."""
         layout.prop(context.scene.splannequin, "take_name")
+        layout.prop(context.scene.splannequin, "detail")
         layout.prop(context.scene.splannequin, "freeze_width")
         layout.prop(context.scene.splannequin, "overscan")
         layout.prop(context.scene.splannequin, "path_camera")

@@ -176,9 +176,16 @@ class ShotSettings:
         poll=lambda _, item: item.type == "CAMERA",
         options=set(),
     )
+    detail: BoolProperty(
+        name="Detail",
+        description="Make frozen frames of the plates, where they can be believed: as sharp as the plate. "
+        "Off: of the splats alone, soft throughout",
+        default=True,
+        options=set(),
+    )
     freeze_width: IntProperty(
         name="Width",
-        description="Width in pixels of the frozen frames; 0: as trained, or as the scene renders from a camera "
+        description="Width in pixels of the frozen frames; 0: the source's own, or as the scene renders from a camera "
         "of your own",
         default=0,
         min=0,

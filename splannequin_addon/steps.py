@@ -108,6 +108,7 @@ def params_of(scene: Any, step: str) -> Any:
         t_star_per_frame=keyed_instants(scene),
         width=props.freeze_width,
         overscan=-1.0 if props.overscan == "LENS" else 0.0,
+        detail="on" if props.detail else "off",
         only_missing=True,
         device=backend.device(),
     )
@@ -190,6 +191,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         overscan=facts.get("overscan", 0.0),
         only_missing=True,
         grain=bool(facts.get("grain")),
+        detail="on" if facts.get("detail") else "off",
     )
 
 

@@ -145,17 +145,24 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
         return
     psnr = summary["heldout_psnr_db"]
     quality = f"{psnr:.2f} dB on held-out frames" if psnr is not None else "no frames held out"
-    quality = f"{summary['quality']}: {quality}" if summary.get("quality") else quality
     print(
         f"\nFrozen at frame {summary['t_star_frame']}: {summary['frames']} frames, "
         f"{summary['registered']} of {summary['solved_frames']} solved frames registered.\n"
         f"{quality}, {summary['gaussians']} Gaussians, {100 * summary['moving_share']:.1f} % of them move, "
         f"trained in {summary['train_seconds']:.0f} s.\n"
-        f"EXR frames:    {summary['exr_dir']}\n"
+        + "".join(f"{line}\n" for line in summary["verdict"])
+        + f"EXR frames:    {summary['exr_dir']}\n"
         f"Contact sheet: {summary['contact_sheet']}\nVideo:         {summary['video']}",
         file=console.stream,
         flush=True,
     )
+
+
+def print_verdict(told: dict[str, Any], console: Console) -> None:
+    """What an artist should know of a run or a take, line by line."""
+    if not console.as_json:
+        for line in contract.verdict_lines(told):
+            print(line, file=console.stream, flush=True)
 
 
 def modelled_table(rows: list[dict[str, Any]]) -> str:
@@ -268,6 +275,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         width=args.freeze_width,
         overscan=args.overscan,
         grain=not args.no_grain,
+        detail=args.detail,
         only_missing=True,
         device=args.device,
     )
@@ -412,7 +420,10 @@ def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
     to.add_argument("--t-star", type=int, help="frame number at which time stands still (default: suggested)")
     to.add_argument("--camera-path", default="", help="JSON camera path to render from (default: the clip's poses)")
     to.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"))
-    to.add_argument("--freeze-width", type=int, default=0, help="width of the frozen frames in pixels")
+    text = "width of the frozen frames in pixels (0: the source's own)"
+    to.add_argument("--freeze-width", type=int, default=0, help=text)
+    text = "on: frozen frames are made of the plates, where they can be believed; off: of the splats alone"
+    to.add_argument("--detail", default="on", choices=contract.DETAILS, help=text)
     to.add_argument(
         "--overscan", type=_overscan, default=0.0, metavar="PERCENT",
         help="picture beyond the frame on every side, or `lens`: what the way back through the lens needs",
@@ -470,9 +481,9 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
         params = contract.SolveParams(camera_model=args.camera_model, cameras=given)
         run_station(Shot.open(args.shot), "solve", params, console)
     elif args.command == "train":
-        run_station(Shot.open(args.shot), "train", _train_params(args), console)
+        print_verdict(run_station(Shot.open(args.shot), "train", _train_params(args), console), console)
     elif args.command == "take":
-        run_station(Shot.open(args.shot), "freeze", _freeze_params(args), console)
+        print_verdict(run_station(Shot.open(args.shot), "freeze", _freeze_params(args), console), console)
     else:
         return {"status": status, "doctor": doctor, "export": export, "stmaps": stmaps}[args.command](args, console)
     return ExitCode.OK

@@ -223,7 +223,9 @@ class FreezeParams:
     query: str = "nearest"
     """nearest: each Gaussian is asked at its nearest supported time to t*; plain: at t* itself."""
     width: int = 0
-    """Width in pixels of the frozen frames; 0: the preset's delivery size."""
+    """Width in pixels of the frozen frames; 0: the source's own."""
+    detail: str = "on"
+    """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
     overscan: float = 0.0
     """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
     lens needs. `width` is that of the frame without it."""
@@ -231,6 +233,8 @@ class FreezeParams:
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
     grain: bool = True
     """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
+    detail: str = "on"
+    """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
     device: str = "auto"
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
@@ -246,6 +250,8 @@ def overscan(text: str) -> float:
     return value
 
 
+DETAILS = ("on", "off")
+"""What `FreezeParams.detail` may be."""
 DEVICES = ("auto", "cpu", "cuda")
 """Where a run may train and freeze."""
 
@@ -296,7 +302,7 @@ LIMITS: dict[type, dict[str, Limit]] = {
         "first": Limit("first frame", -_FRAMES, _FRAMES),
         "last": Limit("last frame", -_FRAMES, _FRAMES),
         "step": Limit("step between frozen frames", 1, 1_000_000),
-        "width": Limit("width of the frozen frames", 16, 16_384, {0: "the training's"}),
+        "width": Limit("width of the frozen frames", 16, 16_384, {0: "the source's"}),
         "overscan": Limit("overscan in percent", 0, 100, {-1: "what the lens needs"}),
     },
 }
@@ -1013,6 +1019,54 @@ NO_DEPTH = 1e10
 """Depth of a pixel that nothing covers (what Blender's own Z pass says)."""
 
 
+# ------------------------------------------------------------------------------------------------- what came out
+
+VERDICT_WORDS = {"good": "Good.", "fair": "Fair.", "poor": "Poor."}
+"""Good: it holds. Fair: it holds but for what is named. Poor: it is not worth going on from. As they are shown."""
+_MOST_LINES = 12
+
+
+@dataclass
+class Verdict:
+    """What an artist should know of a run or a take; stands in a run's summary.json and in a take.json."""
+
+    word: str
+    """One of `VERDICT_WORDS`."""
+    sentences: list[str]
+    """What is so."""
+    where: list[dict[str, Any]] = field(default_factory=list)
+    """Where it will not hold, worst first: `first` and `last` frame number, `region` of the picture in words, `share`
+    of its worst part."""
+    advice: list[str] = field(default_factory=list)
+    """What to do about it."""
+
+    def lines(self) -> list[str]:
+        """All of it as it is printed and drawn; the word stands before the first sentence."""
+        return [f"{VERDICT_WORDS[self.word]} {self.sentences[0]}", *self.sentences[1:], *self.advice]
+
+
+def verdict_of(told: Mapping[str, Any]) -> Verdict | None:
+    """The verdict in a summary.json or take.json, which may come from anywhere; None if there is none to be shown."""
+    data = told.get("verdict")
+    if not isinstance(data, dict):
+        return None
+    try:
+        found: Verdict = from_dict(Verdict, data)
+    except ValueError:
+        return None
+    texts = [*found.sentences, *found.advice]
+    if found.word not in VERDICT_WORDS or not found.sentences or not all(isinstance(text, str) for text in texts):
+        return None
+    shown, advice = ([printable(text, 300) for text in part[:_MOST_LINES]] for part in (found.sentences, found.advice))
+    return Verdict(found.word, shown, found.where, advice)
+
+
+def verdict_lines(*told: Mapping[str, Any]) -> list[str]:
+    """The lines of the verdicts that summaries or takes hold; none where there is no verdict."""
+    found = (verdict_of(one) for one in told)
+    return [line for verdict in found if verdict is not None for line in verdict.lines()]
+
+
 def summarise(
     shot: str, source: str, results: Mapping[str, Mapping[str, Any]], stages: Mapping[str, float], wall_seconds: float
 ) -> dict[str, Any]:
@@ -1035,6 +1089,8 @@ def summarise(
         "train_width_px": train["width_px"],
         "modelled": train.get("modelled", []),
         "quality": train.get("quality", ""),
+        "verdict": verdict_lines(train, freeze),
+        **{k: (freeze.get("detail") or {}).get(k) for k in ("plate_share", "invented_share")},
         **{k: freeze[k] for k in ("t_star_frame", "exr_dir", "contact_sheet", "video", "ply", "take")},
         "run": train["run"],
         "wall_seconds_by_stage": dict(stages),

@@ -1,4 +1,7 @@
-"""A handheld camera: walks forward, pans, goes and returns, or orbits. World in metres, z up; axes OpenCV."""
+"""A handheld camera: walks forward, pans, goes and returns, or orbits; or one that turns on a tripod.
+
+World in metres, z up; axes OpenCV.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,16 @@ from .noise import Array, stream, wander
 FOCAL_PER_WIDTH = 0.85
 """Focal length over image width: 61 degrees across, as a phone's main camera."""
 
+PIVOT_METRES = 0.05
+"""How far a lens stands before the axis that a tripod's head turns about."""
+
 
 @dataclass(frozen=True)
 class CameraMove:
     """The path of one scene, as a function of time."""
 
     move: str
-    """One of sizes.CAMERA_MOVES."""
+    """One of sizes.CAMERA_MOVES, or tripod: it turns about a pivot and nobody's hand is on it."""
     seed: int
     duration: float
     """Seconds of the clip: the path is walked once in this time."""
@@ -45,15 +51,22 @@ class CameraMove:
             radius = 3.6 + depth
             eye = np.stack([radius * np.sin(angle), 0.4 - radius * np.cos(angle)], 1)
             target = np.tile([0.0, 0.4], (len(u), 1))
+        elif self.move == "tripod":
+            yaw = side * np.radians(-16.0 + 32.0 * u)
+            ahead = np.stack([np.sin(yaw), np.cos(yaw)], 1)
+            eye = np.array([0.0, -3.4 + depth]) + PIVOT_METRES * ahead
+            target = eye + 3.5 * ahead
         else:
-            raise ValueError(f"camera move {self.move!r} is none of forward, pan, return, orbit")
-        walking = 0.015 * np.sin(2 * np.pi * 1.8 * seconds) if self.move != "pan" else 0.0
+            raise ValueError(f"camera move {self.move!r} is none of forward, pan, return, orbit, tripod")
+        walking = 0.015 * np.sin(2 * np.pi * 1.8 * seconds) if self.move not in ("pan", "tripod") else 0.0
         eyes = np.column_stack([eye, height + walking + np.zeros_like(u)])
         return eyes, np.column_stack([target, np.full_like(u, height - rng.uniform(0.25, 0.5))])
 
     def world_to_camera(self, seconds: Array) -> Array:
         """[T, 4, 4] with the tremble of the hand: centimetres and half degrees, at walking pace and faster."""
         eyes, targets = self.eyes_and_targets(seconds)
+        if self.move == "tripod":
+            return np.array([_look(e, t, np.zeros(3)) for e, t in zip(eyes, targets, strict=True)])
         rng = stream(self.seed, "camera hand")
         eyes = eyes + 0.012 * wander(rng, seconds, 0.9, 3) + 0.002 * wander(rng, seconds, 0.25, 3)
         degrees = np.array([0.5, 0.5, 0.7]) * wander(rng, seconds, 1.1, 3) + 0.08 * wander(rng, seconds, 0.25, 3)

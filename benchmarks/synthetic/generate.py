@@ -32,6 +32,8 @@ EXPOSURE_RAMP_STOPS = 1.2
 SHUTTER_SECONDS = 0.06
 """Time between the first and the last row of a frame in `rolling-shutter`."""
 SHUTTER_BANDS = 9
+WALK_METRES = 3.2
+"""How far the one in `walker` goes, against the camera: one who goes along with it looks like one who stands nearer."""
 
 
 @dataclass
@@ -64,21 +66,27 @@ def frame_seconds(size: Size) -> Array:
     return np.arange(size.frames) / size.fps
 
 
-def camera_of(seed: int, size: Size) -> CameraMove:
+def camera_of(seed: int, size: Size, kind: str = "plain") -> CameraMove:
     """The camera's path through the clip."""
-    return CameraMove(camera_move_of(seed), seed, (size.frames - 1) / size.fps)
+    return CameraMove(camera_move_of(seed, kind), seed, (size.frames - 1) / size.fps)
 
 
 def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bodies: Bodies) -> None:
     """Everything that rendering needs, plan.json last."""
     seconds = frame_seconds(size)
-    camera = camera_of(seed, size)
+    camera = camera_of(seed, size, kind)
     path = camera.eyes_and_targets(np.linspace(0.0, camera.duration, 60))[0][:, :2]
     people = _people(seed, kind, path, camera)
-    furnisher = Furnisher(seed, path, [Keepout(*p.place, 0.45) for p in people])
+    kept = [Keepout(*p.place, 0.45) for p in people]
+    kept += [Keepout(x, p.place[1], 0.45) for p in people if p.walks for x in np.linspace(*_ends(p), 8)]
+    furnisher = Furnisher(seed, path, kept)
     movers = []
     for person in people:
         body = bodies.make(person, seed, seconds)
+        if kind == "still":
+            body.vertices[:] = body.vertices[:1]
+        elif person.walks:
+            body.vertices += _walk(person, seconds, camera.duration)
         mesh = Mesh(body.vertices[0], body.triangles, body.uv, np.zeros(len(body.triangles), np.int32))
         movers.append(Mover(person.name, body.vertices, mesh, f"{person.name}.png"))
         write_png(folder / "textures" / f"{person.name}.png", body.texture)
@@ -143,9 +151,12 @@ def _people(seed: int, kind: str, path: Array, camera: CameraMove) -> list[Perso
         if len(people) == count:
             break
         x, y = float(rng.uniform(-2.4, 2.4)), float(rng.uniform(-1.6, 2.2))
+        walks = kind == "walker" and not people
+        if walks:
+            x, y = float(np.copysign(0.5 * WALK_METRES, path[-1, 0] - path[0, 0])), 0.0
         clear = np.hypot(path[:, 0] - x, path[:, 1] - y).min() > 0.85
         apart = all(np.hypot(p.place[0] - x, p.place[1] - y) > 0.95 for p in people)
-        if not clear or not apart or _share_in_view(views, np.array([x, y, 1.0])) < 0.5:
+        if not walks and (not clear or not apart or _share_in_view(views, np.array([x, y, 1.0])) < 0.5):
             continue
         to_camera = path[len(path) // 2] - [x, y]
         heading = float(np.arctan2(to_camera[0], -to_camera[1]) + np.radians(rng.normal(0.0, 40.0)))
@@ -159,11 +170,25 @@ def _people(seed: int, kind: str, path: Array, camera: CameraMove) -> list[Perso
         }
         accents = {"spine03": tuple(rng.normal(0.0, 2.0, 3)), "head": tuple(rng.normal(0.0, 5.0, 3))}
         waves = kind == "fast-mover" and not people
-        pose = "wave" if waves else poses[len(people)]
+        pose = "wave" if waves else "stand" if walks else poses[len(people)]
+        heading = float(np.copysign(np.pi / 2, -x)) if walks else heading
         name = f"person{len(people)}"
         restless = float(rng.uniform(0.7, 1.4))
-        people.append(Person(name, phenotype, pose, (x, y), heading, restless, waves, accents))
+        people.append(Person(name, phenotype, pose, (x, y), heading, restless, waves, accents, walks))
     return people
+
+
+def _walk(person: Person, seconds: Array, duration: float) -> NDArray[np.float32]:
+    """[T, 1, 3] metres: from where somebody stands to as far on the other side of the middle, in one clip."""
+    begin, end = _ends(person)
+    offset = np.zeros((len(seconds), 1, 3), np.float32)
+    offset[:, 0, 0] = (end - begin) * seconds / duration
+    return offset
+
+
+def _ends(person: Person) -> tuple[float, float]:
+    """x in metres where one who walks begins and ends."""
+    return person.place[0], person.place[0] - float(np.copysign(WALK_METRES, person.place[0]))
 
 
 def _share_in_view(views: Array, point: Array) -> float:

@@ -93,7 +93,7 @@ def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: C
     made = time.perf_counter()
     _render(folder, bpy, lambda text: say(f"{size.name}/{folder.name}: {text}"))
     rendered = time.perf_counter()
-    write_regions(folder, seed, size, _Eta(say, f"{size.name}/{folder.name}: regions"))
+    write_regions(folder, seed, kind, size, _Eta(say, f"{size.name}/{folder.name}: regions"))
     seconds = {"geometry": made - began, "pictures": rendered - made, "regions": time.perf_counter() - rendered}
     _write_record(folder, size, seed, kind, key, seconds)
     say(f"{size.name}/{folder.name}: finished, {sum(seconds.values()):.0f} s in this run")
@@ -157,7 +157,7 @@ def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seco
     plan: dict[str, Any] = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
     cameras = [
         {"frame": frame_number(i), "seconds": float(t), "world_to_camera": view.matrix.tolist()}
-        for i, (t, view) in enumerate(zip(frame_seconds(size), views_of(seed, size), strict=True))
+        for i, (t, view) in enumerate(zip(frame_seconds(size), views_of(seed, size, kind), strict=True))
     ]
     record = {
         "version": FORMAT_VERSION,
@@ -168,7 +168,7 @@ def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seco
         "kind": kind,
         "size": size.name,
         "place": place_of(seed),
-        "camera_move": camera_move_of(seed),
+        "camera_move": camera_move_of(seed, kind),
         "width": size.width,
         "height": size.height,
         "fps": size.fps,

@@ -93,6 +93,8 @@ class Person:
     """Swings the right arm up and down all the time: a limit of the method."""
     accents: Pose = field(default_factory=dict)
     """Added to the pose."""
+    walks: bool = False
+    """Swings legs and arms as in walking: the case in which a freeze does not hold."""
 
 
 @dataclass
@@ -243,6 +245,12 @@ class Bodies:
             swing = np.sin(2 * np.pi * 0.9 * seconds)[:, None]
             add("upperarm01.R", np.array([-10.0, 45.0, 0.0]) * (0.5 + 0.5 * swing))
             add("lowerarm01.R", np.array([-20.0, 35.0, 0.0]) * swing)
+        if person.walks:
+            swing = np.sin(2 * np.pi * 0.9 * seconds)[:, None]
+            for side, sign in ((".L", 1.0), (".R", -1.0)):
+                add("upperleg01" + side, np.array([26.0 * sign, 0.0, 0.0]) * swing)
+                add("lowerleg01" + side, np.array([22.0, 0.0, 0.0]) * np.clip(sign * swing, 0.0, 1.0))
+                add("upperarm01" + side, np.array([-22.0 * sign, 0.0, 0.0]) * swing)
         rotations = np.tile(np.eye(4), (count, len(self.bones), 1, 1))
         for bone, degrees in angles.items():
             rotations[:, self.bones.index(bone), :3, :3] = _rotations(np.radians(degrees))

@@ -94,9 +94,9 @@ class View:
         return inside & (depth > 0.0)
 
 
-def write_regions(folder: Path, seed: int, size: Size, progress: Callable[[int, int], None]) -> None:
+def write_regions(folder: Path, seed: int, kind: str, size: Size, progress: Callable[[int, int], None]) -> None:
     """masks/NNNNNN.npz for the clip's frames and truth/<t*>/NNNNNN.npz for the truth's; what exists is left alone."""
-    views = views_of(seed, size)
+    views = views_of(seed, size, kind)
     instants = set(size.t_star_indices())
     todo: dict[int, list[tuple[int | None, Path]]] = {}
     for index in range(size.frames):
@@ -125,10 +125,10 @@ def write_regions(folder: Path, seed: int, size: Size, progress: Callable[[int, 
             progress(done, total)
 
 
-def views_of(seed: int, size: Size) -> list[View]:
+def views_of(seed: int, size: Size, kind: str = "plain") -> list[View]:
     """The exact cameras of the clip's frames."""
     K = intrinsics(size.width, size.height)
-    matrices = camera_of(seed, size).world_to_camera(frame_seconds(size))
+    matrices = camera_of(seed, size, kind).world_to_camera(frame_seconds(size))
     return [View(matrix, K, size.width, size.height) for matrix in matrices]
 
 

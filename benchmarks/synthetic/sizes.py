@@ -9,7 +9,9 @@ TUNING_SEEDS = range(0, 10)
 REPORT_SEEDS = range(100, 110)
 LIMITS = ("moving-shadow", "exposure-ramp", "fast-mover", "rolling-shutter")
 """Kinds of scenes beside `plain`: each breaks one assumption of the method."""
-KINDS = ("plain", *LIMITS)
+VERDICTS = ("walker", "still", "tripod")
+"""Kinds of scenes that the verdict is tried on: somebody walks through, nothing moves, the camera only turns."""
+KINDS = ("plain", *LIMITS, *VERDICTS)
 CAMERA_MOVES = ("forward", "pan", "return", "orbit")
 MOVING_PX = 0.5
 """A pixel moves if its surface point is ever farther than this, in pixels of the view, from where it is at t*."""
@@ -71,6 +73,6 @@ def place_of(seed: int) -> str:
     return "ground" if seed % 10 in (1, 4, 7) else "room"
 
 
-def camera_move_of(seed: int) -> str:
-    """One of CAMERA_MOVES."""
-    return CAMERA_MOVES[seed % len(CAMERA_MOVES)]
+def camera_move_of(seed: int, kind: str = "plain") -> str:
+    """One of CAMERA_MOVES, or `tripod`."""
+    return "tripod" if kind == "tripod" else CAMERA_MOVES[seed % len(CAMERA_MOVES)]

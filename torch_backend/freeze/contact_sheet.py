@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,9 @@ _MARGIN, _GAP, _FRAME = 32, 12, 3
 _TITLE_SIZE, _LABEL_SIZE = 28, 18
 _GROUND = (30, 30, 30)
 _TEXT, _QUIET, _ACCENT = (0.93, 0.93, 0.93), (0.62, 0.62, 0.62), (0.98, 0.76, 0.30)
+_ALARM = (226, 74, 51)
+_FLAG = 22
+"""Side of the corner that is cut off a frozen frame which will not hold, pixels."""
 _FONT, _BOLD = "DroidSans", "DroidSans-Bold"
 
 
@@ -32,12 +35,15 @@ def write_contact_sheet(
     *,
     mark: int | None = None,
     columns: int = COLUMNS,
+    note: str = "",
+    unsure: Collection[int] = (),
 ) -> Path:
     """Writes the sheet as 8-bit PNG, atomically.
 
     `plates` and `frozen` are display-referred PNGs, one per number in `frames`; `plates` None (a camera path of its
     own has none) leaves that row out. At most `columns` frames are shown, evenly over the clip, with the first and
-    the last. `mark`, the frame number of t*, is always among them if it is in `frames`, and is outlined.
+    the last. `mark`, the frame number of t*, is always among them if it is in `frames`, and is outlined. `note` stands
+    under the title; frozen frames whose numbers are in `unsure` lose a corner to a red mark.
 
     ValueError if the lists differ in length or are empty; FileNotFoundError or ValueError for a picture that is
     missing or damaged; OSError if the sheet cannot be written.
@@ -56,7 +62,10 @@ def write_contact_sheet(
     )
     labels = [str(frames[i]) for i in picked]
     marked = [mark is not None and frames[i] == mark for i in picked]
-    write_png(path, _compose(cells, size, labels, marked, title))
+    for column, index in enumerate(picked):
+        if frames[index] in unsure:
+            _flag(cells["Frozen"][column])
+    write_png(path, _compose(cells, size, labels, marked, title, note))
     return Path(path)
 
 
@@ -94,14 +103,17 @@ def _compose(
     labels: list[str],
     marked: list[bool],
     title: str,
+    note: str,
 ) -> NDArray[np.uint8]:
-    """The sheet [H,W,3] uint8: title, one row per entry of `cells`, frame numbers under the last."""
+    """The sheet [H,W,3] uint8: title, note, one row per entry of `cells`, frame numbers under the last."""
     width, height = size
     left = _MARGIN + max(oiio.ImageBufAlgo.text_size(name, _LABEL_SIZE, _FONT).xend for name in cells) + 2 * _GAP
-    top = _MARGIN + _TITLE_SIZE + 2 * _GAP
     columns = len(labels)
     title_end = _MARGIN + oiio.ImageBufAlgo.text_size(title, _TITLE_SIZE, _BOLD).xend
     sheet_width = max(left + columns * (width + _GAP) - _GAP, title_end) + _MARGIN
+    lines = _wrapped(note, sheet_width - 2 * _MARGIN)
+    below = _MARGIN + _TITLE_SIZE + _GAP
+    top = below + len(lines) * (_LABEL_SIZE + _GAP // 2) + _GAP
     sheet_height = top + len(cells) * (height + _GAP) + _LABEL_SIZE + _MARGIN
     sheet = np.full((sheet_height, sheet_width, 3), _GROUND, dtype=np.uint8)
     for row, thumbnails in enumerate(cells.values()):
@@ -113,6 +125,9 @@ def _compose(
             _block(sheet, y, x, thumbnail.shape, 0)[:] = thumbnail
     image = oiio.ImageBuf(sheet)
     _write(image, title, _MARGIN, _MARGIN, _TITLE_SIZE, _BOLD, _TEXT, "left", "top")
+    for number, line in enumerate(lines):
+        y = below + number * (_LABEL_SIZE + _GAP // 2)
+        _write(image, line, _MARGIN, y, _LABEL_SIZE, _FONT, _QUIET, "left", "top")
     for row, name in enumerate(cells):
         middle = top + row * (height + _GAP) + height // 2
         _write(image, name, _MARGIN, middle, _LABEL_SIZE, _FONT, _QUIET, "left", "center")
@@ -121,6 +136,25 @@ def _compose(
         x = left + column * (width + _GAP) + width // 2
         _write(image, text, x, top + len(cells) * (height + _GAP), _LABEL_SIZE, _FONT, colour, "center", "top")
     return np.asarray(image.get_pixels(oiio.UINT8))
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Words in lines of at most so many pixels; a longer word has a line of its own."""
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and oiio.ImageBufAlgo.text_size(longer, _LABEL_SIZE, _FONT).xend <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
+
+
+def _flag(picture: NDArray[np.uint8]) -> None:
+    """Marks a picture [h,w,3], in place, in its upper right corner."""
+    height, width = picture.shape[:2]
+    rows, columns = np.mgrid[0:height, 0:width]
+    picture[columns - rows >= width - _FLAG] = _ALARM
 
 
 def _block(sheet: NDArray[np.uint8], y: int, x: int, shape: tuple[int, ...], border: int) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Where another camera sees what a pixel shows: points from depth, their places in other views, pictures looked up there.
+"""Where another camera sees what a pixel shows: points from depth, their places in other views, pictures there.
 
 Pure functions on tensors, the same on CPU and GPU. Pixel centres are at +0.5; depth is along the camera's axis.
 """

@@ -24,18 +24,17 @@ from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .device import choose_device, unused_card
+from .evidence import gather
 from .extend import EXTENSION_FILE, pending
 from .model import DynamicModel
 from .needs import modelled
 from .trainer import Trainer, restore_model
-from .verdict import judge, tell
+from .verdict import figures_of, told, warn
 
 _ATTEMPTS = 5
 """A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
 _FIELD_BYTES = 8e6
 """Of a field with its moments, and of a run's small things (a preview's HexPlane: 4.4 MB)."""
-_TOO_MUCH_MOTION = 0.25
-"""Share of open Gaussians above which the artist is told (holding still left 0.03 to 0.21 open: docs/benchmarks.md)."""
 
 
 @dataclass
@@ -112,12 +111,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if folder != run:
         take_place(run, folder)
     report.metric("train", summary)
-    tell(summary, report)
-    if config.method == "auto" and summary["moving_share"] > _TOO_MUCH_MOTION:
-        report.warning(
-            f"Too much motion: {100 * summary['moving_share']:.0f} % of the Gaussians had to move.",
-            "Expect ghosts where people walked; a range in which they hold still does better.",
-        )
+    warn(summary, report)
     return summary
 
 
@@ -168,7 +162,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     write_json(folder / SUMMARY_FILE, summary)
     beside.unlink(missing_ok=True)
     report.metric("train", summary)
-    tell(summary, report)
+    warn(summary, report)
     return summary
 
 
@@ -288,7 +282,7 @@ def save_png(path: Path, image: Tensor) -> None:
 def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, key: str) -> dict[str, Any]:
     """The run's figures, units in the key names; what was modelled and what it cost."""
     value = trainer.heldout_psnr(test, held_out)
-    model = trainer.model
+    model, seen = trainer.model, gather(trainer, test, held_out)
     return {
         "version": 1,
         "key": key,
@@ -305,7 +299,7 @@ def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, ke
         "train_frames": len(trainer.train_ids),
         "heldout_frames": len(test),
         "heldout_psnr_db": None if value is None else round(value, 3),
-        **judge(trainer, test, held_out),
+        **told(figures_of(seen, trainer.scene.width, trainer.width * trainer.height)),
         "gaussians": len(model.gaussians),
         "moving_gaussians": len(model.open_rows()),
         "moving_share": round(moving_share(model), 5),

@@ -1,56 +1,245 @@
-"""Is a trained run any good? A word about what it leaves unexplained of its frames, from figures of real clips."""
+"""A run in words: does it hold, where not, and what to do. Figures in, sentences out; `evidence` has the figures."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from torch import Tensor
+from numpy.typing import NDArray
 
-from ..contract import Reporter
-from .trainer import Trainer
-
-POOR_MEDIAN_DB, POOR_TENTH_DB = 21.5, 18.0
-"""Below one of them a run is poor: PSNR of the median frame, and of the worst tenth.
-
-Presets' runs of clips whose people hold still give 24.6 to 28.8 dB on held-out frames (docs/benchmarks.md); the bundled
-clip, the hardest of them, 24.4 and 22.8 dB (median, tenth) there and 25.7 and 23.4 dB on the frames that it trained on.
-With a figure painted in that walks across all of it, 1200 preview steps left it at 18.9 and 17.6 dB (training frames:
-19.7 and 17.9).
-"""
-_MOST = 24
-"""Frames that are looked at, evenly over the clip, where none are held out."""
+from ..contract import Reporter, Verdict
+from .evidence import GRID, FrameEvidence
 
 
-def judge(trainer: Trainer, test: list[int], held_out: Tensor) -> dict[str, Any]:
-    """`quality` (Good or Poor) of a run, and the figures behind the word, for its summary.
-
-    On held-out frames [I, H, W, 3] at scene indices `test`; on some of those it trained on if there are none.
+@dataclass(frozen=True)
+class RunLimits:
+    """Where a run stops being good. Tuned on preview runs of three Mannequin Challenge clips in which people hold still
+    (`sitting`, `kitchen`, `hall`), and of one synthetic scene each with a walker and a still world (docs/synthetic.md).
     """
-    if test:
-        values, on = trainer.frame_psnrs(test, held_out), "held-out frames"
+
+    poor_median_db: float = 21.5
+    """PSNR of the median frame below which a run is poor. Presets' runs of clips whose people hold still give 24.6 to
+    28.8 dB on held-out frames (docs/benchmarks.md); the bundled clip, the hardest of them, 24.4 and 22.8 dB (median,
+    worst tenth) there and 25.7 and 23.4 dB on the frames that it trained on. With a figure painted in that walks across
+    all of it, 1200 preview steps left it at 18.9 and 17.6 dB (training frames: 19.7 and 17.9)."""
+    poor_tenth_db: float = 18.0
+    """The same of the worst tenth of the frames."""
+    lost: float = 0.3
+    """Share of a cell of the picture that may be unexplained; the clips have at most 0.18 in any cell of any frame."""
+    poor_lost: float = 0.5
+    """Share of the frames with such a cell above which a run is poor."""
+    far: float = 0.05
+    """Travel as a share of the width, over which something does not sway but goes somewhere: the clips' farthest pixel
+    travels 0.04."""
+    far_share: float = 0.002
+    """Least share of the picture that travels that far, on average over the frames, to be told."""
+    moves: float = 0.003
+    """Share of the picture that moves at all, below which nothing does; the clips have 0.08 to 0.34."""
+
+
+@dataclass(frozen=True)
+class RunFigures:
+    """What a run's verdict goes by."""
+
+    width: int
+    """Width in pixels of the working frames, in which travel is told."""
+    frames: list[int]
+    """[F] numbers of the frames that were looked at, ascending."""
+    unexplained: NDArray[np.floating]
+    """[F, GRID, GRID] as in `FrameEvidence`."""
+    travel: NDArray[np.floating]
+    """[F, GRID, GRID] as in `FrameEvidence`."""
+    moving: float
+    """Share of the picture that moves in the clip, on average."""
+    sway: float
+    """95th percentile of the travel of what moves, as a share of the width."""
+    far: float
+    """Share of the picture that travels more than `RunLimits.far`, on average."""
+    farthest: float
+    """99th percentile of the travel of what moves."""
+    median_db: float
+    """PSNR of the median frame of those held out; of all that were looked at if none is."""
+    tenth_db: float
+    """PSNR that all but the worst tenth of them reach."""
+    held_out: bool
+    """Those are frames that were held out."""
+    still_unexplained: float | None = None
+    """Share of what the motion mattes call still that is not explained; None without mattes."""
+    moving_unexplained: float | None = None
+    """Share of what they call moving."""
+
+
+def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int, limits: RunLimits | None = None) -> RunFigures:
+    """A run's figures from its frames; `width` of the working frames, `pixels` of a frame as it was trained on."""
+    limits = limits or RunLimits()
+    kept = [one for one in seen if one.held_out]
+    values = [one.psnr_db for one in kept or seen]
+    moving = np.concatenate([one.moving for one in seen])
+    whole = len(seen) * pixels / 16  # `moving` has every 16th pixel
+    by_matte = []
+    for name in ("still_unexplained", "moving_unexplained"):
+        known = [value for one in seen if (value := getattr(one, name)) is not None]
+        by_matte.append(float(np.mean(known)) if known else None)
+    return RunFigures(
+        width,
+        [one.frame for one in seen],
+        np.stack([one.unexplained for one in seen]),
+        np.stack([one.travel for one in seen]),
+        len(moving) / whole,
+        float(np.percentile(moving, 95)) if len(moving) else 0.0,
+        float((moving > limits.far).sum()) / whole,
+        float(np.percentile(moving, 99)) if len(moving) else 0.0,
+        float(np.percentile(values, 50)),
+        float(np.percentile(values, 10)),
+        bool(kept),
+        *by_matte,
+    )
+
+
+def judge(figures: RunFigures, limits: RunLimits | None = None) -> Verdict:
+    """The verdict on a run."""
+    limits = limits or RunLimits()
+    lost = figures.unexplained > limits.lost
+    bad: NDArray[np.bool_] = np.asarray(lost.any(axis=(1, 2)))
+    dim = not (figures.median_db >= limits.poor_median_db and figures.tenth_db >= limits.poor_tenth_db)
+    places = spans_of(figures.frames, figures.unexplained, lost)
+    walks = figures.far > limits.far_share
+    poor = dim or float(bad.mean()) > limits.poor_lost
+    word = "poor" if poor else "fair" if places or walks else "good"
+    return Verdict(word, _sentences(figures, limits, dim, places), places, _advice(figures, dim, bad, places, limits))
+
+
+def _sentences(figures: RunFigures, limits: RunLimits, dim: bool, places: list[dict[str, Any]]) -> list[str]:
+    """What is so: how well it fits, what moves and how far, where it does not hold."""
+    width, said = figures.width, []
+    if dim:
+        on = "held-out frames" if figures.held_out else "training frames"
+        said.append(
+            f"It does not show the clip: {figures.median_db:.1f} dB on half of its {on}, "
+            f"{figures.tenth_db:.1f} dB on the worst tenth."
+        )
+    elif not places:
+        said.append("It shows all of the clip.")
+    said += [f"It does not hold in {where_words(place)}." for place in places]
+    if figures.moving < limits.moves:
+        said.append("Nothing moves in it.")
+    elif figures.far > limits.far_share:
+        farthest = round(figures.farthest * width)
+        said.append(f"Something travels up to {farthest} of {width} pixels: it does not hold still.")
     else:
-        count = len(trainer.train_ids)
-        picked = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int)).tolist()
-        values = trainer.frame_psnrs([trainer.train_ids[n] for n in picked], trainer.images[picked])
-        on = "training frames"
-    median, tenth = (round(float(np.percentile(values, share)), 2) for share in (50, 10))
-    poor = not (median >= POOR_MEDIAN_DB and tenth >= POOR_TENTH_DB)
+        said.append(f"What moves sways by up to {max(1, round(figures.sway * width))} of {width} pixels.")
+    return said
+
+
+def _advice(
+    figures: RunFigures, dim: bool, bad: NDArray[np.bool_], places: list[dict[str, Any]], limits: RunLimits
+) -> list[str]:
+    """What to do about it."""
+    if figures.moving < limits.moves and not places and not dim:
+        return ["Any frame will do as t*."]
+    span = _longest_good(figures.frames, bad)
+    if dim or (places and span is None):
+        return [_LOOK]
+    if span is not None and places:
+        return [f"Choose t* in frames {span[0]} to {span[1]}, or train on that range alone."]
+    if figures.far > limits.far_share:
+        return ["Paint who walks in the motion matte, or take a range in which all hold still."]
+    return []
+
+
+_LOOK = (
+    "Look at its previews. Somebody walks through, or the camera is wrong: take a range in which all hold still, "
+    "or solve again."
+)
+
+
+# --------------------------------------------------------------------------------------------------- where
+
+
+_REGIONS = (
+    ("upper left", "top", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "bottom", "lower right"),
+)
+
+
+def region_words(cells: NDArray[np.floating]) -> str:
+    """Where in the picture the weight of cells [GRID, GRID] lies, rows from above: "lower left", "top", "middle"."""
+    weights = np.asarray(cells, np.float64)
+    total = weights.sum()
+    if not total > 0.0 or (weights > 0.25 * weights.max()).mean() > 0.6:
+        return "most of the picture"
+    rows, columns = np.mgrid[0:GRID, 0:GRID]
+    down, across = (float((weights * at).sum() / total) / (GRID - 1) for at in (rows, columns))
+    row, column = (0 if at < 0.3 else 2 if at > 0.7 else 1 for at in (down, across))
+    return _REGIONS[row][column]
+
+
+def spans_of(
+    frames: Sequence[int], cells: NDArray[np.floating], lost: NDArray[np.bool_], most: int = 3
+) -> list[dict[str, Any]]:
+    """Where something is lost: spans of frames, each with its region and `share`, that of its worst cell; worst first.
+
+    Args:
+        frames: [F] ascending numbers.
+        cells: [F, GRID, GRID] shares.
+        lost: [F, GRID, GRID] which of them are too large.
+        most: how many spans are told.
+    """
+    bad = np.flatnonzero(lost.any(axis=(1, 2)))
+    if not len(bad):
+        return []
+    groups = np.split(bad, np.flatnonzero(np.diff(bad) > 2) + 1)  # one good frame between does not part them
+    spans = []
+    for group in groups:
+        weight = (cells[group] * lost[group]).sum(axis=0)
+        spans.append(
+            {
+                "first": int(frames[group[0]]),
+                "last": int(frames[group[-1]]),
+                "region": region_words(weight),
+                "share": round(float(cells[group].max()), 3),
+            }
+        )
+    return sorted(spans, key=lambda span: -span["share"] * (1 + span["last"] - span["first"]))[:most]
+
+
+def where_words(place: dict[str, Any]) -> str:
+    """'frames 10 to 30, lower left'."""
+    if place["first"] == place["last"]:
+        return f"frame {place['first']}, {place['region']}"
+    return f"frames {place['first']} to {place['last']}, {place['region']}"
+
+
+def _longest_good(frames: Sequence[int], bad: NDArray[np.bool_], least: int = 4) -> tuple[int, int] | None:
+    """First and last number of the longest row of good frames; None if it has fewer than `least`."""
+    groups = np.split(np.arange(len(bad)), np.flatnonzero(bad))
+    good = max(([n for n in group if not bad[n]] for group in groups), key=len)
+    return (int(frames[good[0]]), int(frames[good[-1]])) if len(good) >= least else None
+
+
+# --------------------------------------------------------------------------------------------------- a summary's part
+
+
+def told(figures: RunFigures) -> dict[str, Any]:
+    """A run's verdict and the figures behind it, for its summary."""
+    verdict = judge(figures)
     return {
-        "quality": "Poor" if poor else "Good",
-        "quality_on": on,
-        "median_psnr_db": median,
-        "worst_tenth_psnr_db": tenth,
+        "quality": verdict.word.capitalize(),
+        "quality_on": "held-out frames" if figures.held_out else "training frames",
+        "median_psnr_db": round(figures.median_db, 2),
+        "worst_tenth_psnr_db": round(figures.tenth_db, 2),
+        "unexplained_share": round(float(figures.unexplained.mean()), 4),
+        "travel_px": round(figures.sway * figures.width, 1),
+        "farthest_px": round(figures.farthest * figures.width, 1),
+        "verdict": vars(verdict),
     }
 
 
-def tell(summary: dict[str, Any], report: Reporter) -> None:
+def warn(summary: dict[str, Any], report: Reporter) -> None:
     """Warns of a poor run, from its summary."""
-    if summary["quality"] != "Poor":
-        return
-    median, tenth = summary["median_psnr_db"], summary["worst_tenth_psnr_db"]
-    report.warning(
-        f"The run is poor: {median:.1f} dB on half of its {summary['quality_on']}, {tenth:.1f} dB on the worst tenth.",
-        "Look at its previews. Somebody walks through, or the camera is wrong: take a range in which all hold still, "
-        "or solve again.",
-    )
+    verdict = Verdict(**summary["verdict"])
+    if verdict.word == "poor":
+        report.warning(verdict.lines()[0], " ".join([*verdict.sentences[1:], *verdict.advice]))
