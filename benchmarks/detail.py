@@ -41,7 +41,7 @@ def judge_frame(clip: DetailClip, frame: int, t_star: int) -> tuple[Row, dict[st
     """(figures by variant, pictures by name, still pixels) of one frame of a freeze."""
     plate, withheld = clip.plate(frame), clip.view(frame, t_star, {frame})
     delivered = clip.view(frame, t_star, image=withheld.image)
-    still = clip.still(frame, t_star, withheld.image)
+    still = clip.still(frame, t_star, delivered)
     pictures = dict(zip(VARIANTS, (withheld.splats, withheld.picture, delivered.picture), strict=True))
     row: Row = {name: picture_figures(picture, plate, still) for name, picture in pictures.items()}
     row |= {"frame": frame, "still_share": float(still.float().mean())}
