@@ -41,7 +41,7 @@ def judge_frame(clip: DetailClip, frame: int, t_star: int) -> tuple[Row, dict[st
     """(figures by variant, pictures by name, still pixels) of one frame of a freeze."""
     plate, withheld = clip.plate(frame), clip.view(frame, t_star, {frame})
     delivered = clip.view(frame, t_star, image=withheld.image)
-    still = clip.still(frame, t_star, withheld.image)
+    still = clip.still(frame, t_star, delivered)
     pictures = dict(zip(VARIANTS, (withheld.splats, withheld.picture, delivered.picture), strict=True))
     row: Row = {name: picture_figures(picture, plate, still) for name, picture in pictures.items()}
     row |= {"frame": frame, "still_share": float(still.float().mean())}
@@ -59,6 +59,7 @@ def judge(
     `worst` > 0 keeps only the strips of so many frames at each t*, those with the lowest best-90 % dB withheld.
     """
     result: dict[str, Any] = {"t_stars": list(t_stars), "size": [clip.width, clip.height], "freezes": []}
+    result["motion_from"] = clip.motion_from
     rows: dict[int, list[Row]] = {t_star: [] for t_star in t_stars}
     differences: list[float] = []
     for n, frame in enumerate(frames):
@@ -113,7 +114,7 @@ def table(name: str, result: dict[str, Any]) -> list[str]:
         cells = ["–" if v is None else f"{v:.2f}" for v in means(both[0])[variant].values()]
         lines.append(f"| both, {variant} | " + " | ".join(cells) + " |")
     share = _mean(row["still_share"] for row in both[0])
-    lines += ["", f"Still: {100 * (share or 0):.0f} % of the pixels."]
+    lines += ["", f"Still: {100 * (share or 0):.0f} % of the pixels, by {result['motion_from']}."]
     if result["instants_differ_255"] is not None:
         lines[-1] += f" There two instants differ by {result['instants_differ_255']:.3f} / 255 on average."
     return lines

@@ -15,8 +15,8 @@ from benchmarks.sources import Log
 from torch_backend.contract import FreezeParams
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze.detail import DetailedFrame, Detailer
-from torch_backend.freeze.query import FrozenGaussians, FrozenImage, freeze_at, render_frozen
-from torch_backend.freeze.take import OutputFrame, choose_t_star, span_of
+from torch_backend.freeze.query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen
+from torch_backend.freeze.take import choose_t_star, span_of
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.shot import Shot
 from torch_backend.solve.motion import load_motion
@@ -54,9 +54,14 @@ class DetailClip:
         self.plates = Plates(shot, size) if size else own
         self.width, self.height = self.plates.width, self.plates.height
         self.Ks = self.scene.camera_at(self.width, self.height)
-        # A detailer may carry weights along the path: those with and without plate n are not mixed.
-        self._detailers = {name: Detailer(self.run, self.scene, self.plates) for name in VARIANTS[1:]}
+        self.detailer = Detailer(self.run, self.scene, self.plates)
         self._frozen: dict[int, FrozenGaussians] = {}
+
+    @property
+    def motion_from(self) -> str:
+        """Which mattes say what moves."""
+        found = self.matte(self.frames[0]) is not None
+        return "the shot's motion mattes" if found else "the gate, which misses movers: the shot has no motion mattes"
 
     @property
     def frames(self) -> list[int]:
@@ -100,8 +105,7 @@ class DetailClip:
         viewmat, K = self.camera(frame)
         image = image or self.splats(frame, t_star)
         output = OutputFrame(frame, viewmat, K, float(t_star), float(frame))
-        detailer = self._detailers["withheld" if withheld else "delivered"]
-        detailed = detailer.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
+        detailed = self.detailer.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
         return View(image, detailed, over(image.color, image.alpha), over(detailed.color, detailed.alpha))
 
     def plate(self, frame: int) -> Tensor:
@@ -116,7 +120,7 @@ class DetailClip:
         values = torch.from_numpy(matte.astype("float32") / 255.0)[None, None]
         return F.interpolate(values, (self.height, self.width), mode="nearest-exact")[0, 0]
 
-    def mattes(self, frame: int, t_star: int, image: FrozenImage) -> tuple[Tensor, Tensor]:
+    def mattes(self, frame: int, t_star: int, view: View) -> tuple[Tensor, Tensor]:
         """(matte of what moves in the frame, matte of what of the frozen frame moves at t*), each [H, W] in 0..1.
 
         The second is that of frame t*, brought here by the frozen depth; 0 where t* does not look. Without mattes in
@@ -124,15 +128,15 @@ class DetailClip:
         """
         own, there = self.matte(frame), self.matte(t_star)
         if own is None or there is None:
-            gate = (image.motion >= STILL_MATTE).float()
+            gate = (view.image.motion >= STILL_MATTE).float()
             return gate, gate
-        places, depth = induced_places(image.depth, *self.camera(frame), *self.camera(t_star))
+        places, depth = induced_places(view.detailed.depth, *self.camera(frame), *self.camera(t_star))
         known = inside(places, self.width, self.height, 0.0) & (depth > 0)
         return own, torch.where(known, sampled(there, places, nearest=True), 0.0)
 
-    def still(self, frame: int, t_star: int, image: FrozenImage) -> Tensor:
+    def still(self, frame: int, t_star: int, view: View) -> Tensor:
         """Pixels of the frame in which the frozen frame must show what the plate shows, bool [H, W]."""
-        own, frozen = self.mattes(frame, t_star, image)
+        own, frozen = self.mattes(frame, t_star, view)
         return still_pixels(own, frozen > 0.75)
 
 

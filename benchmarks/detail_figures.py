@@ -1,7 +1,7 @@
 """Figures of frozen frames made of plates, as pure functions: where nothing moves, what a camera's motion explains.
 
 Pictures are display-referred [H, W, 3] in [0, 1], masks bool [H, W], places [H, W, 2] in pixels (x, y) with pixel
-centres at +0.5, cameras OpenCV world-to-camera [4, 4] and K [3, 3] in pixels.
+centres at +0.5, cameras OpenCV world-to-camera [4, 4] and K [3, 3] in pixels. None of it is shared with what is judged.
 """
 
 # Packages of requirements/bench.txt may be absent; each use says what to do then.

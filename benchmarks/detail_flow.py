@@ -47,7 +47,6 @@ from benchmarks.detail_figures import (
     widened,
 )
 from torch_backend.contract import JobError
-from torch_backend.freeze.query import FrozenImage
 from torch_backend.native import default_threads
 from torch_backend.shot import write_json
 
@@ -67,7 +66,8 @@ class Shown:
     """One frozen frame of the path."""
 
     frame: int
-    image: FrozenImage
+    depths: dict[str, Tensor]
+    """Of each of `WHAT`, [H, W]: the frozen depth, which has a surface more where plates showed one."""
     pictures: dict[str, Tensor]
     """Of each of `WHAT`."""
     own: Tensor
@@ -107,9 +107,10 @@ class Sums:
 def show(clip: DetailClip, frame: int, t_star: int) -> Shown:
     """The frame with everything that is compared."""
     view = clip.view(frame, t_star)
-    own, there = clip.mattes(frame, t_star, view.image)
+    own, there = clip.mattes(frame, t_star, view)
     pictures = {"plate": clip.plate(frame), "splats": view.splats, "delivered": view.picture}
-    return Shown(frame, view.image, pictures, own, there)
+    depths = {"plate": view.detailed.depth, "splats": view.image.depth, "delivered": view.detailed.depth}
+    return Shown(frame, depths, pictures, own, there)
 
 
 @dataclass
@@ -126,10 +127,10 @@ class Pair:
     """Likewise what moves in neither."""
 
 
-def lay_over(clip: DetailClip, a: Shown, b: Shown) -> Pair:
-    """Frames a and b as a `Pair`."""
-    places, depth = induced_places(a.image.depth, *clip.camera(a.frame), *clip.camera(b.frame))
-    both = seen_again(places, depth, b.image.depth) & inside(places, clip.width, clip.height, 4.0)
+def lay_over(clip: DetailClip, a: Shown, b: Shown, what: str) -> Pair:
+    """Frames a and b as a `Pair`, by the depth of one of `WHAT`."""
+    places, depth = induced_places(a.depths[what], *clip.camera(a.frame), *clip.camera(b.frame))
+    both = seen_again(places, depth, b.depths[what]) & inside(places, clip.width, clip.height, 4.0)
     own_b, there_b = (sampled(matte, places, nearest=True) for matte in (b.own, b.there))
     matte = torch.stack([a.own, own_b]).amax(0)
     mover = torch.stack([a.there, there_b]).amax(0) > MOVER_MATTE
@@ -139,11 +140,10 @@ def lay_over(clip: DetailClip, a: Shown, b: Shown) -> Pair:
 
 def judge_pair(flow: Flow, clip: DetailClip, a: Shown, b: Shown, sums: dict[str, Sums]) -> dict[str, Any]:
     """Figures of frames a and b, added to `sums`: {what: {moving, still, excess: px}}."""
-    pair = lay_over(clip, a, b)
-    masks = {"moving": pair.moving, "still": pair.still}
     row: dict[str, Any] = {"frame": a.frame, "next": b.frame}
-    row |= {f"{region}_share": float(mask.float().mean()) for region, mask in masks.items()}
     for what in WHAT:
+        pair = lay_over(clip, a, b, what)
+        masks = {"moving": pair.moving, "still": pair.still}
         one, two = a.pictures[what], b.pictures[what]
         left, judged = unexplained_flow(flow, one, two, pair.places, pair.both), textured(one)
         difference = unsteadiness(one, two, pair.places)
@@ -153,6 +153,7 @@ def judge_pair(flow: Flow, clip: DetailClip, a: Shown, b: Shown, sums: dict[str,
             enough = int((mask & judged).sum()) >= LEAST
             found[region] = float(left[mask & judged].quantile(PERCENT / 100.0)) if enough else None
         moving, still = found["moving"], found["still"]
+        found |= {f"{region}_share": float(mask.float().mean()) for region, mask in masks.items()}
         row[what] = {**found, "excess": None if moving is None or still is None else moving - still}
     return row
 
@@ -186,7 +187,7 @@ def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: in
     flow = Flow()
     for row in worst_frames(freeze["frames"], count):
         a, b = (show(clip, row[name], freeze["t_star"]) for name in ("frame", "next"))
-        pair, one, two = lay_over(clip, a, b), a.pictures["delivered"], b.pictures["delivered"]
+        pair, one, two = lay_over(clip, a, b, "delivered"), a.pictures["delivered"], b.pictures["delivered"]
         left = unexplained_flow(flow, one, two, pair.places, pair.both) * (textured(one) & (pair.moving | pair.still))
         told = torch.stack([pair.moving, pair.still, torch.zeros_like(pair.still)], dim=2) * 0.5
         strip = [one, sampled(two, pair.places), (left / 2.0)[..., None].expand(-1, -1, 3), one * 0.5 + told]
@@ -254,8 +255,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"Error: {error}", file=sys.stderr)
         return 1
     result = {"version": 1, "shot": str(args.shot), "run": args.run, "freezes": freezes}
+    result["motion_from"] = clip.motion_from
     write_json(args.results / f"flow-{name}.json", result | {"seconds": time.perf_counter() - since})
-    print("\n".join(["", *table(name, freezes), "", *verdicts(freezes)]))
+    print("\n".join(["", *table(name, freezes), "", *verdicts(freezes), f"What moves: {clip.motion_from}."]))
     return 0
 
 

@@ -21,10 +21,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import torch
 
 from benchmarks.bench import RunSpec, hold_out_phase, train_spec
-from benchmarks.sources import load_source
+from benchmarks.sources import Log, load_source
 from torch_backend.contract import JobError
 from torch_backend.native import default_threads
-from torch_backend.report.evaluate import detailers, freeze_run
+from torch_backend.report.evaluate import freeze_run, plate_detail
 from torch_backend.report.metrics import WHOLE, psnr_by_region
 from torch_backend.report.records import DELIVERED, SPLATS, WITHHELD
 from torch_backend.report.truth import REGIONS, TruthScene
@@ -54,9 +54,9 @@ def trained(truth: TruthScene, source: str, args: argparse.Namespace) -> str:
 def judge(truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1) -> list[dict[str, Any]]:
     """PSNR in dB of every pose: [{t_star, pose, variant: {region: dB or None}}]."""
     run, scene = load_run(truth.shot, run_name, torch.device("cpu")), load_scene(truth.shot)
-    made, size, rows = detailers(truth.shot, run, scene), (run.width, run.height), []
+    detailer, size, rows = plate_detail(truth.shot, run, scene, Log()), (run.width, run.height), []
     for t_star in t_stars:
-        frozen = freeze_run(run, scene, t_star, "nearest", made)
+        frozen = freeze_run(run, scene, t_star, "nearest", detailer)
         for pose in truth.poses(t_star, [])[::every]:
             target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
             row: dict[str, Any] = {"t_star": t_star, "pose": pose}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,11 @@ from ..contract import JobError, Reporter, frame_file, read_json
 from ..footage.images import write_png
 from ..footage.plates import Plates
 from ..freeze.detail import Detailer
-from ..freeze.query import FrozenGaussians, freeze_at, render_frozen
-from ..freeze.take import OutputFrame, span_of
+from ..freeze.query import FrozenGaussians, OutputFrame, freeze_at, render_frozen
+from ..freeze.take import span_of
 from ..scene import Scene, load_scene, read_image, split_frames
 from ..shot import Shot
+from ..solve.motion import find_motion
 from ..train import LoadedRun, load_run
 from ..train.checkpoint import load_checkpoint
 from ..train.model import render
@@ -43,8 +44,8 @@ class Frozen:
     scene: Scene
     t_star: int
     gaussians: FrozenGaussians
-    detailers: dict[str, Detailer] = field(default_factory=dict)
-    """One for each of `WITHHELD` and `DELIVERED`: what a detailer carries from pose to pose is not mixed."""
+    detailer: Detailer | None = None
+    """What makes plate detail; None: splats are all there is."""
 
     def view(self, pose: int, shown: str = SPLATS) -> Tensor:
         """[H, W, 3] in [0, 1] from the pose of frame `pose`, exposed as that frame is, before grey."""
@@ -56,18 +57,21 @@ class Frozen:
             self.gaussians, scene.viewmats[index], K, run.width, run.height, run.model.exposure, exposed_at
         )
         color, alpha = image.color, image.alpha
-        if shown != SPLATS:
+        if shown != SPLATS and self.detailer is not None:
             output = OutputFrame(pose, scene.viewmats[index], K, float(self.t_star), float(pose))
             withheld = (pose,) if shown == WITHHELD else ()
-            made = self.detailers[shown].frame(output, self.gaussians, image, run.width, run.height, withheld)
+            made = self.detailer.frame(output, self.gaussians, image, run.width, run.height, withheld)
             color, alpha = made.color, made.alpha
         return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0)
 
 
-def detailers(shot: Shot, run: LoadedRun, scene: Scene) -> dict[str, Detailer]:
-    """What `Frozen.view` needs to show plate detail at the run's size. JobError if the footage cannot be read."""
-    plates = Plates(shot, (run.width, run.height))
-    return {shown: Detailer(run, scene, plates) for shown in (WITHHELD, DELIVERED)}
+def plate_detail(shot: Shot, run: LoadedRun, scene: Scene, report: Reporter) -> Detailer:
+    """What makes plate detail at the run's size. Motion mattes are found in the shot if it has none.
+
+    JobError if the footage cannot be read.
+    """
+    find_motion(shot, report)
+    return Detailer(run, scene, Plates(shot, (run.width, run.height)))
 
 
 def evaluate_run(
@@ -87,13 +91,14 @@ def evaluate_run(
     """
     run, scene = load_run(truth.shot, run_name, device), load_scene(truth.shot)
     held_out = held_out_frames(run, scene)
-    missing, made = missing_metrics(), dict[str, Detailer]()
+    missing, detailer, kinds = missing_metrics(), None, [SPLATS]
     try:
-        made = detailers(truth.shot, run, scene)
+        detailer = plate_detail(truth.shot, run, scene, report)
+        kinds += [WITHHELD, DELIVERED]
     except JobError as error:
         missing["detail"] = f"Plate detail of {truth.name} was not judged: {error.message}"
-    frozen = {t_star: freeze_run(run, scene, t_star, query, made) for t_star in truth.t_stars}
-    shown = {name: _shown(truth, frozen, held_out, name, report) for name in (SPLATS, *made)}
+    frozen = {t_star: freeze_run(run, scene, t_star, query, detailer) for t_star in truth.t_stars}
+    shown = {name: _shown(truth, frozen, held_out, name, report) for name in kinds}
     for name, of in shown.items():
         if name != WITHHELD:  # as fast as what is delivered, and not to be looked at
             of.frozen_fps = _fps(next(iter(frozen.values())), scene, name)
@@ -143,10 +148,10 @@ def held_out_frames(run: LoadedRun, scene: Scene) -> list[int]:
     return [scene.frames[i] for i in test]
 
 
-def freeze_run(run: LoadedRun, scene: Scene, t_star: int, query: str, made: dict[str, Detailer]) -> Frozen:
-    """The run frozen at frame `t_star`; `made` as `detailers` gives them, empty for splats alone."""
+def freeze_run(run: LoadedRun, scene: Scene, t_star: int, query: str, detailer: Detailer | None = None) -> Frozen:
+    """The run frozen at frame `t_star`; `detailer` as `plate_detail` gives it, None for splats alone."""
     frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), query)
-    return Frozen(run, scene, t_star, frozen, made)
+    return Frozen(run, scene, t_star, frozen, detailer)
 
 
 @torch.no_grad()

@@ -15,6 +15,9 @@ import torch
 from torch_backend.footage.images import write_png
 from torch_backend.report.metrics import score
 from torch_backend.report.records import (
+    DELIVERED,
+    WITHHELD,
+    Detailed,
     FrameScore,
     HeldOut,
     Picture,
@@ -72,8 +75,24 @@ def example(results: Path, frame: torch.Tensor, scene: str, seed: int, host: str
         {"8": 8.9, "24": None}, pictures,
         [p for p in pictures if p.pose == 40], plates, {}, machine_facts(), "bench", "2026-11-21 12:00",
     )  # fmt: skip
+    if host == "auto":
+        gains = {WITHHELD: 2.0, DELIVERED: 4.0}
+        for shown, gain in gains.items():
+            shots = [] if shown == WITHHELD else pictures
+            better = [sharper(row, gain) for row in rows]
+            speed = None if shown == WITHHELD else 3.0
+            record.detailed[shown] = Detailed(better, {"8": 9.0, "24": None}, speed, shots, record.two_instants)
     save_record(results, record)
     return record
+
+
+def sharper(row: FrameScore, gain: float) -> FrameScore:
+    """The same frame, better by `gain` dB everywhere."""
+    regions = {
+        name: {**of, "psnr_db": None if of["psnr_db"] is None else of["psnr_db"] + gain}
+        for name, of in row.regions.items()
+    }
+    return FrameScore(row.t_star, row.pose, row.held_out, regions, 35.0, 0.99)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +123,7 @@ def test_a_record_comes_back_as_it_went(results):
 
 
 def test_a_damaged_record_is_named(tmp_path):
-    (tmp_path / "x.json").write_text('{"version": 2, "rows": []}')
+    (tmp_path / "x.json").write_text('{"version": 3, "rows": []}')
     with pytest.raises(ValueError, match="x.json"):
         load_record(tmp_path / "x.json")
     (tmp_path / "y.json").write_text('{"version": 99}')
@@ -123,14 +142,47 @@ def test_means_are_those_of_the_frames(results, report):
     assert float(row[4]) == pytest.approx(np.mean(values), abs=0.006)
     assert float(row[7]) == pytest.approx(np.mean(sorted(values)[:6]), abs=0.006)
     assert float(row[8]) == pytest.approx(min(values), abs=0.006)
-    assert quality["marks"] == {str([r[0] for r in quality["rows"]].index("auto (ours)")): "best"}
+    assert quality["marks"] == {str([r[0] for r in quality["rows"]].index("auto (ours), plate detail")): "best"}
 
 
 def test_what_is_compared_with_what(results):
     names = [(a.label, b.label) for a, b in comparisons(settings_of(load_records(results), "synthetic"))]
     assert ("4DGaussians + paper", "4DGaussians") in names and ("4DGaussians + support", "4DGaussians + paper") in names
     assert ("auto (ours)", "static 3DGS") in names and ("auto (ours)", "4DGaussians + support") in names
-    assert len(names) == 6
+    assert ("auto (ours), plate detail", "auto (ours)") in names
+    assert ("auto (ours), plate detail, plate withheld", "auto (ours)") in names
+    assert len(names) == 8
+
+
+def test_every_table_has_a_row_of_what_is_delivered(results):
+    """And figures of it: in the table of who wins by region, beside splats alone in the others."""
+    tables = {table.title: table for table in all_tables(load_records(results))}
+    kinds = ("plate detail, plate withheld", "plate detail")
+    for title, table in tables.items():
+        for kind in kinds:
+            assert any(row[0].split(" against ")[0] == f"auto (ours), {kind}" for row in table.rows), (title, kind)
+    regions = {row[0]: row[1:] for row in tables["By region"].rows}
+    for kind, gain in zip(kinds, (2.0, 4.0), strict=True):
+        for alone, made in zip(regions["auto (ours)"], regions[f"auto (ours), {kind}"], strict=True):
+            assert float(made) - float(alone) == pytest.approx(gain, abs=0.011)
+    won = [row for row in tables["Who wins"].rows if row[0] == "auto (ours), plate detail against auto (ours)"]
+    assert [row[1] for row in won] == ["whole frame", "seen at t*", "never seen at t*", "moving", "static"]
+    assert all(row[2] == "frozen frame 80.00" and row[3] == "+4.000" and row[-1] == "win" for row in won)
+    cost = {row[0]: row for row in tables["What it cost (synthetic scenes)"].rows}
+    fps, held = (tables["What it cost (synthetic scenes)"].header.index(n) for n in ("frozen frames / s", "moving"))
+    assert cost["auto (ours), plate detail"][fps] == "3.0" and cost["auto (ours)"][fps] == "240.0"
+    # A run's own frames at their own times are no freezes.
+    assert cost["auto (ours), plate detail"][held] == "–" != cost["auto (ours)"][held]
+
+
+def test_an_ablation_is_held_against_splats_alone(results, tmp_path):
+    record = load_record(next(results.glob("*auto*.json")))
+    record.pictures, record.two_instants, record.detailed[DELIVERED].pictures = [], [], []
+    save_record(tmp_path, record)
+    record.run_id, record.variant = "without", "no exposure"
+    save_record(tmp_path, record)
+    table = next(t for t in all_tables(load_records(tmp_path)) if t.title == "Ablations")
+    assert {row[1] for row in table.rows} == {"auto (ours)"} and {row[3] for row in table.rows} == {"+0.000"}
 
 
 def test_who_wins_where_and_at_what_cost(results):
@@ -163,7 +215,7 @@ def test_one_metric_missing_leaves_a_dash_and_a_sentence(results, tmp_path):
         for region in row.regions.values():
             region["flip"] = None
     record.missing = {"flip": "FLIP was not measured: flip-evaluator is not installed (requirements/bench.txt)."}
-    record.pictures, record.two_instants = [], []
+    record.pictures, record.two_instants, record.detailed = [], [], {}
     save_record(tmp_path, record)
     text = write_report(tmp_path, tmp_path / "report").read_text()
     assert record.missing["flip"] in text
@@ -213,7 +265,7 @@ def test_the_page_needs_nothing_from_outside(report):
     page = Outside()
     page.feed(text)
     assert page.loads == [] and "http://" not in text and "https://" not in text and "@import" not in text
-    assert page.sliders == 20 * 6 and len(page.pictures) == 2 * page.sliders
+    assert page.sliders == 24 * 6 and len(page.pictures) == 2 * page.sliders
     data = json.loads(re.search(r'id="pictures">(.*?)</script>', text, re.S).group(1))
     assert set(page.pictures) == set(data) and all(v.startswith("data:image/jpeg;base64,") for v in data.values())
     assert "bench &lt;quick&gt;" in text and "<quick>" not in text
