@@ -58,7 +58,10 @@ class Plates:
         The default holds what a frozen frame and the next one ask for: itself, two before and two after it at every
         other frame, and t*. JobError (FOOTAGE, SOLVE) if the shot is not imported and solved.
         """
-        record, solved = load_frames(shot), load_record(shot)
+        load_cameras(shot)
+        record = load_frames(shot)
+        # Cameras may come without the record of a solve: a scene of truth has none.
+        solved = load_record(shot) if (shot.solve / "solve.json").is_file() else {}
         self._shot, self._keep = shot, max(1, keep)
         self._files = {int(row["frame"]): str(row["file"]) for row in record["frames"]}
         self.frames = sorted(self._files)
