@@ -32,9 +32,9 @@ class FlowConfig:
     """A key frame is matched with those this many key frames before and after; each is double the one before."""
     links: int = 4
     """Matches over the longest baseline are chained this often: 4 links of 8 key frames reach 3 seconds."""
-    tolerance: float = 1.5
+    tolerance: float = 0.8
     """A match this far from where the still point is seen tells of motion: flow and solve err by 0.5 to 1 each."""
-    per_link: float = 0.35
+    per_link: float = 0.2
     """So much more for each further link of a chain."""
     noise: float = 2.5
     """The tolerance of a pair is at least this many times the median distance in it: blur, shutter, a poor pose."""
@@ -42,8 +42,10 @@ class FlowConfig:
     """But at most this many times what it is otherwise, unless a pose was guessed: what moves may fill the picture."""
     round_trip: float = 1.2
     """Greatest distance between a pixel and where the flow there and back ends; above it the pixel is hidden there."""
-    contrast: float = 4.0
+    contrast: float = 2.5
     """A match off its place tells of motion if the picture changes over that distance by so many of 255 steps."""
+    better: float = 1.5
+    """A match off its place tells of motion if pictures differ by this factor more where a still point would be seen."""
     share: float = 0.4
     """A surface moves if so much of what it is matched with says so: most of the time a mover stands where it is."""
     likeness: float = 8.0

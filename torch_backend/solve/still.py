@@ -59,24 +59,19 @@ def still_points(
 
 
 class Look:
-    """A key's picture prepared for comparison: a point may look like anything within a pixel of its place."""
+    """A key's picture prepared for comparison."""
 
     def __init__(self, picture: NDArray[np.uint8]) -> None:
-        smooth = cv2.GaussianBlur(picture, (0, 0), 1.0)
-        block = np.ones((3, 3), np.uint8)
-        self.low, self.high = cv2.erode(smooth, block), cv2.dilate(smooth, block)
+        self._smooth = cv2.GaussianBlur(picture, (0, 0), 1.0)
         half = picture.shape[1] // 2, picture.shape[0] // 2
-        self.grid = cv2.resize(smooth, half, interpolation=cv2.INTER_AREA).astype(np.float32)
+        self.grid = cv2.resize(self._smooth, half, interpolation=cv2.INTER_AREA).astype(np.float32)
         """[h, w] at the grid's points."""
 
     def unlike(self, values: Map, at: tuple[Map, Map], gain: tuple[float, float]) -> Map:
         """Mean square difference around each point between `values` and this picture, times and plus `gain`, there."""
-        x, y = at[0] - np.float32(0.5), at[1] - np.float32(0.5)
-        low, high = (
-            cv2.remap(p, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in (self.low, self.high)
-        )
-        beyond = np.maximum(values - (high * np.float32(gain[0]) + np.float32(gain[1])), 0.0)
-        beyond += np.maximum((low * np.float32(gain[0]) + np.float32(gain[1])) - values, 0.0)
+        half = np.float32(0.5)
+        there = cv2.remap(self._smooth, at[0] - half, at[1] - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        beyond = values - np.float32(gain[1]) - there * np.float32(gain[0])
         return cv2.blur(beyond * beyond, (5, 5))
 
 
@@ -144,7 +139,7 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
     gains = []
     for n, (ray, s) in enumerate(zip(rays, seen, strict=True)):
         at, _ = ray.project(inverse)
-        length = np.hypot(s.at[0] - at[0], s.at[1] - at[1])
+        length = np.hypot(_smoothed(s.at[0] - at[0], s.found), _smoothed(s.at[1] - at[1], s.found))
         told = s.found & telling
         if np.count_nonzero(told) > 50:
             usual = config.noise * float(np.median(length[told]))
@@ -155,26 +150,34 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
     inverse = _best_depth(test, look, rays, seen, gains, _surroundings(inverse, on >= 3))
     on, off = np.zeros_like(inverse), np.zeros_like(inverse)
     gone: dict[int, Mask] = {}
+    nearly = 0.5 * (xx + yy) * unit**2  # what a pixel aside makes
     for ray, s, limit, gain in zip(rays, seen, limits, gains, strict=True):
         at, _ = ray.project(inverse)
-        x, y = s.at[0] - at[0], s.at[1] - at[1]
+        x, y = _smoothed(s.at[0] - at[0], s.found), _smoothed(s.at[1] - at[1], s.found)
         length = np.hypot(x, y)
         there = test.look(s.key)
         unlike = there.unlike(look.grid, at, gain)
         inside = _inside(at, look.grid.shape)
         away = s.found & (length > limit)
-        alike = inside & (unlike < _like(unlike, s.found & ~away & telling, config))
+        alike = inside & (unlike - nearly < _like(unlike, s.found & ~away & telling, config))
         shorter = np.square(np.minimum(1.0, 3.0 * unit / np.maximum(length, 1e-6)))
         change = shorter * (xx * x * x + 2 * xy * x * y + yy * y * y)
-        told = away & (change > config.contrast**2) & ~alike
+        better = unlike > config.better * there.unlike(look.grid, s.at, gain) + config.contrast**2
+        told = away & (change > config.contrast**2) & better
         off += told
         on += s.found & ~away
-        on += 0.5 * (alike & (away | ~s.found))
+        on += 0.5 * ((away & ~better) | (alike & ~s.found))
         gone[s.key - key] = inside & ~s.found & ~alike
     for step in config.baselines[:2]:
         if step in gone and -step in gone:
             off += gone[step] & gone[-step]
     return on, off
+
+
+def _smoothed(values: Map, found: Mask) -> Map:
+    """Mean of what is found around each point: a surface moves as one, flow errs here and there."""
+    weight = found.astype(np.float32)
+    return cv2.blur(values * weight, (5, 5)) / np.maximum(cv2.blur(weight, (5, 5)), 1e-3)
 
 
 def _like(unlike: Map, still: Mask, config: FlowConfig) -> float:
