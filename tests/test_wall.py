@@ -26,7 +26,7 @@ STATIONS = (
     "live",
     "report",
 )
-"""In the order of docs/architecture.md: a station imports only stations before it. One file of `footage/` comes later."""
+"""In the order of docs/architecture.md: a station imports only stations before it. `footage/plates.py` is late."""
 CODE_RUNNING_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib", "yaml"}
 NETWORK_SERVERS = {"http.server", "socketserver", "xmlrpc.server", "wsgiref"}
 
