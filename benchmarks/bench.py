@@ -231,14 +231,14 @@ def plan(
                             scene_key=scene.key,
                             preset=preset,
                             seed=seed,
-                            holdout_phase=_phase(scene),
+                            holdout_phase=hold_out_phase(scene),
                             **common,
                         )
                     )
     return runs, said
 
 
-def _phase(scene: TruthScene) -> int:
+def hold_out_phase(scene: TruthScene) -> int:
     """The hold-out phase that keeps the fewest instants out of training; 0 (used elsewhere) if it can be."""
     if scene.kind == "real":
         return 0
@@ -343,19 +343,26 @@ def work(request: Path, results: Path, jobs: int) -> int:
         raise ValueError("the program was changed while the benchmark ran: start it again")
     truth = load_source(spec.source, results)
     run_name = spec.run_name
-    # The job's parameters name a preset; this process knows one more, with the plan's overrides in it.
-    known = PRESETS[spec.preset]
-    PRESETS[spec.preset] = lambda: _overridden(known(), spec)
-    if config_from_params(spec.params(run_name)) != spec.config():
-        raise ValueError(f"an override of {spec.run_id} is set by the job's parameters: give it there")
-    # A child of a benchmark that was killed a moment ago may still be at its last checkpoint.
-    with locked(truth.shot.root / "bench" / f"{run_name}.lock"):
-        code, device, trained = _train(spec, truth, run_name, jobs)
+    code, device, trained = train_spec(spec, truth, jobs)
     return code or _judge(spec, truth, run_name, results, trained, device)
 
 
+def train_spec(spec: RunSpec, truth: TruthScene, jobs: int) -> tuple[int, str, dict[str, Any]]:
+    """Trains what is not trained yet, alone: (exit code, device, facts of the training that its summary has not)."""
+    run_name, known = spec.run_name, PRESETS[spec.preset]
+    # The job's parameters name a preset; meanwhile this process knows one more, with the plan's overrides in it.
+    PRESETS[spec.preset] = lambda: _overridden(known(), spec)
+    try:
+        if config_from_params(spec.params(run_name)) != spec.config():
+            raise ValueError(f"an override of {spec.run_id} is set by the job's parameters: give it there")
+        # A child of a benchmark that was killed a moment ago may still be at its last checkpoint.
+        with locked(truth.shot.root / "bench" / f"{run_name}.lock"):
+            return _train(spec, truth, run_name, jobs)
+    finally:
+        PRESETS[spec.preset] = known
+
+
 def _train(spec: RunSpec, truth: TruthScene, run_name: str, jobs: int) -> tuple[int, str, dict[str, Any]]:
-    """Trains what is not trained yet: (exit code, device, facts of the training that its summary does not have)."""
     folder = truth.shot.run(run_name)
     path = folder / "bench.json"
     facts: dict[str, Any] = read_json(path) if path.is_file() else {}

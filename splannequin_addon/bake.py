@@ -15,14 +15,23 @@ DIGITS = "######"
 _DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (what Blender gives a new file)
 
 
-def insert(scene: Any, shot: Path, take: str) -> list[str]:
+def insert(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[str]:
     """Puts a take into the scene's compositor, or updates it; returns what was changed, in words.
 
+    Args:
+        scene: the scene.
+        shot: shot folder.
+        take: name of the take.
+        warp: True freezes the plate that is led into the group, False shows the take's own frames, None: as it does.
+
     Raises:
-        contract.JobError: the take has no frames.
+        contract.JobError: the take has no frames, or is to be used as a warp and cannot be.
     """
     frozen, plate = _sources(scene, shot, take)
-    changes = compositor.insert(scene, frozen, plate, _footage(scene, shot, plate), scene.splannequin.insert_at)
+    if warp:
+        _need_warp(shot, frozen)
+    footage = _footage(scene, shot, plate)
+    changes = compositor.insert(scene, frozen, plate, footage, scene.splannequin.insert_at, warp)
     lacking = missing_frames(shot, take, frames_of(scene))
     if lacking:
         changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
@@ -32,7 +41,25 @@ def insert(scene: Any, shot: Path, take: str) -> list[str]:
 def read_ahead(scene: Any, shot: Path, take: str) -> Iterator[None]:
     """Has Blender read what `insert` will need, a picture a turn. JobError as `insert`."""
     frozen, plate = _sources(scene, shot, take)
-    return compositor.read_ahead(frozen, plate if compositor.shows_plate(scene) else None)
+    shown = plate if compositor.shows_plate(scene) else None
+    return compositor.read_ahead(frozen, shown, compositor.wants_warp(scene))
+
+
+def _need_warp(shot: Path, take: compositor.Take) -> None:
+    """JobError if a take cannot freeze a plate that shows frame n at frame n."""
+    name = take.folder.name
+    if not any(take.plate_size):
+        raise contract.JobError(
+            f"The take {name!r} has no warp: it was frozen without detail.",
+            "Freeze it again with detail.",
+            contract.ExitCode.BAKE,
+        )
+    if shots.read(shot).takes.get(name, {}).get("camera_path"):
+        raise contract.JobError(
+            f"The take {name!r} is seen from a camera of your own: its warp looks into other frames of the plate.",
+            "Use its frozen frames, or freeze a take on the clip's own camera.",
+            contract.ExitCode.BAKE,
+        )
 
 
 def _sources(scene: Any, shot: Path, take: str) -> tuple[compositor.Take, Path | None]:

@@ -159,16 +159,26 @@ def new_quotient(tree: Any, picture: Any, value: Any) -> Any:
     """Socket of a picture whose four channels are divided by a value; 0 where that is 0. Until 4.5."""
     node = tree.nodes.new("CompositorNodeMixRGB")
     node.blend_type = "DIVIDE"
-    parts, whole = tree.nodes.new("CompositorNodeSeparateColor"), tree.nodes.new("CompositorNodeSetAlpha")
+    parts = tree.nodes.new("CompositorNodeSeparateColor")
     alpha = new_math_node(tree, "DIVIDE")
-    whole.mode = "REPLACE_ALPHA"
     for source, target in (
         (picture, node.inputs[1]), (value, node.inputs[2]), (picture, parts.inputs[0]),
         (parts.outputs["Alpha"], alpha.inputs[0]), (value, alpha.inputs[1]),
-        (node.outputs[0], whole.inputs["Image"]), (alpha.outputs[0], whole.inputs["Alpha"]),
     ):  # fmt: skip
         tree.links.new(source, target)
-    return whole.outputs[0]
+    return with_alpha(tree, node.outputs[0], alpha.outputs[0])
+
+
+def with_alpha(tree: Any, picture: Any, alpha: Any) -> Any:
+    """Socket of a picture with another alpha; its colours stay. A mix has its first picture's until 5.1, then a mix."""
+    node = tree.nodes.new("CompositorNodeSetAlpha")
+    if HAS_COMPOSITING_GROUP:
+        node.inputs["Type"].default_value = "Replace Alpha"
+    else:
+        node.mode = "REPLACE_ALPHA"
+    tree.links.new(picture, node.inputs["Image"])
+    tree.links.new(alpha, node.inputs["Alpha"])
+    return node.outputs[0]
 
 
 def new_nearest_node(tree: Any) -> Any:
@@ -198,6 +208,48 @@ def new_crop_node(tree: Any, margin: tuple[int, int], size: tuple[int, int]) -> 
         node.min_x, node.max_x = left, left + width
         node.min_y, node.max_y = low + height, low  # the upper one first
     return node
+
+
+def new_look_up(tree: Any, picture: Any, x: Any, y: Any) -> Any:
+    """Socket of a picture's pixels at coordinates x and y, 0..1 over it, each the nearest one, as it is."""
+    place = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeCombineXYZ")
+    place.inputs["Z"].default_value = 1.0  # 0 would be nothing
+    node = tree.nodes.new("CompositorNodeMapUV")
+    if HAS_COMPOSITING_GROUP:
+        node.inputs["Interpolation"].default_value = "Nearest"
+    else:
+        node.filter_type, node.alpha = "NEAREST", 0
+    for source, target in (
+        (x, place.inputs["X"]), (y, place.inputs["Y"]),
+        (picture, node.inputs["Image"]), (place.outputs[0], node.inputs["UV"]),
+    ):  # fmt: skip
+        tree.links.new(source, target)
+    return node.outputs[0]
+
+
+def new_coordinates(tree: Any, vector: Any) -> tuple[Any, Any]:
+    """Sockets of the first two values of a vector."""
+    node = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeSeparateXYZ")
+    tree.links.new(vector, node.inputs[0])
+    return node.outputs["X"], node.outputs["Y"]
+
+
+def sized(tree: Any, picture: Any, size: tuple[int, int]) -> Any:
+    """Socket of a picture brought to a size in pixels; one that has it stays as it is, bit by bit.
+
+    The picture itself before 4.5, where a Scale node leaves no pixel as it is.
+    """
+    if not CROPS_WHOLE:
+        return picture
+    node = tree.nodes.new("CompositorNodeScale")
+    if HAS_COMPOSITING_GROUP:
+        node.inputs["Type"].default_value = "Absolute"
+        node.inputs["Extension X"].default_value = node.inputs["Extension Y"].default_value = "Extend"
+    else:
+        node.space = "ABSOLUTE"
+    node.inputs["X"].default_value, node.inputs["Y"].default_value = size
+    tree.links.new(picture, node.inputs[0])
+    return node.outputs[0]
 
 
 def set_png(settings: Any) -> None:

@@ -3,7 +3,8 @@
 It stands in for the plate where a node of the artist's tree shows it, so that the grade goes on from there; else before
 the output. Nothing else in the tree is touched: the links that leave the plate, or the one into the output, are led
 through the group, and led back when the group is removed. The group reads the take's multilayer EXR files; scene frame
-n shows n.exr.
+n shows n.exr. Where the take was frozen with detail the group can tell plate from splats, and freeze the stream that is
+led into it by the take's warp, see `warp_nodes`.
 """
 
 from __future__ import annotations
@@ -21,16 +22,19 @@ import bpy
 import numpy as np
 
 from ..torch_backend import contract
-from . import compat
+from . import compat, warp_nodes
 
 GROUP_NAME = "Splannequin Freeze"
 _TAG = "splannequin"
 _STANDS_IN = "splannequin_stands_in"
 _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 _BEFORE = "splannequin_before"
+_WARPS = "splannequin_warps"
 _CG = "cg"
 _LAYERS = ("Combined", "Depth", "Support", "Motion")
-"""Of a frozen frame; `_GRAIN` is in some."""
+"""Of a frozen frame; `_GRAIN` and `_DETAIL` are in some."""
+_DETAIL = ("Plate", "Source", "Splat")
+"""Of a frozen frame that was made of plates, too."""
 _FROZEN, _DEPTH = "Frozen", "Depth in scene units"
 """Nodes inside the group."""
 _GAP = 200.0
@@ -57,10 +61,17 @@ class Take:
     """Width and height of the frames in pixels, without overscan."""
     margin: tuple[int, int] = (0, 0)
     """Pixels beyond the frame on the left and right, and above and below: overscan."""
+    plate_size: tuple[int, int] = (0, 0)
+    """Width and height in pixels of the plate that the take's warp is for; (0, 0): it has none."""
 
 
 def insert(
-    scene: Any, take: Take, plate: Path | None = None, footage: Sequence[Path] = (), where: str = "AUTO"
+    scene: Any,
+    take: Take,
+    plate: Path | None = None,
+    footage: Sequence[Path] = (),
+    where: str = "AUTO",
+    warp: bool | None = None,
 ) -> list[str]:
     """Puts the freeze group into the scene's compositor, or updates the one that is there.
 
@@ -71,6 +82,8 @@ def insert(
         footage: files by which a node that shows the plate is known: the plate's, the clip's.
         where: "PLATE" behind the node that shows the plate, "OUTPUT" before the output, "AUTO" the first of these
             that there is. A group that is there already stays where it is with "AUTO".
+        warp: the group freezes the stream that is led into it, by the take's warp, instead of showing the take's own
+            frames; None: as it does, or not.
 
     Returns:
         What was changed, one sentence each.
@@ -81,7 +94,8 @@ def insert(
     """
     changes: list[str] = []
     behind = _place_of(scene, footage, where)
-    frozen, stream = _frozen_image(take), None
+    wanted = wants_warp(scene) if warp is None else warp
+    frozen, flow, stream = _frozen_image(take), _warp_image(take) if wanted else None, None
     if plate is not None and shows_plate(scene):
         stream = load_sequence(plate, _plate_name(plate), "srgb")
     enabled = compat.compositor_enabled(scene)
@@ -108,9 +122,9 @@ def insert(
             changes.append(f'The node group "{GROUP_NAME}" was moved.')
         _set_defaults(node, _give_sockets(node.node_tree))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
-    _fill_group(scene, node.node_tree, take, frozen)
-    if node.inputs[_GRAIN].default_value and _GRAIN not in node.node_tree.nodes:
-        changes.append("The take has no grain to add: freeze it again.")
+    changes += _switch_warp(node, wanted, flow is not None)
+    _fill_group(scene, node, take, frozen, flow)
+    changes += _lacking(node)
     if stream is not None:
         _show_plate(scene, tree, node, stream, take)
     return changes
@@ -119,16 +133,61 @@ def insert(
 def _frozen_image(take: Take) -> Any:
     """The take's frames as a data-block. ValueError if they lack a layer."""
     image = load_sequence(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")
+    return _with_layers(image, take, _LAYERS)
+
+
+def _warp_image(take: Take) -> Any | None:
+    """The take's warp as a data-block, None if it has none. ValueError if it lacks a layer."""
+    return _with_layers(load_sequence(*_warp_picture(take)), take, warp_nodes.LAYERS) if any(take.plate_size) else None
+
+
+def _with_layers(image: Any, take: Take, names: Sequence[str]) -> Any:
+    """A sequence of the take, once it is known to have some layers. ValueError if not."""
     group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
     try:
         node = group.nodes.new("CompositorNodeImage")
         show_sequence(node, image, take.first, take.last)
-        missing = [n for n in _LAYERS if n not in node.outputs]
+        missing = [n for n in names if n not in node.outputs]
     finally:
         bpy.data.node_groups.remove(group)
     if missing:
         raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
     return image
+
+
+def _switch_warp(node: Any, wanted: bool, possible: bool) -> list[str]:
+    """Gives our node the factor of the warp, or takes it away; says what was changed. The inside is not touched."""
+    group, face, name = node.node_tree, node.node_tree.interface, warp_nodes.FACTOR
+    there = [i for i in face.items_tree if i.item_type == "SOCKET" and i.in_out == "INPUT" and i.name == name]
+    group[_WARPS] = wanted
+    if wanted and possible and not there:
+        text = "1: the plate that you lead in, frozen by the take's warp; 0: the take's own frames"
+        _factor(face.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat", description=text), 1.0)
+        node.inputs[name].default_value = 1.0
+        return ["What is led into the group is frozen by the take's warp, with its own values."]
+    if there and not (wanted and possible):
+        face.remove(there[0])
+        why = "The take has no warp: its own frames are shown." if wanted else "The take's own frames are shown again."
+        return [why]
+    return []
+
+
+def wants_warp(scene: Any) -> bool:
+    """True if the scene's freeze group freezes the stream that is led into it, or would if its take had a warp."""
+    tree = compat.compositor_tree(scene)
+    node = group_node(tree) if tree else None
+    return node is not None and bool(node.node_tree.get(_WARPS))
+
+
+def _lacking(node: Any) -> list[str]:
+    """What our node is asked for that the take does not have, in words."""
+    inside, asked = node.node_tree.nodes, []
+    if node.inputs[_GRAIN].default_value and _GRAIN not in inside:
+        asked.append("The take has no grain to add: freeze it again.")
+    frozen = inside[_FROZEN].outputs
+    if (node.inputs["Splat"].default_value or node.inputs[_INVENTED].default_value) and "Plate" not in frozen:
+        asked.append("The take does not tell plate from splats: it was frozen without detail.")
+    return asked
 
 
 def shows_plate(scene: Any) -> bool:
@@ -229,7 +288,18 @@ def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
     numbers = frame_numbers(folder)
     if not numbers:
         raise FileNotFoundError(f"{folder} holds no frozen frames (NNNNNN.exr)")
-    return Take(folder, numbers[0], numbers[-1], depth_scale, *exr_windows(frame_path(folder, numbers[0])))
+    windows = exr_windows(frame_path(folder, numbers[0]))
+    return Take(folder, numbers[0], numbers[-1], depth_scale, *windows, _plate_size(folder, numbers))
+
+
+def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:
+    """Width and height of the plate that a take's warp is for; (0, 0) if a frame lacks its warp."""
+    folder = take / warp_nodes.FOLDER
+    if set(numbers) - set(frame_numbers(folder)):
+        return 0, 0
+    header = _exr_header(frame_path(folder, numbers[0]))
+    found = [_exr_value(header, f"splannequin:{name}", "int", "<i") for name in ("plateWidth", "plateHeight")]
+    return (found[0][0], found[1][0]) if found[0] and found[1] else (0, 0)
 
 
 def exr_size(path: Path) -> tuple[int, int]:
@@ -243,22 +313,29 @@ def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     From its header: Blender says 0 x 0 of a multilayer file. ValueError without one, or for margins that are not the
     same on opposite sides: Blender centres the pixels, wherever the frame lies in them.
     """
-    with contract.open_regular(path) as source:
-        header = source.read(16384)
-    if header[:4] != b"\x76\x2f\x31\x01":
+    header = _exr_header(path)
+    frame, data = (_exr_value(header, name, "box2i", "<4i") for name in ("displayWindow", "dataWindow"))
+    if frame is None or data is None:
         raise ValueError(f"{path} is no OpenEXR file: render the take again")
-    boxes = []
-    for name in (b"displayWindow", b"dataWindow"):
-        key = name + b"\0box2i\0"
-        at = header.find(key)
-        if at < 0:
-            raise ValueError(f"{path} is no OpenEXR file: render the take again")
-        boxes.append(struct.unpack_from("<4i", header, at + len(key) + 4))
-    (left, top, right, bottom), (data_left, data_top, data_right, data_bottom) = boxes
+    (left, top, right, bottom), (data_left, data_top, data_right, data_bottom) = frame, data
     margin = (left - data_left, top - data_top)
     if margin != (data_right - right, data_bottom - bottom) or min(margin) < 0:
         raise ValueError(f"{path} does not reach equally far beyond its frame on all sides: render the take again")
     return (right - left + 1, bottom - top + 1), margin
+
+
+def _exr_header(path: Path) -> bytes:
+    """What a file begins with, attributes first; empty if it is no OpenEXR file."""
+    with contract.open_regular(path) as source:
+        header = source.read(16384)
+    return header if header[:4] == b"\x76\x2f\x31\x01" else b""
+
+
+def _exr_value(header: bytes, name: str, kind: str, form: str) -> tuple[Any, ...] | None:
+    """Value of an attribute, as `struct` unpacks it; None if the header lacks it."""
+    key = f"{name}\0{kind}\0".encode()
+    at = header.find(key)
+    return None if at < 0 else struct.unpack_from(form, header, at + len(key) + 4)
 
 
 def frame_numbers(folder: Path, suffix: str = ".exr") -> list[int]:
@@ -278,14 +355,21 @@ _ahead: set[str] = set()
 """Files that `read_ahead` has just had read: the next `load_sequence` takes them as they are."""
 
 
-def read_ahead(take: Take, plate: Path | None = None) -> Iterator[None]:
+def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Iterator[None]:
     """Has Blender read what `insert` needs, one picture a turn: it does so while its window stands still."""
     wanted = [(frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")]
+    if warp and any(take.plate_size):
+        wanted.append(_warp_picture(take))
     if plate is not None:
         wanted.append((plate, _plate_name(plate), "srgb"))
     for path, name, encoding in wanted:
         _read(path, name, encoding, take)
         yield
+
+
+def _warp_picture(take: Take) -> tuple[Path, str, str]:
+    """File, name and encoding of a take's warp."""
+    return frame_path(take.folder / warp_nodes.FOLDER, take.first), f"Warp {take.folder.name}", "linear"
 
 
 def forget_ahead() -> None:
@@ -360,12 +444,25 @@ _FACTORS = (
     ("Only Moving", 0.0, "1: your stream shows through where nothing moves in the footage"),
 )
 _GRAIN = "Grain"
+_INVENTED = "Show What Is Invented"
+_LOOKS = (
+    ("Splat", 0.0, "1: the splats alone, as they were before the plates' pixels came in"),
+    (_INVENTED, 0.0, "1: what splats made up is tinted, what comes from a plate is not"),
+)
+"""Factors of what only takes with detail can show."""
 _OUT = (
     ("Image", "NodeSocketColor", "Frozen frame, scene-linear"),
     ("Depth", "NodeSocketFloat", "Distance along the camera's axis in scene units; 1e10 where there is nothing"),
     ("Support", "NodeSocketFloat", "1 where the footage saw this at the frozen instant, 0 where it is a guess"),
     ("Motion", "NodeSocketFloat", "1 where things move in the footage, 0 where they never do"),
+    ("Plate", "NodeSocketFloat", "1 where the pixel is a plate's, 0 where splats made it up"),
+    ("Source", "NodeSocketFloat", "Number of the frame whose plate gives most of the pixel"),
 )
+
+
+def _factor(socket: Any, value: float) -> None:
+    """Makes a new socket of a group a factor from 0 to 1."""
+    socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
 
 
 def _give_sockets(group: Any) -> set[str]:
@@ -382,10 +479,10 @@ def _give_sockets(group: Any) -> set[str]:
         return face.new_socket(name, in_out=side, socket_type=kind, description=text)
 
     new("Image", "INPUT", "NodeSocketColor", "Your stream, up to here")
-    for name, value, text in _FACTORS:
+    for name, value, text in (*_FACTORS, *_LOOKS):
         socket = new(name, "INPUT", "NodeSocketFloat", text)
         if socket is not None:
-            socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
+            _factor(socket, value)
     grain = new(
         _GRAIN, "INPUT", "NodeSocketFloat", "0: the frozen frame is clean, 1: it has as much grain as the plate"
     )
@@ -404,7 +501,7 @@ def _give_sockets(group: Any) -> set[str]:
 
 def _set_defaults(node: Any, names: set[str]) -> None:
     """Gives the named inputs of our node their values: a node does not always take its group's."""
-    for name, value, _ in _FACTORS:
+    for name, value, _ in (*_FACTORS, *_LOOKS):
         if name in names:
             node.inputs[name].default_value = value
     if _GRAIN in names:
@@ -530,8 +627,9 @@ def _conforms(scene: Any, node: Any, plate: Any) -> bool:
     return node.bl_idname == "CompositorNodeScale" and tuple(data.size) != render_size(scene)
 
 
-def _fill_group(scene: Any, group: Any, take: Take, image: Any) -> None:
-    """(Re)builds the inside of the group; its sockets, and so the links around it, stay."""
+def _fill_group(scene: Any, node: Any, take: Take, image: Any, warp: Any | None) -> None:
+    """(Re)builds the inside of our node's group; its sockets, and so the links around it, stay."""
+    group, shown = node.node_tree, {i.name for i in (image, warp) if i is not None}
     old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image} - {_RAMP}
     group.nodes.clear()
     enter = group.nodes.new("NodeGroupInput")
@@ -546,7 +644,13 @@ def _fill_group(scene: Any, group: Any, take: Take, image: Any) -> None:
     enter.location, frozen.location = (-2 * _GAP, 150.0), (-3 * _GAP, -100.0)
     mix.location, depth.location, leave.location = (3 * _GAP, 150.0), (_GAP, -100.0), (4 * _GAP, 0.0)
 
-    fitted = _fitted(scene, group, take, frozen)
+    layers = {n: frozen.outputs[n] for n in (*_LAYERS, _GRAIN, *_DETAIL) if n in frozen.outputs}
+    if warp is not None:
+        layers["Combined"] = _warped(group, enter, layers["Combined"], warp, take)
+    if "Plate" in layers:
+        layers["Combined"] = _looked_at(group, enter, layers)
+    layers.pop("Splat", None)
+    fitted = _fitted(scene, group, take, layers)
     share = _share(group, enter, fitted)
     nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0])
     group.links.new(share, factor)
@@ -556,12 +660,56 @@ def _fill_group(scene: Any, group: Any, take: Take, image: Any) -> None:
     group.links.new(mixed, leave.inputs["Image"])
     group.links.new(fitted["Depth"], depth.inputs[0])
     group.links.new(depth.outputs[0], leave.inputs["Depth"])
-    group.links.new(fitted["Support"], leave.inputs["Support"])
-    group.links.new(fitted["Motion"], leave.inputs["Motion"])
-    for name in old - {image.name}:
+    if "Source" in fitted:  # numbers, whatever scaling made of them
+        whole = compat.new_math_node(group, "ROUND")
+        group.links.new(fitted["Source"], whole.inputs[0])
+        fitted["Source"] = whole.outputs[0]
+    for name in ("Support", "Motion", "Plate", "Source"):
+        if name in fitted:
+            group.links.new(fitted[name], leave.inputs[name])
+    for name in old - shown:
         stale = bpy.data.images.get(name)
         if stale is not None and stale.users == 0:
             bpy.data.images.remove(stale)
+
+
+def _warped(group: Any, enter: Any, own: Any, image: Any, take: Take) -> Any:
+    """Socket of the frozen picture: the take's own, or what is led into the group, frozen by the take's warp."""
+    reader = group.nodes.new("CompositorNodeImage")
+    reader.name = reader.label = "Warp"
+    reader.location = (-3 * _GAP, -1500.0)
+    show_sequence(reader, image, take.first, take.last)
+    frozen = warp_nodes.frozen(group, enter.outputs["Image"], reader.outputs, take.plate_size)
+    node, factor, first, second, mixed = compat.new_mix_node(group)
+    node.label, node.location = warp_nodes.FACTOR, (-2 * _GAP, 330.0)
+    group.links.new(enter.outputs[warp_nodes.FACTOR], factor)
+    group.links.new(own, first)
+    group.links.new(frozen, second)
+    return mixed
+
+
+_TINT, _TINTED = (1.0, 0.0, 0.4, 1.0), 0.6
+"""Colour that shows what is invented, and how much of it there is where nothing is plate."""
+
+
+def _looked_at(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+    """Socket of the frozen picture, or of the splats alone, with what is invented tinted as much as is asked for."""
+    node, factor, first, second, chosen = compat.new_mix_node(group)
+    node.label, node.location = "Splat", (-2 * _GAP, 500.0)
+    group.links.new(enter.outputs["Splat"], factor)
+    group.links.new(layers["Combined"], first)
+    group.links.new(layers["Splat"], second)
+    # tinted * (1 - plate), by as much as is asked for
+    invented = compat.new_math_node(group, "MULTIPLY_ADD")
+    invented.inputs[1].default_value, invented.inputs[2].default_value = -_TINTED, _TINTED
+    group.links.new(layers["Plate"], invented.inputs[0])
+    amount = _product(group, enter.outputs[_INVENTED], invented.outputs[0])
+    tint, factor, first, second, tinted = compat.new_mix_node(group)
+    tint.label, second.default_value = _INVENTED, _TINT
+    group.links.new(amount, factor)
+    group.links.new(chosen, first)
+    invented.location, tint.location = (-2 * _GAP, 670.0), (-_GAP, 500.0)
+    return tinted
 
 
 def _grainy(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
@@ -735,13 +883,12 @@ def show_sequence(user: Any, image: Any, first: int, last: int) -> None:
     user.use_auto_refresh = True
 
 
-def _fitted(scene: Any, group: Any, take: Take, frozen: Any) -> dict[str, Any]:
-    """The frozen layers' sockets: without overscan, and scaled to the render's size, whatever that is when it renders.
+def _fitted(scene: Any, group: Any, take: Take, layers: dict[str, Any]) -> dict[str, Any]:
+    """The layers' sockets, by name: without overscan, and scaled to the render's size, whatever it is when it renders.
 
     Frames wider than the scene's picture are cut, as the camera sees it; flatter ones leave bars.
     """
-    names = _LAYERS + ((_GRAIN,) if _GRAIN in frozen.outputs else ())
-    sockets = {n: frozen.outputs[n] for n in names}
+    names, sockets = tuple(layers), dict(layers)
     for row, name in enumerate(names if any(take.margin) else ()):
         node = compat.new_crop_node(group, take.margin, take.size)
         node.label = f"{name} without overscan"

@@ -198,7 +198,7 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
         steps.run(scene, "freeze", params, console)
     if cameras.find(scene, shot, "CAMERA") is None and (shot / "solve" / "cameras.json").is_file():
         steps.load_camera(scene, shot)
-    baked = _bake(scene, fresh, shot, args.take, output, console, span)
+    baked = _bake(scene, fresh, shot, args.take, output, console, span, args.as_warp or None)
     path = output / "summary.json"
     summary = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
@@ -279,13 +279,20 @@ def _fit_range(scene: Any, shot: Path, take: str) -> None:
 
 
 def _bake(
-    scene: Any, fresh: bool, shot: Path, take: str, output: Path, console: Console, span: range | None = None
+    scene: Any,
+    fresh: bool,
+    shot: Path,
+    take: str,
+    output: Path,
+    console: Console,
+    span: range | None = None,
+    warp: bool | None = None,
 ) -> dict[str, Any]:
     """Compositor, render of `span` (None: the scene's range), shot.blend; returns what the summary tells of it."""
     changes = bake.fit_take(scene, shot, take, fresh) if fresh or scene_setup.fitted(scene) else []
     if span is not None:
         scene.frame_start, scene.frame_end, scene.frame_step = span.start, span.stop - 1, span.step
-    changes += steps.insert_freeze(scene, shot, take)
+    changes += steps.insert_freeze(scene, shot, take, warp)
     for change in changes:
         console.say(f"  {change}")
     folder = output / "composited"
@@ -454,6 +461,8 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--step", type=int, default=0, help="bake every n-th frame (0: the scene's step)")
     _add_device_flag(one)
     one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
+    text = "freeze the plate that the .blend shows by the take's warp, instead of showing the take's frames"
+    one.add_argument("--as-warp", action="store_true", help=text)
     one.add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # to the launcher, by the standard input
     one = add("stmaps", write_stmaps, "ST maps of the lens, both ways, into SHOT/solve.")
     one.add_argument("shot", help="shot folder")

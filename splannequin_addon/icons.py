@@ -14,6 +14,7 @@ OF = {
     "splannequin.export_cameras": "EXPORT",
     "splannequin.freeze": "FREEZE",
     "splannequin.import_clip": "IMPORT",
+    "splannequin.freeze_as_warp": "MOD_WARP",
     "splannequin.insert_freeze": "NODE_COMPOSITING",
     "splannequin.live": "HIDE_OFF",
     "splannequin.load_camera": "OUTLINER_OB_CAMERA",

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..torch_backend import contract
-from . import backend, bake, cameras, markers, steps, supervisor, viewport
+from . import backend, bake, cameras, compositor, markers, steps, supervisor, viewport
 from .translations import tr
 
 
@@ -240,6 +240,20 @@ class SPLANNEQUIN_OT_insert_freeze(bpy.types.Operator):
         return _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take))
 
 
+class SPLANNEQUIN_OT_freeze_as_warp(bpy.types.Operator):
+    """Freeze your own plate, whatever is led into the group, instead of showing the take's frames: it keeps its own
+    grade, highlights and grain. Press again to show the take's frames"""
+
+    bl_idname = "splannequin.freeze_as_warp"
+    bl_label = "Freeze as Warp"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Inserts or updates the group, the other way."""
+        take, warp = context.scene.splannequin.take_name, not compositor.wants_warp(context.scene)
+        return _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take, warp))
+
+
 class SPLANNEQUIN_OT_combine_cg(bpy.types.Operator):
     """Lead the scene's own render into the freeze, so that your objects stand in front of and behind the frozen people
     by depth. Sets the film transparent and the depth pass on"""
@@ -391,6 +405,7 @@ CLASSES = (
     SPLANNEQUIN_OT_render,
     SPLANNEQUIN_OT_load_camera,
     SPLANNEQUIN_OT_insert_freeze,
+    SPLANNEQUIN_OT_freeze_as_warp,
     SPLANNEQUIN_OT_combine_cg,
     SPLANNEQUIN_OT_remove_shot,
     SPLANNEQUIN_OT_t_star_here,

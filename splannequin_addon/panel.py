@@ -618,7 +618,7 @@ class SPLANNEQUIN_PT_bake(_StepPanel, bpy.types.Panel):
         layout.prop(context.scene.splannequin, "insert_at")
         name = "splannequin.insert_freeze"
         layout.operator(name, text="Insert in Compositor Only", icon=icons.of(name))
-        for name in ("splannequin.combine_cg", "splannequin.remove_shot"):
+        for name in ("splannequin.freeze_as_warp", "splannequin.combine_cg", "splannequin.remove_shot"):
             layout.operator(name, icon=icons.of(name))
 
 

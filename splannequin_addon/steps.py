@@ -340,11 +340,11 @@ def load_camera(scene: Any, shot: Path) -> list[str]:
     return [f"{camera.name} is the scene's camera, with the plate behind it.", *changes]
 
 
-def insert_freeze(scene: Any, shot: Path, take: str) -> list[str]:
-    """Puts a take into the scene's compositor, and keeps the plate's colours if the artist consents."""
+def insert_freeze(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[str]:
+    """Puts a take into the scene's compositor, or its warp, and keeps the plate's colours if the artist consents."""
     with intact.scene_of(scene):
         changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
-        return bake.insert(scene, shot, take) + changes
+        return bake.insert(scene, shot, take, warp) + changes
 
 
 def combine_cg(scene: Any, shot: Path) -> list[str]:

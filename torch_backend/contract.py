@@ -223,7 +223,9 @@ class FreezeParams:
     query: str = "nearest"
     """nearest: each Gaussian is asked at its nearest supported time to t*; plain: at t* itself."""
     width: int = 0
-    """Width in pixels of the frozen frames; 0: the preset's delivery size."""
+    """Width in pixels of the frozen frames; 0: the source's own."""
+    detail: str = "on"
+    """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
     overscan: float = 0.0
     """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
     lens needs. `width` is that of the frame without it."""
@@ -300,7 +302,7 @@ LIMITS: dict[type, dict[str, Limit]] = {
         "first": Limit("first frame", -_FRAMES, _FRAMES),
         "last": Limit("last frame", -_FRAMES, _FRAMES),
         "step": Limit("step between frozen frames", 1, 1_000_000),
-        "width": Limit("width of the frozen frames", 16, 16_384, {0: "the training's"}),
+        "width": Limit("width of the frozen frames", 16, 16_384, {0: "the source's"}),
         "overscan": Limit("overscan in percent", 0, 100, {-1: "what the lens needs"}),
     },
 }

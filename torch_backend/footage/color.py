@@ -100,6 +100,7 @@ PRIMARIES: dict[str, tuple[str, Chromaticities]] = {
 DIFFUSE_WHITE_NITS = 203.0
 """Luminance of white in HDR footage, which becomes 1 (ITU-R BT.2408)."""
 _HLG_PEAK_NITS, _HLG_GAMMA = 1000.0, 1.2
+_HALF_MAX = 65504.0
 _REC2020_LUMA = np.array([0.2627, 0.6780, 0.0593], np.float32)
 
 
@@ -225,12 +226,31 @@ class InputSpace:
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=65504.0, neginf=0.0)
         if self.as_it_stands:
             return np.clip(pixels, 0.0, 1.0), 0.0
+        light, encode = self._light(pixels)
+        clipped = float((light > 1.0 + 1e-6).any(axis=-1).mean()) if self.is_light else 0.0
+        return encode(np.clip(light, 0.0, 1.0)), clipped
+
+    def to_linear(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[H, W, 3] as read to scene-linear Rec.709, values below 0 and above 1 kept; `to_srgb` is this, cut, encoded.
+
+        NaN becomes 0, what a half float cannot hold the most that it can.
+        """
+        pixels = np.nan_to_num(pixels, nan=0.0, posinf=_HALF_MAX, neginf=-_HALF_MAX)
+        if self.as_it_stands:
+            light = srgb_to_linear(pixels)
+        else:
+            light, encode = self._light(pixels)
+            # A picture made for a display is taken as it stands once its primaries are ours: not its light is.
+            light = light if self.is_light else srgb_to_linear(encode(light))
+        return np.clip(np.nan_to_num(light, nan=0.0), -_HALF_MAX, _HALF_MAX)
+
+    def _light(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], Callable]:
+        """Light of these numbers, with Rec.709's primaries, and the curve by which it leaves."""
         decode, encode = _DISPLAY.get(self.transfer) or (_SCENE[self.transfer], linear_to_srgb)
         light = decode(pixels)
         if self._wide is not None:
             light = light @ to_rec709(self._wide).T.astype(np.float32)
-        clipped = float((light > 1.0 + 1e-6).any(axis=-1).mean()) if self.is_light else 0.0
-        return encode(np.clip(light, 0.0, 1.0)), clipped
+        return light, encode
 
 
 def named_space(name: str) -> InputSpace | None:

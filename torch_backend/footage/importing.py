@@ -17,7 +17,7 @@ from ..contract import LAST_FRAME, JobError, Reporter, frame_file, read_json
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import is_whole_png, resize, working_size, write_png
-from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, footage_error, frame_words, open_source
+from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, SourceInfo, footage_error, frame_words, open_source
 
 FRAMES_VERSION = 1
 FRAMES_FILE = "frames.json"
@@ -76,8 +76,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     _check(config)
     opened = open_source(source, config.fps, config.layer)
     _check_range(opened, config)
-    asked = {name: value for name, value in asdict(config).items() if name != "layer" or value}
-    key = content_key(FRAMES_VERSION, opened.info.key, asked)
+    key = import_key(opened.info, config)
     restore_folder(shot.frames)
     for folder in (shot.frames / "raw", shot.solve):
         shot.own(folder)
@@ -96,6 +95,12 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
         _keep_strangers(shot.frames, fresh, record)
     _publish(shot, record, source)
     return _result(shot, record)
+
+
+def import_key(info: SourceInfo, config: FootageConfig) -> str:
+    """What tells an import from others: of which footage it is, and what was taken of it."""
+    asked = {name: value for name, value in asdict(config).items() if name != "layer" or value}
+    return content_key(FRAMES_VERSION, info.key, asked)
 
 
 def load_frames(shot: Shot) -> dict[str, Any]:
@@ -307,6 +312,9 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "colour": info.colour,
         "reading": info.reading,
         "bits": 16 if info.deep else 8,
+        "source_size": [info.width, info.height],
+        "extended": info.extended,
+        "start": start,
         "step": step,
         "config": asdict(config),
         "key": key,

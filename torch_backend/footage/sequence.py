@@ -16,12 +16,15 @@ from fileseq.exceptions import FileSeqException
 from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
+from . import codes
 from .color import InputSpace, named_space, space_of_chromaticities
 from .images import resize, told_by
 from .layers import Layer, find_layer, shown
 from .sources import (
     FASTEST_FPS,
     SLOWEST_FPS,
+    Known,
+    PlateReader,
     SourceFrame,
     SourceInfo,
     believable_aspect,
@@ -115,6 +118,7 @@ class SequenceSource:
             first=min(self._files),
             last=max(self._files),
             deep=light or not space.as_it_stands or str(spec.format) not in ("uint8", "int8"),
+            extended=light or not space.as_it_stands or str(spec.format) in ("half", "float", "double"),
             colour="linear" if light else "srgb",
             # Without the folder: footage and shot may have been moved together. What is read otherwise than it used to
             # be is imported again.
@@ -191,8 +195,34 @@ class SequenceSource:
             "Open one in Blender to see whether it is whole.",
         )
 
+    def plates(self, known: Known) -> PlateReader:
+        """See `Source.plates`."""
+        return self
+
+    def plate(self, number: int) -> NDArray:
+        """See `PlateReader.plate`."""
+        if number not in self._files:
+            raise footage_error(f"Frame {number} of the sequence is not there any more.", "Put it back.")
+        rgb = self._stored_pixels(self._files[number], _Met())
+        if self.info.extended:
+            rgb = codes.half_of(rgb, self._space)
+        elif self.info.deep:
+            rgb = np.rint(np.clip(rgb, 0.0, 1.0) * np.float32(65535.0)).astype(np.uint16)
+        return codes.resize_plate(np.ascontiguousarray(rgb), self.info.width, self.info.height)
+
+    def close(self) -> None:
+        """See `PlateReader.close`: files are not kept open."""
+
     def _read(self, file: Path, met: _Met) -> tuple[NDArray, float]:
         """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels. OSError if unreadable."""
+        rgb, clipped = self._stored_pixels(file, met), 0.0
+        if self.info.deep:
+            rgb, clipped = self._space.to_srgb(rgb)
+            rgb = np.rint(rgb * np.float32(65535.0)).astype(np.uint16)
+        return resize(np.ascontiguousarray(rgb), self.info.width, self.info.height), clipped
+
+    def _stored_pixels(self, file: Path, met: _Met) -> NDArray:
+        """[h, w, 3] of the layer, straight, in the file's space and pixels: uint8, or float32 if the source is deep."""
         (spec, buffer, failed), layer = _open(file, self._layer.part), self._layer
         if spec.channelnames != self._channels:
             layer = self._same_layer(file)
@@ -223,11 +253,7 @@ class SequenceSource:
             met.transparent |= bool((alpha[inner] < opaque).any())
             if not spec.get_int_attribute("oiio:UnassociatedAlpha"):
                 rgb = _straight(rgb, alpha, opaque)
-        clipped = 0.0
-        if self.info.deep:
-            rgb, clipped = self._space.to_srgb(rgb)
-            rgb = np.rint(rgb * np.float32(65535.0)).astype(np.uint16)
-        return resize(np.ascontiguousarray(rgb), self.info.width, self.info.height), clipped
+        return rgb
 
     def _same_layer(self, file: Path) -> Layer:
         """Where the sequence's layer lies in a file whose channels are others than the first one's."""

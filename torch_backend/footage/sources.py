@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -53,6 +53,8 @@ class SourceInfo:
     """Number of the last frame; None where the container does not say."""
     deep: bool
     """True if working frames keep 16 bits."""
+    extended: bool
+    """True if its plates may hold values below 0 and above 1: light, floats, other primaries than Rec.709."""
     colour: str
     """srgb, or linear for pictures that hold light: scene-linear, log, HDR."""
     key: list
@@ -69,6 +71,37 @@ class Source(Protocol):
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
         """Frames `first` to `last`, inclusive, in order. Those that cannot be decoded are left out, with a warning."""
+        ...
+
+    def plates(self, known: Known) -> PlateReader:
+        """Reads single frames of an import of this source again, at the source's own size and depth."""
+        ...
+
+
+@dataclass
+class Known:
+    """What an import found out about the frames that are now read again."""
+
+    seconds: dict[int, float]
+    """Time of each listed frame since the first of them, by its number."""
+    start: float | None
+    """Time of the first listed frame on the source's own clock; None if the import did not record it."""
+    agrees: Callable[[int, NDArray], bool]
+    """Whether a frame's plate shows what its working frame shows."""
+
+
+class PlateReader(Protocol):
+    """Single frames of a source, in any order; ascending ones, and their near neighbours, are quick."""
+
+    def plate(self, number: int) -> NDArray:
+        """Frame `number`, upright, with square pixels, uncut, as `codes` has it.
+
+        OSError or JobError (FOOTAGE) if it cannot be read.
+        """
+        ...
+
+    def close(self) -> None:
+        """Frees what is held open."""
         ...
 
 

@@ -14,10 +14,20 @@ from av.error import FFmpegError
 from av.video.reformatter import Colorspace, Interpolation
 from numpy.typing import NDArray
 
+from . import codes
 from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
 from .images import resize
-from .sources import SourceFrame, SourceInfo, believable_aspect, footage_error, frame_words, square_size
+from .sources import (
+    Known,
+    PlateReader,
+    SourceFrame,
+    SourceInfo,
+    believable_aspect,
+    footage_error,
+    frame_words,
+    square_size,
+)
 
 NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
 """FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
@@ -84,6 +94,7 @@ class VideoSource:
             first=1,
             last=count or None,
             deep=self._deep,
+            extended=not self._space.as_it_stands,
             colour="linear" if self._space.is_light else "srgb",
             # What is read otherwise than it used to be is imported again; all else keeps its key.
             key=[path.name, stat.st_size, stat.st_mtime_ns, *([] if self._space.as_it_stands else [self._space.name])],
@@ -125,6 +136,35 @@ class VideoSource:
                     "The file is damaged there: copy or export it again.",
                 )
             )
+
+    def plates(self, known: Known) -> PlateReader:
+        """See `Source.plates`."""
+        from .seeking import VideoReader  # it stands on this module
+
+        return VideoReader(self, known)
+
+    def plate_of(self, frame: av.VideoFrame) -> NDArray:
+        """A decoded frame as a plate, see `codes`. JobError if its size is not the clip's."""
+        if (frame.width, frame.height) != self._size:
+            raise footage_error(f"{self.path.name} is not the clip that was imported: its size changes.")
+        if self._space.as_it_stands:
+            pixels = _rgb(frame, "rgb48le" if self._deep else "rgb24")
+        else:
+            pixels = codes.half_of(_exact_rgb(frame), self._space)
+        pixels = codes.resize_plate(pixels, *square_size(frame.width, frame.height, self._aspect))
+        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
+
+    def decode(self, container: Any, stream: Any) -> Iterator[Any]:
+        """Frames from where a container of `open` stands, and errors in the place of what cannot be decoded."""
+        return _decoded(container, stream)
+
+    def open(self, threads: int) -> tuple[Any, Any]:
+        """The container and its stream, to be decoded by at most so many threads. JobError if it cannot be opened."""
+        container = self._open()
+        stream = _best_stream(container, self.path)
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = threads
+        return container, stream
 
     def _stop_at_change(self, number: int, got: int, frame: av.VideoFrame) -> None:
         """A stream may change its size midway; the shot has one, and ends there."""

@@ -1,12 +1,12 @@
-"""Frozen frames as OpenEXR: colour, depth and both mattes in one single-part file.
+"""Frozen frames as OpenEXR: colour, depth, mattes and what the frame was made of, in one single-part file.
 
 Channel names were chosen by experiment with the bpy wheels 4.2.23, 4.5.15, 5.0.1 and 5.2.3. With `CHANNELS`, Blender
 loads the file as MULTILAYER, "Linear Rec.709", and the compositor's Image node shows the sockets Combined, Alpha,
 Depth, Motion and Support in all four versions, values bit-exact; R G B A Z are plain, so Nuke and other readers show
-`rgba` and `depth` at once and find `Support` and `Motion` as further layers. With `GRAIN_CHANNELS` a socket Grain joins
-them, a colour. Rejected: `Frozen.Combined.R ...` (same
-sockets, but no plain RGBA elsewhere); plain RGBA with `Frozen.Support.V` (a second layer, so the mattes are not on
-the same node); a lone `.R` or `.A` in a matte (aborts 5.2.3 with corrupted memory).
+`rgba` and `depth` at once and find `Support` and `Motion` as further layers. With `GRAIN_CHANNELS` a socket Grain, a
+colour, joins them; with `DETAIL_CHANNELS` Splat, a colour, and Plate and Source, values. Rejected:
+`Frozen.Combined.R ...` (same sockets, but no plain RGBA elsewhere); plain RGBA with `Frozen.Support.V` (a second layer,
+so the mattes are not on the same node); a lone `.R` or `.A` in a matte (aborts 5.2.3 with corrupted memory).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import errno
 import math
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +29,8 @@ CHANNELS = ("R", "G", "B", "A", "Z", "Support.V", "Motion.V")
 """Channel names in the order of the arrays: colour, depth, support matte, motion matte."""
 GRAIN_CHANNELS = ("Grain.R", "Grain.G", "Grain.B", "Grain.A")
 """Channel names of the grain, which a frame may lack."""
+DETAIL_CHANNELS = ("Splat.R", "Splat.G", "Splat.B", "Splat.A", "Plate.V", "Source.V")
+"""Channel names of `DetailLayers`, which a frame of splats alone lacks."""
 BLENDER_SOCKETS = ("Combined", "Alpha", "Depth", "Motion", "Support")
 """Outputs of Blender's compositor Image node for such a file, 4.2 to 5.2."""
 HALF_MAX = 65504.0
@@ -38,6 +41,10 @@ COLOR_SPACE = "lin_rec709_scene"
 """Scene-linear, Rec.709 / sRGB primaries, D65 (ASWF colour interop id, written as `colorInteropID`)."""
 
 _FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) + (oiio.HALF,) * 2
+# A half counts frames up to 2048 only.
+_DETAIL_FORMATS = (oiio.HALF,) * 5 + (oiio.FLOAT,)
+_COLOURS = ("rgba", "splat")
+_ROWS = 64
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -63,6 +70,18 @@ class FrameMetadata:
 
 
 @dataclass(frozen=True, eq=False)
+class DetailLayers:
+    """Where the pixels of a frame come from that is made of plates as well as of splats."""
+
+    splat: ArrayLike
+    """[H,W,4] scene-linear, premultiplied: the frame as the splats alone show it."""
+    plate: ArrayLike
+    """[H,W] in 0..1: share of the pixel that is plate; 0 where splats invented it."""
+    source: ArrayLike
+    """[H,W] number of the frame whose plate gives most of the pixel; 0 where `plate` is 0."""
+
+
+@dataclass(frozen=True, eq=False)
 class FrozenFrame:
     """One frozen frame as read back."""
 
@@ -79,6 +98,8 @@ class FrozenFrame:
     """Pixels beyond the frame on the left and right, and above and below; the arrays hold them."""
     grain: NDArray[np.float32] | None = None
     """[H,W,3] scene-linear, premultiplied: what added to `rgba` gives it the plate's grain. None: not in the file."""
+    detail: DetailLayers | None = None
+    """float32. None: the frame is of splats alone."""
 
 
 def write_frozen_exr(
@@ -90,8 +111,9 @@ def write_frozen_exr(
     metadata: FrameMetadata,
     margin: tuple[int, int] = (0, 0),
     grain: ArrayLike | None = None,  # [H,W,3]
+    detail: DetailLayers | None = None,
 ) -> Path:
-    """Writes one frame atomically: half colour and mattes, float32 depth, ZIP. Arrays as in `FrozenFrame`.
+    """Writes one frame atomically: half colour and mattes, float32 depth and `source`, ZIP. Arrays as in `FrozenFrame`.
 
     Grain is noise, which does not compress: it keeps 2 bits of its mantissa and is off by an eighth of itself at most,
     which takes a third off what it adds to the file (0.74 instead of 1.25 MB at 640 x 480).
@@ -109,22 +131,52 @@ def write_frozen_exr(
     written (errno ENOSPC when the disk is full).
     """
     path = Path(path)
-    pixels = _stack(rgba, depth, support, motion)
+    parts: list[NDArray] = _checked({"rgba": rgba, "depth": depth, "support": support, "motion": motion})
+    names, formats = CHANNELS, _FORMATS
     if grain is not None:
-        pixels = np.concatenate([pixels, _coarse(grain, pixels.shape[:2])], axis=2)
-    spec = _spec(pixels.shape[1], pixels.shape[0], metadata, grain is not None)
+        parts.append(_coarse(grain, parts[0].shape[:2]))
+        names, formats = names + GRAIN_CHANNELS, formats + (oiio.HALF,) * len(GRAIN_CHANNELS)
+    if detail is not None:
+        layers = {"rgba": rgba, "splat": detail.splat, "plate": detail.plate, "source": detail.source}
+        parts += _checked(layers)[1:]
+        names, formats = names + DETAIL_CHANNELS, formats + _DETAIL_FORMATS
+    spec = _spec(parts[0].shape[1], parts[0].shape[0], names, formats, metadata)
+    set_margin(spec, margin)
+    return write_exr(path, spec, parts)
+
+
+def set_margin(spec: oiio.ImageSpec, margin: tuple[int, int]) -> None:
+    """Makes the middle of a picture its frame, with `margin` pixels left and right, and above and below, beyond it.
+
+    ValueError if they leave nothing.
+    """
     across, down = margin
-    if not (0 <= 2 * across < pixels.shape[1] and 0 <= 2 * down < pixels.shape[0]):
-        raise ValueError(f"a margin of {margin} pixels leaves nothing of {pixels.shape[1]} x {pixels.shape[0]}")
+    if not (0 <= 2 * across < spec.width and 0 <= 2 * down < spec.height):
+        raise ValueError(f"a margin of {margin} pixels leaves nothing of {spec.width} x {spec.height}")
     spec.x, spec.y = -across, -down
     spec.full_x, spec.full_y = 0, 0
-    spec.full_width, spec.full_height = pixels.shape[1] - 2 * across, pixels.shape[0] - 2 * down
+    spec.full_width, spec.full_height = spec.width - 2 * across, spec.height - 2 * down
+
+
+def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[NDArray]) -> Path:
+    """Writes layers [H,W,c], whose channels are those of `spec` one after the other, whole or not at all.
+
+    What is stored as half is clamped to +-65504. A few rows at a time: a 4K frame of all layers has half a gigabyte.
+    OSError with the system's reason, as `write_frozen_exr`.
+    """
+    most = np.array([HALF_MAX if kind.basetype == oiio.HALF else np.inf for kind in spec.channelformats], np.float32)
     with atomic_path(path) as beside:
         output = oiio.ImageOutput.create(str(beside))
         if output is None:
             raise OSError(errno.EIO, f"OpenImageIO cannot write EXR: {oiio.geterror()}", str(path))
-        if not (output.open(str(beside), spec) and output.write_image(pixels) and output.close()):
-            raise _os_error(output.geterror(), path, pixels.nbytes)
+        good = output.open(str(beside), spec)
+        for top in range(0, spec.height, _ROWS) if good else ():
+            rows = np.concatenate([part[top : top + _ROWS] for part in parts], axis=2, dtype=np.float32)
+            np.clip(rows, -most, most, out=rows)
+            begin = spec.y + top
+            good = good and output.write_scanlines(begin, begin + len(rows), 0, rows)
+        if not (good and output.close()):
+            raise _os_error(output.geterror(), path, spec.height * spec.width * 4 * spec.nchannels)
     return path
 
 
@@ -159,7 +211,12 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
     grain = None
     if all(name in names for name in GRAIN_CHANNELS):
         grain = np.ascontiguousarray(pixels[..., [names.index(name) for name in GRAIN_CHANNELS[:3]]])
-    return FrozenFrame(np.ascontiguousarray(pixels[..., order[:4]]), depth, support, motion, metadata, beyond, grain)
+    detail = None
+    if all(name in names for name in DETAIL_CHANNELS):
+        found = pixels[..., [names.index(name) for name in DETAIL_CHANNELS]]
+        detail = DetailLayers(*(np.ascontiguousarray(found[..., i]) for i in (slice(0, 4), 4, 5)))
+    rgba = np.ascontiguousarray(pixels[..., order[:4]])
+    return FrozenFrame(rgba, depth, support, motion, metadata, beyond, grain, detail)
 
 
 def read_key(path: str | Path) -> str | None:
@@ -174,7 +231,7 @@ def read_key(path: str | Path) -> str | None:
         image.close()
 
 
-def _coarse(grain: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _coarse(grain: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float16]:
     """Grain [H,W,3], checked, as half floats whose eight lowest bits are 0, and an alpha of 0: [H,W,4]."""
     half = np.asarray(grain, dtype=np.float32).astype(np.float16)
     if half.shape != (*shape, 3):
@@ -183,30 +240,35 @@ def _coarse(grain: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
         raise ValueError("grain has NaN or infinite values")
     # Rounded to the nearest: cut off, it would lose a tenth of its strength.
     half = ((half.view(np.uint16) + np.uint16(0x80)) & np.uint16(0xFF00)).view(np.float16)
-    return np.concatenate([half, np.zeros((*shape, 1), np.float16)], axis=2).astype(np.float32)
+    return np.concatenate([half, np.zeros((*shape, 1), np.float16)], axis=2)
 
 
-def _stack(rgba: ArrayLike, depth: ArrayLike, support: ArrayLike, motion: ArrayLike) -> NDArray[np.float32]:
-    """[H,W,7] in the order of `CHANNELS`, checked, half layers clamped."""
-    layers = {"rgba": rgba, "depth": depth, "support": support, "motion": motion}
+def _checked(layers: dict[str, ArrayLike]) -> list[NDArray]:
+    """[H,W,c] float32: `rgba` and layers like it. ValueError names the one that is wrong."""
     with np.errstate(over="ignore"):
         arrays = {name: np.asarray(layer, dtype=np.float32) for name, layer in layers.items()}
     colour = arrays["rgba"]
     if colour.ndim != 3 or colour.shape[2] != 4 or not colour.size:
         raise ValueError(f"rgba should be [H,W,4], got shape {colour.shape}")
-    pixels = np.empty((*colour.shape[:2], len(CHANNELS)), dtype=np.float32)
-    for channel, (name, layer) in zip((slice(0, 4), 4, 5, 6), arrays.items(), strict=True):
-        if layer.shape[:2] != colour.shape[:2] or layer.ndim != (3 if name == "rgba" else 2):
-            raise ValueError(f"{name} should be {list(colour.shape[:2])} like rgba, got shape {list(layer.shape)}")
-        finite = np.isfinite(layer)
-        if not finite.all():
-            y, x, *_ = np.argwhere(~finite)[0]
-            raise ValueError(f"{name} has {finite.size - finite.sum()} NaN or infinite values, the first at ({x}, {y})")
-        pixels[..., channel] = layer if name == "depth" else np.clip(layer, -HALF_MAX, HALF_MAX)
-    return pixels
+    for name, layer in arrays.items():
+        wanted = colour.shape if name in _COLOURS else colour.shape[:2]
+        if layer.shape != wanted:
+            raise ValueError(f"{name} should be {list(wanted)} like rgba, got shape {list(layer.shape)}")
+        check_finite(name, layer)
+    return [layer.reshape(*colour.shape[:2], -1) for layer in arrays.values()]
 
 
-def _spec(width: int, height: int, metadata: FrameMetadata, with_grain: bool) -> oiio.ImageSpec:
+def check_finite(name: str, layer: NDArray[np.float32]) -> None:
+    """ValueError names a layer [H,W,...] with NaN or infinity in it, and the first place."""
+    finite = np.isfinite(layer)
+    if not finite.all():
+        y, x, *_ = np.argwhere(~finite)[0]
+        raise ValueError(f"{name} has {finite.size - finite.sum()} NaN or infinite values, the first at ({x}, {y})")
+
+
+def _spec(
+    width: int, height: int, names: tuple[str, ...], formats: tuple[oiio.BASETYPE, ...], metadata: FrameMetadata
+) -> oiio.ImageSpec:
     viewmat = np.asarray(metadata.viewmat, dtype=np.float32)
     intrinsics = np.asarray(metadata.K, dtype=np.float32)
     for name, matrix, shape in (("viewmat", viewmat, (4, 4)), ("K", intrinsics, (3, 3))):
@@ -214,13 +276,7 @@ def _spec(width: int, height: int, metadata: FrameMetadata, with_grain: bool) ->
             raise ValueError(f"metadata.{name} should be a finite matrix of shape {shape}, got {matrix.tolist()}")
     if not math.isfinite(metadata.t_star_frame):
         raise ValueError(f"metadata.t_star_frame should be finite, got {metadata.t_star_frame}")
-    names = CHANNELS + (GRAIN_CHANNELS if with_grain else ())
-    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
-    spec.channelnames = names
-    spec.channelformats = _FORMATS + (oiio.HALF,) * (len(names) - len(CHANNELS))
-    spec.attribute("compression", "zip")
-    spec.attribute("oiio:ColorSpace", COLOR_SPACE)
-    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), _REC709)
+    spec = linear_spec(width, height, names, formats)
     spec.attribute("worldToCamera", oiio.TypeDesc("matrix"), _flat((_FLIP_YZ @ viewmat).T))
     spec.attribute("splannequin:viewmat", oiio.TypeDesc("matrix"), _flat(viewmat))
     spec.attribute("splannequin:K", oiio.TypeDesc("matrix33"), _flat(intrinsics))
@@ -230,6 +286,17 @@ def _spec(width: int, height: int, metadata: FrameMetadata, with_grain: bool) ->
     spec.attribute("splannequin:version", int(metadata.version))
     if metadata.key:
         spec.attribute("splannequin:key", metadata.key)
+    return spec
+
+
+def linear_spec(width: int, height: int, names: tuple[str, ...], formats: tuple[oiio.BASETYPE, ...]) -> oiio.ImageSpec:
+    """What a ZIP-compressed EXR of `COLOR_SPACE` with these channels begins with."""
+    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
+    spec.channelnames = names
+    spec.channelformats = formats
+    spec.attribute("compression", "zip")
+    spec.attribute("oiio:ColorSpace", COLOR_SPACE)
+    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), _REC709)
     return spec
 
 

@@ -50,6 +50,22 @@ class FrozenImage:
         return FrozenImage(*(value.cpu() for value in vars(self).values()))
 
 
+@dataclass
+class OutputFrame:
+    """One frame to render."""
+
+    frame: int
+    """Number in the clip."""
+    viewmat: Tensor
+    """[4, 4] world-to-camera, scene units."""
+    K: Tensor
+    """[3, 3] pixels of the output size, without overscan."""
+    t_star: float
+    """Frame number at which time stands still."""
+    exposed_like: float
+    """Frame number whose exposure the camera has: its own on the clip's poses, t* on a path of its own."""
+
+
 @torch.no_grad()
 def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "nearest") -> FrozenGaussians:
     """Freezes a model at a normalised time. The field is evaluated once; views then cost only rasterisation.

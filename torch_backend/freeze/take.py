@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,38 +16,30 @@ from torch import Tensor
 from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, Reporter, Verdict, frame_file, read_json
 from ..footage.color import premultiplied_srgb_to_linear
 from ..footage.images import read_png
+from ..footage.plates import Plates
 from ..gaussians.ply import write_ply
 from ..scene import Scene, frame_table, load_scene
 from ..shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, write_json
+from ..solve.motion import find_motion, motion_key
 from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
 from ..train.run import save_png
 from .contact_sheet import write_contact_sheet
-from .exr import FrameMetadata, read_key, write_frozen_exr
+from .detail import DetailedFrame, Detailer
+from .exr import DetailLayers, FrameMetadata, read_frozen_exr, read_key, write_frozen_exr
 from .grain import Grain, draw, measure_plate
-from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen, suggest_t_star
+from .query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, suggest_t_star
+from .reproject import resized
 from .verdict import judge_take, unsure
 from .video import write_video
+from .warp import FOLDER as WARPS
+from .warp import WarpMetadata, write_warp
 
 TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
+DETAIL_VERSION = 1
+"""The same, of frames made of plates."""
 _FRAME = re.compile(r"-?\d+")
-
-
-@dataclass
-class OutputFrame:
-    """One frame to render."""
-
-    frame: int
-    """Number in the clip."""
-    viewmat: Tensor
-    """[4, 4] world-to-camera, scene units."""
-    K: Tensor
-    """[3, 3] pixels of the output size, without overscan."""
-    t_star: float
-    """Frame number at which time stands still."""
-    exposed_like: float
-    """Frame number whose exposure the camera has: its own on the clip's poses, t* on a path of its own."""
 
 
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
@@ -57,26 +50,30 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     run = load_run(shot, params.run, choose_device(params.device))
     scene = load_scene(shot)
     t_star = choose_t_star(shot, scene, run, params, report)
-    width, height = output_size(scene, run, params)
+    width, height = output_size(shot, scene, params)
     whole = plan(scene, params, t_star, width, height)
     frames = in_range(whole, params)
     folder = shot.own(shot.take(params.take))
-    for inner in ("preview", TAKE_REDISTORT.parent):
+    for inner in ("preview", TAKE_REDISTORT.parent, WARPS):
         shot.own(folder / inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
     grain = plate_grain(shot, scene) if params.grain else None
     # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
     plate = (shot.info().width, round(shot.info().width * height / width))
-    look = Look(run, params.query, (width, height), beyond, grain, plate)
+    detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
+    look = Look(run, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail))
     keys = {f.frame: look.key(f) for f in whole}
     key = take_key(run, params, t_star, width, height, beyond)
-    done = _prepare(folder, keys, key, params)
+    done = _prepare(folder, keys, key, params, detail is not None)
     left = sum(f.frame not in done for f in frames)
-    need_disk(folder, left * look.whole[0] * look.whole[1] * (26.0 if grain else 20.0), "the take")
+    each = look.whole[0] * look.whole[1] * (20.0 + (6.0 if grain else 0.0) + (24.0 if detail else 0.0))
+    need_disk(folder, left * each, "the take")
     try:
-        _render_all(folder, frames, done, scene, look, keys, report)
+        shares = _render_all(folder, frames, done, scene, look, keys, report)
         there = done | {f.frame for f in frames}
-        facts = _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, report)
+        facts = _finish(
+            shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, shares, report
+        )
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
     if run.stale:
@@ -102,6 +99,10 @@ class Look:
     """The plate's, None if it is not wanted."""
     grain_size: tuple[int, int]
     """Width and height in pixels at which a frame's grain is drawn, without overscan."""
+    detail: Detailer | None = None
+    """Makes the frames of plates; None: splats alone."""
+    detail_key: str = ""
+    """Identifies the plates and mattes that it uses; empty without it."""
 
     @property
     def whole(self) -> tuple[int, int]:
@@ -127,7 +128,37 @@ class Look:
             output.viewmat.flatten().tolist(),
             output.K.flatten().tolist(),
             *([self.beyond] if any(self.beyond) else []),
+            *([self.detail_key] if self.detail_key else []),
         )
+
+
+def plate_detail(
+    shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, first: OutputFrame, size: tuple[int, int],
+    report: Reporter,
+) -> Detailer | None:  # fmt: skip
+    """What makes a take's frames of plates; None where `params` wants splats alone. `first` is any frame of the take.
+
+    Plates are read at the scale of the frames, so that one pixel answers one: at their own size by default.
+    """
+    if params.detail == "off":
+        return None
+    find_motion(shot, report)  # of shots solved before the solve looked for it
+    plates = Plates(shot)
+    scale = float(first.K[0, 0]) / float(scene.Ks[0, 0, 0] * plates.width / scene.width)
+    if not params.camera_path and size != (plates.width, plates.height):
+        plates = Plates(shot, size)
+    elif params.camera_path and scale < 0.99:
+        plates = Plates(shot, (max(16, round(plates.width * scale)), max(16, round(plates.height * scale))))
+    if plates.note:
+        report.warning(plates.note)
+    return Detailer(run, scene, plates)
+
+
+def detail_key(shot: Shot, detail: Detailer | None) -> str:
+    """Identifies what plate detail is made of, beside the run; empty without it."""
+    if detail is None or not isinstance(detail.plates, Plates):
+        return ""
+    return content_key(DETAIL_VERSION, detail.plates.key, motion_key(shot), dataclasses.asdict(detail.config))
 
 
 def plate_grain(shot: Shot, scene: Scene) -> Grain:
@@ -158,11 +189,12 @@ def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams
     return nearest
 
 
-def output_size(scene: Scene, run: LoadedRun, params: FreezeParams) -> tuple[int, int]:
-    """(width, height) of the frozen frames: as wide as trained unless asked otherwise, shaped like clip or path."""
-    if params.width <= 0 and not params.camera_path:
-        return run.width, run.height
-    width = min(max(16, params.width or run.width), 16_384)
+def output_size(shot: Shot, scene: Scene, params: FreezeParams) -> tuple[int, int]:
+    """(width, height) of the frozen frames: as wide as the footage unless asked otherwise, shaped like clip or path."""
+    plates = Plates(shot)
+    if not params.camera_path and params.width in (0, plates.width):
+        return plates.width, plates.height
+    width = min(max(16, params.width or plates.width), 16_384)
     shape = CameraPath.load(params.camera_path) if params.camera_path else scene
     return width, max(16, round(shape.height * width / shape.width))
 
@@ -230,7 +262,7 @@ def take_key(
     )
 
 
-def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams) -> set[int]:
+def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams, with_warps: bool) -> set[int]:
     """Makes the take's folder; returns the frames in it that are already right. All others are removed.
 
     A frame that is not asked for now stays if it is right: a part of the range does not undo the rest of the take.
@@ -243,16 +275,20 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams)
             ExitCode.FREEZE,
         )
     make_folder(folder / "preview")
+    if with_warps:
+        make_folder(folder / WARPS)
     # Frames without a key of their own are of before grain, too.
-    old_are_right = not params.grain and state.is_file() and read_json(state).get("key") == key
+    old_are_right = not params.grain and not with_warps and state.is_file() and read_json(state).get("key") == key
     done = set()
     for n in frames_in(folder.glob("*.exr")) if params.only_missing else ():
         told = read_key(folder / frame_file(n, ".exr"))
         right = n in keys and (told == keys[n] or (told == "" and old_are_right))
-        if right and (folder / "preview" / frame_file(n, ".png")).is_file():
+        warped = not with_warps or (folder / WARPS / frame_file(n, ".exr")).is_file()
+        if right and warped and (folder / "preview" / frame_file(n, ".png")).is_file():
             done.add(n)
     stale = [p for p in [*folder.glob("*.exr"), *(folder / "preview").glob("*.png")] if _FRAME.fullmatch(p.stem)]
     stale = [p for p in stale if int(p.stem) not in done]
+    stale += [folder / WARPS / frame_file(int(p.stem), ".exr") for p in stale if p.suffix == ".exr"]
     for old in [folder / "take.json", *stale] if stale else ():
         old.unlink(missing_ok=True)
     write_json(state, {"version": 1, "key": key})
@@ -267,8 +303,10 @@ def frames_in(paths: Iterable[Path]) -> list[int]:
 def _render_all(
     folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, look: Look, keys: dict[int, str],
     report: Reporter,
-) -> None:  # fmt: skip
+) -> dict[int, Tensor]:  # fmt: skip
+    """Renders and writes what is not done. Returns frame number -> [h, w] share of plate, small, of those rendered."""
     run = look.run
+    shares: dict[int, Tensor] = {}
     frozen: FrozenGaussians | None = None
     at = float("nan")
     for n, output in enumerate(frames):
@@ -285,8 +323,15 @@ def _render_all(
         K = output.K.clone()
         K[:2, 2] += torch.tensor(look.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
         image = render_frozen(frozen, output.viewmat, K, *look.whole, run.model.exposure, exposed_at)
-        _write_frame(folder, output, image, scene, look, keys[output.frame])
+        if look.detail is None:
+            _write_frame(folder, output, image, scene, look, keys[output.frame])
+            continue
+        made = look.detail.frame(output, frozen, image, *look.size)
+        _write_warp(folder, output, made, look, keys[output.frame])
+        _write_frame(folder, output, made, scene, look, keys[output.frame])
+        shares[output.frame] = small_share(made.plate)
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
+    return shares
 
 
 def span_of(scene: Scene, run: LoadedRun) -> float:
@@ -295,7 +340,9 @@ def span_of(scene: Scene, run: LoadedRun) -> float:
     return max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
 
 
-def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: Scene, look: Look, key: str) -> None:
+def _write_frame(
+    folder: Path, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, look: Look, key: str
+) -> None:
     shown = image.color + (1.0 - image.alpha[..., None]) * 0.5
     (width, height), beyond = look.size, look.beyond
     # Previews, and so contact sheet and video, show the frame as it stands over the plate.
@@ -304,20 +351,74 @@ def _write_frame(folder: Path, output: OutputFrame, image: FrozenImage, scene: S
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ torch.from_numpy(scene.centre)
     depth = torch.where(image.depth < NO_DEPTH, image.depth / scene.scale, NO_DEPTH)
+    layers = None
+    alpha = image.alpha.numpy()
+    if isinstance(image, DetailedFrame):
+        rgba = np.concatenate([image.linear.numpy(), alpha[..., None]], axis=2)
+        layers = DetailLayers(scene_linear(image.splat.numpy(), image.splat_alpha.numpy()), image.plate, image.source)
+    else:
+        rgba = scene_linear(image.color.numpy(), alpha)
     grain = None
     if look.grain is not None:
-        rgba = np.concatenate([image.color.numpy(), image.alpha.numpy()[..., None]], axis=2)
-        grain = draw(look.grain, output.frame, rgba, look.whole_grain_size)
+        shown = np.concatenate([image.color.numpy(), alpha[..., None]], axis=2)
+        grain = draw(look.grain, output.frame, shown, look.whole_grain_size)
+        if isinstance(image, DetailedFrame):  # plates have theirs
+            grain = grain * (1.0 - image.plate.numpy()[..., None])
     write_frozen_exr(
         folder / frame_file(output.frame, ".exr"),
-        scene_linear(image.color.numpy(), image.alpha.numpy()),
+        rgba,
         depth.numpy(),
         image.support.numpy(),
         image.motion.numpy(),
         FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy(), key=key),
         look.beyond,
         grain,
+        layers,
     )
+
+
+def _write_warp(folder: Path, output: OutputFrame, made: DetailedFrame, look: Look, key: str) -> None:
+    """Before its frame: a frame that is there has its warp."""
+    assert look.detail is not None
+    plates = look.detail.plates
+    write_warp(
+        folder / WARPS / frame_file(output.frame, ".exr"),
+        made.st,
+        made.matte,
+        made.fill,
+        made.alpha,
+        WarpMetadata(output.frame, made.leading, output.t_star, plates.width, plates.height, key),
+        look.beyond,
+    )
+
+
+def small_share(plate: Tensor) -> Tensor:
+    """[H, W] share of plate, averaged to a picture about 160 pixels wide, for figures."""
+    height, width = plate.shape
+    small = min(width, 160)
+    return resized(plate, small, max(4, round(height * small / width)))
+
+
+def detail_facts(shares: dict[int, Tensor]) -> dict[str, Any]:
+    """What a take's frames are made of, for take.json: means over frames, and each frame with a grid of regions.
+
+    `plate_share` is the mean share of plate; `invented_share` the share of pixels of which splats invented more than
+    half; `regions` the same on a grid of 4 x 4, rows from the top.
+    """
+    rows = []
+    for frame, share in sorted(shares.items()):
+        invented = (share < 0.5).float()
+        grid = torch.nn.functional.adaptive_avg_pool2d(invented[None, None], 4)[0, 0]
+        rows.append(
+            {
+                "frame": frame,
+                "plate_share": round(float(share.mean()), 4),
+                "invented_share": round(float(invented.mean()), 4),
+                "regions": [[round(float(v), 3) for v in row] for row in grid],
+            }
+        )
+    means = {name: round(float(np.mean([row[name] for row in rows])), 4) for name in ("plate_share", "invented_share")}
+    return {**means, "per_frame": rows}
 
 
 def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -332,14 +433,16 @@ def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 def _finish(
     shot: Shot, scene: Scene, params: FreezeParams, t_star: int, frames: list[OutputFrame], look: Look, key: str,
-    report: Reporter,
+    shares: dict[int, Tensor], report: Reporter,
 ) -> dict[str, Any]:  # fmt: skip
     """Contact sheet, video, PLY and take.json of all frames that the take has by now; they are on disk."""
     folder, run, size = shot.take(params.take), look.run, look.size
     numbers = [f.frame for f in frames]
     report.progress("finishing the take", 0, 3, "contact sheet")
     previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
-    verdict = judge_take({"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path})
+    made_of = _made_of(folder, numbers, look, shares)
+    asked = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
+    verdict = judge_take({"t_star_frame": t_star, **asked, "detail": made_of.get("detail")})
     title = f"{shot.info().name}: t* = frame {t_star}, run {params.run}"
     sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
     report.check_cancelled()
@@ -375,6 +478,7 @@ def _finish(
         "contact_sheet": str(sheet),
         "video": str(folder / "video.mp4"),
         "ply": str(folder / "frozen.ply"),
+        **made_of,
         **({} if verdict is None else {"verdict": vars(verdict)}),
     }
     write_json(folder / "take.json", facts)
@@ -382,6 +486,17 @@ def _finish(
     report.image("contact sheet", sheet)
     report.progress("finishing the take", 3, 3, "done")
     return facts
+
+
+def _made_of(folder: Path, numbers: list[int], look: Look, shares: dict[int, Tensor]) -> dict[str, Any]:
+    """What take.json says of plate detail; {} without it. `shares` are of the frames that this job rendered."""
+    if look.detail is None:
+        return {}
+    for n in (n for n in numbers if n not in shares):
+        layers = read_frozen_exr(folder / frame_file(n, ".exr")).detail
+        if layers is not None:
+            shares[n] = small_share(torch.from_numpy(np.asarray(layers.plate, np.float32)))
+    return {"detail": detail_facts(shares), "warp_dir": str(folder / WARPS)}
 
 
 def _redistort(

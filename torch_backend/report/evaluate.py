@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,34 +13,41 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import Reporter, frame_file, read_json
+from ..contract import JobError, Reporter, frame_file, read_json
 from ..footage.images import write_png
+from ..footage.plates import Plates
+from ..freeze.detail import Detailer
 from ..freeze.query import FrozenGaussians, freeze_at, render_frozen
+from ..freeze.take import OutputFrame, span_of
 from ..scene import Scene, load_scene, read_image, split_frames
+from ..shot import Shot
 from ..train import LoadedRun, load_run
 from ..train.checkpoint import load_checkpoint
 from ..train.model import render
 from .colorvideovdp import sequence_jod
 from .metrics import best_share_psnr, gradient_energy, missing_metrics, psnr_by_region, score
-from .records import PICTURES, FrameScore, HeldOut, Picture
+from .records import DELIVERED, PICTURES, SPLATS, WITHHELD, Detailed, FrameScore, HeldOut, Picture
 from .truth import TruthScene
 
-SHOWN = 6
+KEPT = 6
 """Pictures kept of every run, the same frames for all runs of a scene."""
 WORST = 4
 """Pictures kept of a run's worst frames."""
 
 
 @dataclass
-class _Frozen:
+class Frozen:
     """A run frozen at one instant, ready to be seen."""
 
     run: LoadedRun
     scene: Scene
+    t_star: int
     gaussians: FrozenGaussians
+    detailers: dict[str, Detailer] = field(default_factory=dict)
+    """One for each of `WITHHELD` and `DELIVERED`: what a detailer carries from pose to pose is not mixed."""
 
-    def view(self, pose: int) -> Tensor:
-        """[H, W, 3] from the pose of frame `pose`, exposed as that frame is."""
+    def view(self, pose: int, shown: str = SPLATS) -> Tensor:
+        """[H, W, 3] in [0, 1] from the pose of frame `pose`, exposed as that frame is, before grey."""
         run, scene = self.run, self.scene
         index = scene.frames.index(pose)
         K = scene.camera_at(run.width, run.height)[index]
@@ -47,7 +55,19 @@ class _Frozen:
         image = render_frozen(
             self.gaussians, scene.viewmats[index], K, run.width, run.height, run.model.exposure, exposed_at
         )
-        return (image.color + (1.0 - image.alpha[..., None]) * 0.5).clamp(0.0, 1.0)
+        color, alpha = image.color, image.alpha
+        if shown != SPLATS:
+            output = OutputFrame(pose, scene.viewmats[index], K, float(self.t_star), float(pose))
+            withheld = (pose,) if shown == WITHHELD else ()
+            made = self.detailers[shown].frame(output, self.gaussians, image, run.width, run.height, withheld)
+            color, alpha = made.color, made.alpha
+        return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0)
+
+
+def detailers(shot: Shot, run: LoadedRun, scene: Scene) -> dict[str, Detailer]:
+    """What `Frozen.view` needs to show plate detail at the run's size. JobError if the footage cannot be read."""
+    plates = Plates(shot, (run.width, run.height))
+    return {shown: Detailer(run, scene, plates) for shown in (WITHHELD, DELIVERED)}
 
 
 def evaluate_run(
@@ -66,25 +86,19 @@ def evaluate_run(
     JobError if there is no such run; `Cancelled` if a stop was asked for.
     """
     run, scene = load_run(truth.shot, run_name, device), load_scene(truth.shot)
-    held_out = _held_out(run, scene)
-    size = (run.width, run.height)
-    rows: list[FrameScore] = []
-    jod: dict[str, float | None] = {}
-    frozen: dict[int, _Frozen] = {}
-    for n, t_star in enumerate(truth.t_stars):
-        frozen[t_star] = _freeze(run, scene, t_star, query)
-        ours, theirs = [], []
-        poses = truth.poses(t_star, held_out)
-        for m, pose in enumerate(poses):
-            report.check_cancelled()
-            report.progress("scoring", n + m / len(poses), len(truth.t_stars), f"t* {t_star}, pose {pose}")
-            image, target = frozen[t_star].view(pose), truth.truth(t_star, pose, *size)
-            rows.append(_score(truth, t_star, pose, pose in held_out, image, target))
-            ours.append(image)
-            theirs.append(target)
-        steady = truth.fps > 0 and len(ours) > 1
-        jod[str(t_star)] = sequence_jod(torch.stack(ours), torch.stack(theirs), truth.fps) if steady else None
-    keeper = _Keeper(truth, frozen, size, results, run_id)
+    held_out = held_out_frames(run, scene)
+    missing, made = missing_metrics(), dict[str, Detailer]()
+    try:
+        made = detailers(truth.shot, run, scene)
+    except JobError as error:
+        missing["detail"] = f"Plate detail of {truth.name} was not judged: {error.message}"
+    frozen = {t_star: freeze_run(run, scene, t_star, query, made) for t_star in truth.t_stars}
+    shown = {name: _shown(truth, frozen, held_out, name, report) for name in (SPLATS, *made)}
+    for name, of in shown.items():
+        if name != WITHHELD:  # as fast as what is delivered, and not to be looked at
+            of.frozen_fps = _fps(next(iter(frozen.values())), scene, name)
+            _Keeper(truth, frozen, (run.width, run.height), results, run_id, name).keep(of)
+    plates = _Keeper(truth, frozen, (run.width, run.height), results, run_id).plates(shown[SPLATS].two_instants)
     summary = read_json(run.folder / "summary.json")
     tensors, _ = load_checkpoint(run.folder / "checkpoint.safetensors")
     return {
@@ -95,25 +109,44 @@ def evaluate_run(
         "width": run.width,
         "height": run.height,
         "model_bytes": sum(v.nbytes for k, v in tensors.items() if not k.startswith("adam.")),
-        "frozen_fps": _fps(next(iter(frozen.values())), scene),
-        "rows": rows,
-        "jod": jod,
-        "pictures": keeper.pictures(rows),
-        **keeper.two_instants(rows),
-        "missing": missing_metrics(),
+        **vars(shown.pop(SPLATS)),
+        "detailed": shown,
+        "plates": plates,
+        "missing": missing,
     }
 
 
-def _held_out(run: LoadedRun, scene: Scene) -> list[int]:
+def _shown(
+    truth: TruthScene, frozen: Mapping[int, Frozen], held_out: Sequence[int], shown: str, report: Reporter
+) -> Detailed:
+    """Every pose of every instant made in one way, against the truth."""
+    rows: list[FrameScore] = []
+    jod: dict[str, float | None] = {}
+    for n, (t_star, at) in enumerate(frozen.items()):
+        ours, theirs = [], []
+        poses = truth.poses(t_star, held_out)
+        for m, pose in enumerate(poses):
+            report.check_cancelled()
+            report.progress(f"scoring {shown}", n + m / len(poses), len(frozen), f"t* {t_star}, pose {pose}")
+            image, target = at.view(pose, shown), truth.truth(t_star, pose, at.run.width, at.run.height)
+            rows.append(_score(truth, t_star, pose, pose in held_out, image, target))
+            ours.append(image)
+            theirs.append(target)
+        steady = truth.fps > 0 and len(ours) > 1
+        jod[str(t_star)] = sequence_jod(torch.stack(ours), torch.stack(theirs), truth.fps) if steady else None
+    return Detailed(rows, jod)
+
+
+def held_out_frames(run: LoadedRun, scene: Scene) -> list[int]:
     """Frame numbers that the run did not train on."""
     _, test = split_frames(scene.solved, run.config.holdout, run.config.holdout_phase)
     return [scene.frames[i] for i in test]
 
 
-def _freeze(run: LoadedRun, scene: Scene, t_star: int, query: str) -> _Frozen:
-    at = dict(zip(scene.frames, scene.seconds, strict=True))
-    span = max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
-    return _Frozen(run, scene, freeze_at(run.model, scene.time_of_frame(t_star), span, query))
+def freeze_run(run: LoadedRun, scene: Scene, t_star: int, query: str, made: dict[str, Detailer]) -> Frozen:
+    """The run frozen at frame `t_star`; `made` as `detailers` gives them, empty for splats alone."""
+    frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), query)
+    return Frozen(run, scene, t_star, frozen, made)
 
 
 @torch.no_grad()
@@ -159,19 +192,21 @@ def _score(truth: TruthScene, t_star: int, pose: int, held_out: bool, image: Ten
     )
 
 
-def _fps(frozen: _Frozen, scene: Scene) -> float:
-    """Frames per second of one frozen instant along the clip's poses (at most 40 of them), after one for warming up.
+def _fps(frozen: Frozen, scene: Scene, shown: str) -> float:
+    """Frames per second of one frozen instant along the clip's poses, after one for warming up.
 
-    Of each pose the fastest of three rounds counts, which other work on the machine lengthens least.
+    At most 40 poses, with plate detail 8. Of each the fastest of three rounds counts, which other work on the machine
+    lengthens least.
     """
-    poses = [scene.frames[i] for i in np.linspace(0, len(scene.frames) - 1, min(40, len(scene.frames))).astype(int)]
-    frozen.view(poses[0])
+    most = min(40 if shown == SPLATS else 8, len(scene.frames))
+    poses = [scene.frames[i] for i in np.linspace(0, len(scene.frames) - 1, most).astype(int)]
+    frozen.view(poses[0], shown)
     rounds = []
     for _ in range(3):
         seconds = []
         for pose in poses:
             since = time.perf_counter()
-            frozen.view(pose)
+            frozen.view(pose, shown)
             seconds.append(time.perf_counter() - since)
         rounds.append(seconds)
     return 1.0 / float(np.median(np.min(rounds, axis=0)))
@@ -181,26 +216,37 @@ class _Keeper:
     """Writes the pictures that the report shows."""
 
     def __init__(
-        self, truth: TruthScene, frozen: dict[int, _Frozen], size: tuple[int, int], results: Path, run_id: str
+        self,
+        truth: TruthScene,
+        frozen: Mapping[int, Frozen],
+        size: tuple[int, int],
+        results: Path,
+        run_id: str,
+        shown: str = SPLATS,
     ) -> None:
-        self._truth, self._frozen, self._size = truth, frozen, size
-        self._results, self._run_id = results, run_id
+        self._truth, self._frozen, self._size, self._shown = truth, frozen, size, shown
+        self._results = results
+        self._own = f"{PICTURES}/{run_id}" + (f"/{shown}" if shown != SPLATS else "")
         self._common = f"{PICTURES}/{truth.key}-{size[0]}"
+
+    def keep(self, of: Detailed) -> None:
+        """The pictures of its rows."""
+        of.pictures, of.two_instants = self.pictures(of.rows), self.two_instants(of.rows)
 
     def pictures(self, rows: list[FrameScore]) -> list[Picture]:
         """The shown and the worst frames, worst first."""
         ranked = sorted(rows, key=lambda row: _rank(self._truth, row))
-        spread = np.linspace(0, len(rows) - 1, min(SHOWN, len(rows))).round().astype(int) if rows else []
+        spread = np.linspace(0, len(rows) - 1, min(KEPT, len(rows))).round().astype(int) if rows else []
         picked = {(row.t_star, row.pose): row for row in [*ranked[:WORST], *(rows[i] for i in spread)]}
         return [self._picture(row) for row in ranked if (row.t_star, row.pose) in picked]
 
-    def two_instants(self, rows: list[FrameScore]) -> dict[str, Any]:
-        """One pose at the instants farthest apart that share one, with the plates of those instants."""
+    def two_instants(self, rows: list[FrameScore]) -> list[Picture]:
+        """One pose at the instants farthest apart that share one."""
         by_pose: dict[int, list[FrameScore]] = {}
         for row in rows:
             by_pose.setdefault(row.pose, []).append(row)
         if not by_pose:
-            return {}
+            return []
         middle = float(np.median([row.pose for row in rows]))
 
         def apart(pose: int) -> tuple[int, float]:
@@ -208,16 +254,16 @@ class _Keeper:
             return max(instants) - min(instants), -abs(pose - middle)
 
         shared = sorted(by_pose[max(by_pose, key=apart)], key=lambda row: row.t_star)
-        pair = [shared[0], shared[-1]] if len(shared) > 1 else []
-        return {
-            "two_instants": [self._picture(row) for row in pair],
-            "plates": {str(row.t_star): self._plate(row.t_star) for row in pair},
-        }
+        return [self._picture(row) for row in ([shared[0], shared[-1]] if len(shared) > 1 else [])]
+
+    def plates(self, pair: Sequence[Picture]) -> dict[str, str]:
+        """The plates of the instants of those pictures."""
+        return {str(picture.t_star): self._plate(picture.t_star) for picture in pair}
 
     def _picture(self, row: FrameScore) -> Picture:
         name = f"{row.t_star:06d}_{row.pose:06d}.png"
-        ours, theirs = f"{PICTURES}/{self._run_id}/{name}", f"{self._common}/{name}"
-        self._write(ours, self._frozen[row.t_star].view(row.pose))
+        ours, theirs = f"{self._own}/{name}", f"{self._common}/{name}"
+        self._write(ours, self._frozen[row.t_star].view(row.pose, self._shown))
         if not (self._results / theirs).is_file():
             self._write(theirs, self._truth.truth(row.t_star, row.pose, *self._size))
         return Picture(row.t_star, row.pose, ours, theirs, _rank(self._truth, row))

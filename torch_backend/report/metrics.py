@@ -150,6 +150,14 @@ def gradient_energy(image: Tensor, mask: Tensor | None = None) -> float:
     return float(energy.mean() if mask is None else energy[mask].mean())
 
 
+def gradient_magnitude(image: Tensor, mask: Tensor | None = None) -> float:
+    """Mean length of the gradient (forward differences) of Rec. 709 luma over pixels [H, W]: grain counts as detail."""
+    luma = image.clamp(0.0, 1.0).double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
+    x, y = F.pad(luma[:, 1:] - luma[:, :-1], (0, 1)), F.pad(luma[1:] - luma[:-1], (0, 0, 0, 1))
+    length = (x.square() + y.square()).sqrt()
+    return float(length.mean() if mask is None else length[mask].mean())
+
+
 # ------------------------------------------------------------------------------------------------- many figures
 
 

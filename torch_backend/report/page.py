@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .plots import THEMES
-from .records import RunRecord
+from .records import DELIVERED, RunRecord
 from .tables import REGION_NAMES, RIGID, WHOLE, Setting, Table
 
 _JPEG_QUALITY = 92
@@ -196,7 +196,7 @@ def _sliders(settings: Sequence[Setting], results: Path, pictures: dict[str, str
     for scene, runs in by_scene.items():
         parts.append(f"<h3>{html.escape(scene)}</h3>")
         # What the product does by default comes first.
-        for n, (label, run) in enumerate(sorted(runs, key=lambda r: (r[1].host != "auto", r[1].variant != "default"))):
+        for n, (label, run) in enumerate(sorted(runs, key=lambda r: _rank(r[1]))):
             frames = "".join(_slider(run, i, results, pictures) for i in range(min(_SHOWN, len(run.pictures))))
             name = f"{label}, seed {run.seed}" if run.seed else label
             opened = " open" if n == 0 else ""
@@ -204,6 +204,10 @@ def _sliders(settings: Sequence[Setting], results: Path, pictures: dict[str, str
                 f'<details{opened}><summary>{html.escape(name)}</summary><div class="frames">{frames}</div></details>'
             )
     return parts
+
+
+def _rank(run: RunRecord) -> tuple[bool, bool, bool]:
+    return run.host != "auto", run.variant != "default", run.shown != DELIVERED
 
 
 def _slider(run: RunRecord, index: int, results: Path, pictures: dict[str, str]) -> str:

@@ -19,7 +19,7 @@ from .tables import HOST_NAMES, Setting, pace
 
 COSTS = {
     "seconds": ("training, seconds", lambda run: run.train_seconds),
-    "frame_ms": ("rendering a frozen frame, milliseconds", lambda run: 1000.0 / run.frozen_fps),
+    "frame_ms": ("rendering a frozen frame, milliseconds", lambda run: run.frozen_fps and 1000.0 / run.frozen_fps),
     "megabytes": ("model, megabytes", lambda run: run.model_bytes / 1e6),
 }
 """File stem -> axis, figure of a run; less is better in all of them."""

@@ -13,10 +13,12 @@ from ..contract import check_version, from_dict, read_json
 from ..shot import write_json
 from .metrics import WHOLE, Key
 
-RECORD_VERSION = 2
+RECORD_VERSION = 3
 """Rises when figures measured before must not stand beside new ones."""
 PICTURES = "pictures"
 """Folder of pictures beside the records."""
+SPLATS, WITHHELD, DELIVERED = "splats", "withheld", "delivered"
+"""What a frozen frame shows: splats alone; plate detail without the plate of its own pose; what a take delivers."""
 
 
 @dataclass
@@ -64,6 +66,20 @@ class Picture:
 
 
 @dataclass
+class Detailed:
+    """The freezes of a run with plate detail, at the same instants and poses."""
+
+    rows: list[FrameScore]
+    jod: dict[str, float | None] = field(default_factory=dict)
+    """t* -> ColorVideoVDP of its poses as a sequence."""
+    frozen_fps: float | None = None
+    """Frozen frames per second, splats and detail; None where it says nothing."""
+    pictures: list[Picture] = field(default_factory=list)
+    two_instants: list[Picture] = field(default_factory=list)
+    """One pose at two instants."""
+
+
+@dataclass
 class RunRecord:
     """One training run and all that was measured of its freezes."""
 
@@ -107,8 +123,8 @@ class RunRecord:
     """Share of the Gaussians that the field moves."""
     model_bytes: int
     """What must be kept to freeze at any instant: Gaussians, field, support, exposure."""
-    frozen_fps: float
-    """Frozen frames per second, one instant, all outputs (colour, alpha, depth, mattes)."""
+    frozen_fps: float | None
+    """Frozen frames per second, one instant, all outputs (colour, alpha, depth, mattes); None where it says nothing."""
     heldout_psnr_db: float | None
     """On frames of the clip kept out of training, each at its own time."""
     rows: list[FrameScore]
@@ -131,12 +147,24 @@ class RunRecord:
     """What to type to repeat it."""
     finished: str = ""
     """Date and time, UTC."""
+    detailed: dict[str, Detailed] = field(default_factory=dict)
+    """`WITHHELD` and `DELIVERED` -> the same freezes made so; `rows` and what else is here are of splats alone."""
+    shown: str = SPLATS
+    """What the frames of this record show; on disk always splats, see `as_shown`."""
     version: int = RECORD_VERSION
 
     @property
-    def setting(self) -> tuple[str, str, str, str, str]:
-        """What is compared: (host, supervision, preset, variant, cameras)."""
-        return self.host, self.supervision, self.preset, self.variant, self.cameras
+    def setting(self) -> tuple[str, str, str, str, str, str]:
+        """What is compared: (host, supervision, preset, variant, cameras, shown)."""
+        return self.host, self.supervision, self.preset, self.variant, self.cameras, self.shown
+
+    def as_shown(self, shown: str) -> RunRecord:
+        """The record of what `detailed` holds. Frames at their own times are no freezes: it has none of those."""
+        of = self.detailed[shown]
+        return dataclasses.replace(
+            self, shown=shown, detailed={}, rows=of.rows, jod=of.jod, frozen_fps=of.frozen_fps, pictures=of.pictures,
+            two_instants=of.two_instants, heldout=[], heldout_psnr_db=None,
+        )  # fmt: skip
 
     @property
     def place(self) -> tuple[str, str, int]:
@@ -172,13 +200,21 @@ def load_record(path: str | Path) -> RunRecord:
     data = read_json(path)
     check_version(data, str(path), RECORD_VERSION)
     try:
-        data["rows"] = [from_dict(FrameScore, row) for row in data["rows"]]
+        data = _with_parts(data)
         data["heldout"] = [from_dict(HeldOut, row) for row in data["heldout"]]
-        for name in ("pictures", "two_instants"):
-            data[name] = [from_dict(Picture, row) for row in data[name]]
+        data["detailed"] = {
+            shown: from_dict(Detailed, _with_parts(of)) for shown, of in data.get("detailed", {}).items()
+        }
         return from_dict(RunRecord, data)
     except (KeyError, ValueError) as error:
         raise ValueError(f"{path} is no record of a benchmark run: {error}") from error
+
+
+def _with_parts(data: dict[str, Any]) -> dict[str, Any]:
+    """JSON of a `RunRecord` or a `Detailed` with its frames and pictures as what they are."""
+    rows = [from_dict(FrameScore, row) for row in data["rows"]]
+    pictures = {name: [from_dict(Picture, row) for row in data[name]] for name in ("pictures", "two_instants")}
+    return {**data, "rows": rows, **pictures}
 
 
 def finished(folder: str | Path, run_id: str) -> bool:

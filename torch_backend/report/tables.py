@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .metrics import METRICS, WHOLE, Key, Paired, Summary, paired, summarise
-from .records import FrameScore, RunRecord
+from .records import DELIVERED, SPLATS, WITHHELD, FrameScore, RunRecord
 from .truth import REGIONS, RIGID
 
 HOST_NAMES = {
@@ -29,11 +29,18 @@ REGION_NAMES = {
     "static": "static",
     RIGID: "what never moves",
 }
+SHOWN_NAMES = {WITHHELD: "plate detail, plate withheld", DELIVERED: "plate detail"}
+"""What frames show, besides splats -> what is added to a method's name."""
 QUERIES = {"plain": "at t*", "nearest": "nearest seen"}
 """How Gaussians are asked -> in a table."""
 QUERY_NOTE = (
     "Hosts without anchors and with the paper's are frozen at t* itself, as published; with support every Gaussian is "
     "asked at the time nearest to t* at which it was seen."
+)
+DETAIL_NOTE = (
+    "A method alone is splats alone; with *plate detail* the frames are what a take delivers: the plates' own pixels, "
+    "carried to t*, where they can be believed. *Plate withheld*: without the plate of the pose that is judged, which "
+    "on what never moves is the answer itself."
 )
 _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
 NONE = "–"
@@ -61,6 +68,8 @@ class Setting:
     preset: str
     variant: str
     cameras: str
+    shown: str
+    """What its frames show: splats, withheld or delivered."""
     runs: list[RunRecord]
 
     def summary(self, metric: str, region: str = WHOLE) -> Summary | None:
@@ -112,8 +121,12 @@ class Setting:
 
 
 def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
-    """The records of synthetic or real scenes by setting, hosts in the order of `HOST_NAMES`."""
-    chosen = [r for r in records if r.kind == kind]
+    """The records of synthetic or real scenes by setting, hosts in the order of `HOST_NAMES`.
+
+    What was judged with plate detail too is a setting of its own, after that of splats alone.
+    """
+    alone = [r for r in records if r.kind == kind]
+    chosen = [shown for r in alone for shown in (r, *(r.as_shown(name) for name in r.detailed))]
     presets, cameras = {r.preset for r in chosen}, {r.cameras for r in chosen}
     groups: dict[tuple[str, ...], list[RunRecord]] = {}
     for record in chosen:
@@ -121,17 +134,18 @@ def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
     hosts, supervisions = list(HOST_NAMES), ["none", "paper", "support"]
 
     def order(setting: tuple[str, ...]) -> tuple[Any, ...]:
-        host, supervision, preset, variant, camera = setting
+        host, supervision, preset, variant, camera, shown = setting
         at = hosts.index(host) if host in hosts else len(hosts)
-        return camera, preset, variant != "default", at, supervisions.index(supervision), variant
+        made = (SPLATS, *SHOWN_NAMES).index(shown)
+        return camera, preset, variant != "default", at, supervisions.index(supervision), variant, made
 
     found = []
     for key in sorted(groups, key=order):
-        host, supervision, preset, variant, camera = key
-        label = _label(host, supervision, variant)
+        host, supervision, preset, variant, camera, shown = key
+        label = _label(host, supervision, variant) + (f", {SHOWN_NAMES[shown]}" if shown != SPLATS else "")
         extra = [preset] * (len(presets) > 1) + [f"{camera} cameras"] * (len(cameras) > 1)
         label += f" ({', '.join(extra)})" if extra else ""
-        found.append(Setting(label, host, supervision, preset, variant, camera, groups[key]))
+        found.append(Setting(label, host, supervision, preset, variant, camera, shown, groups[key]))
     return found
 
 
@@ -159,7 +173,7 @@ def all_tables(records: Sequence[RunRecord]) -> list[Table]:
             _regions(main),
             _every_metric(main, (WHOLE, "never_seen"), "Every metric, frame by frame"),
         ]
-    ablations = [s for s in synthetic if s.variant not in ("default", "reference")]
+    ablations = [s for s in synthetic if s.variant not in ("default", "reference") and s.shown == SPLATS]
     if ablations:
         tables.append(_ablations(ablations, main))
     if real:
@@ -195,6 +209,7 @@ def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
     note = (
         "PSNR in dB; bottom shares are means of the worst frames, as in the paper's tables. SSIM and JOD "
         f"(ColorVideoVDP, 10 is no difference): more is better; ST-LPIPS and FLIP: less is better. {QUERY_NOTE}"
+        + _detail_note(settings)
     )
     return Table(title, header, rows, note, _best(means))
 
@@ -205,8 +220,12 @@ def _regions(settings: Sequence[Setting]) -> Table:
         found = [s.summary("psnr_db", region) for region in (WHOLE, *REGIONS)]
         rows.append([s.label, *(number(f and f.mean, "psnr_db") for f in found)])
     header = ["method", *(REGION_NAMES[region] for region in (WHOLE, *REGIONS))]
-    note = "Mean PSNR in dB over frames in which the region is at least 0.2 % of the picture."
+    note = "Mean PSNR in dB over frames in which the region is at least 0.2 % of the picture." + _detail_note(settings)
     return Table("By region", header, rows, note)
+
+
+def _detail_note(settings: Sequence[Setting]) -> str:
+    return f" {DETAIL_NOTE}" if any(s.shown != SPLATS for s in settings) else ""
 
 
 def _costs(settings: Sequence[Setting]) -> Table:
@@ -243,7 +262,8 @@ def _costs(settings: Sequence[Setting]) -> Table:
     note = (
         "Means over runs. Held-out: frames of the clip kept out of training, each at its own time: whole, on what "
         "moves, on what does not. Seconds, milliseconds and frames per second are wall time with that many threads per "
-        "run and that many runs at once; a step's are those of the last third of the run, with the measurements in it."
+        "run and that many runs at once; a step's are those of the last third of the run, with the measurements in it. "
+        "With plate detail a run is the same one, frozen otherwise."
     )
     if there:
         note += f" Load of the machine after the runs: {min(there):.1f} to {max(there):.1f}; wall times include it."
@@ -252,20 +272,23 @@ def _costs(settings: Sequence[Setting]) -> Table:
 
 
 def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
-    """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static."""
+    """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static, plate
+    detail against splats alone."""
     pairs = []
     for group in _places(settings):
-        at = {(s.variant, s.host, s.supervision): s for s in group}
+        at = {(s.variant, s.host, s.supervision): s for s in group if s.shown == SPLATS}
         for variant, host in dict.fromkeys((s.variant, s.host) for s in group):
             for a, b in (("paper", "none"), ("support", "paper"), ("support", "none")):
                 if (variant, host, a) in at and (variant, host, b) in at:
                     pairs.append((at[variant, host, a], at[variant, host, b]))
         ours = at.get(("default", "auto", "support"))
         if ours:
-            bare = [s for s in group if s.host != "auto" and s.supervision == "none"]
-            published = [s for s in group if s.variant == "reference" and s not in bare]
-            gateless = [s for s in group if (s.variant, s.host, s.supervision) == (*GATELESS, "support")]
+            bare = [s for s in at.values() if s.host != "auto" and s.supervision == "none"]
+            published = [s for s in at.values() if s.variant == "reference" and s not in bare]
+            gateless = [s for s in at.values() if (s.variant, s.host, s.supervision) == (*GATELESS, "support")]
             pairs += [(ours, s) for s in (*bare, *published, *gateless)]
+        made = [s for s in group if s.shown != SPLATS]
+        pairs += [(s, at[s.variant, s.host, s.supervision]) for s in made]
     return pairs
 
 
@@ -296,11 +319,15 @@ def _who_wins(settings: Sequence[Setting]) -> Table:
 
     for a, b in comparisons(settings):
         seconds = _times("training", a.ratio(b, lambda r: r.train_seconds))
-        if a.host == b.host:
+        if a.shown != SPLATS:
+            for region in (WHOLE, *REGIONS):
+                frames = _times("frozen frame", a.ratio(b, _frame_seconds))
+                add(a, b, REGION_NAMES[region], a.against(b, "psnr_db", region), frames)
+        elif a.host == b.host:
             for region in (WHOLE, "never_seen"):
                 add(a, b, REGION_NAMES[region], a.against(b, "psnr_db", region), seconds)
         elif b.host == "static":
-            frames = _times("frozen frame", a.ratio(b, lambda r: 1.0 / r.frozen_fps))
+            frames = _times("frozen frame", a.ratio(b, _frame_seconds))
             for region in ("static", "seen"):
                 add(a, b, REGION_NAMES[region], a.against(b, "psnr_db", region), frames)
             add(a, b, "moving, held-out frames of the clip", a.against_heldout(b, "moving"), seconds)
@@ -317,6 +344,10 @@ def _who_wins(settings: Sequence[Setting]) -> Table:
         f"of a run. {QUERY_NOTE}"
     )
     return Table("Who wins", header, rows, note, marks)
+
+
+def _frame_seconds(run: RunRecord) -> float | None:
+    return 1.0 / run.frozen_fps if run.frozen_fps else None
 
 
 def _times(what: str, ratio: float | None) -> str:
@@ -360,7 +391,8 @@ def _ablations(ablations: Sequence[Setting], main: Sequence[Setting]) -> Table:
     rows: list[list[str]] = []
     marks = {}
     for s in ablations:
-        same = [m for m in main if (m.cameras, m.preset, m.host) == (s.cameras, s.preset, s.host)]
+        alone = [m for m in main if m.shown == SPLATS]
+        same = [m for m in alone if (m.cameras, m.preset, m.host) == (s.cameras, s.preset, s.host)]
         base = next((m for m in same if m.supervision == s.supervision), same[-1] if same else None)
         if base is None:
             continue
@@ -407,6 +439,11 @@ def pace(run: RunRecord) -> str:
 def _best(values: Sequence[float | None]) -> dict[int, str]:
     there = [(v, i) for i, v in enumerate(values) if v is not None]
     return {max(there)[1]: "best"} if len(there) > 1 else {}
+
+
+def to_be_seen(setting: Setting) -> bool:
+    """Whether a setting belongs into a picture of all methods: each with splats alone, ours as it is delivered too."""
+    return setting.shown == SPLATS or (setting.shown == DELIVERED and setting.host == "auto")
 
 
 def markdown(table: Table) -> str:

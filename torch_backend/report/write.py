@@ -14,8 +14,8 @@ from ..shot import write_atomic, write_json
 from . import plots
 from .metrics import WHOLE
 from .page import page
-from .records import RunRecord, load_records, machine_facts
-from .tables import NONE, Setting, Table, all_tables, markdown, pace, settings_of
+from .records import DELIVERED, RunRecord, load_records, machine_facts
+from .tables import NONE, Setting, Table, all_tables, markdown, pace, settings_of, to_be_seen
 from .truth import RIGID
 
 TITLE = "Frozen time: speed against error"
@@ -71,7 +71,7 @@ def _facts(records: Sequence[RunRecord], command: str) -> list[str]:
 def _plots(records: Sequence[RunRecord], folder: Path) -> list[tuple[str, Path, Path]]:
     drawn = []
     for kind, region in (("synthetic", WHOLE), ("real", RIGID)):
-        settings = [s for s in settings_of(records, kind) if s.variant in ("default", "reference")]
+        settings = [s for s in settings_of(records, kind) if s.variant in ("default", "reference") and to_be_seen(s)]
         for cost, (axis, _) in plots.COSTS.items():
             paths = [
                 plots.cost_plot(folder / f"{kind}_{cost}{suffix}.png", settings, cost, region, theme)
@@ -91,13 +91,14 @@ def _figures(settings: Sequence[Setting], results: Path, folder: Path) -> list[t
             (s.label, run)
             for s in settings
             for run in s.runs
-            if (run.scene, run.cameras, run.variant) == (scene, cameras, "default")
+            if to_be_seen(s) and (run.scene, run.cameras, run.variant) == (scene, cameras, "default")
         ]
         if not named:
             continue
         seed = min(run.seed for _, run in named)
         named = [(label, run) for label, run in named if run.seed == seed]
-        label, ours = next(((n, r) for n, r in named if r.host == "auto"), named[-1])
+        shown = [(n, r) for n, r in named if r.host == "auto"]
+        label, ours = next(((n, r) for n, r in shown if r.shown == DELIVERED), (shown or named[-1:])[0])
         stem = re.sub(r"[^\w-]+", "-", f"{scene}-{cameras}")
         parts = {
             f"{stem}_methods.png": plots.methods_strip(folder / f"{stem}_methods.png", results, named, scene),

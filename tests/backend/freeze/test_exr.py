@@ -8,8 +8,10 @@ import pytest
 
 from torch_backend.freeze.exr import (
     CHANNELS,
+    DETAIL_CHANNELS,
     GRAIN_CHANNELS,
     HALF_MAX,
+    DetailLayers,
     FrameMetadata,
     read_frozen_exr,
     read_key,
@@ -56,6 +58,48 @@ def test_grain_comes_back_to_an_eighth_and_unbiased_and_may_be_absent(tmp_path):
         write_frozen_exr(tmp_path / "c.exr", metadata=METADATA, grain=grain[:5], **stored)
     with pytest.raises(ValueError, match="^grain has NaN"):
         write_frozen_exr(tmp_path / "c.exr", metadata=METADATA, grain=grain * np.nan, **stored)
+
+
+def detail_of(stored: dict, seed: int = 2) -> DetailLayers:
+    rng = np.random.default_rng(seed)
+    shape = stored["depth"].shape
+    source = rng.integers(100_000, 100_300, shape).astype(np.float32)
+    return DetailLayers(stored["rgba"][:, ::-1] * 0.5, rng.uniform(size=shape).astype(np.float32), source)
+
+
+@pytest.mark.parametrize("with_grain", [False, True])
+def test_what_a_frame_is_made_of_comes_back_and_may_be_absent(tmp_path, with_grain):
+    stored = layers(150, 60)  # more rows than are written at a time
+    detail, grain = detail_of(stored), np.full((150, 60, 3), 0.25, np.float32) if with_grain else None
+    path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, grain=grain, detail=detail, margin=(3, 2), **stored)
+    frame = read_frozen_exr(path)
+    assert frame.detail is not None and frame.margin == (3, 2) and (frame.grain is not None) == with_grain
+    np.testing.assert_array_equal(frame.detail.source, detail.source)  # no half float holds such numbers
+    for name in ("splat", "plate"):
+        np.testing.assert_array_equal(getattr(frame.detail, name), getattr(detail, name).astype(np.float16))
+    np.testing.assert_array_equal(frame.rgba, stored["rgba"].astype(np.float16))
+    np.testing.assert_array_equal(frame.depth, stored["depth"])
+    spec = oiio.ImageBuf(str(path)).spec()
+    kinds = dict(zip(spec.channelnames, map(str, spec.channelformats), strict=True))
+    assert [kinds[name] for name in DETAIL_CHANNELS] == ["half"] * 5 + ["float"]
+    plain = write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, **stored)
+    assert read_frozen_exr(plain).detail is None
+    assert not set(DETAIL_CHANNELS) & set(oiio.ImageBuf(str(plain)).spec().channelnames)
+
+
+@pytest.mark.parametrize("name", ["splat", "plate", "source"])
+def test_a_bad_layer_of_what_a_frame_is_made_of_is_named(tmp_path, name):
+    stored = layers()
+    good = detail_of(stored)
+    flat = dataclasses.replace(good, **{name: getattr(good, name)[:5]})
+    with pytest.raises(ValueError, match=f"^{name} should be"):
+        write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, detail=flat, **stored)
+    torn = dataclasses.replace(good, **{name: getattr(good, name) * np.where(np.arange(9) == 4, np.nan, 1.0).reshape(
+        (1, 9, 1) if name == "splat" else (1, 9)
+    )})  # fmt: skip
+    with pytest.raises(ValueError, match=rf"^{name} has \d+ NaN or infinite values, the first at \(4, 0\)"):
+        write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, detail=torn, **stored)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_key_is_read_from_the_header(tmp_path):

@@ -1,0 +1,188 @@
+"""Frozen frames made of plates, against the plates of a real clip: `python -m benchmarks.detail SHOT --results DIR`.
+
+SHOT is a trained shot folder; nothing is written into it. For t* as suggested and one half a clip away, on frames held
+out of training: splats alone, plate detail with the plate of the same pose withheld, and what is delivered, each
+against that plate: PSNR whole, of the best 90 % of the pixels, of still pixels, and gradients over the plate's. Whole
+frames hold people who moved since, whom no freeze at another instant can match. Then what two instants differ by where
+nothing moves. DIR gets detail-NAME.json and strips (plate, splats, withheld, delivered) at 100 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import torch
+from torch import Tensor
+
+from benchmarks.detail_clip import VARIANTS, DetailClip, open_clip
+from benchmarks.detail_figures import mean_difference, picture_figures
+from torch_backend.contract import JobError
+from torch_backend.footage.images import write_png
+from torch_backend.native import default_threads
+from torch_backend.shot import write_json
+
+FIGURES = {"whole_db": "whole, dB", "best_90_db": "best 90 %, dB", "still_db": "still, dB", "gradient": "gradient"}
+"""Figure of a picture -> in the table."""
+CROP = (640, 480)
+"""Pixels of a picture that a strip shows, at most."""
+Row = dict[str, Any]
+
+
+def judge_frame(clip: DetailClip, frame: int, t_star: int) -> tuple[Row, dict[str, Tensor], Tensor]:
+    """(figures by variant, pictures by name, still pixels) of one frame of a freeze."""
+    plate, withheld = clip.plate(frame), clip.view(frame, t_star, {frame})
+    delivered = clip.view(frame, t_star, image=withheld.image)
+    still = clip.still(frame, t_star, withheld.image)
+    pictures = dict(zip(VARIANTS, (withheld.splats, withheld.picture, delivered.picture), strict=True))
+    row: Row = {name: picture_figures(picture, plate, still) for name, picture in pictures.items()}
+    row |= {"frame": frame, "still_share": float(still.float().mean())}
+    row["plate_share"] = {
+        "withheld": float(withheld.detailed.plate.mean()), "delivered": float(delivered.detailed.plate.mean())
+    }  # fmt: skip
+    return row, {"plate": plate, **pictures}, still
+
+
+def judge(
+    clip: DetailClip, t_stars: Sequence[int], frames: Sequence[int], strips: Path | None = None, worst: int = 0
+) -> dict[str, Any]:
+    """All figures of a clip. With `strips`, a folder, every frame's pictures side by side are written there.
+
+    `worst` > 0 keeps only the strips of so many frames at each t*, those with the lowest best-90 % dB withheld.
+    """
+    result: dict[str, Any] = {"t_stars": list(t_stars), "size": [clip.width, clip.height], "freezes": []}
+    rows: dict[int, list[Row]] = {t_star: [] for t_star in t_stars}
+    differences: list[float] = []
+    for n, frame in enumerate(frames):
+        before: tuple[Tensor, Tensor] | None = None
+        for t_star in t_stars:
+            row, pictures, still = judge_frame(clip, frame, t_star)
+            rows[t_star].append(row)
+            if strips:
+                save_strip(strips / f"t{t_star:06d}_{frame:06d}.png", list(pictures.values()))
+            if before is not None:
+                value = mean_difference(before[0], pictures["delivered"], before[1] & still)
+                differences += [] if value is None else [255.0 * value]
+            before = pictures["delivered"], still
+            print(f"[{n + 1}/{len(frames)}] frame {frame}, t* {t_star}: {_told(row)}", flush=True)
+    for t_star, of_freeze in rows.items():
+        result["freezes"].append({"t_star": t_star, "frames": of_freeze, "mean": means(of_freeze)})
+        if strips and worst:
+            ranked = sorted(of_freeze, key=lambda row: row["withheld"]["best_90_db"])
+            for row in ranked[worst:]:
+                (strips / f"t{t_star:06d}_{row['frame']:06d}.png").unlink()
+    result["instants_differ_255"] = statistics.fmean(differences) if differences else None
+    return result
+
+
+def means(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
+    """{variant: {figure: mean over the frames that have it}}."""
+    return {v: {name: _mean(row[v][name] for row in rows) for name in FIGURES} for v in VARIANTS}
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return statistics.fmean(there) if there else None
+
+
+def _told(row: Row) -> str:
+    return ", ".join(f"{v} {row[v]['best_90_db']:.1f}" for v in VARIANTS) + " dB best 90 %"
+
+
+def table(name: str, result: dict[str, Any]) -> list[str]:
+    """The means in Markdown, a row per t* and variant."""
+    lines = [
+        f"| {name} | " + " | ".join(FIGURES.values()) + " |",
+        "|---|" + "---:|" * len(FIGURES),
+    ]
+    for freeze in result["freezes"]:
+        for variant in VARIANTS:
+            values = [freeze["mean"][variant][figure] for figure in FIGURES]
+            cells = ["–" if v is None else f"{v:.2f}" for v in values]
+            lines.append(f"| t* {freeze['t_star']}, {variant} | " + " | ".join(cells) + " |")
+    both = [[row for freeze in result["freezes"] for row in freeze["frames"]]]
+    for variant in VARIANTS if len(result["freezes"]) > 1 else ():
+        cells = ["–" if v is None else f"{v:.2f}" for v in means(both[0])[variant].values()]
+        lines.append(f"| both, {variant} | " + " | ".join(cells) + " |")
+    share = _mean(row["still_share"] for row in both[0])
+    lines += ["", f"Still: {100 * (share or 0):.0f} % of the pixels."]
+    if result["instants_differ_255"] is not None:
+        lines[-1] += f" There two instants differ by {result['instants_differ_255']:.3f} / 255 on average."
+    return lines
+
+
+# ------------------------------------------------------------------------------------------------- pictures
+
+
+def save_strip(path: Path, pictures: Sequence[Tensor], crop: tuple[int, int, int, int] | None = None) -> None:
+    """Pictures [H, W, 3] side by side at 100 %, cut to `crop` (x, y, width, height) or to the middle."""
+    height, width = pictures[0].shape[:2]
+    w, h = min(width, CROP[0]), min(height, CROP[1])
+    x, y, w, h = crop or ((width - w) // 2, (height - h) // 2, w, h)
+    strip = torch.cat([picture[y : y + h, x : x + w] for picture in pictures], dim=1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, (strip.clamp(0.0, 1.0) * 255.0).round().byte().contiguous().numpy())
+
+
+# ------------------------------------------------------------------------------------------------- command line
+
+
+def chosen_frames(clip: DetailClip, args: argparse.Namespace) -> list[int]:
+    """The frames that are asked for, else every `--every`-th of those held out of training."""
+    frames = args.frames or clip.held_out()[:: args.every]
+    unknown = set(frames) - set(clip.frames)
+    if unknown or not frames:
+        what = f"frame {min(unknown)} is none of the clip's" if unknown else "no frame was held out of training"
+        raise ValueError(f"{what}: name some by --frames ({clip.frames[0]} to {clip.frames[-1]})")
+    return frames
+
+
+def common_arguments(parser: argparse.ArgumentParser) -> None:
+    """Those that all benchmarks of a real clip take."""
+    parser.add_argument("shot", type=Path)
+    parser.add_argument("--run", default="main", metavar="NAME")
+    parser.add_argument("--t-star", type=int, nargs="+", metavar="N", help="default: suggested, and half a clip away")
+    parser.add_argument("--frames", type=int, nargs="+", metavar="N", help="only these")
+    parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th")
+    parser.add_argument("--results", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--worst", type=int, default=10, metavar="N", help="strips of so many frames (0: of all)")
+    parser.add_argument("--no-strips", action="store_true", help="figures alone")
+
+
+def name_of(shot: Path) -> str:
+    """What a shot's files are called: its folder's name, or its parent's where it is called `shot`."""
+    return shot.absolute().parent.name if shot.stem == "shot" else shot.stem
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    common_arguments(parser)
+    parser.add_argument("--width", type=int, default=0, help="pixels (0: the plates' own)")
+    args = parser.parse_args(argv)
+    torch.set_num_threads(default_threads())
+    try:
+        clip = open_clip(args.shot, args.run, args.width)
+        frames = chosen_frames(clip, args)
+        name, since = name_of(args.shot), time.perf_counter()
+        strips = None if args.no_strips else args.results / f"strips-{name}"
+        result = judge(clip, args.t_star or clip.instants(), frames, strips, args.worst)
+    except (JobError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    result |= {"version": 1, "shot": str(args.shot), "run": args.run, "seconds": time.perf_counter() - since}
+    write_json(args.results / f"detail-{name}.json", result)
+    print("\n".join(["", *table(name, result)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,146 @@
+"""A trained shot as the benchmarks of plate detail look at it: its plates, its frozen frames, what moves where."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from benchmarks.detail_figures import STILL_MATTE, induced_places, inside, sampled, still_pixels
+from benchmarks.sources import Log
+from torch_backend.contract import FreezeParams
+from torch_backend.footage.plates import Plates
+from torch_backend.freeze.detail import DetailedFrame, Detailer
+from torch_backend.freeze.query import FrozenGaussians, FrozenImage, freeze_at, render_frozen
+from torch_backend.freeze.take import OutputFrame, choose_t_star, span_of
+from torch_backend.scene import load_scene, split_frames
+from torch_backend.shot import Shot
+from torch_backend.solve.motion import load_motion
+from torch_backend.train import load_run
+
+BACKDROP = 0.5
+"""Grey behind what no Gaussian covers, as in previews."""
+VARIANTS = ("splats", "withheld", "delivered")
+"""Splats alone; with plate detail, the plate of the same pose withheld; with all plates."""
+
+
+@dataclass
+class View:
+    """One frozen frame."""
+
+    image: FrozenImage
+    """Splats alone."""
+    detailed: DetailedFrame
+    """With plate detail."""
+    splats: Tensor
+    """[H, W, 3] splats alone before grey, in [0, 1]."""
+    picture: Tensor
+    """[H, W, 3] with plate detail before grey, in [0, 1]."""
+
+
+class DetailClip:
+    """A run of a shot. Pictures are of `width` x `height`: the plates' own size unless another width is given."""
+
+    def __init__(self, shot: Shot, run: str = "main", width: int = 0) -> None:
+        """JobError if the shot is not solved or the run not trained."""
+        self.shot = shot
+        self.run, self.scene = load_run(shot, run, torch.device("cpu")), load_scene(shot)
+        own = Plates(shot)
+        size = (width, round(own.height * width / own.width)) if width else None
+        self.plates = Plates(shot, size) if size else own
+        self.width, self.height = self.plates.width, self.plates.height
+        self.Ks = self.scene.camera_at(self.width, self.height)
+        # A detailer may carry weights along the path: those with and without plate n are not mixed.
+        self._detailers = {name: Detailer(self.run, self.scene, self.plates) for name in VARIANTS[1:]}
+        self._frozen: dict[int, FrozenGaussians] = {}
+
+    @property
+    def frames(self) -> list[int]:
+        """Numbers of the clip's frames."""
+        return self.scene.frames
+
+    def held_out(self) -> list[int]:
+        """Numbers of the frames that the run did not train on."""
+        _, test = split_frames(self.scene.solved, self.run.config.holdout, self.run.config.holdout_phase)
+        return [self.scene.frames[i] for i in test]
+
+    def instants(self) -> list[int]:
+        """The suggested t*, and the trained frame half a clip from it."""
+        suggested = choose_t_star(self.shot, self.scene, self.run, FreezeParams(), Log())
+        half = len(self.frames) // 2
+        at = self.frames.index(suggested)
+        other = self.frames[at + half if at + half < len(self.frames) else at - half]
+        return [suggested, min(self.run.train_frames, key=lambda frame: abs(frame - other))]
+
+    def camera(self, frame: int) -> tuple[Tensor, Tensor]:
+        """(world-to-camera [4, 4], K [3, 3]) of a frame, scene units and pixels."""
+        index = self.frames.index(frame)
+        return self.scene.viewmats[index], self.Ks[index]
+
+    def frozen(self, t_star: int) -> FrozenGaussians:
+        """The run at an instant."""
+        if t_star not in self._frozen:
+            self._frozen[t_star] = freeze_at(
+                self.run.model, self.scene.time_of_frame(t_star), span_of(self.scene, self.run)
+            )
+        return self._frozen[t_star]
+
+    def splats(self, frame: int, t_star: int) -> FrozenImage:
+        """The frozen frame by splats alone, with mattes and depth."""
+        viewmat, K = self.camera(frame)
+        model, exposed_at = self.run.model, self.scene.time_of_frame(frame)
+        return render_frozen(self.frozen(t_star), viewmat, K, self.width, self.height, model.exposure, exposed_at)
+
+    def view(self, frame: int, t_star: int, withheld: Collection[int] = (), image: FrozenImage | None = None) -> View:
+        """The frozen frame with plate detail; `image` is that of `splats`, if it is at hand."""
+        viewmat, K = self.camera(frame)
+        image = image or self.splats(frame, t_star)
+        output = OutputFrame(frame, viewmat, K, float(t_star), float(frame))
+        detailer = self._detailers["withheld" if withheld else "delivered"]
+        detailed = detailer.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
+        return View(image, detailed, over(image.color, image.alpha), over(detailed.color, detailed.alpha))
+
+    def plate(self, frame: int) -> Tensor:
+        """The plate of a frame, [H, W, 3] in [0, 1]."""
+        return self.plates.display(frame).clamp(0.0, 1.0)
+
+    def matte(self, frame: int) -> Tensor | None:
+        """The motion matte of a frame, [H, W] in 0..1; None if none was found."""
+        matte = load_motion(self.shot, frame)
+        if matte is None:
+            return None
+        values = torch.from_numpy(matte.astype("float32") / 255.0)[None, None]
+        return F.interpolate(values, (self.height, self.width), mode="nearest-exact")[0, 0]
+
+    def mattes(self, frame: int, t_star: int, image: FrozenImage) -> tuple[Tensor, Tensor]:
+        """(matte of what moves in the frame, matte of what of the frozen frame moves at t*), each [H, W] in 0..1.
+
+        The second is that of frame t*, brought here by the frozen depth; 0 where t* does not look. Without mattes in
+        the shot both are the gate's, as the frozen frame shows it.
+        """
+        own, there = self.matte(frame), self.matte(t_star)
+        if own is None or there is None:
+            gate = (image.motion >= STILL_MATTE).float()
+            return gate, gate
+        places, depth = induced_places(image.depth, *self.camera(frame), *self.camera(t_star))
+        known = inside(places, self.width, self.height, 0.0) & (depth > 0)
+        return own, torch.where(known, sampled(there, places, nearest=True), 0.0)
+
+    def still(self, frame: int, t_star: int, image: FrozenImage) -> Tensor:
+        """Pixels of the frame in which the frozen frame must show what the plate shows, bool [H, W]."""
+        own, frozen = self.mattes(frame, t_star, image)
+        return still_pixels(own, frozen > 0.75)
+
+
+def over(color: Tensor, alpha: Tensor) -> Tensor:
+    """Premultiplied colour [H, W, 3] before grey, in [0, 1]."""
+    return (color + (1.0 - alpha[..., None]) * BACKDROP).clamp(0.0, 1.0)
+
+
+def open_clip(path: str | Path, run: str = "main", width: int = 0) -> DetailClip:
+    """The clip of a shot folder."""
+    return DetailClip(Shot.open(path), run, width)

@@ -1,0 +1,263 @@
+"""Does anything still move in a frozen shot? `python -m benchmarks.detail_flow SHOT --results DIR`.
+
+SHOT is a trained shot folder; nothing is written into it. Along the clip's poses, at 640 pixels, frames n and n + 1 of
+the frozen shot are laid over one another by the frozen depth and the cameras. Then, where things move in the clip and
+where nothing does:
+
+- honesty: optical flow that is left, in pixels, at the 99th percentile of the pixels that have texture. What moved and
+  still moves reads more there than still pixels of the same frames do.
+- steadiness: mean absolute difference of the two, of 255.
+
+The same of the plates (where what moves does move) and of splats alone. DIR gets flow-NAME.json and strips of the worst
+frames: frame n, n + 1 laid over it, the flow that is left (black 0, white 2 pixels), what counts as moving.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import torch
+from torch import Tensor
+
+from benchmarks.detail import common_arguments, name_of, save_strip
+from benchmarks.detail_clip import DetailClip, open_clip
+from benchmarks.detail_figures import (
+    FLOW_WIDTH,
+    MOVER_MATTE,
+    Flow,
+    Histogram,
+    induced_places,
+    inside,
+    sampled,
+    seen_again,
+    still_pixels,
+    textured,
+    unexplained_flow,
+    unsteadiness,
+    widened,
+)
+from torch_backend.contract import JobError
+from torch_backend.freeze.query import FrozenImage
+from torch_backend.native import default_threads
+from torch_backend.shot import write_json
+
+WHAT = ("plate", "splats", "delivered")
+"""Of what the flow is taken."""
+PERCENT = 99.0
+ALLOWED = 0.25
+"""Pixels that moving regions may read more than still ones."""
+HIDDEN_MARGIN = 4
+"""Pixels to stay away from what only one of two frames sees."""
+LEAST = 200
+"""Pixels that a region of one frame needs to have a percentile."""
+
+
+@dataclass
+class Shown:
+    """One frozen frame of the path."""
+
+    frame: int
+    image: FrozenImage
+    pictures: dict[str, Tensor]
+    """Of each of `WHAT`."""
+    own: Tensor
+    """[H, W] motion matte of the frame, 0..1."""
+    there: Tensor
+    """[H, W] that of t*, brought here."""
+
+
+class Sums:
+    """Flow and difference of one of `WHAT` over frames, by region."""
+
+    def __init__(self) -> None:
+        self.flow = {region: Histogram() for region in ("moving", "still")}
+        self._steady = {region: [0.0, 0] for region in self.flow}
+
+    def add(self, region: str, flow: Tensor, difference: Tensor) -> None:
+        """Values [V] of one frame's region."""
+        self.flow[region].add(flow)
+        self._steady[region][0] += float(difference.sum())
+        self._steady[region][1] += len(difference)
+
+    def figures(self) -> dict[str, Any]:
+        """{region: {p99_px, unsteady_255, pixels}}, and the excess of moving over still."""
+        found: dict[str, Any] = {}
+        for region, (total, count) in self._steady.items():
+            found[region] = {
+                "p99_px": self.flow[region].percentile(PERCENT),
+                "unsteady_255": 255.0 * total / count if count else None,
+                "pixels": count,
+                "textured": self.flow[region].count,
+            }
+        moving, still = (found[region]["p99_px"] for region in ("moving", "still"))
+        found["excess_px"] = None if moving is None or still is None else moving - still
+        return found
+
+
+def show(clip: DetailClip, frame: int, t_star: int) -> Shown:
+    """The frame with everything that is compared."""
+    view = clip.view(frame, t_star)
+    own, there = clip.mattes(frame, t_star, view.image)
+    pictures = {"plate": clip.plate(frame), "splats": view.splats, "delivered": view.picture}
+    return Shown(frame, view.image, pictures, own, there)
+
+
+@dataclass
+class Pair:
+    """Two neighbouring frames laid over one another. Masks are bool [H, W] in pixels of the first."""
+
+    places: Tensor
+    """[H, W, 2] of the first frame's pixels in the second, by frozen depth and cameras."""
+    both: Tensor
+    """What both frames see."""
+    moving: Tensor
+    """Of that, what moves in either frame, or shows what moved at t*; a little away from what only one sees."""
+    still: Tensor
+    """Likewise what moves in neither."""
+
+
+def lay_over(clip: DetailClip, a: Shown, b: Shown) -> Pair:
+    """Frames a and b as a `Pair`."""
+    places, depth = induced_places(a.image.depth, *clip.camera(a.frame), *clip.camera(b.frame))
+    both = seen_again(places, depth, b.image.depth) & inside(places, clip.width, clip.height, 4.0)
+    own_b, there_b = (sampled(matte, places, nearest=True) for matte in (b.own, b.there))
+    matte = torch.stack([a.own, own_b]).amax(0)
+    mover = torch.stack([a.there, there_b]).amax(0) > MOVER_MATTE
+    inner = ~widened(~both, HIDDEN_MARGIN)
+    return Pair(places, both, inner & ((matte > MOVER_MATTE) | mover), inner & still_pixels(matte, mover))
+
+
+def judge_pair(flow: Flow, clip: DetailClip, a: Shown, b: Shown, sums: dict[str, Sums]) -> dict[str, Any]:
+    """Figures of frames a and b, added to `sums`: {what: {moving, still, excess: px}}."""
+    pair = lay_over(clip, a, b)
+    masks = {"moving": pair.moving, "still": pair.still}
+    row: dict[str, Any] = {"frame": a.frame, "next": b.frame}
+    row |= {f"{region}_share": float(mask.float().mean()) for region, mask in masks.items()}
+    for what in WHAT:
+        one, two = a.pictures[what], b.pictures[what]
+        left, judged = unexplained_flow(flow, one, two, pair.places, pair.both), textured(one)
+        difference = unsteadiness(one, two, pair.places)
+        found: dict[str, float | None] = {}
+        for region, mask in masks.items():
+            sums[what].add(region, left[mask & judged], difference[mask])
+            enough = int((mask & judged).sum()) >= LEAST
+            found[region] = float(left[mask & judged].quantile(PERCENT / 100.0)) if enough else None
+        moving, still = found["moving"], found["still"]
+        row[what] = {**found, "excess": None if moving is None or still is None else moving - still}
+    return row
+
+
+def judge_flow(clip: DetailClip, t_star: int, pairs: Sequence[tuple[int, int]]) -> dict[str, Any]:
+    """All figures of one freeze along a path of pairs of neighbouring frames."""
+    flow, sums = Flow(), {what: Sums() for what in WHAT}
+    rows = []
+    last: Shown | None = None
+    for n, (first, second) in enumerate(pairs):
+        a = last if last is not None and last.frame == first else show(clip, first, t_star)
+        last = show(clip, second, t_star)
+        rows.append(judge_pair(flow, clip, a, last, sums))
+        told = ", ".join(f"{w} {_px(rows[-1][w]['moving'])} / {_px(rows[-1][w]['still'])}" for w in WHAT)
+        print(f"[{n + 1}/{len(pairs)}] t* {t_star}, frames {first}, {second}: {told} px moving / still", flush=True)
+    return {"t_star": t_star, "clip": {what: total.figures() for what, total in sums.items()}, "frames": rows}
+
+
+def _px(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def worst_frames(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
+    """The frames whose moving regions read most above still ones, worst first."""
+    told = [row for row in rows if row["delivered"]["excess"] is not None]
+    return sorted(told, key=lambda row: -row["delivered"]["excess"])[:count]
+
+
+def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: int) -> None:
+    """Strips of the worst frames: frame n, n + 1 laid over it, flow that is left, what counts as moving."""
+    flow = Flow()
+    for row in worst_frames(freeze["frames"], count):
+        a, b = (show(clip, row[name], freeze["t_star"]) for name in ("frame", "next"))
+        pair, one, two = lay_over(clip, a, b), a.pictures["delivered"], b.pictures["delivered"]
+        left = unexplained_flow(flow, one, two, pair.places, pair.both) * (textured(one) & (pair.moving | pair.still))
+        told = torch.stack([pair.moving, pair.still, torch.zeros_like(pair.still)], dim=2) * 0.5
+        strip = [one, sampled(two, pair.places), (left / 2.0)[..., None].expand(-1, -1, 3), one * 0.5 + told]
+        name = f"t{freeze['t_star']:06d}_{100 * row['delivered']['excess']:05.0f}_{row['frame']:06d}.png"
+        save_strip(folder / name, strip)
+
+
+def table(name: str, freezes: Sequence[dict[str, Any]]) -> list[str]:
+    """The clip's figures in Markdown, a row per t* and what was looked at."""
+    header = [name, "flow left, moving, px", "still, px", "more", f"frames over {ALLOWED}", "worst frame"]
+    header += ["difference, moving, / 255", "still, / 255"]
+    lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
+    for freeze in freezes:
+        for what in WHAT:
+            of = freeze["clip"][what]
+            over = [row[what]["excess"] for row in freeze["frames"] if row[what]["excess"] is not None]
+            cells = [_px(v) for v in (of["moving"]["p99_px"], of["still"]["p99_px"], of["excess_px"])]
+            cells += [f"{sum(v > ALLOWED for v in over)} of {len(over)}", _px(max(over, default=None))]
+            cells += [_px(of[region]["unsteady_255"]) for region in ("moving", "still")]
+            lines.append(f"| t* {freeze['t_star']}, {what} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def verdicts(freezes: Sequence[dict[str, Any]]) -> list[str]:
+    """Sentences: whether each freeze is as still, and as steady, as acceptance asks."""
+    said = []
+    for freeze in freezes:
+        delivered, plate = freeze["clip"]["delivered"], freeze["clip"]["plate"]
+        if delivered["excess_px"] is None:
+            said.append(f"t* {freeze['t_star']}: nothing moves in these frames, or nothing is still.")
+            continue
+        honest = delivered["excess_px"] <= ALLOWED
+        steady = delivered["moving"]["unsteady_255"] <= plate["still"]["unsteady_255"]
+        said.append(
+            f"t* {freeze['t_star']}: what moved reads {delivered['excess_px']:+.2f} px against still pixels, which is "
+            f"{'within' if honest else 'more than'} {ALLOWED} px; it is {'no less' if steady else 'less'} steady "
+            "than the plate's still pixels."
+        )
+    return said
+
+
+def pairs_of(clip: DetailClip, args: argparse.Namespace) -> list[tuple[int, int]]:
+    """Neighbouring frames of the clip: all, those from each of `--frames`, or every `--every`-th pair."""
+    frames = clip.frames
+    pairs = [pair for pair in itertools.pairwise(frames) if not args.frames or pair[0] in args.frames]
+    if not pairs:
+        raise ValueError(f"none of --frames has a next one: the clip has {frames[0]} to {frames[-1]}")
+    return pairs[:: args.every]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    common_arguments(parser)
+    args = parser.parse_args(argv)
+    torch.set_num_threads(default_threads())
+    try:
+        clip = open_clip(args.shot, args.run, FLOW_WIDTH)
+        pairs, since = pairs_of(clip, args), time.perf_counter()
+        freezes = [judge_flow(clip, t_star, pairs) for t_star in args.t_star or clip.instants()]
+        name = name_of(args.shot)
+        for freeze in freezes if not args.no_strips else ():
+            save_worst(clip, freeze, args.results / f"flow-{name}", args.worst)
+    except (JobError, ModuleNotFoundError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    result = {"version": 1, "shot": str(args.shot), "run": args.run, "freezes": freezes}
+    write_json(args.results / f"flow-{name}.json", result | {"seconds": time.perf_counter() - since})
+    print("\n".join(["", *table(name, freezes), "", *verdicts(freezes)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

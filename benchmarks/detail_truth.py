@@ -1,0 +1,148 @@
+"""Plate detail against rendered truth: `python -m benchmarks.detail_truth SCENE ... --results DIR`.
+
+SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot, with exact
+cameras, and an `auto` run are made in DIR if they are not there. Printed is the mean PSNR of all poses and instants
+that have a truth, splats -> plate of the pose withheld -> delivered, by region, and what got worse. DIR gets
+truth-NAME.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import torch
+
+from benchmarks.bench import RunSpec, hold_out_phase, train_spec
+from benchmarks.sources import load_source
+from torch_backend.contract import JobError
+from torch_backend.native import default_threads
+from torch_backend.report.evaluate import detailers, freeze_run
+from torch_backend.report.metrics import WHOLE, psnr_by_region
+from torch_backend.report.records import DELIVERED, SPLATS, WITHHELD
+from torch_backend.report.truth import REGIONS, TruthScene
+from torch_backend.scene import load_scene
+from torch_backend.shot import write_json
+from torch_backend.train import load_run
+
+VARIANTS = (SPLATS, WITHHELD, DELIVERED)
+WANTED = {WHOLE: 4.0, "never_seen": 3.0, "moving": 1.5}
+"""Region -> dB that delivered frames should gain over splats."""
+WITHHELD_WANTED = 2.0
+"""dB that the whole frame should gain with the plate of its pose withheld."""
+
+
+def trained(truth: TruthScene, source: str, args: argparse.Namespace) -> str:
+    """Name of the scene's run, trained first if it is not. RuntimeError if that fails."""
+    spec = RunSpec(
+        source, truth.key, "auto", "support", "preview", seed=args.seed, iterations=args.iterations,
+        max_gaussians=args.gaussians, holdout_phase=hold_out_phase(truth),
+    )  # fmt: skip
+    code, _, _ = train_spec(spec, truth, 1)
+    if code:
+        raise RuntimeError(f"the run of {truth.name} could not be trained (exit code {code})")
+    return spec.run_name
+
+
+def judge(truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1) -> list[dict[str, Any]]:
+    """PSNR in dB of every pose: [{t_star, pose, variant: {region: dB or None}}]."""
+    run, scene = load_run(truth.shot, run_name, torch.device("cpu")), load_scene(truth.shot)
+    made, size, rows = detailers(truth.shot, run, scene), (run.width, run.height), []
+    for t_star in t_stars:
+        frozen = freeze_run(run, scene, t_star, "nearest", made)
+        for pose in truth.poses(t_star, [])[::every]:
+            target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
+            row: dict[str, Any] = {"t_star": t_star, "pose": pose}
+            rows.append(row | {v: psnr_by_region(frozen.view(pose, v), target, regions) for v in VARIANTS})
+        print(f"{truth.name}, t* {t_star}: {told(means(rows)[WHOLE])} dB whole so far", flush=True)
+    return rows
+
+
+def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """{region: {variant: mean dB over the poses in which the region is not empty}}; regions that never are."""
+    found = {}
+    for region in (WHOLE, *REGIONS):
+        there = [row for row in rows if row[SPLATS].get(region) is not None]
+        if there:
+            found[region] = {v: statistics.fmean(row[v][region] for row in there) for v in VARIANTS}
+    return found
+
+
+def told(of: dict[str, float]) -> str:
+    """Splats, withheld and delivered."""
+    return " -> ".join(f"{of[v]:.2f}" for v in VARIANTS)
+
+
+def table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
+    """Means by scene and region in Markdown."""
+    lines = [
+        "| scene | region | splats -> withheld -> delivered, dB | withheld | delivered |",
+        "|---|---|---|---:|---:|",
+    ]
+    for scene, regions in found.items():
+        for region, of in regions.items():
+            gains = [f"{of[v] - of[SPLATS]:+.2f}" for v in (WITHHELD, DELIVERED)]
+            lines.append(f"| {scene} | {region} | {told(of)} | {' | '.join(gains)} |")
+    return lines
+
+
+def shortfalls(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
+    """Sentences: regions that got worse, and gains that are less than wanted."""
+    said = []
+    for scene, regions in found.items():
+        for region, of in regions.items():
+            for v in (WITHHELD, DELIVERED):
+                gain = of[v] - of[SPLATS]
+                wanted = WANTED.get(region) if v == DELIVERED else WITHHELD_WANTED if region == WHOLE else None
+                if gain < 0:
+                    said.append(f"WORSE: {scene}, {region}, {v}: {gain:+.2f} dB.")
+                elif wanted is not None and gain < wanted:
+                    said.append(f"short: {scene}, {region}, {v}: {gain:+.2f} dB, wanted {wanted:+.1f}.")
+    return said
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
+    parser.add_argument("--results", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
+    parser.add_argument("--t-star", type=int, nargs="+", metavar="N", help="only these")
+    parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th pose")
+    parser.add_argument("--iterations", type=int, default=1500)
+    parser.add_argument("--gaussians", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0, help="of the training")
+    parser.add_argument("--train-only", action="store_true")
+    args = parser.parse_args(argv)
+    torch.set_num_threads(default_threads())
+    found, results = {}, args.results.absolute()
+    try:
+        for folder in args.scenes:
+            source = f"{args.cameras}:{folder.absolute()}"
+            truth = load_source(source, results)
+            run = trained(truth, source, args)
+            print(f"{truth.name}: {truth.shot.run(run)}", flush=True)
+            if args.train_only:
+                continue
+            rows = judge(truth, run, args.t_star or truth.t_stars, args.every)
+            found[truth.name] = means(rows)
+            name = truth.name.replace(" ", "-")
+            facts = {"version": 1, "scene": truth.name, "run": str(truth.shot.run(run))}
+            write_json(results / f"truth-{name}.json", {**facts, "mean": found[truth.name], "frames": rows})
+    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    if found:
+        print("\n".join(["", *table(found), "", *shortfalls(found)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,105 @@
+"""Frames made of plates for the add-on's tests: in detail/ two frozen frames of 32 x 24 pixels, their warps in
+detail/warp/, and the linear plates that they are made of, with values from -0.2 to 50, in detail/plate/.
+
+    python tests/addon/data/make_detail.py      (with the backend's Python: it uses the backend's own EXR writers)
+
+Frame numbers 5 and 6. The left third is the plate as it is, the middle one the plate moved by parts of a pixel, the
+right one the plate at a share over something else.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+WIDTH, HEIGHT = 32, 24
+FRAMES = (5, 6)
+FOLDER = Path(__file__).with_name("detail")
+
+
+def plate(frame: int) -> np.ndarray:
+    """[H, W, 3] float32, scene-linear, top row first."""
+    rng = np.random.default_rng(frame)
+    pixels = rng.uniform(-0.2, 1.2, (HEIGHT, WIDTH, 3))
+    hot = rng.uniform(size=(HEIGHT, WIDTH)) < 0.1
+    pixels[hot] = rng.uniform(25.0, 50.0, (int(hot.sum()), 3))
+    return pixels.astype(np.float32)
+
+
+def places(frame: int) -> np.ndarray:
+    """[H, W, 2] float64: where each pixel looks in the plate, in pixels of it from the top left, in steps of 1/256."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
+    moves = x >= WIDTH // 3
+    x += moves * 1.4 * np.sin(y / 5.0 + frame)
+    y += moves * 0.9 * np.cos(x / 7.0)
+    return np.clip(np.round(256.0 * np.stack([x, y], axis=2)) / 256.0, 0.0, [WIDTH - 1.0, HEIGHT - 1.0])
+
+
+def matte(frame: int) -> np.ndarray:
+    """[H, W] in 0..1."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    return np.where(x < 2 * WIDTH // 3, 1.0, ((x + y + frame) % 5) / 4.0).astype(np.float32)
+
+
+def moved(pixels: np.ndarray, frame: int) -> np.ndarray:
+    """[H, W, C] float64: a picture seen through `places`, bilinear."""
+    at = places(frame)
+    first = np.minimum(at.astype(int), [WIDTH - 2, HEIGHT - 2])
+    (x, y), (fx, fy) = np.moveaxis(first, 2, 0), np.moveaxis((at - first)[..., None, :], 3, 0)
+    pixels = pixels.astype(np.float64)
+    upper = (1 - fx) * pixels[y, x] + fx * pixels[y, x + 1]
+    return (1 - fy) * upper + fy * ((1 - fx) * pixels[y + 1, x] + fx * pixels[y + 1, x + 1])
+
+
+def other(frame: int) -> np.ndarray:
+    """[H, W, 3] float32: what splats show there; multiples of 1/64."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    return (np.stack([x * 2 + frame, y * 2 + frame, x + y], axis=2) % 65 / 64.0).astype(np.float32)
+
+
+def alpha() -> np.ndarray:
+    """[H, W]: a hole at the right bottom, half covered around it."""
+    whole = np.ones((HEIGHT, WIDTH), np.float32)
+    whole[-4:, -4:], whole[-2:, -2:] = 0.5, 0.0
+    return whole
+
+
+def frozen(frame: int) -> np.ndarray:
+    """[H, W, 3] float64: the frozen frame, scene-linear, premultiplied."""
+    share = (matte(frame) * alpha())[..., None]
+    return share * moved(plate(frame), frame) + (alpha()[..., None] - share) * other(frame)
+
+
+def source(frame: int) -> np.ndarray:
+    """[H, W] float32: numbers that a half float has not."""
+    return np.where(matte(frame) > 0, 100_001.0 + frame, 0.0).astype(np.float32)
+
+
+def main() -> None:
+    """Writes the files into detail/ beside this one."""
+    import OpenImageIO as oiio
+    import torch
+
+    from torch_backend.freeze.exr import DetailLayers, FrameMetadata, linear_spec, write_exr, write_frozen_exr
+    from torch_backend.freeze.warp import WarpMetadata, close, write_warp
+
+    ones, size = np.ones((HEIGHT, WIDTH), np.float32), np.array([WIDTH, HEIGHT])
+    for frame in FRAMES:
+        color, share = frozen(frame).astype(np.float32), matte(frame) * alpha()
+        st = (places(frame) + 0.5) / size
+        st[..., 1] = 1.0 - st[..., 1]
+        splat = np.concatenate([other(frame) * alpha()[..., None], alpha()[..., None]], axis=2)
+        name = f"{frame:06d}.exr"
+        write_frozen_exr(
+            FOLDER / name, np.concatenate([color, alpha()[..., None]], axis=2), frame * ones, ones, 0.5 * ones,
+            FrameMetadata(frame, 6.0, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)),
+            detail=DetailLayers(splat, share, source(frame)),
+        )  # fmt: skip
+        warp = close(*(torch.from_numpy(a) for a in (color, plate(frame), st.astype(np.float32), share)))
+        about = WarpMetadata(frame, frame, 6.0, WIDTH, HEIGHT)
+        write_warp(FOLDER / "warp" / name, *warp, alpha(), about)
+        spec = linear_spec(WIDTH, HEIGHT, ("R", "G", "B"), (oiio.FLOAT,) * 3)
+        write_exr(FOLDER / "plate" / name, spec, [plate(frame)])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,250 @@
+"""A wall and an arm that the model knows, a hand that it does not: found, as deep as it is, and nothing else."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from torch_backend.footage.images import write_png
+from torch_backend.freeze.instant import InstantConfig, instant_layer, join
+from torch_backend.freeze.query import FrozenGaussians, freeze_at, render_frozen
+from torch_backend.gaussians import Gaussians
+from torch_backend.gaussians.model import SH_C0
+from torch_backend.scene import Scene
+from torch_backend.train import LoadedRun
+from torch_backend.train.config import TrainConfig
+from torch_backend.train.exposure import Exposure, ExposureConfig
+from torch_backend.train.model import DynamicModel
+
+W, H, FRAMES, T_STAR = 192, 144, 13, 7
+WALL, ARM = 6.0, 3.0
+FOCAL = 180.0
+
+
+def sheet(x, y, z, step, color):
+    """State of Gaussians on a grid x (from, to), y (from, to) at a depth, `step` apart; color(x, y) -> [N, 3]."""
+    xs, ys = torch.meshgrid(torch.arange(x[0], x[1], step), torch.arange(y[0], y[1], step), indexing="ij")
+    places = torch.stack([xs.flatten(), ys.flatten(), torch.full_like(xs.flatten(), z)], 1)
+    count = len(places)
+    return {
+        "means": places,
+        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        "log_scales": torch.full((count, 3), math.log(0.7 * step)),
+        "opacity_logits": torch.full((count,), 3.0),
+        "sh0": ((color(places[:, 0], places[:, 1]) - 0.5) / SH_C0)[:, None],
+        "shN": torch.zeros(count, 0, 3),
+    }
+
+
+def wall(fine=0.0):
+    """A wall of dull spots; `fine`: how strong a texture of 2 px squares is on it."""
+
+    def color(x, y):
+        spots = 0.35 + 0.12 * torch.sin(2.1 * x + 0.7) * torch.cos(1.7 * y) + 0.08 * torch.sin(5.3 * x + 3.9 * y)
+        squares = torch.where(((x / 0.07).floor() + (y / 0.07).floor()) % 2 > 0, fine, -fine)
+        return (spots + squares)[:, None] * torch.tensor([0.8, 0.9, 1.0])
+
+    return sheet((-4.5, 4.5), (-3.2, 3.2), WALL, 0.07, color)
+
+
+def skin(x, y):
+    shade = 0.04 * torch.sin(23.0 * x) * torch.cos(19.0 * y)
+    return torch.tensor([0.9, 0.6, 0.5]) + shade[:, None]
+
+
+def arm():
+    return sheet((0.1, 0.9), (-0.12, 0.12), ARM, 0.02, skin)
+
+
+def hand(n, drift=(0.02, 0.05), start=(-0.28, 0.0), z=ARM):
+    """A hand at the arm's end, which goes by `drift` scene units a frame, and is in place at t*."""
+    at = [s + d * (n - T_STAR) for s, d in zip(start, drift, strict=True)]
+    state = sheet((-0.2, 0.38), (-0.2, 0.2), z, 0.02, skin)
+    return {**state, "means": state["means"] + torch.tensor([*at, 0.0])}
+
+
+def together(*states):
+    return {name: torch.cat([state[name] for state in states]) for name in states[0]}
+
+
+def frozen_of(state, motion=None):
+    count = len(state["means"])
+    return FrozenGaussians(state, 0, torch.ones(count), torch.zeros(count) if motion is None else motion)
+
+
+@dataclass
+class World:
+    """A clip of what `shown(n)` is at frame n, and a model of what `known` is."""
+
+    scene: Scene
+    run: LoadedRun
+    frozen: FrozenGaussians
+
+    def image(self, state, n):
+        scene = self.scene
+        return render_frozen(frozen_of(state), scene.viewmats[n - 1], scene.Ks[n - 1], W, H).color.numpy()
+
+    def layer(self, motion=None, config=None):
+        return instant_layer(self.run, self.scene, None, self.frozen, T_STAR, config, motion)
+
+    def found(self):
+        layer = self.layer()
+        assert layer is not None
+        return layer
+
+
+def scene_at(folder):
+    viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
+    # The camera sways on its way: a steady one cannot be told from a hand's steady motion.
+    viewmats[:, 0, 3] = torch.linspace(0.7, -0.7, FRAMES)
+    viewmats[:, 1, 3] = 0.06 * torch.sin(torch.arange(FRAMES) * 1.3)
+    K = torch.tensor([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1.0]])
+    times = np.linspace(0, 1, FRAMES)
+    return Scene(
+        list(range(1, FRAMES + 1)), times * FRAMES / 24, times, viewmats, K.repeat(FRAMES, 1, 1), W, H,
+        list(range(FRAMES)), torch.zeros(1, 3), torch.zeros(1, 3), 1.0, np.zeros(3), folder,
+    )  # fmt: skip
+
+
+def world(folder, known, shown, drawn=None, exposed=(0.0, 0.0), motion=None):
+    """`drawn(picture, n)` changes plate n; `exposed`: log-gain and offset that plates and model have."""
+    scene = scene_at(folder)
+    gaussians = Gaussians(known, FRAMES)
+    gaussians.support[:] = True
+    exposure = Exposure(torch.from_numpy(scene.times).float(), ExposureConfig())
+    exposure.values.data[:] = torch.tensor(exposed)[:, None]
+    model = DynamicModel(gaussians, None, torch.from_numpy(scene.times).float(), 0, exposure)
+    run = LoadedRun(folder, TrainConfig(), model, W, H, scene.frames, [])
+    frozen = freeze_at(model, float(scene.times[T_STAR - 1]), 1.0)
+    if motion is not None:
+        frozen.motion = motion
+    made = World(scene, run, frozen)
+    for n in scene.frames:
+        picture = made.image(shown(n), n) * math.exp(exposed[0]) + exposed[1]
+        picture = picture if drawn is None else drawn(picture, n)
+        write_png(folder / f"{n:06d}.png", (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8))
+    return made
+
+
+@pytest.fixture(scope="module")
+def waving(tmp_path_factory):
+    static = together(wall(), arm())
+    return world(tmp_path_factory.mktemp("waving"), static, lambda n: together(static, hand(n)))
+
+
+def where(made, state):
+    """Pixels [H, W] of plate t* that show a state, wholly."""
+    frozen = frozen_of(state)
+    return render_frozen(frozen, made.scene.viewmats[T_STAR - 1], made.scene.Ks[0], W, H).alpha.numpy() > 0.9
+
+
+def test_a_hand_that_the_model_lacks_is_found_as_deep_as_the_arm_it_hangs_on(waving):
+    layer = waving.found()
+    truth = where(waving, hand(T_STAR)) & ~where(waving, arm())
+    found = layer.mask.numpy() > 0.5
+    assert (found & truth).sum() / (found | truth).sum() > 0.8
+    depths = layer.state["means"][:, 2].numpy()
+    assert abs(np.median(depths) / ARM - 1) < 0.06
+    assert np.percentile(np.abs(depths / ARM - 1), 95) < 0.15
+    assert layer.frame == T_STAR and not layer.ghost.any() and bool((layer.kept == 1).all())
+
+
+def test_from_every_pose_the_frozen_scene_shows_the_hand_of_t_star(waving):
+    joined = join(waving.frozen, waving.found())
+    known = waving.frozen.state
+    truth_state = together(known, hand(T_STAR))
+    for n in (1, 4, T_STAR, 10, FRAMES):
+        truth = waving.image(truth_state, n)
+        without, shown = waving.image(known, n), waving.image(joined.state, n)
+        changed = np.abs(truth - without).max(-1) > 0.1
+        before, after = (np.square(image - truth)[changed].mean() for image in (without, shown))
+        assert changed.sum() > 200
+        assert after < 0.25 * before, f"frame {n}: {before:.4f} {after:.4f}"
+        away = np.abs(truth - shown).max(-1)[~changed]
+        assert (away > 0.15).mean() < 0.01
+
+
+def test_twice_as_large_the_layer_has_no_holes(waving):
+    layer = waving.found()
+    K = waving.scene.Ks[0].clone()
+    K[:2] *= 2
+    alone = join(frozen_of({k: v[:0] for k, v in waving.frozen.state.items()}), layer_alone(layer))
+    image = render_frozen(alone, waving.scene.viewmats[T_STAR - 1], K, 2 * W, 2 * H)
+    inside = np.kron(where(waving, hand(T_STAR)) & (layer.mask.numpy() > 0.9), np.ones((2, 2), bool))
+    assert image.alpha.numpy()[inside].min() > 0.85
+    assert image.motion.numpy()[inside].min() > 0.99 and image.support.numpy()[inside].min() > 0.99
+
+
+def layer_alone(layer):
+    layer.kept = layer.kept[:0]
+    return layer
+
+
+def test_nothing_is_found_where_plate_and_model_agree(tmp_path):
+    static = together(wall(), arm())
+    assert world(tmp_path, static, lambda n: static).layer() is None
+
+
+def test_a_model_that_is_merely_soft_is_no_disagreement(tmp_path):
+    assert world(tmp_path, together(wall()), lambda n: wall(fine=0.25)).layer() is None
+
+
+def test_what_the_motion_matte_calls_still_is_left_alone(waving):
+    still, moving = np.zeros((H, W), np.uint8), np.full((H // 2, W // 2), 255, np.uint8)
+    asked = []
+    assert waving.layer(lambda frame: asked.append(frame) or still) is None
+    assert waving.layer(lambda frame: moving) is not None
+    assert set(asked) == {T_STAR}
+
+
+def test_a_thing_that_hangs_on_nothing_is_placed_by_its_parallax(tmp_path):
+    """It goes up and down, and the camera to the side: how far it is shows along the lines, not across."""
+    flies = lambda n: together(wall(), hand(n, drift=(0.0, 0.015), start=(-0.1, -0.3), z=4.0))  # noqa: E731
+    layer = world(tmp_path, wall(), flies).found()
+    assert abs(float(layer.state["means"][:, 2].median()) / 4.0 - 1) < 0.12
+    assert layer.regions[0].attached < 0.5
+
+
+def test_a_logo_on_the_picture_is_no_thing_in_the_scene(tmp_path):
+    stamp = (np.indices((24, 24)).sum(0) // 4 % 2)[..., None] * np.ones(3)
+
+    def drawn(picture, n):
+        picture = picture.copy()
+        picture[110:134, 150:174] = 0.3 * picture[110:134, 150:174] + 0.7 * stamp
+        return picture
+
+    assert world(tmp_path, wall(), lambda n: wall(), drawn).layer() is None
+
+
+def test_moving_gaussians_before_what_plate_t_star_shows_are_faded(tmp_path):
+    known = together(wall(), hand(T_STAR))
+    motion = torch.cat([torch.zeros(len(wall()["means"])), torch.ones(len(hand(T_STAR)["means"]))])
+    gone = world(tmp_path, known, lambda n: wall(), motion=motion)
+    layer = gone.found()
+    truth = where(gone, hand(T_STAR))
+    assert (layer.ghost.numpy() & truth).sum() > 0.8 * truth.sum()
+    assert len(layer.state["means"]) == 0
+    assert bool((layer.kept[motion == 0] == 1).all()) and float(layer.kept[motion > 0].median()) < 0.1
+    for n in (2, 12):
+        truth = gone.image(wall(), n)
+        before, after = (np.abs(gone.image(f.state, n) - truth).mean() for f in (gone.frozen, join(gone.frozen, layer)))
+        assert after < 0.3 * before
+
+
+def test_still_gaussians_are_never_faded(tmp_path):
+    known = together(wall(), hand(T_STAR))
+    layer = world(tmp_path, known, lambda n: wall()).layer()
+    assert layer is None or bool((layer.kept == 1).all())
+
+
+def test_the_layer_is_exposed_once_like_the_rest(tmp_path):
+    static, exposed = together(wall(), arm()), (-0.2, 0.05)
+    dark = world(tmp_path, static, lambda n: together(static, hand(n)), exposed=exposed)
+    colors = 0.5 + SH_C0 * dark.found().state["sh0"][:, 0]
+    assert np.allclose(colors.median(0).values.numpy(), [0.9, 0.6, 0.5], atol=0.03)
+
+
+def test_small_things_are_left_alone(waving):
+    assert waving.layer(config=InstantConfig(least=5000.0)) is None

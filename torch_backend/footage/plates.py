@@ -1,0 +1,267 @@
+"""Plates: the source's frames at its own size and depth, without the lens, one by one.
+
+Working frames are small and cut at white; frozen frames take their pixels from here. Where the source holds no more
+than the working frames do, these are the plates.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..contract import ExitCode, JobError, frame_file
+from ..shot import Shot, content_key
+from ..solve.lens import Lens, load_lens
+from ..solve.stored import load_cameras, load_record
+from ..solve.undistort import BandUndistorter
+from . import codes
+from .images import read_frame, read_png, resize_float, working_size
+from .importing import FootageConfig, import_key, load_frames
+from .sources import Known, PlateReader, Source, open_source
+
+PLATES_VERSION = 1
+_NO_LARGER = 720
+"""Import leaves clips of fewer lines than this at their size unless it is told otherwise."""
+_AGREE = 4.0 / 255.0
+_DISAGREE_SHARE = 1e-3
+"""A plate is of another picture than its working frame if more than this share of values is farther off than that."""
+
+
+@dataclass
+class _Found:
+    """Where plates come from."""
+
+    source: Source | None = None
+    """The footage; None: the working frames."""
+    note: str = ""
+    """Why not the footage, where that costs something."""
+
+
+class Plates:
+    """Undistorted source frames, read as they are asked for; the last few are kept, as codes (see `codes`).
+
+    A kept plate takes 3 to 6 bytes a pixel, 50 MB at 3840 x 2160. Not safe to use from several threads.
+    """
+
+    width: int
+    """Pixels of a plate."""
+    height: int
+    """Pixels."""
+    frames: list[int]
+    """Numbers of every source frame of the range, ascending; also those that a step left out of training."""
+    deep: bool
+    """True if values may lie below 0 and above 1."""
+    note: str
+    """One sentence for a warning where working frames stand in for the source; empty if nothing is lost."""
+    key: str
+    """Changes with the footage, the solve, and the size."""
+
+    def __init__(self, shot: Shot, size: tuple[int, int] | None = None, keep: int = 12) -> None:
+        """`size` is width and height in pixels, None the source's; `keep` the most plates held.
+
+        The default holds what a frozen frame and the next one ask for: itself, two before and two after it at every
+        other frame, and t*. JobError (FOOTAGE, SOLVE) if the shot is not imported and solved.
+        """
+        record, solved = load_frames(shot), load_record(shot)
+        self._shot, self._keep = shot, max(1, keep)
+        self._files = {int(row["frame"]): str(row["file"]) for row in record["frames"]}
+        self.frames = sorted(self._files)
+        working = int(record["width"]), int(record["height"])
+        self._working = working
+        lens, found = _lens(shot), _Found()
+        if isinstance(lens, str):
+            found.note = "" if _holds_no_more(record, working) else lens
+        else:
+            found = self._find(record, working)
+        self.note = found.note
+        info = found.source.info if found.source is not None else None
+        self.width, self.height = size or ((info.width, info.height) if info is not None else working)
+        self.deep = info is not None and info.extended
+        if not self.deep and (self.width, self.height) == working:
+            found.source = None  # the working frames are just that
+        self._undistort = None
+        self._reader: PlateReader | None = None
+        if found.source is not None and not isinstance(lens, str):
+            self._undistort = _undistorter(lens, self.width, self.height)
+            self._reader = found.source.plates(self._known(record))
+        self._held: OrderedDict[int, NDArray] = OrderedDict()
+        footage = info.key if info is not None and found.source is not None else "working frames"
+        self.key = content_key(PLATES_VERSION, record.get("key"), solved.get("key"), footage, [self.width, self.height])
+
+    def display(self, frame: int) -> Tensor:
+        """[H, W, 3] float32 on the CPU, extended display-referred: white 1, values beyond it where `deep`.
+
+        ValueError if the shot has no such frame; JobError (FOOTAGE, SOLVE) if its picture cannot be read any more.
+        """
+        return torch.from_numpy(codes.display(self._codes(frame)))
+
+    def linear(self, frame: int) -> Tensor:
+        """The same in scene-linear Rec.709."""
+        return torch.from_numpy(codes.linear(self._codes(frame)))
+
+    @property
+    def kept(self) -> int:
+        """Plates held now."""
+        return len(self._held)
+
+    def close(self) -> None:
+        """Frees what is held; plates are read anew if they are asked for again."""
+        self._held.clear()
+        if self._reader is not None:
+            self._reader.close()
+
+    def _codes(self, frame: int) -> NDArray:
+        if frame not in self._files:
+            raise ValueError(f"the shot has no frame {frame}: it has {self.frames[0]} to {self.frames[-1]}")
+        if frame in self._held:
+            self._held.move_to_end(frame)
+            return self._held[frame]
+        while len(self._held) >= self._keep:
+            self._held.popitem(last=False)
+        self._held[frame] = self._read(frame)
+        return self._held[frame]
+
+    def _read(self, frame: int) -> NDArray:
+        if self._reader is None:
+            picture = read_frame(self._shot.frames / frame_file(frame, ".png"))
+            return codes.resize_plate(picture, self.width, self.height)
+        try:
+            picture = self._reader.plate(frame)
+        except OSError as error:
+            raise JobError(
+                f"Frame {frame} of the footage cannot be read any more: {error}.",
+                "Check that the disk it lies on is there, and that the file is whole.",
+                ExitCode.FOOTAGE,
+            ) from error
+        picture = codes.resize_plate(picture, self.width, self.height)
+        return picture if self._undistort is None else self._undistort(picture)
+
+    # ------------------------------------------------------------------------------------------------- the source
+
+    def _find(self, record: dict[str, Any], working: tuple[int, int]) -> _Found:
+        """The footage, if it holds more than the working frames and is what was imported."""
+        if _holds_no_more(record, working):
+            return _Found()
+        stays = f"frozen frames stay at {working[0]}x{working[1]} and at what the working frames hold."
+        config = _config(record)
+        places = source_places(self._shot, record)
+        for place in places:
+            try:
+                source = open_source(place, config.fps, config.layer)
+            except (JobError, OSError):
+                continue
+            if not source.info.extended and (source.info.width, source.info.height) == working:
+                return _Found()
+            if self._is_imported(source, record, config, working):
+                return _Found(source)
+            return _Found(note=f"The footage {place} is not what was imported: {stays}")
+        named = self._shot.info().source
+        return _Found(note=f"The footage {named or 'of this shot'} cannot be read: {stays}")
+
+    def _is_imported(
+        self, source: Source, record: dict[str, Any], config: FootageConfig, working: tuple[int, int]
+    ) -> bool:
+        """True if the footage is by its key, or by its first, middle and last picture, what was imported."""
+        info = source.info
+        if import_key(info, config) == record.get("key"):
+            return True
+        if working_size(info.width, info.height, config.working_height) != working:
+            return False
+        reader = source.plates(self._known(record))
+        try:
+            spots = {self.frames[0], self.frames[len(self.frames) // 2], self.frames[-1]}
+            return all(self._agrees(n, reader.plate(n)) for n in sorted(spots))
+        except (JobError, OSError):
+            return False
+        finally:
+            reader.close()
+
+    def _known(self, record: dict[str, Any]) -> Known:
+        rows, start = record["frames"], record.get("start")
+        seconds = {int(row["frame"]): float(row["seconds"]) for row in rows}
+        return Known(seconds, float(start) if start is not None else None, self._agrees)
+
+    def _agrees(self, frame: int, picture: NDArray) -> bool:
+        """True if a picture of the source shows what the raw working frame does."""
+        try:
+            raw = read_png(self._shot.frames / self._files[frame])
+        except (OSError, ValueError):
+            return True  # nothing to hold it against
+        width, height = self._working
+        if picture.dtype == np.float16:
+            small = resize_float(np.clip(codes.display(picture), 0.0, 1.0), width, height)
+        else:
+            small = codes.display(codes.resize_plate(picture, width, height))
+        off = np.abs(np.clip(small, 0.0, 1.0) - codes.display(raw))
+        return bool((off > _AGREE).mean() < _DISAGREE_SHARE)
+
+
+def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
+    """Where a shot's footage may lie: as it was named, beside the shot with which it was moved, in the same folder."""
+    named, beside = shot.info().source, str(record.get("beside") or "")
+    places = [named] if named else []
+    if beside:
+        places.append(str((shot.root / beside).resolve()))
+    if named:
+        places.append(str(shot.root.parent / re.split(r"[\\/]", named)[-1]))
+    return list(dict.fromkeys(places))
+
+
+def _config(record: dict[str, Any]) -> FootageConfig:
+    told = record.get("config") or {}
+    return FootageConfig(**{name: told[name] for name in FootageConfig.__dataclass_fields__ if name in told})
+
+
+def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
+    """True if the footage is known to have the working frames' size and no values that they lack."""
+    size, told = record.get("source_size"), record.get("config") or {}
+    if size is None:  # imported by an earlier version
+        same = not told.get("working_height") and working[1] < _NO_LARGER
+        return same and record.get("bits") == 8
+    return tuple(size) == working and not record.get("extended", True)
+
+
+# --------------------------------------------------------------------------------------------------------- the lens
+
+
+def _lens(shot: Shot) -> Lens | str:
+    """The lens, or a sentence that says why the source cannot be undistorted. JobError (SOLVE) if there is no solve."""
+    load_cameras(shot)
+    try:
+        return load_lens(shot)
+    except JobError as error:
+        return f"{error.message} Frozen frames stay at the working frames' size."
+
+
+def _undistorter(lens: Lens, width: int, height: int) -> Callable[[NDArray], NDArray] | None:
+    """Takes codes of that size through the lens; None where there is nothing to do."""
+    if not any((lens.k1, lens.k2, lens.p1, lens.p2)):
+        return None
+    warp = BandUndistorter(_where(lens, width, height))
+
+    def undistort(picture: NDArray) -> NDArray:
+        # Eight bits are not enough between samples of eight bits.
+        kind = np.dtype(np.float16 if picture.dtype == np.float16 else np.uint16)
+        return warp(picture, codes.display, lambda x: codes.from_display(x, kind), np.empty(picture.shape, kind))
+
+    return undistort
+
+
+def _where(lens: Lens, width: int, height: int) -> NDArray[np.float32]:
+    """[height, width, 2]: where the pixels of an undistorted plate lie in the source, in its pixels."""
+    out = np.empty((height, width, 2), np.float32)
+    ratio = np.array([width / lens.width, height / lens.height])
+    x = np.arange(width) + 0.5
+    for top in range(0, height, codes.ROWS):
+        y = np.arange(top, min(top + codes.ROWS, height)) + 0.5
+        at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / ratio
+        out[top : top + codes.ROWS] = (lens.to_original(at) * ratio).reshape(-1, width, 2)
+    return out

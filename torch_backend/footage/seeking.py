@@ -1,0 +1,158 @@
+"""Single frames of a video, in any order, by the numbers that import gave them.
+
+Import numbers frames by counting what the decoder gives out, which no seek can do. So a frame is found by the time
+that import recorded for it, and what was sought is held against its working frame. A file in which that fails, or
+whose frames have no times, is counted from its beginning, as import did.
+"""
+
+from __future__ import annotations
+
+import os
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import av
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
+from .sources import Known, footage_error
+from .video import VideoSource
+
+_THREADS = 4
+"""Of the decoder; each of them holds frames of its own."""
+_KEPT = 8
+"""Decoded frames held after those that were asked for: neighbours are asked for next, also backwards."""
+_AHEAD = 32
+"""Frames that are rather decoded than jumped over: key frames mostly lie farther apart."""
+_EARLIER = (0.0, 1.0, 5.0, 20.0)
+"""Seconds before a frame at which a key frame is looked for, in this order."""
+_LEAST_GAP = 1e-5
+"""Seconds between frames that can be told apart: import rounds to 1e-6."""
+
+
+class VideoReader:
+    """See `sources.PlateReader`. Holds up to `_KEPT` frames as decoded: at most 25 MB each at 3840 x 2160, 10 bit."""
+
+    def __init__(self, source: VideoSource, known: Known) -> None:
+        self._source, self._known, self._start = source, known, known.start
+        self._listed = sorted(known.seconds)
+        self._seconds = [known.seconds[number] for number in self._listed]
+        gap = min((b - a for a, b in zip(self._seconds, self._seconds[1:], strict=False)), default=1.0)
+        self._can_seek = gap > _LEAST_GAP
+        self._slack = max(0.25 * gap, 0.25 * _LEAST_GAP)
+        self._kept: deque[tuple[int, av.VideoFrame]] = deque(maxlen=_KEPT)
+        self._container: Any = None
+        self._stream: Any = None
+        self._decoder: Iterator[Any] = iter(())
+        self._counted: int | None = None
+        """Frames given out since the beginning; None after a seek: frames are told by their times then."""
+        self._at = 0
+        """Number of the frame that was decoded last."""
+
+    def plate(self, number: int) -> NDArray:
+        """See `PlateReader.plate`."""
+        frame = next((frame for n, frame in self._kept if n == number), None)
+        if frame is not None:
+            return self._source.plate_of(frame)
+        if self._container is None:
+            self._reopen()
+        far = not self._at < number <= self._at + _AHEAD
+        if far and self._can_seek and self._start is not None:
+            plate = self._sought(number)
+            if plate is not None:
+                return plate
+        if not self._at < number or (self._counted is None and not self._can_seek):
+            self._reopen()
+        frame = self._forward(number)
+        if frame is None and self._counted is None:
+            self._reopen()
+            frame = self._forward(number)
+        if frame is None:
+            raise footage_error(
+                f"Frame {number} of {self._source.path.name} cannot be decoded any more.",
+                "The file has changed or is damaged: import the clip again.",
+            )
+        return self._source.plate_of(frame)
+
+    def close(self) -> None:
+        """See `PlateReader.close`."""
+        self._kept.clear()
+        self._decoder = iter(())
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+
+    def _reopen(self) -> None:
+        """To the beginning, where counting starts."""
+        self.close()
+        self._container, self._stream = self._source.open(min(_THREADS, os.cpu_count() or 1))
+        self._decoder = self._source.decode(self._container, self._stream)
+        self._counted, self._at = 0, 0
+
+    def _sought(self, number: int) -> NDArray | None:
+        """The plate by way of the key frame before it; None, once and for all, if this file cannot be sought in."""
+        for earlier in _EARLIER:
+            if not self._jump(self._time_of(number) - earlier):
+                break
+            frame = self._forward(number)
+            if frame is not None:
+                plate = self._source.plate_of(frame)
+                if not self._known.agrees(number, plate):
+                    break
+                return plate
+        self._can_seek = False
+        self._reopen()
+        return None
+
+    def _jump(self, seconds: float) -> bool:
+        """Goes to the key frame before a time, as the container sees it. False if it cannot."""
+        self._kept.clear()
+        self._counted, self._at = None, self._listed[0] - 1
+        try:
+            self._container.seek(int(seconds / self._stream.time_base), stream=self._stream, backward=True)
+        except (FFmpegError, OverflowError):
+            return False
+        self._decoder = self._source.decode(self._container, self._stream)
+        return True
+
+    def _forward(self, number: int) -> av.VideoFrame | None:
+        """Decodes up to frame `number`, keeping those on the way; None if it does not come."""
+        for frame in self._decoder:
+            if self._counted is not None:
+                self._counted += 1
+                found: int | None = self._counted
+            else:
+                found = None if isinstance(frame, FFmpegError) else self._number_at(frame)
+            if found is None:
+                if not isinstance(frame, FFmpegError) and self._is_past(frame, number):
+                    return None
+                continue
+            self._at = found
+            if isinstance(frame, FFmpegError):
+                continue
+            if found == self._listed[0] and self._start is None:
+                self._start = frame.time
+                self._can_seek &= frame.time is not None
+            self._kept.append((found, frame))
+            if found >= number:
+                return frame if found == number else None
+        return None
+
+    def _time_of(self, number: int) -> float:
+        assert self._start is not None
+        return self._start + self._known.seconds[number]
+
+    def _number_at(self, frame: av.VideoFrame) -> int | None:
+        """Number of a frame by its time; None if import listed none there."""
+        if frame.time is None or self._start is None:
+            return None
+        since = frame.time - self._start
+        at = bisect_left(self._seconds, since - self._slack)
+        near = at < len(self._seconds) and abs(self._seconds[at] - since) <= self._slack
+        return self._listed[at] if near else None
+
+    def _is_past(self, frame: av.VideoFrame, number: int) -> bool:
+        """True if a frame without a number comes after `number`, or cannot be placed at all."""
+        return frame.time is None or frame.time > self._time_of(number) + self._slack

@@ -1,0 +1,442 @@
+"""Frozen frames made of the plates: splats give geometry, motion and occlusion, plates give the pixels.
+
+For a camera and an instant t*, with C the frozen render, I_m plate m and R_m the model's own render of plate m (its
+camera, its time, its exposure), a pixel x is
+
+    out(x) = A(x) I_n(p_n(x)) + (1 - A(x)) (C(x) + b(x) sum_m w_m(x) (I_m - R_m)(p_m(x)) / sum_m w_m(x))
+
+n is the leading plate: the frame's own on the clip's poses, the nearest in pose on others. A, its matte, is 1 wherever
+nothing that moves is seen, at t* or in the plate; so a still world is the plate itself, bit for bit. The rest is
+filled: what the model missed in other plates (texture, edges, light) is carried along the surface point that x shows
+to where plate m shows the same point, moved from t* to m as the model moves it. Plate t* is believed even where the
+model cannot explain it, because what it shows is the truth of the frozen instant; others where nothing moves, or where
+they agree with the model. b fades to the splats alone where no plate can be believed.
+
+Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023, "DynIBaR"; figures: docs/benchmarks.md.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from ..scene import Scene, resize_intrinsics
+from ..shot import Shot
+from ..solve.motion import load_motion
+from ..train import LoadedRun
+from ..train.model import render
+from .instant import InstantLayer, instant_layer, join
+from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
+from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
+from .sightings import MovingOf, PlateReader, Sighting, SightingConfig, Sightings
+from .transfer import to_display, to_linear
+from .warp import sample, snap
+
+
+@dataclass(frozen=True)
+class DetailConfig:
+    """How plates are chosen, weighed and mixed. Lengths in pixels are of pictures as wide as decisions are made."""
+
+    sources: int = 5
+    """Plates that a frame is made of, at most: its own and that of t* among them."""
+    reach: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+    """How many frames before and after a pose plates are looked for that see what its own hides."""
+    depth_error: float = 0.02
+    """Share of the depth by which the model's surfaces are expected to be wrong: with the baseline, an error in
+    pixels, at 1 of which a plate is believed by half."""
+    margin: int = 4
+    """Pixels around what moves in which the leading plate is not believed: hair, motion blur, the flow's own error."""
+    feather: float = 2.0
+    """Sigma of the leading plate's matte along its border, pixels."""
+    enough: float = 0.3
+    """Sum of weights at which a pixel is all plate; below, splats are mixed in."""
+    sway: float = 6.0
+    """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
+    sway_trust: float = 0.3
+    """How far a plate of another time is believed in what moves, beside plate t*."""
+    instant: bool = True
+    """Give what plate t* shows and the model lacks a surface of its own (`instant.py`)."""
+    sightings: SightingConfig = field(default_factory=SightingConfig)
+    """How plates are compared with the model."""
+
+
+@dataclass
+class DetailedFrame:
+    """One frozen frame made of plates, on the CPU, with overscan if the render had it."""
+
+    color: Tensor
+    """[H, W, 3] premultiplied, extended display-referred."""
+    linear: Tensor
+    """[H, W, 3] the same, scene-linear: matte * plate(st) + fill."""
+    alpha: Tensor
+    """[H, W] in 0..1."""
+    splat: Tensor
+    """[H, W, 3] premultiplied, display-referred: the splats alone."""
+    splat_alpha: Tensor
+    """[H, W] in 0..1: how much of the pixel they cover."""
+    plate: Tensor
+    """[H, W] in 0..1: share of the pixel that is plate; 0: invented by splats."""
+    source: Tensor
+    """[H, W] float32: number of the frame whose plate gives most; 0 where `plate` is 0."""
+    depth: Tensor
+    """[H, W] as in `FrozenImage`."""
+    support: Tensor
+    """[H, W] as in `FrozenImage`."""
+    motion: Tensor
+    """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell."""
+    leading: int
+    """Frame number of the plate that `st` looks into."""
+    st: Tensor
+    """[H, W, 2] s to the right, t up, 0..1 over the undistorted plate `leading`, pixel centres at (i + 0.5) / size."""
+    matte: Tensor
+    """[H, W] in 0..1: how much of the pixel the leading plate gives."""
+    fill: Tensor
+    """[H, W, 3] scene-linear, premultiplied by 1 - matte: the rest of the pixel."""
+
+
+@dataclass
+class _Shot:
+    """A frame that is being made: its camera at both sizes, and what it shows."""
+
+    viewmat: Tensor
+    K: Tensor
+    """[3, 3] in pixels of the picture with its overscan."""
+    image: FrozenImage
+    t: int
+    """Frame whose plate shows the instant."""
+    frozen: FrozenGaussians
+    points: Tensor
+    """[h, w, 3] world points seen, at the size of decisions."""
+    depth: Tensor
+    """[h, w]"""
+    motion: Tensor
+    """[h, w] in 0..1: what moves in the clip, at t*."""
+    per_pixel: float
+    """Pixels of decisions per pixel of the picture."""
+
+    @property
+    def centre(self) -> Tensor:
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+
+@dataclass
+class _Rest:
+    """Pixels that the leading plate does not give, P of them."""
+
+    y: Tensor
+    """[P] int64 row."""
+    x: Tensor
+    """[P] int64 column."""
+    color: Tensor
+    """[P, 3] premultiplied, display-referred."""
+    share: Tensor
+    """[P] in 0..1: how much of it is plate."""
+    source: Tensor
+    """[P] number of the frame that gives most."""
+
+
+class Detailer:
+    """Makes frozen frames of one run out of plates. What it computes of a plate serves all frames that use it."""
+
+    def __init__(
+        self,
+        run: LoadedRun,
+        scene: Scene,
+        plates: PlateReader,
+        config: DetailConfig | None = None,
+        moving: MovingOf | None = None,
+    ) -> None:
+        """`moving`: see `Sightings`."""
+        self.run, self.scene, self.plates = run, scene, plates
+        self.config = config or DetailConfig()
+        self.seen = Sightings(run, scene, plates, moving, self.config.sightings)
+        self._layers: OrderedDict[tuple[int, float], InstantLayer | None] = OrderedDict()
+
+    @torch.no_grad()
+    def frame(
+        self,
+        output: OutputFrame,
+        frozen: FrozenGaussians,
+        image: FrozenImage,
+        width: int,
+        height: int,
+        withheld: Collection[int] = (),
+    ) -> DetailedFrame:
+        """One frozen frame.
+
+        Args:
+            output: its camera and instant.
+            frozen: the scene frozen at `output.t_star`.
+            image: the splats' render of it, which may show more around the frame: overscan.
+            width, height: pixels of the frame without overscan.
+            withheld: frames whose plates are not to be used.
+        """
+        splat = image
+        frozen, image = self._joined(output, frozen, image, width, height)
+        shot = self._shot(output, frozen, image, width, height)
+        usable = [frame for frame in self.seen.frames if frame not in withheld]
+        leading = self._leading(output, shot, usable)
+        matte, st, own = self._lead(output, shot, leading, usable, (width, height))
+        rest = self._fill(shot, matte, leading, usable)
+        return self._mixed(shot, splat, leading, matte, st, own, rest)
+
+    # ------------------------------------------------------------------------------------------------- the frame
+
+    def _joined(
+        self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, width: int, height: int
+    ) -> tuple[FrozenGaussians, FrozenImage]:
+        """The frozen scene with what plate t* shows and the model lacks, and its render."""
+        layer = self._layer(output.t_star, frozen)
+        if layer is None:
+            return frozen, image
+        frozen = join(frozen, layer)
+        K, exposed_at = _with_overscan(output.K, image, width, height), self.scene.time_of_frame(output.exposed_like)
+        rows, columns = image.alpha.shape
+        exposure = self.run.model.exposure
+        return frozen, render_frozen(frozen, output.viewmat, K, columns, rows, exposure, exposed_at)
+
+    def _layer(self, t_star: float, frozen: FrozenGaussians) -> InstantLayer | None:
+        key = len(frozen.support), t_star
+        if not self.config.instant:
+            return None
+        if key not in self._layers:
+            folder = Shot(self.scene.folder.parent)
+            motion = lambda frame: load_motion(folder, frame)  # noqa: E731
+            self._layers[key] = instant_layer(self.run, self.scene, None, frozen, t_star, motion=motion)
+            while len(self._layers) > 2:
+                self._layers.popitem(last=False)
+        return self._layers[key]
+
+    def _shot(
+        self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, width: int, height: int
+    ) -> _Shot:
+        rows, columns = image.alpha.shape
+        K = _with_overscan(output.K, image, width, height)
+        per_pixel = min(1.0, self.config.sightings.width / width)
+        w, h = max(8, round(columns * per_pixel)), max(8, round(rows * per_pixel))
+        small = pixel_centres(w, h)
+        depth = look_up(image.depth, small * torch.tensor([columns / w, rows / h]), "nearest")
+        points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
+        t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
+        motion = resized(image.motion, w, h)
+        return _Shot(output.viewmat, K, image, t, frozen, points, depth, motion, w / columns)
+
+    def _is_own(self, output: OutputFrame) -> bool:
+        """True if the frame is one of the clip's own, seen as its camera saw it."""
+        i = self.seen.index.get(output.frame)
+        return (
+            i is not None
+            and output.frame in self.seen.frames
+            and output.exposed_like == float(output.frame)
+            and torch.equal(output.viewmat, self.scene.viewmats[i])
+        )
+
+    def _leading(self, output: OutputFrame, shot: _Shot, usable: list[int]) -> int:
+        """The frame's own plate, else the nearest in pose of those usable: in travel over depth, and in direction."""
+        if self._is_own(output) and output.frame in usable:
+            return output.frame
+        at = torch.tensor([self.seen.index[frame] for frame in usable])
+        solid = shot.depth[shot.depth < 1e9]
+        depth = float(solid.median()) if len(solid) else 1.0
+        travel = (self.seen.centres[at] - shot.centre).norm(dim=1) / max(depth, 1e-6)
+        turned = 1.0 - self.scene.viewmats[at][:, 2, :3] @ shot.viewmat[2, :3]
+        return usable[int((travel + turned).argmin())]
+
+    def _lead(
+        self, output: OutputFrame, shot: _Shot, leading: int, usable: list[int], size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor, bool]:
+        """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
+
+        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's.
+        """
+        rows, columns = shot.image.alpha.shape
+        lead = self.seen.seen(leading, shot.points)
+        own = self._is_own(output)
+        truth = self.seen.seen(shot.t, shot.points) if shot.t in usable else None
+        hidden = torch.minimum(shot.motion, lead.moving) if own else shot.motion
+        if truth is not None:
+            shot.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
+        else:
+            shot.motion = torch.maximum(shot.motion, lead.moving) if own else shot.motion
+        st, within = self._places(shot, leading, own, size)
+        if own and leading != output.frame:  # its own plate is withheld
+            return torch.zeros(rows, columns), st, own
+        wrong = widened((torch.maximum(shot.motion, lead.moving) > 0.5).float(), self.config.margin)
+        matte = 1.0 - blurred(wrong, self.config.feather)
+        if not own:
+            error = self._parallax(shot, leading, shot.depth)
+            matte = matte * lead.visible * torch.exp(-(2.0 * error).square())
+        return resized(matte, columns, rows) * within, st, own
+
+    def _places(self, shot: _Shot, leading: int, own: bool, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """(ST [H, W, 2] into the leading plate, [H, W] 1 within it): the identity on the clip's own poses."""
+        rows, columns = shot.image.alpha.shape
+        pixels = pixel_centres(columns, rows)
+        if own:
+            pixels = pixels - torch.tensor([(columns - size[0]) // 2, (rows - size[1]) // 2])
+            share = pixels / torch.tensor(size)
+        else:
+            points = unproject(pixels, shot.image.depth, shot.viewmat, shot.K)
+            viewmat, K = self.seen.camera(leading, self.plates.width, self.plates.height)
+            share = project(points, viewmat, K)[0] / torch.tensor([self.plates.width, self.plates.height])
+        within = ((share > 0.0) & (share < 1.0)).all(dim=-1).float()
+        st = torch.stack([share[..., 0], 1.0 - share[..., 1]], dim=-1).clamp(-4.0, 5.0)
+        return snap(st, (self.plates.width, self.plates.height)), within
+
+    def _parallax(self, shot: _Shot, frame: int, depth: Tensor) -> Tensor:
+        """Pixels of decisions by which a wrong depth moves points at `depth`, against this camera, in a plate."""
+        travel = (self.seen.centres[self.seen.index[frame]] - shot.centre).norm()
+        focal = shot.K[0, 0] * shot.per_pixel
+        return focal * travel / depth.clamp_min(1e-6) * self.config.depth_error
+
+    # ------------------------------------------------------------------------------------------------- the fill
+
+    def _fill(self, shot: _Shot, matte: Tensor, leading: int, usable: list[int]) -> _Rest:
+        """What the leading plate does not give: the splats, with what they missed from other plates."""
+        at = (matte < 0.999).nonzero()
+        y, x = at[:, 0], at[:, 1]
+        count = len(at)
+        rest = _Rest(y, x, shot.image.color[y, x], *(torch.zeros(count) for _ in range(2)))
+        if not count:
+            return rest
+        small = torch.stack([x + 0.5, y + 0.5], dim=-1) * shot.per_pixel
+        chosen = self._chosen(shot, matte, leading, usable)
+        moved, unknown = self._displacements(shot, chosen)
+        pixels = torch.stack([x + 0.5, y + 0.5], dim=-1)
+        points = unproject(pixels, shot.image.depth[y, x], shot.viewmat, shot.K)
+        motion, unknown = look_up(shot.motion, small), look_up(unknown, small)
+        larger = torch.tensor([self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]])
+        total, best, carried = torch.zeros(count), torch.zeros(count), torch.zeros(count, 3)
+        for n, frame in enumerate(chosen):
+            there = points if frame == shot.t else points + look_up(moved[n], small)
+            sighting = self.seen.seen(frame, there)
+            weight = self._weight(shot, frame, sighting, motion, self._sway(frame, points, sighting) * (1.0 - unknown))
+            carried += weight[:, None] * look_up(self.seen.residual(frame), sighting.pixels * larger, "bicubic")
+            total += weight
+            rest.source = torch.where(weight > best, float(frame), rest.source)
+            best = torch.maximum(best, weight)
+        rest.share = (total / self.config.enough).clamp(max=1.0)
+        rest.color += carried / total.clamp_min(1e-6)[:, None] * rest.share[:, None]
+        return rest
+
+    def _sway(self, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
+        """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
+        view = self.seen.view(frame)
+        travel = (project(points, view.viewmat, view.K)[0] - sighting.pixels).norm(dim=-1)
+        trust = torch.exp(-(travel / self.config.sway).square())
+        return self.config.sway_trust * sighting.explained * trust
+
+    def _weight(self, shot: _Shot, frame: int, sighting: Sighting, motion: Tensor, sway: Tensor) -> Tensor:
+        """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*."""
+        near = sighting.visible / (1.0 + self._parallax(shot, frame, sighting.depth).square())
+        if frame == shot.t:
+            return near
+        return near * ((1.0 - motion) * (1.0 - sighting.moving) + motion * sway)
+
+    def _chosen(self, shot: _Shot, matte: Tensor, leading: int, usable: list[int]) -> list[int]:
+        """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
+        h, w = shot.depth.shape
+        need = 1.0 - resized(matte, w, h)[::4, ::4]
+        points, motion = shot.points[::4, ::4], shot.motion[::4, ::4]
+        k = self.seen.frames.index(leading)
+        around = {k + side * step for step in self.config.reach for side in (-1, 1)} | {k}
+        reach = {self.seen.frames[i] for i in around if 0 <= i < len(self.seen.frames)} | {shot.t}
+        zero = torch.zeros_like(motion)
+        gains = {
+            frame: need * self._weight(shot, frame, self.seen.seen(frame, points), motion, zero)
+            for frame in sorted(reach)
+            if frame in usable
+        }
+        first = [frame for frame in (shot.t, leading) if frame in gains]
+        chosen, have = list(dict.fromkeys(first)), torch.zeros_like(need)
+        for frame in chosen:
+            have = have + gains[frame]
+        while len(chosen) < min(self.config.sources, len(gains)):
+            # Diminishing returns: a second plate of the same wall helps less than a first one of another.
+            worth = {
+                frame: float((torch.log1p(10.0 * (have + gain)) - torch.log1p(10.0 * have)).sum())
+                for frame, gain in gains.items()
+                if frame not in chosen
+            }
+            frame = max(worth, key=lambda candidate: worth[candidate])
+            if worth[frame] < 1e-3 * float(need.sum()):
+                break
+            chosen.append(frame)
+            have = have + gains[frame]
+        return chosen
+
+    def _displacements(self, shot: _Shot, chosen: list[int]) -> tuple[list[Tensor], Tensor]:
+        """([h, w, 3] scene units from t* to each plate of what is seen, [h, w] share whose way nobody knows)."""
+        h, w = shot.depth.shape
+        rows, state = self.seen.rows, shot.frozen.state
+        count, known = len(state["means"]), len(self.run.model.gaussians)
+        extra = torch.zeros(count, 3 * len(chosen) + 1, device=state["means"].device)
+        extra[known:, -1] = 1.0
+        if len(rows):
+            now = state["means"][rows].cpu()
+            for n, frame in enumerate(chosen):
+                extra[rows, 3 * n : 3 * n + 3] = (self.seen.view(frame).offsets - now).to(extra.device)
+        if not len(rows) and known == count:
+            return [torch.zeros(h, w, 3) for _ in chosen], torch.zeros(h, w)
+        rows_full, columns = shot.image.alpha.shape
+        K = resize_intrinsics(shot.K[None], columns, rows_full, w, h)[0]
+        out = render(
+            state, 0, shot.viewmat.to(extra.device), K.to(extra.device), w, h, colors=extra, with_contributions=False
+        )
+        shown = (out.colors[0, ..., 3:] / out.alphas[0].clamp_min(1e-3)[..., None]).cpu()
+        return [shown[..., 3 * n : 3 * n + 3] for n in range(len(chosen))], shown[..., -1]
+
+    # ------------------------------------------------------------------------------------------------- the mix
+
+    def _mixed(
+        self, shot: _Shot, splat: FrozenImage, leading: int, matte: Tensor, st: Tensor, own: bool, rest: _Rest
+    ) -> DetailedFrame:
+        image = shot.image
+        rows, columns = image.alpha.shape
+        matte = (matte * 1024.0).round() / 1024.0
+        alpha = image.alpha.clone()
+        alpha[rest.y, rest.x] += (1.0 - alpha[rest.y, rest.x]) * rest.share
+        alpha = torch.maximum(alpha, matte)
+        color = rest.color if self.plates.deep else rest.color.clamp(0.0, 1.0)
+        covered = alpha[rest.y, rest.x].clamp_min(1e-4)[:, None]
+        fill = torch.zeros(rows, columns, 3)
+        left = 1.0 - matte[rest.y, rest.x]
+        fill[rest.y, rest.x] = left[:, None] * covered * to_linear(color / covered)
+        linear = fill
+        if bool(matte.any()):
+            plate = self.plates.linear(leading)
+            lead = _placed(plate, rows, columns) if own else sample(plate, st)
+            linear = torch.addcmul(fill, matte[..., None], lead)
+        share = matte.clone()
+        share[rest.y, rest.x] += left * rest.share
+        source = torch.full((rows, columns), float(leading))
+        source[rest.y, rest.x] = torch.where(left > 0.5, rest.source, float(leading))
+        source[share <= 0.0] = 0.0
+        motion = resized(shot.motion, columns, rows)
+        return DetailedFrame(
+            to_display(linear), linear, alpha, splat.color, splat.alpha, share, source, image.depth, image.support,
+            motion, leading, st, matte, fill,
+        )  # fmt: skip
+
+
+def _with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Tensor:
+    """[3, 3] the camera of a frame of `width` x `height` in pixels of its render, which may show more around it."""
+    rows, columns = image.alpha.shape
+    wide = K.clone()
+    wide[0, 2] += (columns - width) // 2
+    wide[1, 2] += (rows - height) // 2
+    return wide
+
+
+def _placed(plate: Tensor, rows: int, columns: int) -> Tensor:
+    """A plate [h, w, 3] in the middle of [rows, columns, 3], 0 around it."""
+    if plate.shape[:2] == (rows, columns):
+        return plate
+    out = torch.zeros(rows, columns, 3)
+    top, left = (rows - plate.shape[0]) // 2, (columns - plate.shape[1]) // 2
+    out[top : top + plate.shape[0], left : left + plate.shape[1]] = plate
+    return out

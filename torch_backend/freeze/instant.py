@@ -1,0 +1,445 @@
+"""What plate t* shows and the model does not have: a waving hand, a pointing arm, a swinging apple. It gets a depth,
+so that it stands where it stood from every pose, as a layer of small Gaussians in front of the frozen scene.
+
+Whole regions are looked for, on a low-passed residual: a model trained at 320 px is soft everywhere, and softness is
+not disagreement. Depth is told by what a region hangs on (the arm), by the frames around t*, and by what it hides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..gaussians.model import SH_C0
+from ..raster import rasterize
+from ..scene import Scene, read_image, resize_intrinsics
+from ..train import LoadedRun
+from ..train.exposure import Exposure
+from .instant_depth import DepthConfig, Region, View, inverse_depth
+from .query import FrozenGaussians, FrozenImage, render_frozen
+
+STILL, UNKNOWN, MOVING = 0, 128, 255
+"""Values of a motion matte (`solve/motion.py`)."""
+_SIZE = 320.0
+"""Lengths in pixels in the configuration are those of pictures this wide; others are scaled with the width."""
+
+Motion = Callable[[int], "NDArray[np.uint8] | None"]
+"""Motion matte [h, w] of a frame number, None where there is none."""
+
+
+class Shows(Protocol):
+    """Plates by frame number (`footage.plates.Plates` is one)."""
+
+    def display(self, frame: int) -> Tensor:
+        """[H, W, 3] float32 display-referred."""
+        ...
+
+
+@dataclass
+class InstantConfig:
+    """What counts as missing, and what stands in for it. Lengths are in pixels of pictures 320 wide."""
+
+    width: int = 640
+    """Plates are compared, and the layer is made, at the trained size, but no wider than this."""
+    blur: float = 3.0
+    """Standard deviation of the low-pass before plate and render are compared."""
+    shift: float = 1.0
+    """The render may be this far from where the plate has an edge: a difference it explains is none."""
+    seed: float = 0.12
+    """A region has a low-passed difference of at least this somewhere (display-referred)."""
+    grow: float = 0.06
+    """And of at least this everywhere."""
+    least: float = 30.0
+    """Square pixels; smaller regions are left alone."""
+    moving: float = 0.5
+    """Least share of a region's pixels that move: by the matte, or, without one, by flow that contradicts the model."""
+    solid: float = 0.14
+    """Difference at a pixel from which on it is wholly the layer's; below half of it, the model's."""
+    sigma: float = 0.6
+    """Standard deviation of a Gaussian in pixels of the layer: no holes at twice the size, and not softer than that."""
+    opacity: float = 0.97
+    """Of a Gaussian inside a region."""
+    fade: float = 0.5
+    """A moving Gaussian is a ghost if at least this share of what is seen of it lies where plate t* shows what is
+    behind it."""
+    gain: float = 0.1
+    """Layer and fading are kept if they lower the low-passed difference where they act by at least this share."""
+    stuck: float = 0.5
+    """Detail that correlates this well with that at the same pixels of other frames is on the picture (a logo)."""
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    """How depth is told."""
+
+
+@dataclass
+class InstantLayer:
+    """What is added to a frozen scene, and what is taken back."""
+
+    state: dict[str, Tensor]
+    """means, quats, log_scales, opacity_logits, sh0, shN of M Gaussians in scene units, as `FrozenGaussians.state`."""
+    frame: int
+    """Number of the frame whose plate they show."""
+    mask: Tensor
+    """[h, w] float32 in 0..1: where in that plate they are from."""
+    ghost: Tensor
+    """[h, w] bool: where the model showed what that plate does not, and moving Gaussians were faded for it."""
+    kept: Tensor
+    """[N] in 0..1: what is left of the opacity of each Gaussian of the frozen scene."""
+    regions: list[Region]
+    """What was found, with depths."""
+
+
+@torch.no_grad()
+def instant_layer(
+    run: LoadedRun,
+    scene: Scene,
+    plates: Shows | None,
+    frozen: FrozenGaussians,
+    t_star: float,
+    config: InstantConfig | None = None,
+    motion: Motion | None = None,
+) -> InstantLayer | None:
+    """Finds what plate t* shows and a scene frozen at t* does not, and makes Gaussians of it.
+
+    Args:
+        plates: display-referred plates of any size; None: the shot's working frames.
+        frozen: the scene at t*, on any device.
+        t_star: frame number; between two frames the nearer one's plate is looked at.
+        motion: motion mattes; without them flow that contradicts the model's depth tells what moves.
+
+    Returns None if plate and scene agree.
+    """
+    config = config or InstantConfig()
+    index = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
+    bench = _Bench(run, scene, plates, index, config, motion)
+    image = bench.render(frozen)
+    if not (bench.difference(image) >= config.seed).any():
+        return None
+    kept, ghost = _ghosts(bench, frozen, image)
+    if ghost.any():
+        frozen = fade(frozen, kept)
+        image = bench.render(frozen)
+    regions = _regions(bench, image)
+    state, mask, regions = _shell(bench, frozen, image, regions)
+    layer = InstantLayer(state, scene.frames[index], torch.from_numpy(mask), torch.from_numpy(ghost), kept, regions)
+    if len(state["means"]) and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, mask > 0):
+        empty = {name: value[:0] for name, value in state.items()}
+        layer = replace(layer, state=empty, mask=torch.zeros_like(layer.mask), regions=[])
+    return layer if len(layer.state["means"]) or ghost.any() else None
+
+
+def join(frozen: FrozenGaussians, layer: InstantLayer, faded: bool = False) -> FrozenGaussians:
+    """The frozen scene with the layer in it, behind it in order; `faded`: its ghosts have been faded already."""
+    count, device = len(layer.state["means"]), frozen.support.device
+    base = frozen if faded else fade(frozen, layer.kept)
+    state = {name: torch.cat([value, layer.state[name].to(value)]) for name, value in base.state.items()}
+    ones = torch.ones(count, device=device, dtype=frozen.support.dtype)
+    return FrozenGaussians(state, frozen.sh_degree, torch.cat([frozen.support, ones]), torch.cat([frozen.motion, ones]))
+
+
+def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
+    """A frozen scene whose Gaussians have the share `kept` [N] of their opacity left."""
+    logits = frozen.state["opacity_logits"]
+    kept = kept.to(logits)
+    less = torch.logit((torch.sigmoid(logits) * kept).clamp(1e-6, 1.0 - 1e-6))
+    state = {**frozen.state, "opacity_logits": torch.where(kept < 1.0, less, logits)}
+    return replace(frozen, state=state)
+
+
+class _Bench:
+    """Plate t* and its camera, with its neighbours, at the size at which they are compared."""
+
+    def __init__(
+        self, run: LoadedRun, scene: Scene, plates: Shows | None, index: int, config: InstantConfig,
+        motion: Motion | None,
+    ) -> None:  # fmt: skip
+        self.config, self.exposure, self.index = config, run.model.exposure, index
+        self.width = min(run.width, config.width)
+        self.height = max(1, round(run.height * self.width / run.width))
+        self.unit = self.width / _SIZE
+        self.time = float(scene.times[index])
+        self._scene, self._plates, self._motion = scene, plates, motion
+        self._Ks = resize_intrinsics(scene.Ks, scene.width, scene.height, self.width, self.height)
+        self._views: dict[int, View] = {}
+        self.view = self.at(index)
+
+    def at(self, index: int) -> View:
+        """Delivered frame `index`: its plate and camera."""
+        if index in self._views:
+            return self._views[index]
+        scene, size = self._scene, (self.width, self.height)
+        if self._plates is None:
+            picture = read_image(scene.image_path(index), *size).numpy()
+        else:
+            picture = _resized(self._plates.display(scene.frames[index]).numpy().clip(0.0, 1.0), *size)
+        viewmat, K = scene.viewmats[index].double().numpy(), self._Ks[index].double().numpy()
+        self._views[index] = View(index, np.ascontiguousarray(picture, np.float32), viewmat, K)
+        return self._views[index]
+
+    def neighbours(self) -> list[View]:
+        """Frames around t*, on both sides where there are any."""
+        steps = self.config.depth.neighbours
+        found = [self.index + sign * step for step in steps for sign in (-1, 1)]
+        return [self.at(i) for i in found if 0 <= i < len(self._scene.frames)]
+
+    def spread(self, count: int) -> list[View]:
+        """Up to `count` frames, evenly over the clip, without t*."""
+        chosen = np.unique(np.linspace(0, len(self._scene.frames) - 1, count).round().astype(int)).tolist()
+        return [self.at(i) for i in chosen if i != self.index]
+
+    def matte(self) -> NDArray[np.float32] | None:
+        """Motion matte of t* [h, w] in 0..1, if there is one."""
+        found = self._motion(self._scene.frames[self.index]) if self._motion else None
+        if found is None:
+            return None
+        return _resized(np.float32(1.0 / MOVING) * found.astype(np.float32), self.width, self.height)
+
+    def render(self, frozen: FrozenGaussians) -> FrozenImage:
+        """A frozen scene as camera t* sees it, exposed as plate t* is."""
+        camera = self._scene.viewmats[self.index], self._Ks[self.index]
+        return render_frozen(frozen, *camera, self.width, self.height, self.exposure, self.time)
+
+    def difference(self, image: FrozenImage) -> NDArray[np.float32]:
+        """Low-passed difference [h, w] between plate and render, beyond what misplaced edges explain."""
+        c = self.config
+        return low_difference(self.view.picture, image.color.numpy(), c.blur * self.unit, c.shift * self.unit)
+
+
+def low_difference(
+    plate: NDArray[np.float32], shown: NDArray[np.float32], blur: float, shift: float
+) -> NDArray[np.float32]:
+    """Difference between two pictures [h, w, 3] after a low-pass, [h, w], the greatest of the channels.
+
+    A picture that is off by s pixels differs, to first order, by s times the gradient: the difference that `shift`
+    pixels explain is subtracted, so that an edge out of place is none. `blur` is a standard deviation in pixels.
+    """
+    low = _blurred(plate - shown, blur)
+    smooth = _blurred(plate, blur)
+    down, right = np.gradient(smooth, axis=(0, 1))
+    explained = shift * np.hypot(down, right)
+    return np.maximum(np.abs(low) - explained, 0.0).max(-1)
+
+
+def _regions(bench: _Bench, image: FrozenImage) -> list[NDArray[np.bool_]]:
+    """Masks [h, w] of the regions in which plate t* shows something that moves and the render does not."""
+    import cv2
+
+    c, unit = bench.config, bench.unit
+    difference = bench.difference(image)
+    count, labels = cv2.connectedComponents((difference >= c.grow).astype(np.uint8))
+    matte, found = bench.matte(), []
+    for label in range(1, count):
+        region = labels == label
+        if difference[region].max() < c.seed or region.sum() < c.least * unit**2:
+            continue
+        found.append(region)
+    if not found:
+        return []
+    if matte is None:
+        matte = contradicted(bench.view, bench.neighbours(), image.depth.numpy(), c.depth, unit)
+    found = [region for region in found if matte[region].mean() >= c.moving]
+    return [region for region in found if not _stuck(bench, region, image)]
+
+
+def _stuck(bench: _Bench, region: NDArray[np.bool_], image: FrozenImage) -> bool:
+    """True if a region shows the same detail in frames all over the clip, while the world behind it goes by: a logo."""
+    view, unit = bench.view, bench.unit
+    inverse = 1.0 / float(np.median(image.depth.numpy()[region]))
+    alike = []
+    for other in bench.spread(7):
+        travel = np.linalg.norm(view.project(other, inverse) - view.grid(), axis=-1)
+        if np.median(travel[region]) > 3.0 * unit:
+            a, b = ((v.picture - _blurred(v.picture, 2.0 * unit))[region].ravel() for v in (view, other))
+            alike.append(float((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9)))
+    return bool(alike) and float(np.median(alike)) > bench.config.stuck
+
+
+def contradicted(
+    view: View, others: list[View], depth: NDArray[np.float32], config: DepthConfig, unit: float
+) -> NDArray[np.float32]:
+    """1 where the flow to most neighbours is not that of a still surface at `depth` [h, w], else 0."""
+    votes, seen = np.zeros(depth.shape, np.float32), np.zeros(depth.shape, np.float32)
+    for other in others:
+        flow, found = view.flow_to(other, config.round_trip * unit)
+        at = view.project(other, 1.0 / np.maximum(depth, 1e-6))
+        inside = (at >= 0).all(-1) & (at <= depth.shape[::-1]).all(-1)
+        off = np.linalg.norm(flow - (at - view.grid()), axis=-1) > config.contradiction * unit
+        # What is not found again was hidden by something, or went too fast: it is not still, either.
+        votes += inside & (off | ~found)
+        seen += inside
+    return ((seen > 0) & (votes > 0.5 * seen)).astype(np.float32)
+
+
+def _shell(
+    bench: _Bench, frozen: FrozenGaussians, image: FrozenImage, regions: list[NDArray[np.bool_]]
+) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
+    """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
+    view, cover = bench.view, np.zeros((bench.height, bench.width), np.float32)
+    inverse, told = np.zeros_like(cover), []
+    others = bench.neighbours() if regions else []
+    explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9)
+    matte = bench.matte()
+    mover = image.motion.numpy() if matte is None else np.maximum(matte, image.motion.numpy())
+    for region in regions:
+        soft = _cover(bench, image, region)
+        if soft.max() < 0.5:
+            continue
+        depths, facts = inverse_depth(
+            view, others, soft >= 0.5, explained & (soft < 0.1), image.depth.numpy(), mover, bench.config.depth,
+            bench.unit,
+        )  # fmt: skip
+        stronger = soft > cover
+        inverse[stronger], cover[stronger] = depths[stronger], soft[stronger]
+        told.append(facts)
+    rows, columns = np.nonzero(cover > 0.1)
+    means = view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
+    return _gaussians(bench, frozen, means, rows, columns, inverse, cover), cover, told
+
+
+def _gaussians(
+    bench: _Bench, frozen: FrozenGaussians, means: NDArray[np.float64], rows: NDArray[np.intp],
+    columns: NDArray[np.intp], inverse: NDArray[np.float32], cover: NDArray[np.float32],
+) -> dict[str, Tensor]:  # fmt: skip
+    """Gaussians [M] at `means`, coloured by the pixels (rows, columns) of plate t*, one pixel apart on the screen."""
+    like, c = frozen.state, bench.config
+    count = len(means)
+    size = c.sigma / (bench.view.K[0, 0] * np.maximum(inverse[rows, columns], 1e-9))
+    opacity = torch.from_numpy(np.clip(c.opacity * cover[rows, columns], 1e-4, 1.0 - 1e-4))
+    color = _unexposed(torch.from_numpy(bench.view.picture[rows, columns]), bench.exposure, bench.time)
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1.0
+    state = {
+        "means": torch.from_numpy(means),
+        "quats": quats,
+        "log_scales": torch.from_numpy(np.log(np.repeat(size[:, None], 3, axis=1))),
+        "opacity_logits": torch.logit(opacity),
+        "sh0": ((color - 0.5) / SH_C0)[:, None, :],
+        "shN": torch.zeros(count, like["shN"].shape[1], 3),
+    }
+    return {name: state[name].to(value) for name, value in like.items()}
+
+
+def _unexposed(color: Tensor, exposure: Exposure, time: float) -> Tensor:
+    """The colour [M, 3] that the camera shows as `color` at a time."""
+    if not exposure.config.on:
+        return color
+    gain, offset = exposure.at(time)
+    return (color - offset.cpu()) / gain.cpu()
+
+
+def _cover(bench: _Bench, image: FrozenImage, region: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """How much of each pixel [h, w] around a region is what the model lacks, 0..1.
+
+    The low-passed region has the shape of a blot. Inside, the model stands for what is hidden, so what differs from
+    it is in front of it; gaps where it happens to have the same colour are closed.
+    """
+    import cv2
+
+    c, unit = bench.config, bench.unit
+    shown, plate = image.color.numpy(), bench.view.picture
+    down, right = np.gradient(_blurred(shown, 0.7 * unit), axis=(0, 1))
+    off = np.abs(_blurred(plate - shown, 0.7 * unit)) - 0.5 * c.shift * unit * np.hypot(down, right)
+    ramp = np.clip(2.0 * off.max(-1) / c.solid - 1.0, 0.0, 1.0).astype(np.float32)
+    near = cv2.dilate(region.astype(np.uint8), _disc(2.0 * unit)) > 0
+    ramp = np.where(near, ramp, 0.0).astype(np.float32)
+    closed = cv2.morphologyEx(ramp, cv2.MORPH_CLOSE, _disc(2.5 * unit))
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, _disc(1.0 * unit))
+    return np.where(near, opened, 0.0).astype(np.float32)
+
+
+def _ghosts(bench: _Bench, frozen: FrozenGaussians, image: FrozenImage) -> tuple[Tensor, NDArray[np.bool_]]:
+    """(kept [N], mask [h, w]): moving Gaussians that stand before what plate t* shows, judged on that plate.
+
+    A ghost is seen where the render without all that moves is nearer to the plate, by a low-pass, than with it.
+    """
+    kept = torch.ones(len(frozen.motion))
+    nothing = np.zeros((bench.height, bench.width), bool)
+    moves = frozen.motion > 0.5
+    if not bool(moves.any()):
+        return kept, nothing
+    without = bench.render(fade(frozen, (~moves).float()))
+    before, after = bench.difference(image), bench.difference(without)
+    bare = without.alpha.numpy() < 0.9
+    ghost = (before >= bench.config.grow) & (after < 0.5 * before) & ~bare
+    ghost = _large(ghost, before >= bench.config.seed, bench.config.least * bench.unit**2)
+    if not ghost.any():
+        return kept, nothing
+    inside, whole = _shares(bench, frozen, ghost)
+    share = inside / whole.clamp_min(1e-6)
+    guilty = moves.cpu() & (whole > 1e-3) & (share >= bench.config.fade)
+    kept[guilty] = 1.0 - share[guilty]
+    if not _helps(bench, bench.render(fade(frozen, kept)), image, ghost):
+        return torch.ones_like(kept), nothing
+    return kept, ghost
+
+
+def _shares(bench: _Bench, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+    """What camera t* sees of each Gaussian, [N] each: inside a mask [h, w], and at all. Sums of alpha T over pixels."""
+    s, device = frozen.state, frozen.support.device
+    with torch.enable_grad():
+        # The weight of a Gaussian at a pixel is what the pixel gains by the Gaussian's colour: a gradient gathers it.
+        probe = torch.zeros(len(frozen.support), 2, device=device, requires_grad=True)
+        scene, i = bench._scene, bench.index
+        out = rasterize(
+            s["means"], s["quats"], s["log_scales"], s["opacity_logits"], probe,
+            viewmats=scene.viewmats[i : i + 1].to(device), Ks=bench._Ks[i : i + 1].to(device),
+            width=bench.width, height=bench.height,
+        )  # fmt: skip
+        where = torch.from_numpy(mask).to(device)
+        (out.colors[0, ..., 0][where].sum() + out.colors[0, ..., 1].sum()).backward()
+    assert probe.grad is not None
+    inside, whole = probe.grad.cpu().unbind(1)
+    return inside, whole
+
+
+def _helps(bench: _Bench, after: FrozenImage, before: FrozenImage, where: NDArray[np.bool_]) -> bool:
+    """True if the low-passed difference falls enough where something was done, and does not rise around it."""
+    import cv2
+
+    c = bench.config
+    around = cv2.dilate(where.astype(np.uint8), _disc(2.0 * c.blur * bench.unit)) > 0
+    old, new = bench.difference(before), bench.difference(after)
+    return bool(new[where].mean() <= (1.0 - c.gain) * old[where].mean() and new[around].mean() <= old[around].mean())
+
+
+def _large(mask: NDArray[np.bool_], seeds: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+    """The connected parts of a mask [h, w] with at least `least` pixels and one of `seeds`."""
+    import cv2
+
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    sizes = np.bincount(labels.ravel(), minlength=count)
+    seeded = np.bincount(labels[seeds], minlength=count) > 0
+    good = (sizes >= least) & seeded
+    good[0] = False
+    return good[np.asarray(labels, np.int32)]
+
+
+def _blurred(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """A Gaussian low-pass of [h, w] or [h, w, C]; sigma in pixels."""
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32)
+
+
+def _disc(radius: float) -> NDArray[np.uint8]:
+    """A disc of a radius in pixels, at least 1."""
+    import cv2
+
+    side = 2 * max(1, math.ceil(radius)) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)).astype(np.uint8)
+
+
+def _resized(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """[H, W] or [H, W, C] at another size: averaged where it shrinks."""
+    import cv2
+
+    if values.shape[:2] == (height, width):
+        return values
+    kind = cv2.INTER_AREA if width <= values.shape[1] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(values, (width, height), interpolation=kind), np.float32)

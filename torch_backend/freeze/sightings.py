@@ -1,0 +1,213 @@
+"""What a run knows of the clip's plates: where their surfaces are, what moves in them, what its own render missed.
+
+All of it is computed once for a plate and serves every frozen frame that uses that plate.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ..scene import Scene, read_image, resize_intrinsics
+from ..shot import Shot
+from ..solve.motion import MOVING, UNKNOWN, load_motion
+from ..train import LoadedRun
+from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen
+from .reproject import blurred, inside, look_up, project, resized, same_surface, widened
+
+MovingOf = Callable[[int], "Tensor | None"]
+"""Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
+DOUBT = 0.4
+"""How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
+_VIEWS_BYTES = 400e6
+_RESIDUALS_BYTES = 400e6
+
+
+class PlateReader(Protocol):
+    """What plates are asked for: `footage.plates.Plates`."""
+
+    width: int
+    """Pixels of the undistorted plates."""
+    height: int
+    """Pixels."""
+    frames: list[int]
+    """Every frame of the clip's range that has a plate, ascending."""
+
+    deep: bool
+    """True if values may lie beyond 0 and 1."""
+
+    def display(self, frame: int) -> Tensor:
+        """[height, width, 3] float32, extended display-referred."""
+        ...
+
+    def linear(self, frame: int) -> Tensor:
+        """The same, scene-linear."""
+        ...
+
+
+@dataclass
+class PlateView:
+    """Plate m as the model has it, [h, w] at the size of decisions."""
+
+    viewmat: Tensor
+    """[4, 4] world-to-camera, scene units."""
+    K: Tensor
+    """[3, 3] pixels of the size of decisions."""
+    depth: Tensor
+    """[h, w] median depth."""
+    moving: Tensor
+    """[h, w] in 0..1: something that moves in the clip is seen there."""
+    explained: Tensor
+    """[h, w] in 0..1: the model shows there what the plate shows, but for detail."""
+    offsets: Tensor
+    """[M, 3] means of the open Gaussians in that frame, scene units."""
+
+
+@dataclass
+class Sighting:
+    """Where and how points are seen in one plate; leading dimensions are those of the points."""
+
+    pixels: Tensor
+    """[..., 2] in pixels of the size of decisions."""
+    depth: Tensor
+    """[...]"""
+    visible: Tensor
+    """[...] in 0..1: within the picture, and nothing in front."""
+    within: Tensor
+    """[...] in 0..1: within the picture."""
+    moving: Tensor
+    """[...] in 0..1, of the plate there."""
+    explained: Tensor
+    """[...] in 0..1, of the plate there."""
+
+
+@dataclass(frozen=True)
+class SightingConfig:
+    """At what size plates are looked at for decisions, and how finely. Lengths in pixels of that size."""
+
+    width: int = 640
+    """Mattes, depth and visibility are compared at this width at most: they are soft, and the model is no finer."""
+    depth_tolerance: float = 0.03
+    """Share of the depth by which a point may lie off the surface that a plate shows and still be it."""
+    margin: int = 2
+    """What moves is widened by this: the flow's own error, motion blur."""
+    lowpass: float = 4.0
+    """Sigma under which plate and render are compared: splats are soft, that alone contradicts nothing."""
+    unexplained: float = 0.1
+    """Low-passed difference, display-referred, at which a plate is believed 1/e."""
+    region: int = 4
+    """A difference speaks for so many pixels around it: half-rejected movers leave their outlines."""
+
+
+class Sightings:
+    """The plates of a clip as one run sees them."""
+
+    def __init__(
+        self,
+        run: LoadedRun,
+        scene: Scene,
+        plates: PlateReader,
+        moving: MovingOf | None = None,
+        config: SightingConfig | None = None,
+    ) -> None:
+        """`moving` None: the shot's motion mattes, and where it has none the model's own matte."""
+        self.run, self.scene, self.plates = run, scene, plates
+        self.moving = moving or motion_mattes(Shot(scene.folder.parent))
+        self.config = config or SightingConfig()
+        self.index = {frame: i for i, frame in enumerate(scene.frames)}
+        have = set(plates.frames)
+        self.frames = [frame for frame in scene.frames if frame in have]
+        """Frames of the clip that have both a plate and a camera, ascending."""
+        width = min(plates.width, self.config.width)
+        self.size = width, max(8, round(plates.height * width / plates.width))
+        self.rows = run.model.open_rows().cpu()
+        views = scene.viewmats
+        self.centres = -torch.einsum("nji,nj->ni", views[:, :3, :3], views[:, :3, 3])
+        """[F, 3] camera centres of the clip's frames, scene units."""
+        self._views: OrderedDict[int, PlateView] = OrderedDict()
+        self._residuals: OrderedDict[int, Tensor] = OrderedDict()
+
+    def camera(self, frame: int, width: int, height: int) -> tuple[Tensor, Tensor]:
+        """(viewmat [4, 4], K [3, 3]) of a frame of the clip at a picture size."""
+        i = self.index[frame]
+        return (
+            self.scene.viewmats[i],
+            resize_intrinsics(self.scene.Ks[i][None], self.scene.width, self.scene.height, width, height)[0],
+        )
+
+    def view(self, frame: int) -> PlateView:
+        """Plate `frame` as the model has it."""
+        if frame not in self._views:
+            self._views[frame] = self._look(frame)
+            width, height = self.size
+            each = 12.0 * width * height + 12.0 * len(self.rows)
+            while len(self._views) > max(12, _VIEWS_BYTES / each):
+                self._views.popitem(last=False)
+        self._views.move_to_end(frame)
+        return self._views[frame]
+
+    def residual(self, frame: int) -> Tensor:
+        """[H, W, 3] float16: plate `frame` less the model's own render of it, display-referred, at the plates' size."""
+        if frame not in self._residuals:
+            self._residuals[frame] = (self.plates.display(frame) - self._missed_by(frame)).half()
+            each = 6.0 * self.plates.width * self.plates.height
+            while len(self._residuals) > max(6, min(16, _RESIDUALS_BYTES / each)):
+                self._residuals.popitem(last=False)
+        self._residuals.move_to_end(frame)
+        return self._residuals[frame]
+
+    def seen(self, frame: int, points: Tensor) -> Sighting:
+        """Where plate `frame` shows world points [..., 3]."""
+        view = self.view(frame)
+        pixels, depth = project(points, view.viewmat, view.K)
+        within = inside(pixels, *self.size)
+        visible = same_surface(depth, look_up(view.depth, pixels), self.config.depth_tolerance) * within
+        looks = look_up(torch.stack([view.moving, view.explained], dim=-1), pixels)
+        return Sighting(pixels, depth, visible, within, looks[..., 0], looks[..., 1])
+
+    def _missed_by(self, frame: int) -> Tensor:
+        return self._own_render(frame, self.plates.width, self.plates.height)[1].color
+
+    def _own_render(self, frame: int, width: int, height: int) -> tuple[FrozenGaussians, FrozenImage]:
+        time = self.scene.time_of_frame(frame)
+        frozen = freeze_at(self.run.model, time, 1.0)
+        viewmat, K = self.camera(frame, width, height)
+        return frozen, render_frozen(frozen, viewmat, K, width, height, self.run.model.exposure, time)
+
+    def _look(self, frame: int) -> PlateView:
+        width, height = self.size
+        frozen, image = self._own_render(frame, width, height)
+        told = self.moving(frame)
+        moving = image.motion if told is None else resized(told, width, height)
+        # The working frame will do, and need not be decoded from 4K footage.
+        plate = read_image(self.scene.image_path(self.index[frame]), width, height)
+        off = blurred(plate - image.color, self.config.lowpass).abs().amax(dim=-1)
+        off = blurred(widened(off, self.config.region), 0.5 * self.config.region)
+        return PlateView(
+            *self.camera(frame, width, height),
+            image.depth,
+            widened(moving, self.config.margin),
+            torch.exp(-(off / self.config.unexplained).square()),
+            frozen.state["means"].cpu()[self.rows],
+        )
+
+
+def motion_mattes(shot: Shot) -> MovingOf:
+    """The motion mattes of a shot as `MovingOf`: 0 still, `DOUBT` unknown, 1 moving."""
+
+    def moving(frame: int) -> Tensor | None:
+        told = load_motion(shot, frame)
+        if told is None:
+            return None
+        matte = torch.zeros(told.shape)
+        codes = torch.from_numpy(told)
+        matte[codes == UNKNOWN] = DOUBT
+        matte[codes == MOVING] = 1.0
+        return matte
+
+    return moving
