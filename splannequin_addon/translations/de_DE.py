@@ -611,6 +611,8 @@ BACKEND: dict[str, str] = {
     "Nothing moves in it.": "Darin bewegt sich nichts.",
     "Something travels up to {} of {} pixels: it does not hold still.": "Etwas legt bis zu {} von {} Pixeln zurück: es hält nicht still.",
     "What moves sways by up to {} of {} pixels.": "Was sich bewegt, schwankt um bis zu {} von {} Pixeln.",
+    "Somebody walks through: take a range in which all hold still.": "Jemand geht durchs Bild: einen Bereich nehmen, in dem alle stillhalten.",
+    "Even what stands still is not there: solve the camera again, or take a range that it follows well.": "Selbst was stillsteht, fehlt: die Kamera neu lösen oder einen Bereich nehmen, in dem sie gut folgt.",
     "Any frame will do as t*.": "Jedes Bild taugt als t*.",
     "Choose t* in frames {} to {}, or train on that range alone.": "t* in den Bildern {} bis {} wählen oder nur auf diesem Bereich trainieren.",
     "Paint who walks in the motion matte, or take a range in which all hold still.": "Wer geht, in die Bewegungsmatte malen, oder einen Bereich nehmen, in dem alle stillhalten.",

@@ -35,6 +35,9 @@ class RunLimits:
     travels 0.04."""
     far_share: float = 0.002
     """Least share of the picture that travels that far, on average over the frames, to be told."""
+    still_lost: float = 0.05
+    """Share of what the motion mattes call still that may be unexplained: above it the camera is to blame; the clips
+    have at most 0.01."""
     moves: float = 0.003
     """Share of the picture that moves at all, below which nothing does; the clips have 0.08 to 0.34."""
 
@@ -141,7 +144,8 @@ def _advice(
         return ["Any frame will do as t*."]
     span = _longest_good(figures.frames, bad)
     if dim or (places and span is None):
-        return [_LOOK]
+        still = figures.still_unexplained
+        return [_LOOK if still is None else _SOLVE if still > limits.still_lost else _HOLD]
     if span is not None and places:
         return [f"Choose t* in frames {span[0]} to {span[1]}, or train on that range alone."]
     if figures.far > limits.far_share:
@@ -149,6 +153,8 @@ def _advice(
     return []
 
 
+_HOLD = "Somebody walks through: take a range in which all hold still."
+_SOLVE = "Even what stands still is not there: solve the camera again, or take a range that it follows well."
 _LOOK = (
     "Look at its previews. Somebody walks through, or the camera is wrong: take a range in which all hold still, "
     "or solve again."
