@@ -38,8 +38,9 @@ class RunLimits:
     still_lost: float = 0.05
     """Share of what the motion mattes call still that may be unexplained: above it the camera is to blame; the clips
     have at most 0.01."""
-    moves: float = 0.003
-    """Share of the picture that moves at all, below which nothing does; the clips have 0.08 to 0.34."""
+    still: float = 0.008
+    """Sway, as a share of the width, below which nothing moves: 0.004 in a world in which nothing does, 0.016 to 0.021
+    in the clips."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,6 @@ class RunFigures:
     """[F, GRID, GRID] as in `FrameEvidence`."""
     travel: NDArray[np.floating]
     """[F, GRID, GRID] as in `FrameEvidence`."""
-    moving: float
-    """Share of the picture that moves in the clip, on average."""
     sway: float
     """95th percentile of the travel of what moves, as a share of the width."""
     far: float
@@ -90,7 +89,6 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int, limits: R
         [one.frame for one in seen],
         np.stack([one.unexplained for one in seen]),
         np.stack([one.travel for one in seen]),
-        len(moving) / whole,
         float(np.percentile(moving, 95)) if len(moving) else 0.0,
         float((moving > limits.far).sum()) / whole,
         float(np.percentile(moving, 99)) if len(moving) else 0.0,
@@ -126,7 +124,7 @@ def _sentences(figures: RunFigures, limits: RunLimits, dim: bool, places: list[d
     elif not places:
         said.append("It shows all of the clip.")
     said += [f"It does not hold in {where_words(place)}." for place in places]
-    if figures.moving < limits.moves:
+    if figures.sway < limits.still:
         said.append("Nothing moves in it.")
     elif figures.far > limits.far_share:
         farthest = round(figures.farthest * width)
@@ -140,7 +138,7 @@ def _advice(
     figures: RunFigures, dim: bool, bad: NDArray[np.bool_], places: list[dict[str, Any]], limits: RunLimits
 ) -> list[str]:
     """What to do about it."""
-    if figures.moving < limits.moves and not places and not dim:
+    if figures.sway < limits.still and not places and not dim:
         return ["Any frame will do as t*."]
     span = _longest_good(figures.frames, bad)
     if dim or (places and span is None):
