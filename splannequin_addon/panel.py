@@ -287,7 +287,7 @@ class _StepPanel:
 
 
 def unsaid(warnings: list[tuple[str, str]], said: list[str]) -> list[str]:
-    """A job's warnings as lines, without those that the step's state tells anyway: a verdict stays, a job is forgotten."""
+    """A job's warnings as lines, without those that the step's state tells anyway, as it does a verdict."""
     return [f"{message} {hint}".strip() for message, hint in warnings if message not in said]
 
 

@@ -609,7 +609,7 @@ BACKEND: dict[str, str] = {
     "lower right": "unten rechts",
     "most of the picture": "fast das ganze Bild",
     "Nothing moves in it.": "Darin bewegt sich nichts.",
-    "Something travels up to {} of {} pixels: it does not hold still.": "Etwas legt bis zu {} von {} Pixeln zurück: es hält nicht still.",
+    "Something does not hold still: it travels up to {} of {} pixels in {}.": "Etwas hält nicht still: es legt bis zu {} von {} Pixeln zurück in {!t}.",
     "What moves sways by up to {} of {} pixels.": "Was sich bewegt, schwankt um bis zu {} von {} Pixeln.",
     "Somebody walks through: take a range in which all hold still.": "Jemand geht durchs Bild: einen Bereich nehmen, in dem alle stillhalten.",
     "Even what stands still is not there: solve the camera again, or take a range that it follows well.": "Selbst was stillsteht, fehlt: die Kamera neu lösen oder einen Bereich nehmen, in dem sie gut folgt.",

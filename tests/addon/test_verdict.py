@@ -66,6 +66,10 @@ def test_verdicts_are_told_in_german(addon):
     assert said("Good. 98 % of the picture is plate, 2 % is a guess.", "de_DE") == (
         "Gut. 98 % des Bildes sind Plate, 2 % sind geraten."
     )
+    walker = "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 40, lower right."
+    assert said(walker, "de_DE") == (
+        "Etwas hält nicht still: es legt bis zu 141 von 640 Pixeln zurück in den Bildern 10 bis 40, unten rechts."
+    )
     assert said("Mostly a guess in frame 7, middle.", "de_DE") == "Meist geraten in Bild 7, Mitte."
 
 

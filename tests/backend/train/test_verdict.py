@@ -44,19 +44,24 @@ def test_a_still_world_is_told_as_one():
 
 
 def test_a_walker_is_told_with_frames_place_and_what_to_do():
-    verdict = judge(figures(unexplained=lost_at(10, 31, 3, 0), far=0.02, farthest=0.22))
+    travel = lost_at(10, 40, 1, 1, 0.22)
+    verdict = judge(figures(unexplained=lost_at(10, 31, 3, 0), travel=travel, far=0.02, farthest=0.22))
     assert verdict.word == "fair"
-    assert verdict.where == [{"first": 10, "last": 31, "region": "lower left", "share": 0.8}]
+    assert verdict.where == [
+        {"first": 10, "last": 31, "region": "lower left"}, {"first": 10, "last": 40, "region": "middle"}
+    ]  # fmt: skip
     assert verdict.sentences == [
         "It does not hold in frames 10 to 31, lower left.",
-        "Something travels up to 141 of 640 pixels: it does not hold still.",
+        "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 40, middle.",
     ]
-    assert verdict.advice == ["Choose t* in frames 34 to 73, or train on that range alone."]
+    assert verdict.advice == ["Choose t* in frames 43 to 73, or train on that range alone."]
 
 
 def test_one_who_walks_and_is_followed_is_told_too():
-    verdict = judge(figures(far=0.02, farthest=0.22))
+    verdict = judge(figures(travel=lost_at(1, 74, 2, 2, 0.22), far=0.02, farthest=0.22))
     assert verdict.word == "fair" and "141 of 640" in verdict.sentences[-1] and "motion matte" in verdict.advice[0]
+    spot = judge(figures(travel=lost_at(1, 74, 2, 2, 0.22), far=0.0005, farthest=0.034))
+    assert spot.word == "good", "a few far pixels, as in `hall`, are nobody who walks"
 
 
 def test_what_holds_nowhere_is_poor_and_so_is_what_does_not_show_the_clip():
@@ -74,8 +79,8 @@ def test_what_holds_nowhere_is_poor_and_so_is_what_does_not_show_the_clip():
 def test_regions_and_frames_in_words():
     cells = np.zeros((GRID, GRID))
     for (row, column), expected in {
-        (0, 0): "upper left", (0, 2): "top", (0, 3): "upper right", (1, 1): "middle", (2, 0): "left", (3, 3): "lower right",
-        (3, 1): "bottom",
+        (0, 0): "upper left", (0, 2): "top", (0, 3): "upper right", (1, 1): "middle", (2, 0): "left",
+        (3, 1): "bottom", (3, 3): "lower right",
     }.items():  # fmt: skip
         one = cells.copy()
         one[row, column] = 1.0
