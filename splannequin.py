@@ -236,7 +236,7 @@ def home() -> Path:
 
 def backend_environment(testing: bool = False) -> Environment:
     """The backend's environment, with the test tools on request."""
-    probe = "import torch, warp, pycolmap, OpenImageIO, av, fileseq, safetensors, scipy"
+    probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, fileseq, safetensors, scipy"
     files = ("backend.txt", "test.txt") if testing else ("backend.txt",)
     return Environment("the backend", home() / ".venv", files, probe, BACKEND_DISK_GB)
 
@@ -249,7 +249,7 @@ def bpy_environment(series: str, testing: bool = False) -> Environment:
 
 def bench_environment() -> Environment:
     """The backend's environment with the benchmark's packages in it; `backend_environment` is to be ready before."""
-    probe = "import anny, cv2, ffmpeg, flip_evaluator, imageio, matplotlib, PIL, tqdm"
+    probe = "import anny, ffmpeg, flip_evaluator, imageio, matplotlib, PIL, tqdm"
     return Environment("the benchmark's packages", home() / ".venv", ("bench.txt",), probe, 1.0, complete=True)
 
 

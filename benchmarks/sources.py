@@ -41,7 +41,7 @@ def load_source(source: str, results: Path) -> TruthScene:
     if kind == "truth":
         return TruthFolder(folder)
     if kind == "shot":
-        return RealScene(Shot.open(folder), results)
+        return RealScene(Shot.open(folder))
     if kind in ("exact", "solved"):
         return SyntheticTruth(folder, kind, results / "shots")
     raise ValueError(f"scene {source!r}: it should be truth:FOLDER, shot:FOLDER, exact:FOLDER or solved:FOLDER")

@@ -203,7 +203,7 @@ def test_the_extension_package_imports_nothing_at_module_level():
     "module", ["torch_backend", "torch_backend.contract", "torch_backend.shot", "torch_backend.cli"]
 )
 def test_light_modules_load_nothing_heavy(module: str):
-    heavy = ("torch", "numpy", "warp", "pycolmap", "OpenImageIO", "av", "scipy", "safetensors")
+    heavy = ("torch", "numpy", "warp", "pycolmap", "OpenImageIO", "av", "cv2", "scipy", "safetensors")
     code = f"import sys, {module}; print([m for m in {heavy!r} if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert (ran.stdout.strip(), ran.stderr) == ("[]", "")

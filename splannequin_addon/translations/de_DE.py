@@ -468,6 +468,17 @@ MESSAGES: dict[str, str] = {
     "Paused while steps were added. The run is as it was until all are done.": "Pausiert, während Schritte hinzukamen. Der Lauf ist wie zuvor, bis alle getan sind.",
     "Stop this step. It saves what it has first, so that it can go on later; pressed again after 20 seconds, it is ended by force": "Diesen Schritt anhalten. Er sichert zuerst, was er hat, damit es später weitergeht; nach 20 Sekunden erneut gedrückt, wird er gewaltsam beendet",
     "{} frames of the scene's range are not in the take, the first is {}.": "{} Bilder aus dem Bildbereich der Szene sind nicht im Take, das erste ist {}.",
+    # ------------------------------------------------------------------------------------------ layers, the freeze as a warp
+    "Freeze as Warp": "Als Verzerrung einfrieren",
+    "Freeze your own plate, whatever is led into the group, instead of showing the take's frames: it keeps its own grade, highlights and grain. Press again to show the take's frames": "Die eigene Plate, was immer in die Gruppe geführt wird, einfrieren, statt die Bilder des Takes zu zeigen: Sie behält ihr Grading, ihre Lichter und ihr Korn. Noch einmal drücken, um die Bilder des Takes zu zeigen",
+    "What is led into the group is frozen by the take's warp, with its own values.": "Was in die Gruppe geführt wird, wird mit seinen eigenen Werten durch die Verzerrung des Takes eingefroren.",
+    "The take's own frames are shown again.": "Die eigenen Bilder des Takes sind wieder zu sehen.",
+    "The take has no warp: its own frames are shown.": "Der Take hat keine Verzerrung: seine eigenen Bilder sind zu sehen.",
+    "The take {} has no warp: it was frozen without detail.": "Der Take {} hat keine Verzerrung: er wurde ohne Details eingefroren.",
+    "Freeze it again with detail.": "Mit Details noch einmal einfrieren.",
+    "The take {} is seen from a camera of your own: its warp looks into other frames of the plate.": "Der Take {} ist von einer eigenen Kamera gesehen: seine Verzerrung schaut in andere Bilder der Plate.",
+    "Use its frozen frames, or freeze a take on the clip's own camera.": "Seine eingefrorenen Bilder verwenden oder einen Take von der Kamera des Clips aus einfrieren.",
+    "The take does not tell plate from splats: it was frozen without detail.": "Der Take unterscheidet Plate und Splats nicht: er wurde ohne Details eingefroren.",
     # ------------------------------------------------------------------------------------------ cameras from elsewhere, grain
     "The take has no grain to add: freeze it again.": "Der Take hat kein Korn zum Hinzufügen: noch einmal einfrieren.",
     "No folder was given": "Es wurde kein Ordner angegeben",

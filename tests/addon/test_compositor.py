@@ -164,9 +164,10 @@ def test_group_offers_what_a_compositor_needs(addon, scene, take):
     addon("compositor").insert(scene, take)
     node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
     assert [s.name for s in node.inputs] == [
-        "Image", "Mix", "Wipe", "Only Supported", "Only Moving", "Grain", "CG", "CG Depth",
+        "Image", "Mix", "Wipe", "Only Supported", "Only Moving", "Splat", "Show What Is Invented", "Grain", "CG",
+        "CG Depth",
     ]  # fmt: skip
-    assert [s.name for s in node.outputs] == ["Image", "Depth", "Support", "Motion"]
+    assert [s.name for s in node.outputs] == ["Image", "Depth", "Support", "Motion", "Plate", "Source"]
     assert node.inputs["Mix"].default_value == 1.0
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import re
 from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,13 +17,13 @@ from torch import Tensor
 
 from ..contract import ExitCode, JobError, frame_file
 from ..shot import Shot, content_key
-from ..solve.lens import Lens, load_lens
+from ..solve.plate_lens import PlateLens, load_plate_lenses
 from ..solve.stored import load_cameras, load_record
 from ..solve.undistort import BandUndistorter
 from . import codes
 from .images import read_frame, read_png, resize_float, working_size
 from .importing import FootageConfig, import_key, load_frames
-from .sources import Known, PlateReader, Source, open_source
+from .sources import Known, Source, open_source
 
 PLATES_VERSION = 1
 _NO_LARGER = 720
@@ -33,16 +31,6 @@ _NO_LARGER = 720
 _AGREE = 4.0 / 255.0
 _DISAGREE_SHARE = 1e-3
 """A plate is of another picture than its working frame if more than this share of values is farther off than that."""
-
-
-@dataclass
-class _Found:
-    """Where plates come from."""
-
-    source: Source | None = None
-    """The footage; None: the working frames."""
-    note: str = ""
-    """Why not the footage, where that costs something."""
 
 
 class Plates:
@@ -70,30 +58,25 @@ class Plates:
         The default holds what a frozen frame and the next one ask for: itself, two before and two after it at every
         other frame, and t*. JobError (FOOTAGE, SOLVE) if the shot is not imported and solved.
         """
-        record, solved = load_frames(shot), load_record(shot)
+        load_cameras(shot)
+        record = load_frames(shot)
+        # Cameras may come without the record of a solve: a scene of truth has none.
+        solved = load_record(shot) if (shot.solve / "solve.json").is_file() else {}
         self._shot, self._keep = shot, max(1, keep)
         self._files = {int(row["frame"]): str(row["file"]) for row in record["frames"]}
         self.frames = sorted(self._files)
-        working = int(record["width"]), int(record["height"])
-        self._working = working
-        lens, found = _lens(shot), _Found()
-        if isinstance(lens, str):
-            found.note = "" if _holds_no_more(record, working) else lens
-        else:
-            found = self._find(record, working)
-        self.note = found.note
-        info = found.source.info if found.source is not None else None
-        self.width, self.height = size or ((info.width, info.height) if info is not None else working)
+        self._working = int(record["width"]), int(record["height"])
+        self._lenses = _lenses(shot)
+        source, self.note = self._find(record)
+        info = source.info if source is not None else None
+        self.width, self.height = size or ((info.width, info.height) if info is not None else self._working)
         self.deep = info is not None and info.extended
-        if not self.deep and (self.width, self.height) == working:
-            found.source = None  # the working frames are just that
-        self._undistort = None
-        self._reader: PlateReader | None = None
-        if found.source is not None and not isinstance(lens, str):
-            self._undistort = _undistorter(lens, self.width, self.height)
-            self._reader = found.source.plates(self._known(record))
+        if not self.deep and (self.width, self.height) == self._working:
+            source = None  # the working frames are just that
+        self._reader = source.plates(self._known(record)) if source is not None else None
+        self._warp: tuple[PlateLens, BandUndistorter] | None = None
         self._held: OrderedDict[int, NDArray] = OrderedDict()
-        footage = info.key if info is not None and found.source is not None else "working frames"
+        footage = source.info.key if source is not None else "working frames"
         self.key = content_key(PLATES_VERSION, record.get("key"), solved.get("key"), footage, [self.width, self.height])
 
     def display(self, frame: int) -> Tensor:
@@ -141,39 +124,48 @@ class Plates:
                 "Check that the disk it lies on is there, and that the file is whole.",
                 ExitCode.FOOTAGE,
             ) from error
-        picture = codes.resize_plate(picture, self.width, self.height)
-        return picture if self._undistort is None else self._undistort(picture)
+        return self._undistorted(codes.resize_plate(picture, self.width, self.height), frame)
+
+    def _undistorted(self, picture: NDArray, frame: int) -> NDArray:
+        """Codes without the lens; those of 8 bits become 16, which lie between them."""
+        lens = self._lenses[frame] if isinstance(self._lenses, dict) else None
+        if lens is None or lens.is_none:
+            return picture
+        if self._warp is None or self._warp[0] != lens:
+            self._warp = None  # before the next one takes its room
+            self._warp = lens, BandUndistorter(lens.where(self.width, self.height))
+        kind = np.dtype(np.float16 if picture.dtype == np.float16 else np.uint16)
+        into = np.empty(picture.shape, kind)
+        return self._warp[1](picture, codes.display, lambda x: codes.from_display(x, kind), into)
 
     # ------------------------------------------------------------------------------------------------- the source
 
-    def _find(self, record: dict[str, Any], working: tuple[int, int]) -> _Found:
-        """The footage, if it holds more than the working frames and is what was imported."""
-        if _holds_no_more(record, working):
-            return _Found()
-        stays = f"frozen frames stay at {working[0]}x{working[1]} and at what the working frames hold."
+    def _find(self, record: dict[str, Any]) -> tuple[Source | None, str]:
+        """The footage, or None for the working frames and, where those hold less, a sentence that says why."""
+        if _holds_no_more(record, self._working):
+            return None, ""
+        stays = "Frozen frames stay at the size and depth of the working frames."
+        if isinstance(self._lenses, str):
+            return None, f"{self._lenses} {stays}"
         config = _config(record)
-        places = source_places(self._shot, record)
-        for place in places:
+        for place in source_places(self._shot, record):
             try:
                 source = open_source(place, config.fps, config.layer)
             except (JobError, OSError):
                 continue
-            if not source.info.extended and (source.info.width, source.info.height) == working:
-                return _Found()
-            if self._is_imported(source, record, config, working):
-                return _Found(source)
-            return _Found(note=f"The footage {place} is not what was imported: {stays}")
-        named = self._shot.info().source
-        return _Found(note=f"The footage {named or 'of this shot'} cannot be read: {stays}")
+            if not source.info.extended and (source.info.width, source.info.height) == self._working:
+                return None, ""
+            if self._is_imported(source, record, config):
+                return source, ""
+            return None, f"The footage {place} is not what was imported any more. {stays}"
+        return None, f"The footage {self._shot.info().source or 'of this shot'} cannot be read. {stays}"
 
-    def _is_imported(
-        self, source: Source, record: dict[str, Any], config: FootageConfig, working: tuple[int, int]
-    ) -> bool:
+    def _is_imported(self, source: Source, record: dict[str, Any], config: FootageConfig) -> bool:
         """True if the footage is by its key, or by its first, middle and last picture, what was imported."""
         info = source.info
         if import_key(info, config) == record.get("key"):
             return True
-        if working_size(info.width, info.height, config.working_height) != working:
+        if working_size(info.width, info.height, config.working_height) != self._working:
             return False
         reader = source.plates(self._known(record))
         try:
@@ -229,39 +221,10 @@ def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
     return tuple(size) == working and not record.get("extended", True)
 
 
-# --------------------------------------------------------------------------------------------------------- the lens
-
-
-def _lens(shot: Shot) -> Lens | str:
-    """The lens, or a sentence that says why the source cannot be undistorted. JobError (SOLVE) if there is no solve."""
+def _lenses(shot: Shot) -> dict[int, PlateLens] | str:
+    """The lens of each frame, or a sentence that says why there is none. JobError (SOLVE) if there is no solve."""
     load_cameras(shot)
     try:
-        return load_lens(shot)
+        return load_plate_lenses(shot)
     except JobError as error:
-        return f"{error.message} Frozen frames stay at the working frames' size."
-
-
-def _undistorter(lens: Lens, width: int, height: int) -> Callable[[NDArray], NDArray] | None:
-    """Takes codes of that size through the lens; None where there is nothing to do."""
-    if not any((lens.k1, lens.k2, lens.p1, lens.p2)):
-        return None
-    warp = BandUndistorter(_where(lens, width, height))
-
-    def undistort(picture: NDArray) -> NDArray:
-        # Eight bits are not enough between samples of eight bits.
-        kind = np.dtype(np.float16 if picture.dtype == np.float16 else np.uint16)
-        return warp(picture, codes.display, lambda x: codes.from_display(x, kind), np.empty(picture.shape, kind))
-
-    return undistort
-
-
-def _where(lens: Lens, width: int, height: int) -> NDArray[np.float32]:
-    """[height, width, 2]: where the pixels of an undistorted plate lie in the source, in its pixels."""
-    out = np.empty((height, width, 2), np.float32)
-    ratio = np.array([width / lens.width, height / lens.height])
-    x = np.arange(width) + 0.5
-    for top in range(0, height, codes.ROWS):
-        y = np.arange(top, min(top + codes.ROWS, height)) + 0.5
-        at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / ratio
-        out[top : top + codes.ROWS] = (lens.to_original(at) * ratio).reshape(-1, width, 2)
-    return out
+        return error.message

@@ -39,7 +39,7 @@ from .warp import sample, snap
 
 @dataclass(frozen=True)
 class DetailConfig:
-    """How plates are chosen, weighed and mixed. Lengths in pixels are of pictures as wide as decisions are made."""
+    """How plates are chosen, weighed and mixed. Lengths are in pixels of pictures 640 wide."""
 
     sources: int = 5
     """Plates that a frame is made of, at most: its own and that of t* among them."""
@@ -265,8 +265,9 @@ class Detailer:
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns), st, own
-        wrong = widened((torch.maximum(shot.motion, lead.moving) > 0.5).float(), self.config.margin)
-        matte = 1.0 - blurred(wrong, self.config.feather)
+        wrong = torch.maximum(shot.motion, lead.moving) > 0.5
+        wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
+        matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
         if not own:
             error = self._parallax(shot, leading, shot.depth)
             matte = matte * lead.visible * torch.exp(-(2.0 * error).square())
@@ -288,10 +289,10 @@ class Detailer:
         return snap(st, (self.plates.width, self.plates.height)), within
 
     def _parallax(self, shot: _Shot, frame: int, depth: Tensor) -> Tensor:
-        """Pixels of decisions by which a wrong depth moves points at `depth`, against this camera, in a plate."""
+        """Pixels of 640 by which a wrong depth moves points at `depth`, against this camera, in a plate."""
         travel = (self.seen.centres[self.seen.index[frame]] - shot.centre).norm()
         focal = shot.K[0, 0] * shot.per_pixel
-        return focal * travel / depth.clamp_min(1e-6) * self.config.depth_error
+        return focal * travel / depth.clamp_min(1e-6) * self.config.depth_error / self.seen.unit
 
     # ------------------------------------------------------------------------------------------------- the fill
 
@@ -327,7 +328,7 @@ class Detailer:
         """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
         view = self.seen.view(frame)
         travel = (project(points, view.viewmat, view.K)[0] - sighting.pixels).norm(dim=-1)
-        trust = torch.exp(-(travel / self.config.sway).square())
+        trust = torch.exp(-(travel / (self.config.sway * self.seen.unit)).square())
         return self.config.sway_trust * sighting.explained * trust
 
     def _weight(self, shot: _Shot, frame: int, sighting: Sighting, motion: Tensor, sway: Tensor) -> Tensor:

@@ -45,6 +45,7 @@ _FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) + (oiio.HALF,) * 2
 _DETAIL_FORMATS = (oiio.HALF,) * 5 + (oiio.FLOAT,)
 _COLOURS = ("rgba", "splat")
 _ROWS = 64
+_PLATE_STEPS = 256.0
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -116,7 +117,8 @@ def write_frozen_exr(
     """Writes one frame atomically: half colour and mattes, float32 depth and `source`, ZIP. Arrays as in `FrozenFrame`.
 
     Grain is noise, which does not compress: it keeps 2 bits of its mantissa and is off by an eighth of itself at most,
-    which takes a third off what it adds to the file (0.74 instead of 1.25 MB at 640 x 480).
+    which takes a third off what it adds to the file (0.74 instead of 1.25 MB at 640 x 480). `splat` keeps 8 bits, four
+    times finer than 8-bit sRGB, and `plate` steps of 1/256: with `source` they add 0.95 MB instead of 1.29.
 
     Attributes: `chromaticities` and `colorInteropID` (Rec.709); `worldToCamera`, the OpenEXR standard matrix, in the
     renderer axes of Blender and Nuke (x right, y up, looking along -z) for Imath's row vectors (p_camera = p_world @
@@ -138,7 +140,8 @@ def write_frozen_exr(
         names, formats = names + GRAIN_CHANNELS, formats + (oiio.HALF,) * len(GRAIN_CHANNELS)
     if detail is not None:
         layers = {"rgba": rgba, "splat": detail.splat, "plate": detail.plate, "source": detail.source}
-        parts += _checked(layers)[1:]
+        _, splat, plate, source = _checked(layers)
+        parts += [_eight_bits(splat), np.round(plate * _PLATE_STEPS) / _PLATE_STEPS, source]
         names, formats = names + DETAIL_CHANNELS, formats + _DETAIL_FORMATS
     spec = _spec(parts[0].shape[1], parts[0].shape[0], names, formats, metadata)
     set_margin(spec, margin)
@@ -164,7 +167,8 @@ def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[NDArray]) -> Pat
     What is stored as half is clamped to +-65504. A few rows at a time: a 4K frame of all layers has half a gigabyte.
     OSError with the system's reason, as `write_frozen_exr`.
     """
-    most = np.array([HALF_MAX if kind.basetype == oiio.HALF else np.inf for kind in spec.channelformats], np.float32)
+    kinds = [spec.channelformat(channel).basetype for channel in range(spec.nchannels)]
+    most = np.array([HALF_MAX if kind == oiio.HALF else np.inf for kind in kinds], np.float32)
     with atomic_path(path) as beside:
         output = oiio.ImageOutput.create(str(beside))
         if output is None:
@@ -243,6 +247,12 @@ def _coarse(grain: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float16]:
     return np.concatenate([half, np.zeros((*shape, 1), np.float16)], axis=2)
 
 
+def _eight_bits(values: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Values as half floats with 8 bits of mantissa, rounded to the nearest."""
+    bits = np.clip(values, -HALF_MAX, HALF_MAX).view(np.uint32)
+    return ((bits + np.uint32(0x4000)) & np.uint32(0xFFFF8000)).view(np.float32).clip(-HALF_MAX, HALF_MAX).astype("f2")
+
+
 def _checked(layers: dict[str, ArrayLike]) -> list[NDArray]:
     """[H,W,c] float32: `rgba` and layers like it. ValueError names the one that is wrong."""
     with np.errstate(over="ignore"):
@@ -291,9 +301,10 @@ def _spec(
 
 def linear_spec(width: int, height: int, names: tuple[str, ...], formats: tuple[oiio.BASETYPE, ...]) -> oiio.ImageSpec:
     """What a ZIP-compressed EXR of `COLOR_SPACE` with these channels begins with."""
-    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
+    spec = oiio.ImageSpec(width, height, len(names), formats[0])
     spec.channelnames = names
-    spec.channelformats = formats
+    if len(set(formats)) > 1:  # else the writer passes over them
+        spec.channelformats = formats
     spec.attribute("compression", "zip")
     spec.attribute("oiio:ColorSpace", COLOR_SPACE)
     spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), _REC709)

@@ -22,7 +22,7 @@ from ..raster import rasterize
 from ..scene import Scene, read_image, resize_intrinsics
 from ..train import LoadedRun
 from ..train.exposure import Exposure
-from .instant_depth import DepthConfig, Region, View, inverse_depth
+from .instant_depth import DepthConfig, Region, View, inverse_depth, own_motion
 from .query import FrozenGaussians, FrozenImage, render_frozen
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
@@ -59,7 +59,9 @@ class InstantConfig:
     least: float = 30.0
     """Square pixels; smaller regions are left alone."""
     moving: float = 0.5
-    """Least share of a region's pixels that move: by the matte, or, without one, by flow that contradicts the model."""
+    """Least share of a region that the motion matte calls moving, if there is one."""
+    own_motion: float = 0.12
+    """Least distance of a region's flow from its epipolar lines, per frame; twice that where there is no matte."""
     solid: float = 0.14
     """Difference at a pixel from which on it is wholly the layer's; below half of it, the model's."""
     sigma: float = 0.6
@@ -111,7 +113,7 @@ def instant_layer(
         plates: display-referred plates of any size; None: the shot's working frames.
         frozen: the scene at t*, on any device.
         t_star: frame number; between two frames the nearer one's plate is looked at.
-        motion: motion mattes; without them flow that contradicts the model's depth tells what moves.
+        motion: motion mattes; without them flow off its epipolar lines alone tells what moves.
 
     Returns None if plate and scene agree.
     """
@@ -233,18 +235,22 @@ def _regions(bench: _Bench, image: FrozenImage) -> list[NDArray[np.bool_]]:
     c, unit = bench.config, bench.unit
     difference = bench.difference(image)
     count, labels = cv2.connectedComponents((difference >= c.grow).astype(np.uint8))
-    matte, found = bench.matte(), []
+    found = []
     for label in range(1, count):
         region = labels == label
-        if difference[region].max() < c.seed or region.sum() < c.least * unit**2:
-            continue
-        found.append(region)
-    if not found:
-        return []
-    if matte is None:
-        matte = contradicted(bench.view, bench.neighbours(), image.depth.numpy(), c.depth, unit)
-    found = [region for region in found if matte[region].mean() >= c.moving]
-    return [region for region in found if not _stuck(bench, region, image)]
+        if difference[region].max() >= c.seed and region.sum() >= c.least * unit**2:
+            found.append(region)
+    return [region for region in found if _moves(bench, region) and not _stuck(bench, region, image)]
+
+
+def _moves(bench: _Bench, region: NDArray[np.bool_]) -> bool:
+    """True if what plate t* shows in a region moves. What is merely modelled badly stays on its epipolar lines."""
+    c, matte = bench.config, bench.matte()
+    share = 1.0 if matte is None else float(matte[region].mean())
+    own = own_motion(bench.view, bench.neighbours(), region, c.depth, bench.unit)
+    if own is None:  # a hand too fast for its flow is known by its matte alone, and that has to be sure
+        return matte is not None and share >= 0.5 * (1.0 + c.moving)
+    return share >= c.moving and own >= (1.0 if matte is not None else 2.0) * c.own_motion * bench.unit
 
 
 def _stuck(bench: _Bench, region: NDArray[np.bool_], image: FrozenImage) -> bool:
@@ -258,22 +264,6 @@ def _stuck(bench: _Bench, region: NDArray[np.bool_], image: FrozenImage) -> bool
             a, b = ((v.picture - _blurred(v.picture, 2.0 * unit))[region].ravel() for v in (view, other))
             alike.append(float((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9)))
     return bool(alike) and float(np.median(alike)) > bench.config.stuck
-
-
-def contradicted(
-    view: View, others: list[View], depth: NDArray[np.float32], config: DepthConfig, unit: float
-) -> NDArray[np.float32]:
-    """1 where the flow to most neighbours is not that of a still surface at `depth` [h, w], else 0."""
-    votes, seen = np.zeros(depth.shape, np.float32), np.zeros(depth.shape, np.float32)
-    for other in others:
-        flow, found = view.flow_to(other, config.round_trip * unit)
-        at = view.project(other, 1.0 / np.maximum(depth, 1e-6))
-        inside = (at >= 0).all(-1) & (at <= depth.shape[::-1]).all(-1)
-        off = np.linalg.norm(flow - (at - view.grid()), axis=-1) > config.contradiction * unit
-        # What is not found again was hidden by something, or went too fast: it is not still, either.
-        votes += inside & (off | ~found)
-        seen += inside
-    return ((seen > 0) & (votes > 0.5 * seen)).astype(np.float32)
 
 
 def _shell(

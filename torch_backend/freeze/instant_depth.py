@@ -23,8 +23,6 @@ class DepthConfig:
     """Frames before and after t* that are matched."""
     round_trip: float = 0.7
     """Greatest distance between a pixel and where the flow there and back ends."""
-    contradiction: float = 1.0
-    """A match this far from where the model's depth puts it contradicts the model."""
     ring: float = 6.0
     """Width of the surroundings in which a region may hang on something."""
     alike: float = 0.12
@@ -67,8 +65,8 @@ class Region:
     """Depth of what the model shows there, median; infinite if it shows nothing."""
     attached: float
     """0..1: how sure it is what the region hangs on."""
-    own_motion: float
-    """Distance of matches from epipolar lines in pixels per frame: the region's own motion, across the lines."""
+    own_motion: float | None
+    """Distance of matches from epipolar lines in pixels per frame: the region's own motion; None: no match."""
 
 
 @dataclass
@@ -149,7 +147,7 @@ def inverse_depth(
     at = _weighted_median(behind[ring], weight) if held > 0 else hidden
     low, high = _range(behind, region, ring, weight, mover, config)
     grid = np.geomspace(low, high, config.steps)
-    cost, own = _parallax(view, others, region, grid, config, unit)
+    cost = _parallax(view, others, region, grid, config, unit)
     cost = cost + attached * 4.0 * _away(grid, at, config)
     beside, share = _nearby(region, explained, behind, mover, config, unit)
     cost = cost + (1.0 - attached) * share * _away(grid, beside, config)
@@ -162,6 +160,7 @@ def inverse_depth(
     rows, columns = np.nonzero(region)
     box = int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
     found = float(np.median(inverse[region]))
+    own = own_motion(view, others, region, config, unit)
     return inverse, Region(int(region.sum()), box, 1.0 / found, 1.0 / max(hidden, 1e-10), attached, own)
 
 
@@ -239,33 +238,56 @@ def _range(
     return low, max(high, config.free * low)
 
 
+def own_motion(
+    view: View, others: list[View], region: NDArray[np.bool_], config: DepthConfig, unit: float
+) -> float | None:
+    """How far a region leaves its epipolar lines in pixels per frame, median of the frames around; None: not found.
+
+    What moves along the lines only is not told from what is at another depth.
+    """
+    found = []
+    for other in others:
+        matched = _matches(view, other, region, 0.0, 1.0, config, unit)
+        if matched is not None:
+            found.append(float(np.median(matched[1])) / abs(other.index - view.index))
+    return float(np.median(found)) if found else None
+
+
+def _matches(
+    view: View, other: View, region: NDArray[np.bool_], low: float, high: float, config: DepthConfig, unit: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
+    """Where a region's pixels went, [P] each: along their epipolar lines, from the place of inverse depth `low` towards
+    that of `high`, and away from the lines; and how far the two places are apart. Pixels. None if too few are found."""
+    flow, found = view.flow_to(other, config.round_trip * unit)
+    use = region & found
+    if use.sum() < 0.3 * region.sum():
+        return None
+    far = view.project(other, low)[use]
+    line = view.project(other, high)[use] - far
+    length = np.linalg.norm(line, axis=-1, keepdims=True)
+    along = line / np.maximum(length, 1e-9)
+    there = view.grid()[use] + flow[use] - far
+    across = np.abs(there[:, 0] * along[:, 1] - there[:, 1] * along[:, 0])
+    return (there * along).sum(-1), across, float(np.median(length))
+
+
 def _parallax(
     view: View, others: list[View], region: NDArray[np.bool_], grid: NDArray[np.float64], config: DepthConfig,
     unit: float,
-) -> tuple[NDArray[np.float64], float]:  # fmt: skip
-    """(cost [G] of the inverse depths `grid`, own motion in pixels per frame), by matches in the frames around."""
-    cost, own = np.zeros(len(grid)), []
+) -> NDArray[np.float64]:  # fmt: skip
+    """Cost [G] of the inverse depths `grid`, by matches in the frames around."""
+    cost = np.zeros(len(grid))
     for other in others:
-        flow, found = view.flow_to(other, config.round_trip * unit)
-        use = region & found
-        if use.sum() < 0.3 * region.sum():
+        matched = _matches(view, other, region, float(grid[0]), float(grid[-1]), config, unit)
+        if matched is None:
             continue
-        near, far = view.project(other, float(grid[-1]))[use], view.project(other, float(grid[0]))[use]
-        line = near - far
-        length = np.linalg.norm(line, axis=-1, keepdims=True)
-        along = line / np.maximum(length, 1e-9)
-        there = view.grid()[use] + flow[use] - far
-        across = np.abs(there[:, 0] * along[:, 1] - there[:, 1] * along[:, 0])
-        place = float(np.median((there * along).sum(-1)))
-        parallax = float(np.median(length))
+        place, across, parallax = matched
         # A thing moves along the lines as much as across them: that much a place on them is off.
-        steps = abs(other.index - view.index)
         error = np.hypot(config.noise * unit, 1.5 * float(np.median(across)))
-        own.append(float(np.median(across)) / steps)
         expected = parallax * (grid - grid[0]) / (grid[-1] - grid[0])
-        off = np.square((expected - place) / error)
+        off = np.square((expected - float(np.median(place))) / error)
         cost += off / (1.0 + 0.1 * off) / len(others)
-    return cost, float(np.median(own)) if own else 0.0
+    return cost
 
 
 def _bent(

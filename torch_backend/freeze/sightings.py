@@ -24,6 +24,7 @@ MovingOf = Callable[[int], "Tensor | None"]
 """Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
 DOUBT = 0.4
 """How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
+_LENGTHS_OF = 640.0
 _VIEWS_BYTES = 400e6
 _RESIDUALS_BYTES = 400e6
 
@@ -88,7 +89,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class SightingConfig:
-    """At what size plates are looked at for decisions, and how finely. Lengths in pixels of that size."""
+    """At what size plates are looked at for decisions, and how finely. Lengths are in pixels of pictures 640 wide."""
 
     width: int = 640
     """Mattes, depth and visibility are compared at this width at most: they are soft, and the model is no finer."""
@@ -125,6 +126,8 @@ class Sightings:
         """Frames of the clip that have both a plate and a camera, ascending."""
         width = min(plates.width, self.config.width)
         self.size = width, max(8, round(plates.height * width / plates.width))
+        self.unit = width / _LENGTHS_OF
+        """Pixels of decisions to a pixel in which lengths are configured."""
         self.rows = run.model.open_rows().cpu()
         views = scene.viewmats
         self.centres = -torch.einsum("nji,nj->ni", views[:, :3, :3], views[:, :3, 3])
@@ -186,12 +189,13 @@ class Sightings:
         moving = image.motion if told is None else resized(told, width, height)
         # The working frame will do, and need not be decoded from 4K footage.
         plate = read_image(self.scene.image_path(self.index[frame]), width, height)
-        off = blurred(plate - image.color, self.config.lowpass).abs().amax(dim=-1)
-        off = blurred(widened(off, self.config.region), 0.5 * self.config.region)
+        off = blurred(plate - image.color, self.config.lowpass * self.unit).abs().amax(dim=-1)
+        region = round(self.config.region * self.unit)
+        off = blurred(widened(off, region), 0.5 * region)
         return PlateView(
             *self.camera(frame, width, height),
             image.depth,
-            widened(moving, self.config.margin),
+            widened(moving, round(self.config.margin * self.unit)),
             torch.exp(-(off / self.config.unexplained).square()),
             frozen.state["means"].cpu()[self.rows],
         )

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from .exr import check_finite, linear_spec, set_margin, write_exr
@@ -40,14 +40,17 @@ WARP_VERSION = 1
 """Version of the `splannequin:` attributes of a warp."""
 STEPS = 256
 """Coordinates are multiples of one pixel over this."""
-MATTE_STEPS = 1024
+MATTE_STEPS = 256
 """Mattes are multiples of one over this, which half floats hold exactly."""
 
-_FORMATS = (oiio.FLOAT,) * 3 + (oiio.HALF,) + (oiio.FLOAT,) * 3 + (oiio.HALF,)
+_FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) * 3 + (oiio.HALF,)
 _ROWS = 256
 # A fill below this share of its pixel is rounding, and is left out.
 _ROUNDING = 1e-4
 _BLACK = 1e-6
+# Half floats are off by this share of themselves at most; what a pixel may be off by for that.
+_HALF = 2.0**-12
+_OFF, _OFF_BLACK = 5e-4, 5e-6
 
 
 @dataclass(frozen=True)
@@ -128,13 +131,16 @@ def close(color_linear: Tensor, plate_linear: Tensor, st: Tensor, matte: Tensor)
         color_linear: [H,W,3] the frozen frame, scene-linear, premultiplied.
         plate_linear: [h,w,3] the undistorted plate, scene-linear.
         st: [H,W,2] where each pixel looks in the plate; rounded by `snap`.
-        matte: [H,W] how much of the pixel the plate gives; rounded to 1/`MATTE_STEPS`.
+        matte: [H,W] how much of the pixel the plate gives; rounded to 1/`MATTE_STEPS`, and 0 where the plate shows so
+            much more than the frozen frame (a highlight that is not there) that a half float cannot take it away again.
     """
     st = snap(st, (plate_linear.shape[1], plate_linear.shape[0]))
     matte = (matte.float().clamp(0.0, 1.0) * MATTE_STEPS).round() / MATTE_STEPS
-    fill = color_linear.float() - matte[..., None] * sample(plate_linear.float(), st)
-    fill[fill.abs() <= _ROUNDING * color_linear.abs() + _BLACK] = 0.0
-    return st, matte, fill
+    color = color_linear.float()
+    fill = color - matte[..., None] * sample(plate_linear.float(), st)
+    fill[fill.abs() <= _ROUNDING * color.abs() + _BLACK] = 0.0
+    worse = (fill.abs() * _HALF > (_OFF * color.abs()).clamp(min=_OFF_BLACK)).any(-1)
+    return st, matte.masked_fill(worse, 0.0), torch.where(worse[..., None], color, fill)
 
 
 def apply_warp(plate_linear: Tensor, warp: Warp) -> Tensor:
@@ -160,10 +166,9 @@ def write_warp(
     metadata: WarpMetadata,
     margin: tuple[int, int] = (0, 0),
 ) -> Path:
-    """Writes one warp atomically: float32 ST and fill, half matte and alpha, ZIP. Arrays as in `Warp`, from `close`.
+    """Writes one warp atomically: float32 ST, the rest half, ZIP. Arrays as in `Warp`, from `close`.
 
-    The fill keeps 15 bits of its mantissa: half floats are not enough where it makes up for a highlight. With a
-    `margin` the arrays are the data window, as in `write_frozen_exr`.
+    With a `margin` the arrays are the data window, as in `write_frozen_exr`.
 
     ValueError names the layer whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be
     written (errno ENOSPC when the disk is full).
@@ -183,7 +188,7 @@ def write_warp(
     _describe(spec, metadata)
     set_margin(spec, margin)
     ones = np.broadcast_to(np.float32(1.0), (*shape, 1))
-    parts = [_shortened(arrays["fill"]), arrays["alpha"][..., None], arrays["st"], ones, arrays["matte"][..., None]]
+    parts = [arrays["fill"], arrays["alpha"][..., None], arrays["st"], ones, arrays["matte"][..., None]]
     return write_exr(Path(path), spec, parts)
 
 
@@ -216,12 +221,6 @@ def read_warp(path: str | Path) -> Warp:
         for part in (CHANNELS[:3], CHANNELS[3:4], CHANNELS[4:6], CHANNELS[7:])
     )
     return Warp(st, matte, fill, alpha, metadata, (spec.full_x - spec.x, spec.full_y - spec.y))
-
-
-def _shortened(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """float32 rounded to the nearest whose eight lowest bits are 0: two thirds of a file of them is left."""
-    bits = np.ascontiguousarray(values).view(np.uint32)
-    return ((bits + np.uint32(0x80)) & np.uint32(0xFFFFFF00)).view(np.float32)
 
 
 def _describe(spec: oiio.ImageSpec, metadata: WarpMetadata) -> None:

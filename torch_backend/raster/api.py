@@ -72,17 +72,33 @@ def _body(backend: str, means: Tensor) -> str:
     if device not in ("cpu", "cuda") or (device == "cuda" and torch.version.hip is not None):
         raise NotImplementedError(
             f"there is no rasteriser for {'AMD GPU' if device == 'cuda' else device} tensors yet: move the tensors to "
-            "the CPU, or pass backend='reference', which is slow")
+            "the CPU, or pass backend='reference', which is slow"
+        )
     if backend == "cpu" and device == "cuda":
         raise ValueError("backend='cpu' needs tensors on the CPU: move them there, or pass backend='auto'")
     return device if backend == "auto" else backend
 
 
-def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, colors: Tensor | None = None,
-              sh: Tensor | None = None, *, viewmats: Tensor, Ks: Tensor, width: int, height: int,
-              background: Tensor | None = None, settings: RasterSettings | None = None, backend: str = "auto",
-              with_depth: bool = False, with_contributions: bool = False, with_top: bool = False,
-              sh_degree: int | None = None) -> RasterOutput:
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    opacity_logits: Tensor,
+    colors: Tensor | None = None,
+    sh: Tensor | None = None,
+    *,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | None = None,
+    settings: RasterSettings | None = None,
+    backend: str = "auto",
+    with_depth: bool = False,
+    with_contributions: bool = False,
+    with_top: bool = False,
+    sh_degree: int | None = None,
+) -> RasterOutput:
     """Splat N Gaussians into C pinhole views.
 
     means [N, 3] world; quats [N, 4] wxyz of any non-zero norm; log_scales [N, 3] natural logs of world units;
@@ -117,13 +133,23 @@ def rasterize(means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: 
         return value.to(device=means.device, dtype=dtype).contiguous()
 
     scene = Scene(
-        means=ready(means), quats=ready(quats), log_scales=ready(log_scales), opacity_logits=ready(opacity_logits),
-        colors=None if colors is None else ready(colors), sh=None if sh is None else ready(sh),
+        means=ready(means),
+        quats=ready(quats),
+        log_scales=ready(log_scales),
+        opacity_logits=ready(opacity_logits),
+        colors=None if colors is None else ready(colors),
+        sh=None if sh is None else ready(sh),
         viewmats=ready(viewmats),
         Ks=ready(Ks.detach()) if body == "cuda" else Ks.detach().to("cpu", torch.float64),
-        background=None if background is None else ready(background), width=width, height=height, sh_degree=degree,
-        settings=settings or RasterSettings(), with_depth=with_depth, with_contributions=with_contributions,
-        with_top=with_top)
+        background=None if background is None else ready(background),
+        width=width,
+        height=height,
+        sh_degree=degree,
+        settings=settings or RasterSettings(),
+        with_depth=with_depth,
+        with_contributions=with_contributions,
+        with_top=with_top,
+    )
     _check_gaussians(scene)
     if not scene.settings.near > 0:
         raise ValueError(f"settings.near must be positive, not {scene.settings.near}")

@@ -27,8 +27,11 @@ def _compile(channels: int) -> Launch:
     """Kernel of the stages that know no channels (channels = 0), or of blending. Called as f(block, stage, worker)."""
     with _lock:
         if channels not in _kernels:
-            _kernels[channels] = (build(f"raster_blend{channels}", source.blend_source(channels)) if channels
-                                  else build("raster_stages", source.stages_source()))
+            _kernels[channels] = (
+                build(f"raster_blend{channels}", source.blend_source(channels))
+                if channels
+                else build("raster_stages", source.stages_source())
+            )
         return _kernels[channels]
 
 
@@ -97,13 +100,28 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.x_low, block.x_high, block.y_low, block.y_high = limits
     block.near = scene.settings.near
     slots = block.chunks * source.CHUNK
-    for name, each in (("record", block.record_stride), ("aux", 4), ("index", 1), ("hit_count", 1), ("hit_start", 1),
-                       ("order", 1), ("order2", 1), ("key", 1), ("key2", 1), ("span_start", 1), ("span_count", 1)):
+    for name, each in (
+        ("record", block.record_stride),
+        ("aux", 4),
+        ("index", 1),
+        ("hit_count", 1),
+        ("hit_start", 1),
+        ("order", 1),
+        ("order2", 1),
+        ("key", 1),
+        ("key2", 1),
+        ("span_start", 1),
+        ("span_count", 1),
+    ):
         workspace.need(name, slots * each)
     tiles = block.tiles_x * block.tiles_y
     workspace.need("span", 2 * source.SPANS * block.chunks)
-    for name, count in (("chunk_count", block.chunks), ("histogram", tiles * block.workers),
-                        ("tile_start", tiles + 1), ("tile_end", tiles)):
+    for name, count in (
+        ("chunk_count", block.chunks),
+        ("histogram", tiles * block.workers),
+        ("tile_start", tiles + 1),
+        ("tile_end", tiles),
+    ):
         workspace.need(name, count)
 
 
@@ -116,8 +134,10 @@ def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) ->
     run_workers(stages, block, source.PROJECT, by_chunk)
     stages(address, source.SORT, 0)
     if block.hits > _HITS_MAX:
-        raise RuntimeError(f"{block.visible} Gaussians cover {block.hits} tiles of a {block.width}x{block.height} "
-                           f"image, more than the {_HITS_MAX} that fit; their scales are far too large")
+        raise RuntimeError(
+            f"{block.visible} Gaussians cover {block.hits} tiles of a {block.width}x{block.height} "
+            f"image, more than the {_HITS_MAX} that fit; their scales are far too large"
+        )
     workspace.need("hit_slot", block.hits)
     workspace.need("hit_place", block.hits)
     if block.want_weights:
@@ -134,8 +154,19 @@ class _Rasterize(torch.autograd.Function):
     """Autograd's view of the CPU body. Tensors are float32, contiguous, on the CPU."""
 
     @staticmethod
-    def forward(ctx, scene: Scene, norms: tuple[Tensor, Tensor], means, quats, log_scales, logits, colors, sh, viewmats,
-                background):
+    def forward(
+        ctx,
+        scene: Scene,
+        norms: tuple[Tensor, Tensor],
+        means,
+        quats,
+        log_scales,
+        logits,
+        colors,
+        sh,
+        viewmats,
+        background,
+    ):
         cameras, n = viewmats.shape[0], means.shape[0]
         channels = scene.channels + int(scene.with_depth)
         size = (cameras, scene.height, scene.width)
@@ -151,14 +182,30 @@ class _Rasterize(torch.autograd.Function):
         leases = [_Lease() for _ in range(cameras)]
         for c, lease in enumerate(leases):
             _set_up(lease.workspace, scene, c, channels)
-            _point(lease.workspace.block, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors,
-                   sh=sh, background=behind, image=image[c], alpha=alpha[c],
-                   median=median[c] if scene.with_depth else None, radii=radii[c], means2d=means2d[c],
-                   top_ids=top_ids[c], top_weights=top_weights[c], weight_sum=weights[0, c], weight_max=weights[1, c])
+            _point(
+                lease.workspace.block,
+                means=means,
+                quats=quats,
+                log_scales=log_scales,
+                logits=logits,
+                colors=colors,
+                sh=sh,
+                background=behind,
+                image=image[c],
+                alpha=alpha[c],
+                median=median[c] if scene.with_depth else None,
+                radii=radii[c],
+                means2d=means2d[c],
+                top_ids=top_ids[c],
+                top_weights=top_weights[c],
+                weight_sum=weights[0, c],
+                weight_max=weights[1, c],
+            )
             _forward_camera(lease.workspace, scene, channels)
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha,
-                                  behind)
+            ctx.save_for_backward(
+                means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, behind
+            )
             ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
         ctx.mark_non_differentiable(median, radii, means2d, weights, top_ids, top_weights)
         ctx.set_materialize_grads(False)
@@ -170,10 +217,14 @@ class _Rasterize(torch.autograd.Function):
         scene: Scene = ctx.scene
         grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
         grad_alpha = torch.zeros_like(alpha) if grads[1] is None else grads[1].contiguous()
-        out = {"grad_means": torch.zeros_like(means), "grad_quats": torch.zeros_like(quats),
-               "grad_log_scales": torch.zeros_like(log_scales), "grad_logits": torch.zeros_like(logits),
-               "grad_colors": None if colors is None else torch.zeros_like(colors),
-               "grad_sh": None if sh is None else torch.zeros_like(sh)}
+        out = {
+            "grad_means": torch.zeros_like(means),
+            "grad_quats": torch.zeros_like(quats),
+            "grad_log_scales": torch.zeros_like(log_scales),
+            "grad_logits": torch.zeros_like(logits),
+            "grad_colors": None if colors is None else torch.zeros_like(colors),
+            "grad_sh": None if sh is None else torch.zeros_like(sh),
+        }
         grad_view = torch.zeros_like(viewmats)
         stages, blend = _compile(0), _compile(image.shape[-1])
         for norm in ctx.norms:
@@ -183,10 +234,24 @@ class _Rasterize(torch.autograd.Function):
             block = workspace.block
             workspace.need("hit_grad", block.hits * block.grad_stride)
             partial = torch.zeros(max(1, block.chunks), 12)
-            _point(block, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh,
-                   background=behind, image=image[c], alpha=alpha[c], grad_image=grad_image[c],
-                   grad_alpha=grad_alpha[c], grad_view=partial, grad_norm=ctx.norms[0][c], grad_abs=ctx.norms[1][c],
-                   **out)
+            _point(
+                block,
+                means=means,
+                quats=quats,
+                log_scales=log_scales,
+                logits=logits,
+                colors=colors,
+                sh=sh,
+                background=behind,
+                image=image[c],
+                alpha=alpha[c],
+                grad_image=grad_image[c],
+                grad_alpha=grad_alpha[c],
+                grad_view=partial,
+                grad_norm=ctx.norms[0][c],
+                grad_abs=ctx.norms[1][c],
+                **out,
+            )
             threads = scene.settings.threads
             run_workers(blend, block, source.BLEND_BACKWARD, min(threads, block.tiles_x * block.tiles_y))
             run_workers(stages, block, source.PROJECT_BACKWARD, min(threads, block.chunks))
@@ -205,14 +270,32 @@ def rasterize(scene: Scene) -> RasterOutput:
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
     norms = (torch.zeros(cameras, n), torch.zeros(cameras, n))
     image, alphas, median, radii, means2d, weights, top_ids, top_weights = _Rasterize.apply(
-        scene, norms, scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh,
-        scene.viewmats, scene.background)
+        scene,
+        norms,
+        scene.means,
+        scene.quats,
+        scene.log_scales,
+        scene.opacity_logits,
+        scene.colors,
+        scene.sh,
+        scene.viewmats,
+        scene.background,
+    )
     colors, depth = image, None
     if scene.with_depth:
         colors, depth_sum = image[..., :-1], image[..., -1]
         depth = expected_depth(depth_sum, alphas)
     return RasterOutput(
-        colors=colors, alphas=alphas, depth_expected=depth, depth_median=median if scene.with_depth else None,
-        radii=radii, means2d=means2d, weight_sum=weights[0] if scene.with_contributions else None,
-        weight_max=weights[1] if scene.with_contributions else None, means2d_grad=norms[0], means2d_absgrad=norms[1],
-        top_ids=top_ids if scene.with_top else None, top_weights=top_weights if scene.with_top else None)
+        colors=colors,
+        alphas=alphas,
+        depth_expected=depth,
+        depth_median=median if scene.with_depth else None,
+        radii=radii,
+        means2d=means2d,
+        weight_sum=weights[0] if scene.with_contributions else None,
+        weight_max=weights[1] if scene.with_contributions else None,
+        means2d_grad=norms[0],
+        means2d_absgrad=norms[1],
+        top_ids=top_ids if scene.with_top else None,
+        top_weights=top_weights if scene.with_top else None,
+    )

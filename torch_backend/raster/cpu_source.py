@@ -31,19 +31,85 @@ v = d loss / d log alpha, then of |d loss / d mean x|, |d loss / d mean y|."""
 
 _F, _I, _P = ctypes.c_float, ctypes.c_int64, ctypes.c_uint64
 _FIELDS: list[tuple[str, type, str]] = [
-    *[(n, _P, "const float*") for n in ("means", "quats", "log_scales", "logits", "colors", "sh", "background",
-                                        "grad_image", "grad_alpha")],
-    *[(n, _P, "float*") for n in (
-        "record", "aux", "hit_weight", "hit_grad", "image", "alpha", "median", "top_weights", "means2d", "weight_sum",
-        "weight_max", "grad_means", "grad_quats", "grad_log_scales", "grad_logits", "grad_colors", "grad_sh",
-        "grad_view", "grad_norm", "grad_abs")],
-    *[(n, _P, "int*") for n in (
-        "index", "hit_count", "hit_start", "chunk_count", "order", "order2", "key", "key2", "histogram", "tile_start",
-        "tile_end", "hit_slot", "hit_place", "radii", "top_ids", "span", "span_start", "span_count")],
-    *[(n, _I, "long long") for n in (
-        "n", "width", "height", "tiles_x", "tiles_y", "chunks", "visible", "hits", "workers", "n_colors", "n_sh",
-        "sh_degree", "sh_stride", "channels", "record_stride", "grad_stride", "antialiased", "want_depth",
-        "want_weights", "want_top", "want_abs", "counter")],
+    *[
+        (n, _P, "const float*")
+        for n in ("means", "quats", "log_scales", "logits", "colors", "sh", "background", "grad_image", "grad_alpha")
+    ],
+    *[
+        (n, _P, "float*")
+        for n in (
+            "record",
+            "aux",
+            "hit_weight",
+            "hit_grad",
+            "image",
+            "alpha",
+            "median",
+            "top_weights",
+            "means2d",
+            "weight_sum",
+            "weight_max",
+            "grad_means",
+            "grad_quats",
+            "grad_log_scales",
+            "grad_logits",
+            "grad_colors",
+            "grad_sh",
+            "grad_view",
+            "grad_norm",
+            "grad_abs",
+        )
+    ],
+    *[
+        (n, _P, "int*")
+        for n in (
+            "index",
+            "hit_count",
+            "hit_start",
+            "chunk_count",
+            "order",
+            "order2",
+            "key",
+            "key2",
+            "histogram",
+            "tile_start",
+            "tile_end",
+            "hit_slot",
+            "hit_place",
+            "radii",
+            "top_ids",
+            "span",
+            "span_start",
+            "span_count",
+        )
+    ],
+    *[
+        (n, _I, "long long")
+        for n in (
+            "n",
+            "width",
+            "height",
+            "tiles_x",
+            "tiles_y",
+            "chunks",
+            "visible",
+            "hits",
+            "workers",
+            "n_colors",
+            "n_sh",
+            "sh_degree",
+            "sh_stride",
+            "channels",
+            "record_stride",
+            "grad_stride",
+            "antialiased",
+            "want_depth",
+            "want_weights",
+            "want_top",
+            "want_abs",
+            "counter",
+        )
+    ],
     ("view", _F * 12, "float"),
     *[(n, _F, "float") for n in ("fx", "fy", "cx", "cy", "x_low", "x_high", "y_low", "y_high", "near")],
 ]
@@ -225,16 +291,22 @@ auto spans = FN(long long slot, auto&& visit) -> void {
 """
 
 # The same from memory, where it was kept: pairs (tile row, first column | last column << 16).
-_KEPT_SPANS = _SPANS + r"""
+_KEPT_SPANS = (
+    _SPANS
+    + r"""
 auto kept_spans = FN(int slot, auto&& visit) -> void {
     if (P.span_start[slot] < 0) { spans(slot, visit); return; }
     const int* s = P.span + 2 * (long long)P.span_start[slot];
     for (int i = 0; i < P.span_count[slot]; i++) visit(s[2 * i], s[2 * i + 1] & 0xffff, s[2 * i + 1] >> 16);
 };
 """
+)
 
 # Stage 0: project, cull, compact into slots, colour, count tile hits. Parallel over chunks.
-_STAGE_PROJECT = _GATHER + _SPANS + r"""
+_STAGE_PROJECT = (
+    _GATHER
+    + _SPANS
+    + r"""
 const long long RS = P.record_stride;
 const I BIT_INF = (I)0x7f800000;
 auto finite = FN(F v) -> I { return (__builtin_bit_cast(I, v) & BIT_INF) != BIT_INF; };
@@ -256,7 +328,9 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
         if (!any(ok)) continue;
         const F low = (F)@LOG_SCALE_MIN@f;
         F l0 = vmax(r0, low), l1 = vmax(r1, low), l2 = vmax(r2, low);
-""" + _PROJECT + r"""
+"""
+    + _PROJECT
+    + r"""
         F lop = -log2v(1.f + expv(-vmin(vmax(logit, (F)-80.f), (F)80.f)));
         if (P.antialiased) lop += 0.5f * log2v(vmax(dr / det, (F)@COMPENSATION2_MIN@f));
         F level = vmax(lop - PMIN, (F)0.f) * (2.f * LN2);
@@ -329,6 +403,7 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
     }
 }
 """
+)
 
 # Stage 1 (one worker): first hit of every slot; slots that hit a tile in depth order, by a stable radix sort.
 _STAGE_SORT = r"""
@@ -361,12 +436,16 @@ long long tiles = P.tiles_x * P.tiles_y;
 long long from = P.visible * worker / P.workers, to = P.visible * (worker + 1) / P.workers;
 int* mine = P.histogram + worker * tiles;
 """
-_STAGE_COUNT = _KEPT_SPANS + _STRETCH + r"""
+_STAGE_COUNT = (
+    _KEPT_SPANS
+    + _STRETCH
+    + r"""
 for (long long t = 0; t < tiles; t++) mine[t] = 0;
 for (long long rank = from; rank < to; rank++)
     kept_spans(P.order2[rank], FN(int ty, int c0, int c1) -> void {
         for (int c = c0; c <= c1; c++) mine[ty * P.tiles_x + c]++; });
 """
+)
 _STAGE_PREFIX = r"""
 int at = 0; long long tiles = P.tiles_x * P.tiles_y;
 for (long long t = 0; t < tiles; t++) {
@@ -376,7 +455,10 @@ for (long long t = 0; t < tiles; t++) {
 }
 P.tile_start[tiles] = at;
 """
-_STAGE_EMIT = _KEPT_SPANS + _STRETCH + r"""
+_STAGE_EMIT = (
+    _KEPT_SPANS
+    + _STRETCH
+    + r"""
 for (long long rank = from; rank < to; rank++) {
     int slot = P.order2[rank], place = P.hit_start[slot];
     kept_spans(slot, FN(int ty, int c0, int c1) -> void {
@@ -386,6 +468,7 @@ for (long long rank = from; rank < to; rank++) {
         } });
 }
 """
+)
 
 # Stage 5: sum and largest weight of every visible Gaussian over its tiles. Parallel over chunks.
 _STAGE_WEIGHTS = r"""
@@ -399,7 +482,9 @@ for (long long chunk; (chunk = take()) < P.chunks;)
 """
 
 # Stage 6: gradients of the projection from the summed gradients of the hits. Parallel over chunks.
-_STAGE_PROJECT_BACKWARD = _GATHER + r"""
+_STAGE_PROJECT_BACKWARD = (
+    _GATHER
+    + r"""
 const long long GS = P.grad_stride;
 const int D = (int)P.channels;
 for (long long chunk; (chunk = take()) < P.chunks;) {
@@ -427,7 +512,9 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
         F r0 = load(gather[7]), r1 = load(gather[8]), r2 = load(gather[9]), logit = load(gather[10]);
         const F low = (F)@LOG_SCALE_MIN@f;
         F l0 = vmax(r0, low), l1 = vmax(r1, low), l2 = vmax(r2, low);
-""" + _PROJECT + r"""
+"""
+    + _PROJECT
+    + r"""
         F m0 = load(g[0]);
         // log alpha = log opacity - (e^2 / xc + dy^2 / yy) / 2 with e = dx - k dy, k = xy / yy, xc = det / yy.
         // Gradients by way of xc, yy and k lose no digits on long thin Gaussians; by way of the conic they do.
@@ -535,6 +622,7 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
     for (int c = 0; c < 12; c++) P.grad_view[chunk * 12 + c] = sum(gV[c]);
 }
 """
+)
 
 _TILE = r"""
 const int NCH = @NCH@;
@@ -589,17 +677,22 @@ _ALPHA = r"""
                 F w = al * before;
                 T[row] = fma(-al, before, before);
 """
-FORWARD_ROW = _ALPHA + r"""
+FORWARD_ROW = (
+    _ALPHA
+    + r"""
                 for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)channel[c], C[c][row]);
                 total += w; peak = vmax(peak, w);
 """
+)
 """One row of one hit, forward, without the parts that depth and top contributor add."""
 BACKWARD_SUMS = r"""
             F s0 = (F)0.f, s1 = s0, s2 = s0, s3 = s0, s4 = s0, s5 = s0, ax = s0, ay = s0, gc[NCH];
             for (int c = 0; c < NCH; c++) gc[c] = (F)0.f;
             float qa = -2.f * LN2 * A, qc = -2.f * LN2 * R;"""
 """Sums of one hit over its rows."""
-BACKWARD_ROW = _ALPHA + r"""
+BACKWARD_ROW = (
+    _ALPHA
+    + r"""
                 float dy = dys[l][row];
                 F along = (F)0.f;
                 for (int c = 0; c < NCH; c++) {
@@ -614,10 +707,13 @@ BACKWARD_ROW = _ALPHA + r"""
                 s3 = fma(ve, e, s3); s4 = fma(ve, (F)dy, s4); s5 = fma(v, (F)(dy * dy), s5);
                 if (want_abs) { ax += vabs(ve); ay += vabs(fma(v, (F)(qc * dy), ve * -(kk * qa))); }
 """
+)
 """One row of one hit, backward."""
 
 # Blend stage 0: forward. Parallel over tiles.
-_STAGE_BLEND = _TILE + r"""
+_STAGE_BLEND = (
+    _TILE
+    + r"""
 const bool want_depth = P.want_depth != 0, want_top = P.want_top != 0, want_weights = P.want_weights != 0;
 auto prefetch_result = FN(long long place) -> void {
     if (want_weights) __builtin_prefetch(P.hit_weight + 2 * place, 1); };
@@ -634,16 +730,23 @@ for (long long tile; (tile = take()) < tiles;) {
         for (int c = 0; c < NCH; c++) C[c][i] = (F)0.f; }
     long long b = start;
     for (; b < stop; b += 16) {
-""" + _BATCH + r"""
+"""
+    + _BATCH
+    + r"""
         F totals[16], peaks[16];
         for (int l = m; l < 16; l++) { totals[l] = (F)0.f; peaks[l] = (F)0.f; }
         for (int l = 0; l < m; l++) {
-""" + HIT + r"""
+"""
+    + HIT
+    + r"""
             F total = (F)0.f, peak = (F)0.f;
             float depth = 0.f; int id = 0;
             if (want_depth) depth = P.aux[4 * (long long)slots[l] + 3];
             if (want_top) id = P.index[slots[l]];
-""" + ROWS + FORWARD_ROW + r"""
+"""
+    + ROWS
+    + FORWARD_ROW
+    + r"""
                 if (want_depth | want_top) {
                     I larger = w > best[row];
                     // T before > 0.5 and T after <= 0.5: crossed here. Until then, the largest so far.
@@ -682,9 +785,12 @@ for (long long tile; (tile = take()) < tiles;) {
     }
 }
 """
+)
 
 # Blend stage 1: backward, front to back. `left` is what the Gaussians behind still add to d loss / d image . image.
-_STAGE_BLEND_BACKWARD = _TILE + r"""
+_STAGE_BLEND_BACKWARD = (
+    _TILE
+    + r"""
 const long long GS = P.grad_stride;
 const bool want_abs = P.want_abs != 0;
 auto prefetch_result = FN(long long place) -> void { __builtin_prefetch(P.hit_grad + place * GS, 1); };
@@ -709,12 +815,21 @@ for (long long tile; (tile = take()) < tiles;) {
     }
     long long b = start;
     for (; b < stop; b += 16) {
-""" + _BATCH + r"""
+"""
+    + _BATCH
+    + r"""
         for (int l = 0; l < m; l++) {
-""" + HIT + r"""
+"""
+    + HIT
+    + r"""
             F out[(@MOMENTS@ + NCH + 15) / 16 * 16];
-""" + BACKWARD_SUMS + r"""
-""" + ROWS + BACKWARD_ROW + r"""
+"""
+    + BACKWARD_SUMS
+    + r"""
+"""
+    + ROWS
+    + BACKWARD_ROW
+    + r"""
             }
             float* to = P.hit_grad + P.hit_place[b + l] * GS;
             out[0] = s0; out[1] = s1; out[2] = s2; out[3] = s3; out[4] = s4; out[5] = s5; out[6] = qa * ax; out[7] = ay;
@@ -727,6 +842,7 @@ for (long long tile; (tile = take()) < tiles;) {
         for (long long c = 0; c < GS; c += 16) store(P.hit_grad + P.hit_place[h] * GS + c, (F)0.f);
 }
 """
+)
 
 PROJECT, SORT, COUNT, PREFIX, EMIT, WEIGHTS, PROJECT_BACKWARD = range(7)
 BLEND, BLEND_BACKWARD = range(2)
@@ -752,8 +868,18 @@ def assemble(stages: list[str], extra: dict[str, object]) -> str:
 
 def stages_source() -> str:
     """The stages that do not depend on the number of channels."""
-    return assemble([_STAGE_PROJECT, _STAGE_SORT, _STAGE_COUNT, _STAGE_PREFIX, _STAGE_EMIT, _STAGE_WEIGHTS,
-                      _STAGE_PROJECT_BACKWARD], {"GRAD_MAX": 64})
+    return assemble(
+        [
+            _STAGE_PROJECT,
+            _STAGE_SORT,
+            _STAGE_COUNT,
+            _STAGE_PREFIX,
+            _STAGE_EMIT,
+            _STAGE_WEIGHTS,
+            _STAGE_PROJECT_BACKWARD,
+        ],
+        {"GRAD_MAX": 64},
+    )
 
 
 def blend_source(channels: int) -> str:

@@ -74,8 +74,12 @@ def _kernel(name: str, text: str, module: str):
         function(args, wp.tid())
 
     entry.__annotations__ = {"args": structure}
-    return wp.Kernel(entry, key=name, module=wp.get_module(module),
-                     options={"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK})
+    return wp.Kernel(
+        entry,
+        key=name,
+        module=wp.get_module(module),
+        options={"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK},
+    )
 
 
 def module_name(name: str, channels: int = 0) -> str:
@@ -88,9 +92,11 @@ def _refusal(device: torch.device) -> str | None:
     wp = initialised_warp()
     if device.type != "cuda" or (wp.is_cuda_available() and (device.index or 0) < wp.get_cuda_device_count()):
         return None
-    return ("PyTorch sees the NVIDIA GPU, but Warp, which compiles the rasteriser, does not: update the NVIDIA driver "
-            "to version 580 or newer (the GPU must be of the Turing generation, compute capability 7.5, or later), or "
-            "choose the CPU")
+    return (
+        "PyTorch sees the NVIDIA GPU, but Warp, which compiles the rasteriser, does not: update the NVIDIA driver "
+        "to version 580 or newer (the GPU must be of the Turing generation, compute capability 7.5, or later), or "
+        "choose the CPU"
+    )
 
 
 class _Launcher:
@@ -107,8 +113,14 @@ class _Launcher:
         blocks = -(-threads // source.BLOCK)
         kernel = build(name, channels)
         with nullcontext() if self.device.type == "cuda" else _Fibers(self.wp):
-            self.wp.launch(kernel, dim=blocks * source.BLOCK, inputs=[args], block_dim=source.BLOCK,
-                           record_tape=False, **self.where)
+            self.wp.launch(
+                kernel,
+                dim=blocks * source.BLOCK,
+                inputs=[args],
+                block_dim=source.BLOCK,
+                record_tape=False,
+                **self.where,
+            )
 
 
 class _Fibers:
@@ -162,8 +174,10 @@ def _demand(scene: Scene) -> _Demand:
         key = (device, cameras, scene.width, scene.height)
         if key not in _demands:
             if _capturing(device):
-                raise RuntimeError("capture a rasterize call as a CUDA graph only after one of the same device, image "
-                                   "size and number of cameras outside the capture")
+                raise RuntimeError(
+                    "capture a rasterize call as a CUDA graph only after one of the same device, image "
+                    "size and number of cameras outside the capture"
+                )
             _demands[key] = _Demand(device)
         _demands[key].grow(cameras * scene.means.shape[0])
         return _demands[key]
@@ -173,7 +187,11 @@ def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
     """Parameter structure with the sizes and flags of a call."""
     args = _structure(wp)()
     args.n, args.cameras, args.width, args.height = (
-        scene.means.shape[0], scene.viewmats.shape[0], scene.width, scene.height)
+        scene.means.shape[0],
+        scene.viewmats.shape[0],
+        scene.width,
+        scene.height,
+    )
     args.tiles_x, args.tiles_y = -(-scene.width // TILE), -(-scene.height // TILE)
     args.n_colors = 0 if scene.colors is None else scene.colors.shape[1]
     args.n_sh, args.bands = (0, 0) if scene.sh is None else (3, (scene.sh_degree + 1) ** 2)
@@ -237,8 +255,19 @@ class _Rasterize(torch.autograd.Function):
     """Autograd's view of the CUDA body. Tensors are float32, contiguous, on one device."""
 
     @staticmethod
-    def forward(ctx, scene: Scene, norms: tuple[Tensor, Tensor], means, quats, log_scales, logits, colors, sh, viewmats,
-                background):
+    def forward(
+        ctx,
+        scene: Scene,
+        norms: tuple[Tensor, Tensor],
+        means,
+        quats,
+        log_scales,
+        logits,
+        colors,
+        sh,
+        viewmats,
+        background,
+    ):
         make, launch = _Maker(means.device), _Launcher(means.device)
         cameras, n = viewmats.shape[0], means.shape[0]
         channels, slots = scene.channels + int(scene.with_depth), cameras * n
@@ -257,18 +286,55 @@ class _Rasterize(torch.autograd.Function):
         args = _arguments(launch.wp, scene, channels)
         record, aux = make.empty(slots, args.record_stride), make.empty(slots, 2)
         hit_count, depth_key = make.empty(slots, dtype=torch.int32), make.empty(slots, dtype=torch.int32)
-        _point(args, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh,
-               viewmats=viewmats, Ks=scene.Ks, background=behind, record=record, aux=aux, radii=radii, means2d=means2d,
-               hit_count=hit_count, depth_key=depth_key)
+        _point(
+            args,
+            means=means,
+            quats=quats,
+            log_scales=log_scales,
+            logits=logits,
+            colors=colors,
+            sh=sh,
+            viewmats=viewmats,
+            Ks=scene.Ks,
+            background=behind,
+            record=record,
+            aux=aux,
+            radii=radii,
+            means2d=means2d,
+            hit_count=hit_count,
+            depth_key=depth_key,
+        )
         launch("raster_project", args, slots)
         demand = _demand(scene)
         binned = _bin(launch, args, demand, depth_key, hit_count)
-        _point(args, image=image, alpha=alpha, median=median, top_id=top_id, top_weight=top_weight,
-               weight_sum=weight_parts, weight_max=weight_max)
+        _point(
+            args,
+            image=image,
+            alpha=alpha,
+            median=median,
+            top_id=top_id,
+            top_weight=top_weight,
+            weight_sum=weight_parts,
+            weight_max=weight_max,
+        )
         launch("raster_blend", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha,
-                                  record, aux, hit_count, *binned)
+            ctx.save_for_backward(
+                means,
+                quats,
+                log_scales,
+                logits,
+                colors,
+                sh,
+                viewmats,
+                background,
+                image,
+                alpha,
+                record,
+                aux,
+                hit_count,
+                *binned,
+            )
             ctx.scene, ctx.norms, ctx.capacity = scene, norms, args.capacity
         weight_sum = (weight_parts.double() / source.WEIGHT_SCALE).float()
         extras = (median, radii, means2d, weight_sum, weight_max, top_id, top_weight, binned[-1])
@@ -279,8 +345,27 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads):
-        (means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, record, aux, hit_count,
-         order, ends, sorted_slot, tile_start, tile_end, _) = ctx.saved_tensors
+        (
+            means,
+            quats,
+            log_scales,
+            logits,
+            colors,
+            sh,
+            viewmats,
+            background,
+            image,
+            alpha,
+            record,
+            aux,
+            hit_count,
+            order,
+            ends,
+            sorted_slot,
+            tile_start,
+            tile_end,
+            _,
+        ) = ctx.saved_tensors
         scene: Scene = ctx.scene
         make, launch = _Maker(means.device), _Launcher(means.device)
         channels, cameras, n = image.shape[-1], viewmats.shape[0], means.shape[0]
@@ -289,15 +374,44 @@ class _Rasterize(torch.autograd.Function):
         args = _arguments(launch.wp, scene, channels)
         args.capacity, args.want_view = ctx.capacity, int(ctx.needs_input_grad[8])
         grad = make.zeros(cameras * n, args.grad_stride)
-        inputs = {"grad_means": means, "grad_quats": quats, "grad_log_scales": log_scales, "grad_logits": logits,
-                  "grad_colors": colors, "grad_sh": sh}
+        inputs = {
+            "grad_means": means,
+            "grad_quats": quats,
+            "grad_log_scales": log_scales,
+            "grad_logits": logits,
+            "grad_colors": colors,
+            "grad_sh": sh,
+        }
         out = {name: None if value is None else torch.empty_like(value) for name, value in inputs.items()}
         grad_view = torch.zeros_like(viewmats)
-        _point(args, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh,
-               viewmats=viewmats, Ks=scene.Ks, record=record, aux=aux, hit_count=hit_count, order=order, ends=ends,
-               sorted_slot=sorted_slot, tile_start=tile_start, tile_end=tile_end, image=image, alpha=alpha,
-               grad_image=grad_image, grad_alpha=grad_alpha, grad=grad, grad_view=grad_view, grad_norm=ctx.norms[0],
-               grad_abs=ctx.norms[1], **out)
+        _point(
+            args,
+            means=means,
+            quats=quats,
+            log_scales=log_scales,
+            logits=logits,
+            colors=colors,
+            sh=sh,
+            viewmats=viewmats,
+            Ks=scene.Ks,
+            record=record,
+            aux=aux,
+            hit_count=hit_count,
+            order=order,
+            ends=ends,
+            sorted_slot=sorted_slot,
+            tile_start=tile_start,
+            tile_end=tile_end,
+            image=image,
+            alpha=alpha,
+            grad_image=grad_image,
+            grad_alpha=grad_alpha,
+            grad=grad,
+            grad_view=grad_view,
+            grad_norm=ctx.norms[0],
+            grad_abs=ctx.norms[1],
+            **out,
+        )
         if n:
             launch("raster_blend_backward", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
             launch("raster_project_backward", args, n)
@@ -337,21 +451,42 @@ def rasterize(scene: Scene) -> RasterOutput:
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
     tiles = cameras * -(-scene.width // TILE) * -(-scene.height // TILE)
     if max(cameras * n, tiles * source.BLOCK) > 2**31 - source.BLOCK:
-        raise ValueError(f"{cameras} cameras of {scene.width} x {scene.height} px with {n} Gaussians are too much for "
-                         "one call: split the cameras")
+        raise ValueError(
+            f"{cameras} cameras of {scene.width} x {scene.height} px with {n} Gaussians are too much for "
+            "one call: split the cameras"
+        )
     norms = (torch.zeros(cameras, n, device=device), torch.zeros(cameras, n, device=device))
     # Warp leaves its device current; a caller's may be another one.
     with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
         image, alphas, median, radii, means2d, weight_sum, weight_max, top_ids, top_weights, hits = _Rasterize.apply(
-            scene, norms, scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh,
-            scene.viewmats, scene.background)
+            scene,
+            norms,
+            scene.means,
+            scene.quats,
+            scene.log_scales,
+            scene.opacity_logits,
+            scene.colors,
+            scene.sh,
+            scene.viewmats,
+            scene.background,
+        )
     colors, depth = image, None
     if scene.with_depth:
         colors, depth_sum = image[..., :-1], image[..., -1]
         depth = expected_depth(depth_sum, alphas)
     weights, top = scene.with_contributions, scene.with_top
     return RasterOutput(
-        colors=colors, alphas=alphas, depth_expected=depth, depth_median=median if scene.with_depth else None,
-        radii=radii, means2d=means2d, weight_sum=weight_sum if weights else None,
-        weight_max=weight_max if weights else None, means2d_grad=norms[0], means2d_absgrad=norms[1],
-        top_ids=top_ids if top else None, top_weights=top_weights if top else None, hits=hits)
+        colors=colors,
+        alphas=alphas,
+        depth_expected=depth,
+        depth_median=median if scene.with_depth else None,
+        radii=radii,
+        means2d=means2d,
+        weight_sum=weight_sum if weights else None,
+        weight_max=weight_max if weights else None,
+        means2d_grad=norms[0],
+        means2d_absgrad=norms[1],
+        top_ids=top_ids if top else None,
+        top_weights=top_weights if top else None,
+        hits=hits,
+    )

@@ -29,20 +29,72 @@ WIDE_FROM = 2**15 - 1
 """From this many tiles on, tile numbers take 32 bits to sort instead of 16."""
 
 POINTERS = {
-    "const float*": ("means", "quats", "log_scales", "logits", "colors", "sh", "viewmats", "Ks", "background",
-                     "grad_image", "grad_alpha"),
-    "float*": ("record", "aux", "image", "alpha", "median", "top_weight", "means2d", "weight_max", "grad", "grad_means",
-               "grad_quats", "grad_log_scales", "grad_logits", "grad_colors", "grad_sh", "grad_view", "grad_norm",
-               "grad_abs"),
+    "const float*": (
+        "means",
+        "quats",
+        "log_scales",
+        "logits",
+        "colors",
+        "sh",
+        "viewmats",
+        "Ks",
+        "background",
+        "grad_image",
+        "grad_alpha",
+    ),
+    "float*": (
+        "record",
+        "aux",
+        "image",
+        "alpha",
+        "median",
+        "top_weight",
+        "means2d",
+        "weight_max",
+        "grad",
+        "grad_means",
+        "grad_quats",
+        "grad_log_scales",
+        "grad_logits",
+        "grad_colors",
+        "grad_sh",
+        "grad_view",
+        "grad_norm",
+        "grad_abs",
+    ),
     "int*": ("radii", "hit_count", "depth_key", "hit_slot", "sorted_slot", "tile_start", "tile_end", "top_id"),
     "long long*": ("order", "ends", "permutation", "hits", "demand", "weight_sum"),
     "void*": ("hit_key", "sorted_key"),
 }
-SIZES = ("n", "cameras", "width", "height", "tiles_x", "tiles_y", "capacity", "n_colors", "n_sh", "bands",
-         "sh_stride", "channels", "record_stride", "grad_stride", "antialiased", "want_depth", "want_weights",
-         "want_top", "want_abs", "want_view", "wide", "sh_aligned")
-FIELDS = {**{name: "uint64" for names in POINTERS.values() for name in names}, **dict.fromkeys(SIZES, "int32"),
-          "near": "float32"}
+SIZES = (
+    "n",
+    "cameras",
+    "width",
+    "height",
+    "tiles_x",
+    "tiles_y",
+    "capacity",
+    "n_colors",
+    "n_sh",
+    "bands",
+    "sh_stride",
+    "channels",
+    "record_stride",
+    "grad_stride",
+    "antialiased",
+    "want_depth",
+    "want_weights",
+    "want_top",
+    "want_abs",
+    "want_view",
+    "wide",
+    "sh_aligned",
+)
+FIELDS = {
+    **{name: "uint64" for names in POINTERS.values() for name in names},
+    **dict.fromkeys(SIZES, "int32"),
+    "near": "float32",
+}
 """Fields of the parameter structure and their Warp types; pointers travel as integers."""
 _POINTER = {name: kind for kind, names in POINTERS.items() for name in names}
 
@@ -145,7 +197,9 @@ const float sxx = dx * dx, syy = dy * dy, szz = dz * dz;
 _A, _C2, _C3 = k.SH_C1, k.SH_C2, k.SH_C3
 _HARMONICS = [
     (f"{k.SH_C0}f", "", "", ""),
-    (f"{-_A}f * dy", "", f"{-_A}f", ""), (f"{_A}f * dz", "", "", f"{_A}f"), (f"{-_A}f * dx", f"{-_A}f", "", ""),
+    (f"{-_A}f * dy", "", f"{-_A}f", ""),
+    (f"{_A}f * dz", "", "", f"{_A}f"),
+    (f"{-_A}f * dx", f"{-_A}f", "", ""),
     (f"{_C2[0]}f * dx * dy", f"{_C2[0]}f * dy", f"{_C2[0]}f * dx", ""),
     (f"{_C2[1]}f * dy * dz", "", f"{_C2[1]}f * dz", f"{_C2[1]}f * dy"),
     (f"{_C2[2]}f * (2.f * szz - sxx - syy)", f"{-2 * _C2[2]}f * dx", f"{-2 * _C2[2]}f * dy", f"{4 * _C2[2]}f * dz"),
@@ -153,14 +207,30 @@ _HARMONICS = [
     (f"{_C2[4]}f * (sxx - syy)", f"{2 * _C2[4]}f * dx", f"{-2 * _C2[4]}f * dy", ""),
     (f"{_C3[0]}f * dy * (3.f * sxx - syy)", f"{6 * _C3[0]}f * dx * dy", f"{3 * _C3[0]}f * (sxx - syy)", ""),
     (f"{_C3[1]}f * dx * dy * dz", f"{_C3[1]}f * dy * dz", f"{_C3[1]}f * dx * dz", f"{_C3[1]}f * dx * dy"),
-    (f"{_C3[2]}f * dy * (4.f * szz - sxx - syy)", f"{-2 * _C3[2]}f * dx * dy",
-     f"{_C3[2]}f * (4.f * szz - sxx - 3.f * syy)", f"{8 * _C3[2]}f * dy * dz"),
-    (f"{_C3[3]}f * dz * (2.f * szz - 3.f * sxx - 3.f * syy)", f"{-6 * _C3[3]}f * dx * dz", f"{-6 * _C3[3]}f * dy * dz",
-     f"{_C3[3]}f * (6.f * szz - 3.f * sxx - 3.f * syy)"),
-    (f"{_C3[4]}f * dx * (4.f * szz - sxx - syy)", f"{_C3[4]}f * (4.f * szz - 3.f * sxx - syy)",
-     f"{-2 * _C3[4]}f * dx * dy", f"{8 * _C3[4]}f * dx * dz"),
-    (f"{_C3[5]}f * dz * (sxx - syy)", f"{2 * _C3[5]}f * dx * dz", f"{-2 * _C3[5]}f * dy * dz",
-     f"{_C3[5]}f * (sxx - syy)"),
+    (
+        f"{_C3[2]}f * dy * (4.f * szz - sxx - syy)",
+        f"{-2 * _C3[2]}f * dx * dy",
+        f"{_C3[2]}f * (4.f * szz - sxx - 3.f * syy)",
+        f"{8 * _C3[2]}f * dy * dz",
+    ),
+    (
+        f"{_C3[3]}f * dz * (2.f * szz - 3.f * sxx - 3.f * syy)",
+        f"{-6 * _C3[3]}f * dx * dz",
+        f"{-6 * _C3[3]}f * dy * dz",
+        f"{_C3[3]}f * (6.f * szz - 3.f * sxx - 3.f * syy)",
+    ),
+    (
+        f"{_C3[4]}f * dx * (4.f * szz - sxx - syy)",
+        f"{_C3[4]}f * (4.f * szz - 3.f * sxx - syy)",
+        f"{-2 * _C3[4]}f * dx * dy",
+        f"{8 * _C3[4]}f * dx * dz",
+    ),
+    (
+        f"{_C3[5]}f * dz * (sxx - syy)",
+        f"{2 * _C3[5]}f * dx * dz",
+        f"{-2 * _C3[5]}f * dy * dz",
+        f"{_C3[5]}f * (sxx - syy)",
+    ),
     (f"{_C3[6]}f * dx * (sxx - 3.f * syy)", f"{3 * _C3[6]}f * (sxx - syy)", f"{-6 * _C3[6]}f * dx * dy", ""),
 ]
 """Harmonic and its derivatives by the unit direction dx, dy, dz, where they are not 0."""
@@ -224,20 +294,28 @@ auto columns_of = [&](const Extent& e, int ty, int& c0, int& c1) -> void {
 """
 
 # A thread per slot: project, cull, colour, count tile hits.
-_STAGE_PROJECT = _SPANS + _TWELVE + r"""
+_STAGE_PROJECT = (
+    _SPANS
+    + _TWELVE
+    + r"""
 const long long slot = task;
 if (slot >= (long long)P.n * P.cameras) return;
 const int camera = task / P.n;
 const long long g = slot - (long long)camera * P.n;
 P.radii[slot] = 0; P.means2d[2 * slot] = 0.f; P.means2d[2 * slot + 1] = 0.f;
 P.hit_count[slot] = 0; P.depth_key[slot] = 0x7fffffff;
-""" + _CAMERA + _GAUSSIAN + r"""
+"""
+    + _CAMERA
+    + _GAUSSIAN
+    + r"""
 bool ok = finite(X) && finite(Y) && finite(Z) && finite(qw) && finite(qx) && finite(qy) && finite(qz);
 ok = ok && r0 <= @LOG_SCALE_MAX@f && r1 <= @LOG_SCALE_MAX@f && r2 <= @LOG_SCALE_MAX@f && logit == logit;
 ok = ok && qmax > @QUAT_MIN@f && fx > 0.f && fy > 0.f && finite(fx) && finite(fy) && finite(cx) && finite(cy);
 const float pz = V[8] * X + V[9] * Y + V[10] * Z + V[11];
 if (!(ok && pz > P.near && finite(pz))) return;
-""" + _PROJECT + r"""
+"""
+    + _PROJECT
+    + r"""
 float lop = -log2f(1.f + expf(-smin(smax(logit, -80.f), 80.f)));
 if (P.antialiased) lop += 0.5f * log2f(smax(dr / det, @COMPENSATION2_MIN@f));
 float level = smax(lop - PMIN, 0.f) * (2.f * LN2), hx = sqrtf(level * xx), hy = sqrtf(level * yy);
@@ -245,11 +323,18 @@ ok = level > 0.f && xx + yy < @VARIANCE_MAX@f && mx + hx >= 0.5f && mx - hx <= W
 if (!(ok && my + hy >= 0.5f && my - hy <= H - 0.5f)) return;
 float* channel = P.record + slot * P.record_stride + @HEAD@;
 if (P.n_sh) {
-""" + _DIRECTION + r"""
+"""
+    + _DIRECTION
+    + r"""
     float c0 = 0.5f, c1 = 0.5f, c2 = 0.5f, f[12];
     const float* from = P.sh + g * P.sh_stride;
-""" + _harmonics("load12(from + @q@, 3 * P.bands - @q@, f);\n",
-                 "{ const float b = @Y@; c0 += b * f[@i@]; c1 += b * f[@i@ + 1]; c2 += b * f[@i@ + 2]; }", "") + r"""
+"""
+    + _harmonics(
+        "load12(from + @q@, 3 * P.bands - @q@, f);\n",
+        "{ const float b = @Y@; c0 += b * f[@i@]; c1 += b * f[@i@ + 1]; c2 += b * f[@i@ + 2]; }",
+        "",
+    )
+    + r"""
     if (!(finite(c0) && finite(c1) && finite(c2))) return;
     *(float4*)channel = float4{smax(c0, 0.f), smax(c1, 0.f), smax(c2, 0.f), pz};
     channel += 3;
@@ -276,9 +361,12 @@ P.means2d[2 * slot] = mx; P.means2d[2 * slot + 1] = my;
 P.hit_count[slot] = hits;
 if (hits) P.depth_key[slot] = bits(pz);
 """
+)
 
 # A thread per rank: write the hits, those of a large Gaussian by the whole block. Hits come in depth order.
-_STAGE_EMIT = _SPANS + r"""
+_STAGE_EMIT = (
+    _SPANS
+    + r"""
 SHARED int many, large[@BLOCK@], first[@BLOCK@], width[@BLOCK@];
 const long long rank = task, total = (long long)P.n * P.cameras, tiles = (long long)P.tiles_x * P.tiles_y;
 auto put = [&](long long at, long long tile, long long slot) -> void {
@@ -323,6 +411,7 @@ for (int j = 0; j < @BLOCK@; j++) {
     }
 }
 """
+)
 
 # A thread per place of the sorted list: where the tiles begin and end in it.
 _STAGE_RANGES = r"""
@@ -341,7 +430,9 @@ if (at == 0 || key(at - 1) != tile) P.tile_start[tile] = (int)at;
 if (at == P.capacity - 1 || key(at + 1) != tile) P.tile_end[tile] = (int)at + 1;
 """
 
-_TILE = _SHUFFLE + r"""
+_TILE = (
+    _SHUFFLE
+    + r"""
 enum { NCH = @NCH@, SLOTS = 2, STRIDE = (@HEAD@ + NCH + 3) / 4 * 4 };
 SHARED __attribute__((aligned(16))) float batch[@BLOCK@ * STRIDE];
 SHARED int live, flags[@BLOCK@];
@@ -361,8 +452,11 @@ UNROLL for (int s = 0; s < SLOTS; s++) {
     inside[s] = tx * 16 + (lane & 15) < P.width && ty * 16 + row + 2 * s < P.height;
     T[s] = inside[s] ? 1.f : 0.f; }
 """
+)
 # Next hits of the tile into shared memory: record, rows in which the ellipse meets the tile's columns, and slot.
-_BATCH = _SPANS + r"""
+_BATCH = (
+    _SPANS
+    + r"""
 while (at < stop) {
     if (tid == 0) live = 0;
     WP_TILE_SYNC();
@@ -416,6 +510,7 @@ while (at < stop) {
         const float* channel = h + @HEAD@;
         bool touched = false;
 """
+)
 # One row pair of the warp; `end` is the row after the last.
 _ALPHA = r"""
         UNROLL for (int s = 0; s < SLOTS; s++) {
@@ -428,15 +523,21 @@ _ALPHA = r"""
 """
 
 # A block per tile: forward.
-_STAGE_BLEND = _TILE + r"""
+_STAGE_BLEND = (
+    _TILE
+    + r"""
 float C[SLOTS][NCH], best[SLOTS], median[SLOTS], largest[SLOTS];
 int winner[SLOTS];
 UNROLL for (int s = 0; s < SLOTS; s++) {
     best[s] = 0.f; largest[s] = 0.f; median[s] = @DEPTH_EMPTY@f; winner[s] = -1;
     UNROLL for (int c = 0; c < NCH; c++) C[s][c] = 0.f; }
-""" + _BATCH + r"""
+"""
+    + _BATCH
+    + r"""
         float sum = 0.f, peak = 0.f;
-""" + _ALPHA + r"""
+"""
+    + _ALPHA
+    + r"""
             T[s] = fmaf(-al, T[s], T[s]);
             UNROLL for (int c = 0; c < NCH; c++) C[s][c] = fmaf(w, channel[c], C[s][c]);
             sum += w; peak = smax(peak, w);
@@ -465,9 +566,12 @@ UNROLL for (int s = 0; s < SLOTS; s++) if (inside[s]) {
     UNROLL for (int c = 0; c < NCH; c++) P.image[pixel * NCH + c] = C[s][c] + T[s] * P.background[c];
 }
 """
+)
 
 # A block per tile: backward, front to back. `left` is what the Gaussians behind still add to d loss / d image . image.
-_STAGE_BLEND_BACKWARD = _TILE + r"""
+_STAGE_BLEND_BACKWARD = (
+    _TILE
+    + r"""
 enum { GROUPS = (@MOMENTS@ + NCH + 15) / 16, GROUP = 16 };
 float left[SLOTS], G[SLOTS][NCH];
 UNROLL for (int s = 0; s < SLOTS; s++) {
@@ -479,11 +583,15 @@ UNROLL for (int s = 0; s < SLOTS; s++) {
     UNROLL for (int c = 0; c < NCH; c++) {
         G[s][c] = P.grad_image[pixel * NCH + c]; left[s] = fmaf(G[s][c], P.image[pixel * NCH + c], left[s]); }
 }
-""" + _BATCH + r"""
+"""
+    + _BATCH
+    + r"""
         float out[GROUPS * GROUP];
         UNROLL for (int i = 0; i < GROUPS * GROUP; i++) out[i] = 0.f;
         const float qa = -2.f * LN2 * A, qc = -2.f * LN2 * R;
-""" + _ALPHA + r"""
+"""
+    + _ALPHA
+    + r"""
             float along = 0.f;
             UNROLL for (int c = 0; c < NCH; c++) {
                 along = fmaf(G[s][c], channel[c], along);
@@ -506,12 +614,18 @@ UNROLL for (int s = 0; s < SLOTS; s++) {
     WP_TILE_SYNC();
 }
 """
+)
 
 # A thread per Gaussian, camera after camera: gradients of the projection from those of the moments.
-_STAGE_PROJECT_BACKWARD = _SHUFFLE + _TWELVE + r"""
+_STAGE_PROJECT_BACKWARD = (
+    _SHUFFLE
+    + _TWELVE
+    + r"""
 const long long g = task < P.n ? task : 0;
 const bool mine = task < P.n;
-""" + _GAUSSIAN + r"""
+"""
+    + _GAUSSIAN
+    + r"""
 bool seen = false;
 float aX[3] = {0.f, 0.f, 0.f}, aq[4] = {0.f, 0.f, 0.f, 0.f}, as[3] = {0.f, 0.f, 0.f}, al = 0.f;
 float* sh_to = P.grad_sh + g * P.sh_stride; float* color_to = P.grad_colors + g * P.n_colors;
@@ -521,9 +635,13 @@ for (int camera = 0; camera < P.cameras; camera++) {
     float gV[16] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};
     if (mine && !use) { P.grad_norm[slot] = 0.f; P.grad_abs[slot] = 0.f; }
     if (use) {
-""" + _CAMERA + r"""
+"""
+    + _CAMERA
+    + r"""
         const float pz = V[8] * X + V[9] * Y + V[10] * Z + V[11];
-""" + _PROJECT + r"""
+"""
+    + _PROJECT
+    + r"""
         const float4 ma = ((const float4*)(P.grad + slot * P.grad_stride))[0];
         const float4 mb = ((const float4*)(P.grad + slot * P.grad_stride))[1];
         const float* gc = P.grad + slot * P.grad_stride + @MOMENTS@;
@@ -574,7 +692,9 @@ for (int camera = 0; camera < P.cameras; camera++) {
         aX[2] += V[2] * gpx + V[6] * gpy + V[10] * gpz;
         float gcx = 0.f, gcy = 0.f, gcz = 0.f;
         if (P.n_sh) {
-""" + _DIRECTION + r"""
+"""
+    + _DIRECTION
+    + r"""
             // A floored channel passes only what would raise it; the record holds the floored colour.
             const float* shown = P.record + slot * P.record_stride + @HEAD@;
             const float* from = P.sh + g * P.sh_stride;
@@ -583,13 +703,16 @@ for (int camera = 0; camera < P.cameras; camera++) {
             const float h2 = shown[2] > 0.f || gc[2] < 0.f ? gc[2] : 0.f;
             float gdx = 0.f, gdy = 0.f, gdz = 0.f;
             float f[12], o[12];
-""" + _harmonics(
-            "load12(from + @q@, 3 * P.bands - @q@, f); UNROLL for (int i = 0; i < 12; i++) o[i] = 0.f;\n"
-            "if (seen) load12(sh_to + @q@, 3 * P.bands - @q@, o);\n",
-            "{ const float b = @Y@; "
-            "[[maybe_unused]] const float through = h0 * f[@i@] + h1 * f[@i@ + 1] + h2 * f[@i@ + 2]; @dY@ "
-            "o[@i@] += b * h0; o[@i@ + 1] += b * h1; o[@i@ + 2] += b * h2; }",
-            "store12(sh_to + @q@, 3 * P.bands - @q@, o);") + r"""
+"""
+    + _harmonics(
+        "load12(from + @q@, 3 * P.bands - @q@, f); UNROLL for (int i = 0; i < 12; i++) o[i] = 0.f;\n"
+        "if (seen) load12(sh_to + @q@, 3 * P.bands - @q@, o);\n",
+        "{ const float b = @Y@; "
+        "[[maybe_unused]] const float through = h0 * f[@i@] + h1 * f[@i@ + 1] + h2 * f[@i@ + 2]; @dY@ "
+        "o[@i@] += b * h0; o[@i@ + 1] += b * h1; o[@i@ + 2] += b * h2; }",
+        "store12(sh_to + @q@, 3 * P.bands - @q@, o);",
+    )
+    + r"""
             const float radial = dx * gdx + dy * gdy + dz * gdz;
             gcx = -(gdx - dx * radial) * inv; gcy = -(gdy - dy * radial) * inv; gcz = -(gdz - dz * radial) * inv;
             aX[0] -= gcx; aX[1] -= gcy; aX[2] -= gcz;
@@ -628,6 +751,7 @@ if (P.n_sh && P.sh_aligned) for (int i = seen ? (P.bands + 3) / 4 * 12 : 0; i < 
 if (P.n_sh && !P.sh_aligned) for (int i = seen ? 3 * P.bands : 0; i < P.sh_stride; i++) sh_to[i] = 0.f;
 if (!seen) for (int c = 0; c < P.n_colors; c++) color_to[c] = 0.f;
 """
+)
 
 
 def _field(match: re.Match) -> str:
@@ -647,11 +771,17 @@ def _assemble(stage: str, **extra: object) -> str:
 
 def stages() -> dict[str, str]:
     """Snippets of the stages that know no channels, by kernel name."""
-    return {"raster_project": _assemble(_STAGE_PROJECT), "raster_emit": _assemble(_STAGE_EMIT),
-            "raster_ranges": _assemble(_STAGE_RANGES), "raster_project_backward": _assemble(_STAGE_PROJECT_BACKWARD)}
+    return {
+        "raster_project": _assemble(_STAGE_PROJECT),
+        "raster_emit": _assemble(_STAGE_EMIT),
+        "raster_ranges": _assemble(_STAGE_RANGES),
+        "raster_project_backward": _assemble(_STAGE_PROJECT_BACKWARD),
+    }
 
 
 def blending(channels: int) -> dict[str, str]:
     """Snippets of blending for images of `channels` channels (depth included), by kernel name."""
-    return {"raster_blend": _assemble(_STAGE_BLEND, NCH=channels),
-            "raster_blend_backward": _assemble(_STAGE_BLEND_BACKWARD, NCH=channels)}
+    return {
+        "raster_blend": _assemble(_STAGE_BLEND, NCH=channels),
+        "raster_blend_backward": _assemble(_STAGE_BLEND_BACKWARD, NCH=channels),
+    }

@@ -41,12 +41,23 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
         out += [-k.SH_C1 * y, k.SH_C1 * z, -k.SH_C1 * x]
     if degree > 1:
         xx, yy, zz = x * x, y * y, z * z
-        out += [k.SH_C2[0] * x * y, k.SH_C2[1] * y * z, k.SH_C2[2] * (2 * zz - xx - yy),
-                k.SH_C2[3] * x * z, k.SH_C2[4] * (xx - yy)]
+        out += [
+            k.SH_C2[0] * x * y,
+            k.SH_C2[1] * y * z,
+            k.SH_C2[2] * (2 * zz - xx - yy),
+            k.SH_C2[3] * x * z,
+            k.SH_C2[4] * (xx - yy),
+        ]
         if degree > 2:
-            out += [k.SH_C3[0] * y * (3 * xx - yy), k.SH_C3[1] * x * y * z, k.SH_C3[2] * y * (4 * zz - xx - yy),
-                    k.SH_C3[3] * z * (2 * zz - 3 * xx - 3 * yy), k.SH_C3[4] * x * (4 * zz - xx - yy),
-                    k.SH_C3[5] * z * (xx - yy), k.SH_C3[6] * x * (xx - 3 * yy)]
+            out += [
+                k.SH_C3[0] * y * (3 * xx - yy),
+                k.SH_C3[1] * x * y * z,
+                k.SH_C3[2] * y * (4 * zz - xx - yy),
+                k.SH_C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+                k.SH_C3[4] * x * (4 * zz - xx - yy),
+                k.SH_C3[5] * z * (xx - yy),
+                k.SH_C3[6] * x * (xx - 3 * yy),
+            ]
     return torch.stack(out, -1)
 
 
@@ -54,10 +65,20 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations [N, 3, 3] of quaternions [N, 4] wxyz of any non-zero norm."""
     quats = quats / quats.detach().abs().amax(-1, keepdim=True)  # the norm's squares neither vanish nor overflow
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    return torch.stack((
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1).reshape(-1, 3, 3)
+    return torch.stack(
+        (
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ),
+        -1,
+    ).reshape(-1, 3, 3)
 
 
 @dataclass
@@ -160,8 +181,17 @@ def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
     index = candidates[order]
     f = _footprint(scene, camera, index)
     conic = torch.stack((f.yy, -f.xy, f.xx), -1) / f.det[:, None]
-    return _Projected(index, f.mean2d, conic, f.opacity, f.depth, _colors(scene, index, scene.means[index], viewmat),
-                      extent[order], radius[order], torch.zeros_like(f.mean2d) if scene.settings.absgrad else None)
+    return _Projected(
+        index,
+        f.mean2d,
+        conic,
+        f.opacity,
+        f.depth,
+        _colors(scene, index, scene.means[index], viewmat),
+        extent[order],
+        radius[order],
+        torch.zeros_like(f.mean2d) if scene.settings.absgrad else None,
+    )
 
 
 @torch.no_grad()
@@ -282,7 +312,7 @@ class _Camera:
         counts, first = self.counts[order].tolist(), 0
         while first < len(counts):
             size = max(1, _LANES // (max(counts[first], 1) * k.TILE**2))
-            yield order[first:first + size]
+            yield order[first : first + size]
             first += size
 
     def _empty(self, tiles: Tensor) -> tuple[Tensor, Tensor, _Pixels]:
@@ -306,8 +336,10 @@ class _Camera:
             numbers = torch.arange(first, min(first + step, most), device=tiles.device)
             valid = numbers < counts
             batch = _Batch(self.members[torch.where(valid, starts + numbers, 0)], valid, xs, ys)
-            weights, after, sums, out.left = cast(tuple[Tensor, ...], checkpoint(
-                _blend, self.p, batch, out.left, use_reentrant=False, preserve_rng_state=False))
+            weights, after, sums, out.left = cast(
+                tuple[Tensor, ...],
+                checkpoint(_blend, self.p, batch, out.left, use_reentrant=False, preserve_rng_state=False),
+            )
             out.sums = out.sums + sums
             with torch.no_grad():
                 if self.scene.with_contributions:
@@ -343,7 +375,7 @@ class _Camera:
         def image(name: str) -> Tensor:
             value = torch.cat([getattr(batch, name) for batch in pixels])[place]
             value = value.unflatten(1, (k.TILE, k.TILE)).unflatten(0, (self.down, self.across))
-            return value.transpose(1, 2).flatten(2, 3).flatten(0, 1)[:self.scene.height, :self.scene.width]
+            return value.transpose(1, 2).flatten(2, 3).flatten(0, 1)[: self.scene.height, : self.scene.width]
 
         return _Pixels(*(image(field.name) for field in fields(_Pixels)))
 
@@ -388,27 +420,49 @@ def rasterize(scene: Scene) -> RasterOutput:
         out = blender.images()
         weight_sum[camera, p.index], weight_max[camera, p.index] = blender.weight_sum, blender.weight_max
         top = torch.cat((p.index, p.index.new_tensor([-1])))[out.top].to(torch.int32)
-        images.append((out.sums[..., :-1] + out.left[..., None] * background, 1 - out.left, out.sums[..., -1],
-                       out.median, top, out.top_weight))
+        images.append(
+            (
+                out.sums[..., :-1] + out.left[..., None] * background,
+                1 - out.left,
+                out.sums[..., -1],
+                out.median,
+                top,
+                out.top_weight,
+            )
+        )
     if cameras:
         colors, alphas, depth_sum, median, top, top_weight = (torch.stack(i) for i in zip(*images, strict=True))
     else:
         colors, top = torch.zeros(*size, scene.channels, **like), radii.new_zeros(size)
         alphas = depth_sum = median = top_weight = torch.zeros(size, **like)
     return RasterOutput(
-        colors=anchor(colors, scene), alphas=alphas,
+        colors=anchor(colors, scene),
+        alphas=alphas,
         depth_expected=expected_depth(depth_sum, alphas) if scene.with_depth else None,
-        depth_median=median if scene.with_depth else None, radii=radii, means2d=means2d,
+        depth_median=median if scene.with_depth else None,
+        radii=radii,
+        means2d=means2d,
         weight_sum=weight_sum if scene.with_contributions else None,
         weight_max=weight_max if scene.with_contributions else None,
-        means2d_grad=norm, means2d_absgrad=absnorm, top_ids=top if scene.with_top else None,
-        top_weights=top_weight if scene.with_top else None)
+        means2d_grad=norm,
+        means2d_absgrad=absnorm,
+        top_ids=top if scene.with_top else None,
+        top_weights=top_weight if scene.with_top else None,
+    )
 
 
 def anchor(colors: Tensor, scene: Scene) -> Tensor:
     """Tie `colors` to every input, so that inputs that reach no pixel get zero gradients instead of none."""
-    inputs = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh, scene.viewmats,
-              scene.background)
+    inputs = (
+        scene.means,
+        scene.quats,
+        scene.log_scales,
+        scene.opacity_logits,
+        scene.colors,
+        scene.sh,
+        scene.viewmats,
+        scene.background,
+    )
     for value in inputs:
         if value is not None and value.requires_grad:
             colors = colors + value.reshape(-1)[:0].sum()

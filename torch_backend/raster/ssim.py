@@ -30,8 +30,20 @@ _FIELDS_FORWARD, _FIELDS_BACKWARD = 4, 3
 _FIELDS: list[tuple[str, type, str]] = [
     *[(n, ctypes.c_uint64, "const float*") for n in ("image", "target", "inverse_x", "inverse_y")],
     *[(n, ctypes.c_uint64, "float*") for n in ("gradient", "row_score", "blurred", "scratch")],
-    *[(n, ctypes.c_int64, "long long") for n in (
-        "height", "length", "channels", "padded", "margin", "pitch", "scratch_stride", "want_gradient", "counter")],
+    *[
+        (n, ctypes.c_int64, "long long")
+        for n in (
+            "height",
+            "length",
+            "channels",
+            "padded",
+            "margin",
+            "pitch",
+            "scratch_stride",
+            "want_gradient",
+            "counter",
+        )
+    ],
 ]
 """`length` = width * channels floats of a row, `padded` the same up to full vectors, `pitch` with `margin` zeros either
 side; `blurred` [3, height, padded] holds the gradient's fields between the passes, `scratch` a worker's rows."""
@@ -187,8 +199,11 @@ def warm_up() -> None:
 @functools.lru_cache(maxsize=16)
 def _inverse(size: int, repeat: int, total: int) -> Tensor:
     """[total] reciprocal weight sums of `size` positions, each `repeat` times, then zeros."""
-    inside = torch.nn.functional.conv1d(torch.ones(1, 1, size, dtype=torch.float64),
-                                        torch.tensor(_taps(), dtype=torch.float64)[None, None], padding=_HALF)
+    inside = torch.nn.functional.conv1d(
+        torch.ones(1, 1, size, dtype=torch.float64),
+        torch.tensor(_taps(), dtype=torch.float64)[None, None],
+        padding=_HALF,
+    )
     out = torch.zeros(total)
     out[: size * repeat] = (1.0 / inside[0, 0]).repeat_interleave(repeat)
     return out
@@ -221,11 +236,23 @@ def _run(image: Tensor, target: Tensor, want_gradient: bool, threads: int) -> tu
     inverse_x, inverse_y = _inverse(width, channels, padded), _inverse(height, 1, height + _ROWS)
     gradient, scores = torch.empty_like(image) if want_gradient else None, torch.empty(height)
     block: Any = _Block(
-        image=image.data_ptr(), target=target.data_ptr(), inverse_x=inverse_x.data_ptr(),
-        inverse_y=inverse_y.data_ptr(), gradient=0 if gradient is None else gradient.data_ptr(),
-        row_score=scores.data_ptr(), blurred=_local.blurred.data_ptr(), scratch=_local.scratch.data_ptr(),
-        height=height, length=length, channels=channels, padded=padded, margin=margin, pitch=pitch,
-        scratch_stride=stride, want_gradient=int(want_gradient))
+        image=image.data_ptr(),
+        target=target.data_ptr(),
+        inverse_x=inverse_x.data_ptr(),
+        inverse_y=inverse_y.data_ptr(),
+        gradient=0 if gradient is None else gradient.data_ptr(),
+        row_score=scores.data_ptr(),
+        blurred=_local.blurred.data_ptr(),
+        scratch=_local.scratch.data_ptr(),
+        height=height,
+        length=length,
+        channels=channels,
+        padded=padded,
+        margin=margin,
+        pitch=pitch,
+        scratch_stride=stride,
+        want_gradient=int(want_gradient),
+    )
     run_workers(launch, block, 0, threads)
     if want_gradient:
         run_workers(launch, block, 1, threads)
@@ -251,7 +278,8 @@ class _Ssim(torch.autograd.Function):
 def supports(image: Tensor, target: Tensor) -> bool:
     """Whether `ssim` takes these tensors: float32, dense, on the CPU, and no gradient asked for the target."""
     return not target.requires_grad and all(
-        t.dtype == torch.float32 and t.device.type == "cpu" and t.layout == torch.strided for t in (image, target))
+        t.dtype == torch.float32 and t.device.type == "cpu" and t.layout == torch.strided for t in (image, target)
+    )
 
 
 def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
@@ -262,11 +290,15 @@ def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
     is smaller than the window, or `supports` says no.
     """
     if image.ndim != 3 or image.shape != target.shape or min(image.shape[:2]) < WINDOW or image.shape[2] < 1:
-        raise ValueError(f"SSIM needs two [H, W, C] images of one shape and at least {WINDOW} px, "
-                         f"got {tuple(image.shape)} and {tuple(target.shape)}")
+        raise ValueError(
+            f"SSIM needs two [H, W, C] images of one shape and at least {WINDOW} px, "
+            f"got {tuple(image.shape)} and {tuple(target.shape)}"
+        )
     if not supports(image, target):
-        raise ValueError(f"SSIM here takes float32 CPU images and a target without gradient, got {image.dtype} on "
-                         f"{image.device} and {target.dtype} on {target.device}")
+        raise ValueError(
+            f"SSIM here takes float32 CPU images and a target without gradient, got {image.dtype} on "
+            f"{image.device} and {target.dtype} on {target.device}"
+        )
     workers = default_threads() if threads is None else threads
     if workers < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")

@@ -127,9 +127,13 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     ValueError if the shapes differ, a side is smaller than the window, or `supports` says no.
     """
     if image.ndim != 3 or image.shape != target.shape or min(image.shape[:2]) < WINDOW or image.shape[2] < 1:
-        raise ValueError(f"SSIM needs two [H, W, C] images of one shape and at least {WINDOW} px, "
-                         f"got {tuple(image.shape)} and {tuple(target.shape)}")
+        raise ValueError(
+            f"SSIM needs two [H, W, C] images of one shape and at least {WINDOW} px, "
+            f"got {tuple(image.shape)} and {tuple(target.shape)}"
+        )
     if not supports(image, target):
-        raise ValueError(f"SSIM here takes float32 images of one device and a target without gradient, got "
-                         f"{image.dtype} on {image.device} and {target.dtype} on {target.device}")
+        raise ValueError(
+            f"SSIM here takes float32 images of one device and a target without gradient, got "
+            f"{image.dtype} on {image.device} and {target.dtype} on {target.device}"
+        )
     return _Ssim.apply(image, target)  # type: ignore[no-any-return]

@@ -16,23 +16,19 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from ..contract import check_version, frame_file, read_json
-from ..footage.images import read_png, resize
 from ..scene import load_scene, read_image
-from ..shot import Shot, atomic_path, content_key
-from .real import far_from, rigid_mask
+from ..shot import Shot, content_key
+from ..solve.motion import motion_key
+from .real import ensure_motion, far_from, motion_shares
 
 TRUTH_VERSION = 1
 REGIONS = ("seen", "never_seen", "moving", "static")
 """By truth: visible in the clip's frame at t*; not; on something that moves in the clip; on nothing that does."""
 RIGID = "rigid"
 """The region of a real clip in which the plate is the truth."""
-_FLOW_WIDTH = 640
-"""Optical flow is computed on plates of at most this width."""
 
 
 class TruthScene(Protocol):
@@ -111,33 +107,30 @@ class TruthFolder:
 
 
 class RealScene:
-    """A real clip: the plate is the truth on the pixels that stay on their epipolar lines through the clip."""
+    """A real clip: the plate is the truth on the pixels that stand still through the clip, far from what moves."""
 
     kind = "real"
     cameras = "solved"
     fps = 0.0
     judged = RIGID
 
-    def __init__(self, shot: Shot, cache: str | Path, instants: int = 8) -> None:
+    def __init__(self, shot: Shot, instants: int = 8) -> None:
         """Args:
-            shot: a solved shot.
-            cache: folder that keeps the masks between runs.
+            shot: a solved shot; it gets its motion matte here if it has none.
             instants: how many t*, evenly spread over the solved frames.
 
         JobError if the shot is not solved.
         """  # fmt: skip
         self.shot, self.name = shot, shot.info().name
         self._scene = load_scene(shot)
+        ensure_motion(shot)
         solved = [self._scene.frames[i] for i in self._scene.solved]
         picked = np.linspace(0, len(solved) - 1, min(instants, len(solved))).round().astype(int)
         self.t_stars = [solved[i] for i in picked]
-        self.key = content_key(read_json(shot.solve / "cameras.json"), self.t_stars)
-        self._cache, self._asked = Path(cache), set[int]()
-        self._masks: dict[int, Tensor] = {}
+        self.key = content_key(read_json(shot.solve / "cameras.json"), self.t_stars, motion_key(shot))
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
         """Held-out frames more than a quarter of the clip away from t*."""
-        self._asked |= set(held_out)
         return far_from(held_out, t_star, self._scene.frames[-1] - self._scene.frames[0] + 1)
 
     def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
@@ -146,31 +139,9 @@ class RealScene:
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
         """The rigid pixels of the plate; one counts if nearly all of it is."""
-        return {RIGID: self._rigid_share(pose, width, height) > 0.95}
+        return {RIGID: motion_shares(self.shot, pose, width, height)["rigid"] > 0.95}
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """Static: nearly all of the pixel stays on its epipolar lines; moving: nearly nothing of it does."""
-        share = self._rigid_share(frame, width, height)
-        return {"moving": share < 0.05, "static": share > 0.95}
-
-    def _rigid_share(self, frame: int, width: int, height: int) -> Tensor:
-        if frame not in self._masks:
-            self._masks = self._load_masks(sorted({*self._asked, frame}))
-        return F.interpolate(self._masks[frame].float()[None, None], (height, width), mode="area")[0, 0]
-
-    def _load_masks(self, frames: list[int]) -> dict[int, Tensor]:
-        """The masks of `frames`, from the cache or from optical flow."""
-        scene = self._scene
-        cached = self._cache / f"rigid-{content_key(self.key, frames)}.npz"
-        if not cached.is_file():
-            width = min(_FLOW_WIDTH, scene.width)
-            height = round(scene.height * width / scene.width)
-            plates = np.stack([resize(read_png(scene.image_path(i)), width, height) for i in scene.solved])
-            plates = plates if plates.dtype == np.uint8 else (plates >> 8).astype(np.uint8)
-            Ks = scene.camera_at(width, height)[scene.solved].numpy()
-            wanted = [scene.solved.index(scene.frames.index(frame)) for frame in frames]
-            masks = rigid_mask(plates, scene.viewmats[scene.solved].numpy(), Ks, wanted)
-            with atomic_path(cached) as beside:
-                np.savez_compressed(beside, masks=masks)
-        with np.load(cached, allow_pickle=False) as stored:
-            return {frame: torch.from_numpy(mask) for frame, mask in zip(frames, stored["masks"], strict=True)}
+        """Static: nearly all of the pixel stands still; moving: nearly all of it moves. What is unknown is neither."""
+        shares = motion_shares(self.shot, frame, width, height)
+        return {"moving": shares["moving"] > 0.95, "static": shares["still"] > 0.95}

@@ -1,239 +1,185 @@
-"""The motion matte: per delivered frame what stands still, what moves by itself, and what is not known.
+"""The motion matte of a shot: per delivered frame what stands still, what moves by itself, and what is not known.
 
 SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size: STILL, UNKNOWN or MOVING. motion.json beside them says
-of which frames and cameras they are. What an artist paints lies in SHOT/motion_paint/NNNNNN.png and goes before.
+which cameras they belong to; mattes of a solve of before are not read. What an artist paints goes before what is found:
+SHOT/motion_paint/NNNNNN.png, which no solve touches.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import cv2
 import numpy as np
-import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from ..contract import ExitCode, JobError, Reporter, frame_file, read_json
-from ..footage import load_frames
-from ..footage.images import read_frame, told_by
-from ..shot import Shot, atomic_path, content_key, make_folder, write_json
-from . import flow
-from .flow import FlowConfig, Map
-from .stored import load_cameras, load_points
+from ..contract import ExitCode, JobError, Reporter, frame_file, open_regular, read_json
+from ..footage.images import is_whole_png
+from ..footage.importing import FRAMES_FILE
+from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
+from .flow import FlowConfig
+from .moving import Clip, mattes
+from .stored import load_cameras
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
+"""Values of a matte. Whoever reads one takes those nearer to another for that one."""
 MOTION_VERSION = 1
-_FLOW_WIDTH = 640
-_KEYS_PER_SECOND = 10.0
+FOLDER, PAINTED = "motion", "motion_paint"
+"""Of the found mattes, in the solve's folder, and of the painted ones, in the shot's."""
+_RECORD, _UNFINISHED = "motion.json", "unfinished.json"
+_LABELS = np.array([STILL, UNKNOWN, MOVING], np.uint8)
 
 
-class _Clip:
-    """Frames and cameras of a shot as the flow sees them."""
+class MotionResult(TypedDict):
+    """What `find_motion` returns."""
 
-    def __init__(self, shot: Shot) -> None:
-        path, rows = load_cameras(shot), {int(r["frame"]): r for r in load_frames(shot)["frames"]}
-        self.shot = shot
-        self.frames = [c.frame for c in path.frames]
-        self.width, self.height = path.width, path.height
-        scale = min(2.0, _FLOW_WIDTH / path.width)
-        self.flow_size = tuple(max(32, round(side * scale / 2) * 2) for side in (path.width, path.height))
-        self.unit = self.flow_size[0] / 640.0
-        self.viewmats = np.array([c.viewmat for c in path.frames], np.float64).reshape(-1, 4, 4)
-        ratio = np.array([self.flow_size[0] / path.width, self.flow_size[1] / path.height, 1.0])
-        self.Ks = np.array([[[c.K[0], 0, c.K[2]], [0, c.K[1], c.K[3]], [0, 0, 1]] for c in path.frames])
-        self.Ks *= ratio[None, :, None]
-        self.keys = _keys([float(rows[f]["seconds"]) for f in self.frames])
-        points = load_points(shot)["xyz"].astype(np.float64)
-        self.depths = [_typical_depth(points, self.viewmats[i]) for i in range(len(self.frames))]
-        self._grey: dict[int, NDArray[np.uint8]] = {}
-        self._looks: dict[int, flow.Look] = {}
-
-    def plate(self, index: int) -> NDArray[np.uint8]:
-        """The working frame [H, W, 3] in 8 bits."""
-        pixels = read_frame(self.shot.frames / frame_file(self.frames[index], ".png"))
-        return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
-
-    def grey(self, index: int) -> NDArray[np.uint8]:
-        """It in the flow's size, grey."""
-        if index not in self._grey:
-            grey = cv2.cvtColor(self.plate(index), cv2.COLOR_RGB2GRAY)
-            how = cv2.INTER_AREA if self.flow_size[0] < self.width else cv2.INTER_CUBIC
-            self._grey[index] = cv2.resize(grey, self.flow_size, interpolation=how)
-        return self._grey[index]
-
-    def look(self, index: int) -> flow.Look:
-        if index not in self._looks:
-            self._looks[index] = flow.Look(self.grey(index))
-        return self._looks[index]
-
-    def forget(self, before: int) -> None:
-        for store in (self._grey, self._looks):
-            for index in [i for i in store if i < before]:
-                del store[index]
+    motion_pixels_share: float
+    """Share of the frames' pixels that move by themselves."""
+    unknown_share: float
+    """Share of them of which nothing is known."""
 
 
-def _keys(seconds: list[float]) -> list[int]:
-    """Indices of the frames that are looked at first: about ten a second, the first and the last among them."""
-    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    stride = max(1, round(1.0 / (_KEYS_PER_SECOND * step))) if step > 0 else 1
-    return sorted({*range(0, len(seconds), stride), len(seconds) - 1})
+def find_motion(shot: Shot, report: Reporter, config: FlowConfig | None = None) -> MotionResult:
+    """Writes the motion matte of every delivered frame, from optical flow against the camera's own motion.
 
-
-def _typical_depth(points: NDArray, viewmat: NDArray) -> float:
-    """Median depth of the sparse points before a camera; 1 if there are none."""
-    z = points @ viewmat[2, :3] + viewmat[2, 3]
-    z = z[z > 0]
-    return float(np.median(z)) if len(z) else 1.0
-
-
-def find_motion(shot: Shot, report: Reporter, config: FlowConfig | None = None) -> dict[str, Any]:
-    """Writes the motion matte of every delivered frame; what is there for these frames and cameras is left alone.
-
-    Returns motion_pixels_share and unknown_share, means over the frames. JobError if the shot is not solved.
+    Mattes that are there and belong to these cameras are left alone; a run that was stopped is gone on with. JobError
+    if the shot is not solved or a frame is damaged, and Cancelled.
     """
     config = config or FlowConfig()
-    key = found_key(shot, config)
-    folder = shot.own(shot.solve / "motion")
-    there = _record(shot)
-    if there.get("key") == key and isinstance(there.get("result"), dict):
-        return there["result"]
-    clip = _Clip(shot)
-    make_folder(folder)
-    shares = []
-    for index, matte in _mattes(clip, config, report):
-        write_grey(folder / frame_file(clip.frames[index], ".png"), matte)
-        shares.append(((matte == MOVING).mean(), (matte == UNKNOWN).mean()))
-    result = {
-        "motion_pixels_share": round(float(np.mean([s[0] for s in shares])), 4),
-        "unknown_share": round(float(np.mean([s[1] for s in shares])), 4),
-    }
-    write_json(folder / "motion.json", {"version": MOTION_VERSION, "key": key, "result": result})
+    key = _solve_key(shot, config)
+    folder = shot.own(shot.solve / FOLDER)
+    done = _record(folder / _RECORD)
+    path = load_cameras(shot)
+    files = {camera.frame: folder / frame_file(camera.frame, ".png") for camera in path.frames}
+    if done.get("key") == key and all(is_whole_png(file) for file in files.values()):
+        return MotionResult(**done["result"])
+    need_disk(shot.root, 0.1 * path.width * path.height * len(files), "The motion matte")
+    _begin(folder, key)
+    clip = Clip(shot)
+    written = {n for n, frame in enumerate(clip.frames) if is_whole_png(files[frame])}
+    shares = np.zeros((len(files), 3))
+    for n in written:
+        shares[n] = _shares(_read_found(files[clip.frames[n]]))
+    for count, (n, labels) in enumerate(mattes(clip, config, written, report), start=len(written) + 1):
+        write_matte(files[clip.frames[n]], labels)
+        shares[n] = _shares(labels)
+        report.progress("solve: motion", count, len(files), f"frame {clip.frames[n]}")
+    mean = shares.mean(0)
+    result = MotionResult(motion_pixels_share=round(float(mean[2]), 4), unknown_share=round(float(mean[1]), 4))
+    write_json(folder / _RECORD, {"version": MOTION_VERSION, "key": key, "result": result})
+    (folder / _UNFINISHED).unlink(missing_ok=True)
     return result
 
 
-def _mattes(clip: _Clip, config: FlowConfig, report: Reporter):
-    """(index, matte [H, W]) of every frame, key frames first."""
-    keys = clip.keys
-    matches = flow.Matches(lambda k: clip.grey(keys[k]), config, clip.unit)
-    scores: dict[int, tuple[Map, Map]] = {}
-    final: dict[int, tuple[Map, Map]] = {}
-    reach, long = 2 * config.baselines[-1], config.links * config.baselines[-1]
-    for turn in range(len(keys) + reach):
-        if turn < len(keys):
-            report.check_cancelled()
-            report.progress("solve: motion", turn + 1, len(keys), f"frame {clip.frames[keys[turn]]}")
-            scores[turn] = _own_score(clip, matches, turn, config)
-        key = turn - reach
-        if key >= 0:
-            near = [s for s in flow.neighbours(matches, key, len(keys), config) if abs(s.key - key) <= reach]
-            final[key] = flow.fused(scores[key], [(s, *scores[s.key]) for s in near])
-            yield keys[key], _label(clip, keys[key], *final[key])
-            if key:
-                for index in range(keys[key - 1] + 1, keys[key]):
-                    yield index, _label(clip, index, *_between(clip, matches, index, key, final))
-            for store in (scores, final):
-                for old in [k for k in store if k < key - reach]:
-                    del store[old]
-            matches.forget(key - config.baselines[-1] + 1, key - long)
-            clip.forget(keys[max(0, key - config.baselines[-1])])
+def _begin(folder: Path, key: str) -> None:
+    """Empties the folder of mattes that are not of this key, before the first one is written."""
+    make_folder(folder)
+    if _record(folder / _RECORD).get("key") != key and _record(folder / _UNFINISHED).get("key") != key:
+        for name in (_RECORD, _UNFINISHED):  # while neither is there, the mattes belong to nothing
+            (folder / name).unlink(missing_ok=True)
+        for file in folder.glob("*.png"):
+            file.unlink()
+    write_json(folder / _UNFINISHED, {"version": MOTION_VERSION, "key": key})
+    (folder / _RECORD).unlink(missing_ok=True)
 
 
-def _own_score(clip: _Clip, matches: flow.Matches, key: int, config: FlowConfig) -> tuple[Map, Map]:
-    """Share of a key frame's matches that tell of motion, and how sure that is."""
-    keys = clip.keys
-    seen = flow.neighbours(matches, key, len(keys), config)
-    scene = flow.Scene(lambda k: clip.look(keys[k]), clip.viewmats[keys], clip.Ks[keys], matches.grid, clip.unit)
-    found = flow.evidence(scene, key, seen, clip.depths[keys[key]], config)
-    count = found.on + found.off
-    return np.clip(found.off / np.maximum(count, 1) * 2.5, 0, 1), np.clip(count / 6, 0, 1) * (count >= 2)
+def _shares(labels: NDArray[np.uint8]) -> tuple[float, float, float]:
+    """How much of a matte is still, unknown and moving."""
+    return tuple(float((labels == value).mean()) for value in (STILL, UNKNOWN, MOVING))  # type: ignore[return-value]
 
 
-def _between(clip: _Clip, matches: flow.Matches, index: int, key: int, final: dict[int, tuple[Map, Map]]):
-    """Score and weight of a frame between two key frames, by flow to both."""
-    total, weight = np.float32(0), np.float32(1e-6)
-    for other in (key - 1, key):
-        at, found = matches.loose(clip.grey(index), clip.grey(clip.keys[other]))
-        w = flow.sample(final[other][1], at) * found
-        total, weight = total + w * flow.sample(final[other][0], at), weight + w
-    return total / weight, weight
+def _solve_key(shot: Shot, config: FlowConfig) -> str:
+    """Identifies the cameras and frames that a matte is made from; of a shot without them, what it has."""
+    digests = []
+    for file in (shot.solve / "cameras.json", shot.frames / FRAMES_FILE):
+        with contextlib.suppress(OSError, ValueError), open_regular(file) as handle:
+            digests.append(hashlib.sha256(handle.read()).hexdigest())
+    return content_key(MOTION_VERSION, config, digests)
 
 
-def _label(clip: _Clip, index: int, score: Map, weight: Map) -> NDArray[np.uint8]:
-    """The matte [H, W] of score and weight on the grid."""
-    grey = cv2.resize(clip.grey(index), score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
-    guide = flow.Guide(grey, 6, 10.0)
-    weight = np.minimum(weight, 3.0)
-    known = np.maximum(guide(weight), 0)
-    spread = guide(score * weight) / np.maximum(known, 1e-3)
-    size = clip.width, clip.height
-    spread = cv2.resize(spread, size, interpolation=cv2.INTER_LINEAR)
-    known = cv2.resize(known, size, interpolation=cv2.INTER_LINEAR)
-    return np.where(known < 0.1, UNKNOWN, np.where(spread > 0.4, MOVING, STILL)).astype(np.uint8)
-
-
-def found_key(shot: Shot, config: FlowConfig | None = None) -> str:
-    """Identifies the frames and cameras that a found matte is of."""
-    record = read_json(shot.solve / "solve.json")
-    cameras = read_json(shot.solve / "cameras.json")
-    return content_key(MOTION_VERSION, config or FlowConfig(), record.get("key"), cameras)
-
-
-def _record(shot: Shot) -> dict[str, Any]:
+def _record(path: Path) -> dict[str, Any]:
+    """A record of this version; {} if there is none that can be read."""
     try:
-        return read_json(shot.solve / "motion" / "motion.json")
+        found = read_json(path)
     except (OSError, ValueError):
         return {}
+    whole = found.get("version") == MOTION_VERSION and isinstance(found.get("key"), str)
+    result = found.get("result", {})
+    if not whole or not isinstance(result, dict):
+        return {}
+    named = path.name != _RECORD or set(result) == set(MotionResult.__annotations__)
+    return found if named else {}
+
+
+def is_found(shot: Shot, config: FlowConfig | None = None) -> bool:
+    """True if the shot has mattes of the solve that it has now."""
+    return _record(shot.solve / FOLDER / _RECORD).get("key") == _solve_key(shot, config or FlowConfig())
 
 
 def motion_key(shot: Shot) -> str:
-    """Changes when a matte does, found or painted."""
-    painted = sorted((shot.root / "motion_paint").glob("*.png"))
-    return content_key(_record(shot).get("key"), *painted)
+    """Changes when any matte does, found or painted."""
+    found = _record(shot.solve / FOLDER / _RECORD).get("key") if is_found(shot) else None
+    return content_key(found, *sorted(p for p in (shot.root / PAINTED).glob("*.png") if p.is_file()))
 
 
 def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
-    """The matte of a frame, [h, w] of the working frames: the painted one before the found one; None without one."""
-    path = shot.solve / "motion" / frame_file(frame, ".png")
-    found = read_grey(path) if path.is_file() else None
-    painted = shot.root / "motion_paint" / frame_file(frame, ".png")
-    if painted.is_file():
-        info = shot.info()
-        found = _painted(painted, found, info.width, info.height)
-    return found
+    """The matte of a frame: STILL, UNKNOWN or MOVING, [h, w] of the working frames; None if there is none.
+
+    Where an artist painted, that is it. JobError if a file of it is damaged.
+    """
+    path = shot.solve / FOLDER / frame_file(frame, ".png")
+    painted = shot.root / PAINTED / frame_file(frame, ".png")
+    found = _read_found(path) if path.is_file() and is_found(shot) else None
+    if not painted.is_file():
+        return found
+    info = shot.info()
+    size = (info.width, info.height) if found is None else found.shape[::-1]
+    return _painted(painted, found, size)
 
 
-def _painted(path: Path, found: NDArray[np.uint8] | None, width: int, height: int) -> NDArray[np.uint8]:
-    """`found` with what was painted over it."""
-    buffer = oiio.ImageBuf(str(path))
-    pixels = None if buffer.has_error else buffer.get_pixels(oiio.FLOAT)
-    if pixels is None or buffer.has_error:
-        raise JobError(
-            f"The painted matte {path} cannot be read: {told_by(buffer)}.",
-            "Paint it again, or remove it.",
-            ExitCode.FOOTAGE,
-        )
-    pixels = np.asarray(pixels, np.float32)
-    channels = pixels.shape[2]
-    grey = pixels[..., :3].mean(2) if channels >= 3 else pixels[..., 0]
-    alpha = pixels[..., channels - 1] if channels in (2, 4) else np.ones_like(grey)
-    grey, alpha = (cv2.resize(p, (width, height), interpolation=cv2.INTER_LINEAR) for p in (grey, alpha))
-    label = np.where(grey * 255 < 85, STILL, np.where(grey * 255 > 170, MOVING, UNKNOWN)).astype(np.uint8)
-    return np.where(alpha > 0.5, label, found if found is not None else np.uint8(UNKNOWN)).astype(np.uint8)
+def write_matte(path: Path, labels: NDArray[np.uint8]) -> None:
+    """Writes [H, W] uint8 as a grey PNG, whole or not at all."""
+    packed, data = cv2.imencode(".png", labels, [cv2.IMWRITE_PNG_COMPRESSION, 4])
+    if not packed:
+        raise OSError(f"the motion matte {path} cannot be packed as PNG")
+    write_atomic(path, data.tobytes())
 
 
-def write_grey(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """[H, W] uint8 as PNG, whole or not at all."""
-    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 4])
-    if not ok:
-        raise OSError(f"cannot write picture {path}")
-    with atomic_path(path) as beside:
-        beside.write_bytes(data.tobytes())
-
-
-def read_grey(path: Path) -> NDArray[np.uint8]:
-    """[H, W] uint8 of a PNG. ValueError if it cannot be read."""
-    pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-    if pixels is None:
-        raise ValueError(f"picture {path} cannot be read")
+def _read_found(path: Path) -> NDArray[np.uint8]:
+    pixels = _decoded(path, cv2.IMREAD_GRAYSCALE)
+    if pixels is None or pixels.dtype != np.uint8:
+        raise JobError(f"The motion matte {path} is damaged.", "Solve the camera again.", ExitCode.SOLVE)
     return pixels
+
+
+def _painted(path: Path, found: NDArray[np.uint8] | None, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """`found` with what was painted over it: grey below 85 of 255 is still, above 170 moving, alpha to 0.5 nothing."""
+    pixels = _decoded(path, cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        raise JobError(
+            f"The painted motion matte {path} is damaged or no PNG.", "Paint it again, or remove it.", ExitCode.FOOTAGE
+        )
+    pixels = pixels.astype(np.float32) * (255.0 / np.iinfo(pixels.dtype).max)
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    grey = pixels[..., : 3 if pixels.shape[2] >= 3 else 1].mean(2)
+    labels = _LABELS[np.searchsorted([85.0, 170.0], grey, side="right")]
+    alpha = pixels[..., -1] if pixels.shape[2] in (2, 4) else np.full_like(grey, 255.0)
+    labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR)
+    below = np.full_like(labels, UNKNOWN) if found is None else found
+    return np.where(alpha > 127.5, labels, below)
+
+
+def _decoded(path: Path, how: int) -> NDArray | None:
+    """Pixels of a file; None if it holds no picture that can be read whole."""
+    with open_regular(path) as handle:
+        data = np.frombuffer(handle.read(), np.uint8)
+    if not len(data) or not is_whole_png(path):
+        return None
+    try:
+        return cv2.imdecode(data, how)
+    except cv2.error:
+        return None

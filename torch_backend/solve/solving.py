@@ -8,12 +8,12 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraFrame, CameraPath, ExitCode, JobError, Reporter, frame_file, open_regular
+from ..contract import CameraFrame, CameraPath, Cancelled, ExitCode, JobError, Reporter, frame_file, open_regular
 from ..footage import load_frames
 from ..footage.images import is_whole_png, read_frame, write_png
 from ..footage.sources import frame_words
@@ -75,6 +75,10 @@ class SolveResult(TypedDict):
     """Focal length of the undistorted frames in pixels."""
     quality: str
     """The same in words."""
+    motion_pixels_share: NotRequired[float]
+    """Share of the frames' pixels that move by themselves; absent if it could not be found out."""
+    unknown_share: NotRequired[float]
+    """Share of them of which that is not known."""
 
 
 def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str = "") -> SolveResult:
@@ -88,6 +92,8 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
     its world, frames without one interpolated.
 
+    Then the motion matte of every frame is found (`motion.find_motion`); the solve holds without it.
+
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
     _check(config)
@@ -100,7 +106,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     done = _finished(shot, frames, key)
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
-        return done["result"]
+        return _with_motion(shot, done["result"], report)
     taken = prepare(frames, cameras, report) if cameras else None
     _refuse_damaged(shot, frames)
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
@@ -122,8 +128,25 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
         raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    result = _with_motion(shot, result, report)
     report.metric("solve", dict(result))
     return result
+
+
+def _with_motion(shot: Shot, result: SolveResult, report: Reporter) -> SolveResult:
+    """`result` with what moves in the clip. Cameras took minutes: whatever keeps the matte from them is a warning."""
+    try:
+        from .motion import find_motion
+
+        return SolveResult(**{**result, **find_motion(shot, report)})
+    except Cancelled:
+        raise
+    except Exception as error:  # OpenCV raises its own kinds, and is missing where set-up was not run again
+        report.warning(
+            f"What moves by itself could not be told from the pictures: {' '.join(str(error).split())[:300]}",
+            "The cameras are whole; solve again to try once more.",
+        )
+        return result
 
 
 def _log_end(log: Path) -> str:
@@ -343,6 +366,8 @@ def _finish(
         "camera_model": answer["camera_model"],
         "distortion": answer["distortion"],
         "focal_px": answer["focal_px"],
+        "lenses": [_lens(file) for file in maps],
+        "lens_of_frame": lenses,
         "triangulation_angle_deg": answer["triangulation_angle_deg"],
         "quality": result["quality"],
         "cameras_from": answer.get("given", "solve"),
@@ -358,6 +383,12 @@ def _finish(
 def _pinhole(file: Path) -> NDArray[np.float64]:
     with np.load(file, allow_pickle=False) as data:
         return data["pinhole"]
+
+
+def _lens(file: Path) -> dict[str, Any]:
+    """A lens of the working frames, as COLMAP names and orders it."""
+    with np.load(file, allow_pickle=False) as data:
+        return {"model": str(data["model"]), "params": data["params"].tolist()}
 
 
 def _camera_path(

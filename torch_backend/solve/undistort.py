@@ -114,7 +114,7 @@ def _bend(at: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _second_difference(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     """[n, ...] to [n - 2, ...]."""
-    return rows[:-2] - (rows[1:-1] + rows[1:-1]) + rows[2:]
+    return np.asarray(rows[:-2] - (rows[1:-1] + rows[1:-1]) + rows[2:], np.float32)
 
 
 def _taps(at: NDArray[np.float32], size: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

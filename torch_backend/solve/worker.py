@@ -8,7 +8,7 @@ Standard input is held open by the parent: when it closes, the parent is gone an
 carries JSON lines: {"stage"} when one begins, with {"done", "total"} where COLMAP calls back; {"result": {...}} or
 {"failure": "reason"} at the end.
 Beside the request it writes: model/ (binary COLMAP model), points.npz, poses.json (cameras from world, 3x4) and, for
-each lens, undistort_N.npz (camera of the undistorted frames and where each of its pixels lies in the distorted ones).
+each lens, undistort_N.npz (the lens, camera of the undistorted frames, where its pixels lie in the distorted ones).
 
 A request with "known" cameras ({"lenses": [{"model", "width", "height", "params"}], "images": {name: {"lens",
 "pose"}}, "triangulate"}) is not solved: the lenses are undistorted and, if asked for, points are triangulated with the
@@ -473,7 +473,8 @@ def write_points(request: Request, model: pycolmap.Reconstruction) -> None:
 def write_undistortion(request: Request, camera: pycolmap.Camera, number: int) -> None:
     """`undistortion` of a lens, as the parent reads it."""
     pinhole, where = undistortion(camera)
-    np.savez(request.scratch / f"undistort_{number}.npz", pinhole=pinhole, where=where)
+    lens = {"model": camera.model_name, "params": camera.params}
+    np.savez(request.scratch / f"undistort_{number}.npz", pinhole=pinhole, where=where, **lens)
 
 
 def smallest_depths(model: pycolmap.Reconstruction, points: list[pycolmap.Point3D]) -> NDArray[np.float32]:

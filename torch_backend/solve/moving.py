@@ -1,0 +1,204 @@
+"""From a solved clip to its motion mattes: key frames are tested, their scores follow surfaces through time, and areas.
+
+Keys are about ten frames a second, whatever the clip's rate; the frames between two keys take theirs by flow. Frames go
+through a window of a few seconds, so a clip of any length takes the same memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contract import Reporter, frame_file
+from ..footage import load_frames
+from ..footage.images import read_frame
+from ..shot import Shot
+from .flow import FlowConfig, Map, Matches, neighbours, sample
+from .still import Look, StillTest, evidence
+from .stored import load_cameras, load_points
+
+_FLOW_WIDTH = 640
+_LARGEST_SCALE = 2.0
+_KEYS_PER_SECOND = 10.0
+_LEAST_SIDE = 64
+
+
+class Clip:
+    """Frames and cameras of a solved shot, in the flow's size."""
+
+    def __init__(self, shot: Shot) -> None:
+        """JobError if it is not solved."""
+        path = load_cameras(shot)
+        seconds = {int(row["frame"]): float(row["seconds"]) for row in load_frames(shot)["frames"]}
+        self._shot = shot
+        self.frames = [camera.frame for camera in path.frames]
+        """Numbers of the delivered frames, ascending."""
+        self.width, self.height = path.width, path.height
+        scale = min(_LARGEST_SCALE, _FLOW_WIDTH / path.width)
+        width, height = (max(_LEAST_SIDE, round(side * scale / 2) * 2) for side in (path.width, path.height))
+        self.flow_size = width, height
+        self.unit = width / 640.0
+        """Flow pixels in one pixel of a picture 640 wide."""
+        self.keys = _keys([seconds.get(frame, float(n)) for n, frame in enumerate(self.frames)])
+        """Indices into `frames`."""
+        viewmats = np.array([c.viewmat for c in path.frames], np.float64).reshape(-1, 4, 4)
+        Ks = np.array([[[c.K[0], 0, c.K[2]], [0, c.K[1], c.K[3]], [0, 0, 1]] for c in path.frames], np.float64)
+        Ks *= np.array([width / path.width, height / path.height, 1.0])[None, :, None]
+        self.viewmats, self.Ks = viewmats[self.keys], Ks[self.keys]
+        """Of the keys: [K, 4, 4] world-to-camera, solve units, and [K, 3, 3] in flow pixels."""
+        self.guessed = [path.frames[i].source == "interpolated" for i in self.keys]
+        """Keys whose pose was not solved."""
+        points = load_points(shot)["xyz"].astype(np.float64)
+        self.depths = [_typical_depth(points, viewmat) for viewmat in self.viewmats]
+        """Of the keys: median depth of the sparse points before the camera."""
+        self._pictures: dict[int, NDArray[np.uint8]] = {}
+        self._looks: dict[int, Look] = {}
+
+    def picture(self, key: int) -> NDArray[np.uint8]:
+        """Grey picture of a key in the flow's size. JobError if the frame is damaged."""
+        if key not in self._pictures:
+            self._pictures[key] = self.grey(self.keys[key])
+        return self._pictures[key]
+
+    def look(self, key: int) -> Look:
+        """It, prepared for comparison."""
+        if key not in self._looks:
+            self._looks[key] = Look(self.picture(key))
+        return self._looks[key]
+
+    def grey(self, index: int) -> NDArray[np.uint8]:
+        """Grey picture of any frame, as `picture`."""
+        pixels = read_frame(self._shot.frames / frame_file(self.frames[index], ".png"))
+        pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+        grey = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+        if grey.shape == self.flow_size[::-1]:
+            return grey
+        how = cv2.INTER_AREA if self.flow_size[0] < grey.shape[1] else cv2.INTER_CUBIC
+        return np.asarray(cv2.resize(grey, self.flow_size, interpolation=how), np.uint8)
+
+    def forget(self, before: int) -> None:
+        """Drops the pictures of keys below `before`."""
+        for store in (self._pictures, self._looks):
+            for key in [key for key in store if key < before]:
+                del store[key]
+
+
+def _keys(seconds: list[float]) -> list[int]:
+    """Indices of the key frames: evenly spaced, the first and the last frame among them."""
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    stride = max(1, round(1.0 / (_KEYS_PER_SECOND * step))) if step > 0 else 1
+    return sorted({*range(0, len(seconds), stride), len(seconds) - 1})
+
+
+def _typical_depth(points: NDArray, viewmat: NDArray) -> float:
+    """Median depth of points [P, 3] before a camera [4, 4]; 1 if there are none."""
+    z = points @ viewmat[2, :3] + viewmat[2, 3]
+    z = z[z > 0]
+    return float(np.median(z)) if len(z) else 1.0
+
+
+def mattes(
+    clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order."""
+    keys, reach = clip.keys, 2 * config.baselines[-1]
+    groups = [range(keys[k - 1] + 1 if k else 0, keys[k] + 1) for k in range(len(keys))]
+    wanted = [any(n not in written for n in group) for group in groups]
+    if not any(wanted):
+        return
+    first, last = wanted.index(True), len(wanted) - 1 - wanted[::-1].index(True)
+    matches = Matches(clip.picture, config, clip.unit)
+    own: dict[int, tuple[Map, Map]] = {}
+    final: dict[int, tuple[Map, Map]] = {}
+    for turn in range(max(0, first - 1 - reach), last + reach + 1):
+        report.check_cancelled()
+        if turn < len(keys):
+            own[turn] = _own_score(clip, matches, turn, config)
+        key = turn - reach
+        if key < max(0, first - 1) or not (wanted[key] or wanted[min(key + 1, last)]):
+            continue
+        final[key] = _followed(matches, key, own, len(keys), reach, config)
+        for n in groups[key] if wanted[key] else ():
+            if n not in written:
+                score = final[key] if n == keys[key] else _between(clip, matches, n, key, final)
+                yield n, _labels(clip, n, *score)
+        for store in (own, final):
+            for old in [k for k in store if k < key - reach + 1]:
+                del store[old]
+        matches.forget(key - config.baselines[-1] + 1, key - config.links * config.baselines[-1])
+        clip.forget(key - config.baselines[-1])
+
+
+def _own_score(clip: Clip, matches: Matches, key: int, config: FlowConfig) -> tuple[Map, Map]:
+    """How much of what a key frame's points are matched with says that they move, 0 to 1, and how sure that is."""
+    seen = neighbours(matches, key, len(clip.keys), config)
+    test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
+    on, off = evidence(test, key, seen, clip.depths[key], config)
+    count = on + off
+    score = np.clip(off / np.maximum(count, 1.0) / config.share, 0.0, 1.0)
+    return score, np.clip(count / 6.0, 0.0, 1.0) * (count >= 2)
+
+
+def _followed(
+    matches: Matches, key: int, own: dict[int, tuple[Map, Map]], count: int, reach: int, config: FlowConfig
+) -> tuple[Map, Map]:
+    """Score and weight of a key frame with those of its neighbours followed to it: a surface has one label."""
+    score, sure = own[key]
+    total, weight = 2.0 * score * sure, 2.0 * sure
+    for seen in neighbours(matches, key, count, config):
+        if abs(seen.key - key) <= reach:
+            score, sure = own[seen.key]
+            share = sample(sure, seen.at) * seen.found
+            total = total + share * sample(score, seen.at)
+            weight = weight + share
+    return total / np.maximum(weight, 1e-6), weight
+
+
+def _between(clip: Clip, matches: Matches, index: int, key: int, final: dict[int, tuple[Map, Map]]) -> tuple[Map, Map]:
+    """Score and weight of a frame between key - 1 and key, by flow to both."""
+    picture = clip.grey(index)
+    total = np.zeros(picture.shape, np.float32)[::2, ::2]
+    weight = np.zeros_like(total)
+    for other in (key - 1, key):
+        at, found = matches.loose(picture, clip.picture(other))
+        score, sure = final[other]
+        share = sample(sure, at) * found
+        total, weight = total + share * sample(score, at), weight + share
+    return total / np.maximum(weight, 1e-6), weight
+
+
+def _labels(clip: Clip, index: int, score: Map, weight: Map) -> NDArray[np.uint8]:
+    """The labels [H, W] of a frame's score and weight on the grid."""
+    grey = cv2.resize(clip.grey(index), score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+    guide = _Guide(grey, 6, 10.0)
+    weight = np.minimum(weight, 3.0)
+    known = np.maximum(guide(weight), 0)
+    spread = guide(score * weight) / np.maximum(known, 1e-3)
+    size = clip.width, clip.height
+    spread = cv2.resize(spread, size, interpolation=cv2.INTER_LINEAR)
+    known = cv2.resize(known, size, interpolation=cv2.INTER_LINEAR)
+    return np.where(known < 0.1, 128, np.where(spread > 0.4, 255, 0)).astype(np.uint8)
+
+
+class _Guide:
+    """Spreads values within the areas of a picture, stopping at its edges: a guided filter (He 2010), grey."""
+
+    def __init__(self, picture: Map, radius: int, edge: float) -> None:
+        """`picture` [h, w] 0 to 255; differences below `edge` are none."""
+        self._size = (2 * radius + 1, 2 * radius + 1)
+        self._picture = picture
+        self._mean = self._blur(picture)
+        self._variance = self._blur(picture * picture) - self._mean**2 + np.float32(edge * edge)
+
+    def _blur(self, values: Map) -> Map:
+        return cv2.blur(values, self._size, borderType=cv2.BORDER_REFLECT)
+
+    def __call__(self, values: Map) -> Map:
+        """[h, w] to the same."""
+        mean = self._blur(values)
+        slope = (self._blur(values * self._picture) - mean * self._mean) / self._variance
+        level = mean - slope * self._mean
+        return self._blur(slope) * self._picture + self._blur(level)
