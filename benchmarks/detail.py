@@ -62,6 +62,8 @@ def judge(
     result["motion_from"] = clip.motion_from
     rows: dict[int, list[Row]] = {t_star: [] for t_star in t_stars}
     differences: list[float] = []
+    for old in strips.glob("t[0-9]*_[0-9]*.png") if strips else ():
+        old.unlink()  # of an earlier run
     for n, frame in enumerate(frames):
         before: tuple[Tensor, Tensor] | None = None
         for t_star in t_stars:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
+import statistics
 import sys
 import time
 from collections.abc import Sequence
@@ -183,32 +184,49 @@ def worst_frames(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, A
 
 
 def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: int) -> None:
-    """Strips of the worst frames: frame n, n + 1 laid over it, flow that is left, what counts as moving."""
+    """Strips of the worst frames: frame n, n + 1 laid over it, flow that is left, what counts as moving.
+
+    Those of an earlier run at the same instant are removed.
+    """
     flow = Flow()
+    for old in folder.glob(f"t{freeze['t_star']:06d}_*.png"):
+        old.unlink()
     for row in worst_frames(freeze["frames"], count):
         a, b = (show(clip, row[name], freeze["t_star"]) for name in ("frame", "next"))
         pair, one, two = lay_over(clip, a, b, "delivered"), a.pictures["delivered"], b.pictures["delivered"]
         left = unexplained_flow(flow, one, two, pair.places, pair.both) * (textured(one) & (pair.moving | pair.still))
         told = torch.stack([pair.moving, pair.still, torch.zeros_like(pair.still)], dim=2) * 0.5
-        strip = [one, sampled(two, pair.places), (left / 2.0)[..., None].expand(-1, -1, 3), one * 0.5 + told]
+        strip = [
+            one,
+            torch.where(pair.both[..., None], sampled(two, pair.places), one),
+            (left / 2.0)[..., None].expand(-1, -1, 3),
+            one * 0.5 + told,
+        ]
         name = f"t{freeze['t_star']:06d}_{100 * row['delivered']['excess']:05.0f}_{row['frame']:06d}.png"
         save_strip(folder / name, strip)
 
 
 def table(name: str, freezes: Sequence[dict[str, Any]]) -> list[str]:
     """The clip's figures in Markdown, a row per t* and what was looked at."""
-    header = [name, "flow left, moving, px", "still, px", "more", f"frames over {ALLOWED}", "worst frame"]
-    header += ["difference, moving, / 255", "still, / 255"]
+    header = [name, "flow left, moving, px", "still, px", "more", "more, mean of frames", f"frames over {ALLOWED}"]
+    header += ["worst frame", "difference, moving, / 255", "still, / 255"]
     lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
     for freeze in freezes:
         for what in WHAT:
-            of = freeze["clip"][what]
-            over = [row[what]["excess"] for row in freeze["frames"] if row[what]["excess"] is not None]
+            of, more = freeze["clip"][what], excesses(freeze, what)
             cells = [_px(v) for v in (of["moving"]["p99_px"], of["still"]["p99_px"], of["excess_px"])]
-            cells += [f"{sum(v > ALLOWED for v in over)} of {len(over)}", _px(max(over, default=None))]
-            cells += [_px(of[region]["unsteady_255"]) for region in ("moving", "still")]
+            cells += [_px(statistics.fmean(more) if more else None), f"{sum(v > ALLOWED for v in more)} of {len(more)}"]
+            cells += [
+                _px(max(more, default=None)),
+                *(_px(of[region]["unsteady_255"]) for region in ("moving", "still")),
+            ]
             lines.append(f"| t* {freeze['t_star']}, {what} | " + " | ".join(cells) + " |")
     return lines
+
+
+def excesses(freeze: dict[str, Any], what: str) -> list[float]:
+    """By how many pixels moving regions read more than still ones in each frame that has both."""
+    return [row[what]["excess"] for row in freeze["frames"] if row[what]["excess"] is not None]
 
 
 def verdicts(freezes: Sequence[dict[str, Any]]) -> list[str]:
@@ -216,15 +234,16 @@ def verdicts(freezes: Sequence[dict[str, Any]]) -> list[str]:
     said = []
     for freeze in freezes:
         delivered, plate = freeze["clip"]["delivered"], freeze["clip"]["plate"]
-        if delivered["excess_px"] is None:
+        more = excesses(freeze, "delivered")
+        if not more:
             said.append(f"t* {freeze['t_star']}: nothing moves in these frames, or nothing is still.")
             continue
-        honest = delivered["excess_px"] <= ALLOWED
+        mean, together = statistics.fmean(more), delivered["excess_px"]
         steady = delivered["moving"]["unsteady_255"] <= plate["still"]["unsteady_255"]
         said.append(
-            f"t* {freeze['t_star']}: what moved reads {delivered['excess_px']:+.2f} px against still pixels, which is "
-            f"{'within' if honest else 'more than'} {ALLOWED} px; it is {'no less' if steady else 'less'} steady "
-            "than the plate's still pixels."
+            f"t* {freeze['t_star']}: what moved reads {mean:+.2f} px against still pixels of the same frame (all frames "
+            f"together {together:+.2f}), which is {'within' if mean <= ALLOWED else 'more than'} {ALLOWED} px; it is "
+            f"{'no less' if steady else 'less'} steady than the plate's still pixels."
         )
     return said
 
