@@ -110,5 +110,6 @@ def test_a_verdict_that_is_none_is_not_shown(damaged):
 
 
 def test_a_verdict_from_a_strange_file_is_cut_and_has_no_control_characters():
-    (first, *rest) = verdict_lines({"verdict": {"word": "poor", "sentences": [f"a\x1b[2J{n}" + "b" * 999 for n in range(50)]}})
+    sentences = [f"a\x1b[2J{n}" + "b" * 999 for n in range(50)]
+    (first, *rest) = verdict_lines({"verdict": {"word": "poor", "sentences": sentences}})
     assert len(rest) == 11 and "\x1b" not in first and len(first) < 320
