@@ -1063,7 +1063,8 @@ def verdict_of(told: Mapping[str, Any]) -> Verdict | None:
 def verdict_lines(*told: Mapping[str, Any]) -> list[str]:
     """The lines of the verdicts that summaries or takes hold; none where there is no verdict."""
     found = (verdict_of(one) for one in told)
-    return [line for verdict in found if verdict is not None for line in verdict.lines()]
+    lines = (line for verdict in found if verdict is not None for line in verdict.lines())
+    return list(dict.fromkeys(lines))  # a take repeats what its run's verdict found amiss
 
 
 def summarise(
