@@ -767,6 +767,8 @@ def closing_figures(summary: dict[str, Any], output: Path) -> None:
         f"{summary.get('solved_frames', summary.get('frames'))} frames registered; "
         f"{summary['wall_seconds']:.0f} s in all."
     )
+    for line in summary.get("verdict", []):
+        say(line)
 
 
 def setup(series: Sequence[str], testing: bool, backend_only: bool, output: Path) -> int:

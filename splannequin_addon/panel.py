@@ -276,15 +276,19 @@ class _StepPanel:
             return
         if job is not None and job.state == "cancelled" and not self._paused(context):
             wrap(layout, context, "Cancelled. Finished work is kept: start it again to go on.", "CANCEL")
-        for message, hint in job.warnings if job is not None else []:
-            if message not in said:
-                wrap(layout, context, f"{message} {hint}".strip(), "ERROR")
+        for line in unsaid(job.warnings if job is not None else [], said):
+            wrap(layout, context, line, "ERROR")
         for note in watch.notes.get(self.step, []):
             wrap(layout, context, note, "DOT")
 
     def _paused(self, context: Any) -> bool:
         """True if the panel says already that what was stopped can go on."""
         return False
+
+
+def unsaid(warnings: list[tuple[str, str]], said: list[str]) -> list[str]:
+    """A job's warnings as lines, without those that the step's state tells anyway, as it does a verdict."""
+    return [f"{message} {hint}".strip() for message, hint in warnings if message not in said]
 
 
 def can_load_camera(running: str | None) -> bool:

@@ -1035,8 +1035,7 @@ class Verdict:
     sentences: list[str]
     """What is so."""
     where: list[dict[str, Any]] = field(default_factory=list)
-    """Where it will not hold, worst first: `first` and `last` frame number, `region` of the picture in words, `share`
-    of its worst part."""
+    """Where it will not hold, worst first: `first` and `last` frame number, and `region` of the picture in words."""
     advice: list[str] = field(default_factory=list)
     """What to do about it."""
 

@@ -19,7 +19,7 @@ from torch_backend.freeze.exr import read_frozen_exr
 CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
 KEYS = {
     "frames", "registered", "gaussians", "moving_share", "train_seconds", "heldout_psnr_db", "wall_seconds_by_stage",
-    "exr_dir", "contact_sheet", "t_star_frame",
+    "exr_dir", "contact_sheet", "t_star_frame", "verdict", "plate_share", "invented_share",
 }  # fmt: skip
 
 
@@ -46,6 +46,7 @@ def test_summary_has_the_figures(frozen):
     assert abs(summary["t_star_frame"] - 10) <= 1
     assert summary["heldout_psnr_db"] > 19.0
     assert f"{summary['heldout_psnr_db']:.2f} dB" in printed
+    assert summary["verdict"] and all(f"\n{line}\n" in printed for line in summary["verdict"])
     assert set(summary["wall_seconds_by_stage"]) == {"import", "solve", "train", "freeze"}
 
 

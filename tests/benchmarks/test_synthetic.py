@@ -264,7 +264,14 @@ def test_each_limit_breaks_what_it_says(kind, bodies, tmp_path):
         if mover["in_view"]:
             vertices = np.load(tmp_path / "geometry" / f"{mover['name']}.npy")
             fastest = max(fastest, float(np.linalg.norm(np.diff(vertices, axis=0), axis=2).max()) * TINY.fps)
-    assert (fastest > 2.0) == (kind == "fast-mover")
+    assert (fastest > 2.0) == (kind in ("fast-mover", "walker")) and (fastest == 0.0) == (kind == "still")
+    views = np.array([job["bands"][0]["world_to_camera"] for job in clip])
+    centres = -np.einsum("nji,nj->ni", views[:, :3, :3], views[:, :3, 3])
+    assert (np.ptp(centres, axis=0).max() < 0.06) == (kind == "tripod"), "the camera travels"
+    if kind == "walker":
+        walker = np.load(tmp_path / "geometry" / "person0.npy")[..., 0].mean(axis=1)
+        assert abs(walker[-1] - walker[0]) == pytest.approx(3.2, abs=0.2)
+        assert (walker[-1] - walker[0]) * (centres[-1] - centres[0])[0] < 0, "against the camera"
 
 
 def test_an_exact_shot_is_one_that_the_product_trains_on(scene, tmp_path):

@@ -52,7 +52,7 @@ class Plates:
     key: str
     """Changes with the footage, the solve, and the size."""
 
-    def __init__(self, shot: Shot, size: tuple[int, int] | None = None, keep: int = 12) -> None:
+    def __init__(self, shot: Shot, size: tuple[int, int] | None = None, keep: int = 11) -> None:
         """`size` is width and height in pixels, None the source's; `keep` the most plates held.
 
         The default holds what a frozen frame and the next one ask for: itself, two before and two after it at every

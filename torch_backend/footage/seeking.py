@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from .sources import Known, footage_error
 from .video import VideoSource
 
-_THREADS = 4
+_THREADS = 2
 """Of the decoder; each of them holds frames of its own."""
-_KEPT = 8
+_KEPT = 4
 """Decoded frames held after those that were asked for: neighbours are asked for next, also backwards."""
 _AHEAD = 32
 """Frames that are rather decoded than jumped over: key frames mostly lie farther apart."""

@@ -57,7 +57,7 @@ class DetailConfig:
     sway: float = 6.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.3
-    """How far a plate of another time is believed in what moves, beside plate t*."""
+    """How far a plate of another time is believed in what moves, and only where plate t* does not show it."""
     instant: bool = True
     """Give what plate t* shows and the model lacks a surface of its own (`instant.py`)."""
     sightings: SightingConfig = field(default_factory=SightingConfig)
@@ -312,10 +312,12 @@ class Detailer:
         motion, unknown = look_up(shot.motion, small), look_up(unknown, small)
         larger = torch.tensor([self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]])
         total, best, carried = torch.zeros(count), torch.zeros(count), torch.zeros(count, 3)
+        untold = 1.0 - self.seen.seen(shot.t, points).visible if shot.t in chosen else torch.ones(count)
+        untold = untold * (1.0 - unknown)
         for n, frame in enumerate(chosen):
             there = points if frame == shot.t else points + look_up(moved[n], small)
             sighting = self.seen.seen(frame, there)
-            weight = self._weight(shot, frame, sighting, motion, self._sway(frame, points, sighting) * (1.0 - unknown))
+            weight = self._weight(shot, frame, sighting, motion, self._sway(frame, points, sighting) * untold)
             carried += weight[:, None] * look_up(self.seen.residual(frame), sighting.pixels * larger, "bicubic")
             total += weight
             rest.source = torch.where(weight > best, float(frame), rest.source)

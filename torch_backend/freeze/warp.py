@@ -8,9 +8,10 @@ nothing moves ST is the identity, matte 1 and fill 0, so the plate leaves as it 
 
 The filter is bilinear, on coordinates in steps of 1/256 of a pixel: what lies on a pixel's centre is that pixel, bit
 for bit, though float32 coordinates of a wide plate are off by some 1e-4 pixels, which beside a highlight of 50 shows.
-Of the filters of Blender's Map UV node only Nearest is the same from 4.2 to 5.2 and keeps the identity (Bilinear is
-there from 5.0 on and has that error; Anisotropic blurs the identity in 4.2 and 5.2, Bicubic wherever it is): the
-add-on's group blends four such look-ups by the fraction, and agrees with `sample` to 1e-4 relative.
+Of the filters of Blender's Map UV node only Nearest is there from 4.2 to 5.2 and keeps the identity, a quarter into
+a pixel (in 4.3 a pixel's centre is the next one's already). Bilinear is there from 5.0 on and has that error;
+Anisotropic blurs the identity in 4.2, 4.3 and 5.2, Bicubic wherever it is. So the add-on's group blends four nearest
+look-ups by the fraction, and agrees with `sample` to 1e-4 relative.
 
 Channels, by experiment with the bpy wheels 4.2.23, 4.5.15, 5.0.1 and 5.2.3: `CHANNELS` are sockets Combined (the fill),
 Alpha, ST and Matte of one Image node. Rejected: `forward.u` and `forward.v` (4.2 and 5.2 read two channels wrongly) and
@@ -40,17 +41,9 @@ WARP_VERSION = 1
 """Version of the `splannequin:` attributes of a warp."""
 STEPS = 256
 """Coordinates are multiples of one pixel over this."""
-MATTE_STEPS = 256
-"""Mattes are multiples of one over this, which half floats hold exactly."""
 
 _FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) * 3 + (oiio.HALF,)
 _ROWS = 256
-# A fill below this share of its pixel is rounding, and is left out.
-_ROUNDING = 1e-4
-_BLACK = 1e-6
-# Half floats are off by this share of themselves at most; what a pixel may be off by for that.
-_HALF = 2.0**-12
-_OFF, _OFF_BLACK = 5e-4, 5e-6
 
 
 @dataclass(frozen=True)
@@ -82,7 +75,7 @@ class Warp:
     matte: Tensor
     """[H,W] in 0..1."""
     fill: Tensor
-    """[H,W,3] scene-linear, premultiplied; below 0 where the warped plate gives too much."""
+    """[H,W,3] scene-linear, premultiplied."""
     alpha: Tensor
     """[H,W] in 0..1: how opaque the frozen frame is."""
     metadata: WarpMetadata
@@ -124,25 +117,6 @@ def _between(share: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
     return first.long(), (first.long() + 1).clamp(max=size - 1), (at - first).float()[..., None]
 
 
-def close(color_linear: Tensor, plate_linear: Tensor, st: Tensor, matte: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(st, matte, fill) that give a frozen frame back from its leading plate.
-
-    Args:
-        color_linear: [H,W,3] the frozen frame, scene-linear, premultiplied.
-        plate_linear: [h,w,3] the undistorted plate, scene-linear.
-        st: [H,W,2] where each pixel looks in the plate; rounded by `snap`.
-        matte: [H,W] how much of the pixel the plate gives; rounded to 1/`MATTE_STEPS`, and 0 where the plate shows so
-            much more than the frozen frame (a highlight that is not there) that a half float cannot take it away again.
-    """
-    st = snap(st, (plate_linear.shape[1], plate_linear.shape[0]))
-    matte = (matte.float().clamp(0.0, 1.0) * MATTE_STEPS).round() / MATTE_STEPS
-    color = color_linear.float()
-    fill = color - matte[..., None] * sample(plate_linear.float(), st)
-    fill[fill.abs() <= _ROUNDING * color.abs() + _BLACK] = 0.0
-    worse = (fill.abs() * _HALF > (_OFF * color.abs()).clamp(min=_OFF_BLACK)).any(-1)
-    return st, matte.masked_fill(worse, 0.0), torch.where(worse[..., None], color, fill)
-
-
 def apply_warp(plate_linear: Tensor, warp: Warp) -> Tensor:
     """[H,W,3] the frozen frame, scene-linear, premultiplied, of a plate [h,w,3]: matte * plate(ST) + fill.
 
@@ -166,9 +140,11 @@ def write_warp(
     metadata: WarpMetadata,
     margin: tuple[int, int] = (0, 0),
 ) -> Path:
-    """Writes one warp atomically: float32 ST, the rest half, ZIP. Arrays as in `Warp`, from `close`.
+    """Writes one warp atomically: float32 ST, the rest half, ZIP. Arrays as in `Warp`, ST from `snap`.
 
-    With a `margin` the arrays are the data window, as in `write_frozen_exr`.
+    Mattes in steps of 1/1024 are exact in half floats, and the fill is off by 2.5e-4 of itself: that is little of the
+    frame, too, for a fill that adds light to what the plate gives, instead of taking some away. With a `margin`
+    the arrays are the data window, as in `write_frozen_exr`.
 
     ValueError names the layer whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be
     written (errno ENOSPC when the disk is full).

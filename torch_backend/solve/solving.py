@@ -218,14 +218,16 @@ def _ask_worker(
     return answer["result"]
 
 
+_TURNING = "The camera only turns on the spot: there is nothing to tell depth by."
+
+
 def _failure(answer: dict[str, Any]) -> JobError:
     flow = answer["flow_px"]
     if answer["failure"] == "still":
         message = f"The camera does not move: features shift by at most {flow:.1f} px over the clip."
         return JobError(message, STILL_HINT, ExitCode.SOLVE)
     if answer["failure"] == "turning":
-        message = "The camera only turns on the spot: there is nothing to tell depth by."
-        return JobError(message, STILL_HINT, ExitCode.SOLVE)
+        return JobError(_TURNING, STILL_HINT, ExitCode.SOLVE)
     return JobError(
         "No two frames show enough of the same scene from different places to start a camera solve.",
         f"{STILL_HINT} Blur and bare walls give nothing to match.",
@@ -238,6 +240,8 @@ def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
     solved = [f["frame"] for f in frames["frames"] if f["solve"]]
     registered, angle = answer["registered"], answer["triangulation_angle_deg"]
     if registered < min(LEAST_REGISTERED, len(solved)) or registered < REFUSED_SHARE * len(solved):
+        if answer.get("turning"):  # a tripod's head: what was placed was placed by chance
+            raise JobError(_TURNING, STILL_HINT, ExitCode.SOLVE)
         parts = [_spans(solved, part) for part in answer["parts"] if len(part) >= LEAST_REGISTERED]
         apart = f"; {len(parts)} parts of the clip do not connect" if len(parts) > 1 else ""
         worked = f": {_span_words(parts[0])}" if parts else ""

@@ -110,6 +110,7 @@ def main(path: str) -> int:
             "focal_px": camera.mean_focal_length(),
             "distortion": [float(camera.params[i]) for i in camera.extra_params_idxs()],
             "flow_px": flow,
+            "turning": turning_share(request) > TURNING_SHARE,
             "localised": len(poses) - model.num_reg_images(),
             "lens": {"doubt": doubt, "held": held, "found_px": found, "width": camera.width, "height": camera.height},
         }

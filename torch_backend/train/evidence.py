@@ -30,6 +30,8 @@ UNEXPLAINED = 0.12
 """Difference of the low-passed pictures, of 1, above which a pixel is not explained."""
 MOMENTS = 24
 """Times at which it is asked where a Gaussian is."""
+MOVING_SHARE = 0.3
+"""Share of a pixel that has to be of what moves before it is taken to travel."""
 STILL_SHARE = 1 / 640
 """Travel below this share of the width is none."""
 
@@ -50,7 +52,8 @@ class FrameEvidence:
     unexplained: NDArray[np.float32]
     """[GRID, GRID] share of each cell's pixels that differ by more than `UNEXPLAINED`; rows from above."""
     travel: NDArray[np.float32]
-    """[GRID, GRID] how far the surfaces of each cell travel, as a share of the width: the 90th percentile."""
+    """[GRID, GRID] how far the surfaces of each cell travel, as a share of the width: the 97th percentile, so
+    that a fifth of a percent of the picture counts."""
     moving: NDArray[np.float32]
     """[K] travel of the picture's pixels that travel at all, as a share of the width, every 16th."""
     still_unexplained: float | None = None
@@ -120,17 +123,18 @@ def _look(
 ) -> FrameEvidence:
     model, rows, width = trainer.model, trainer.model.open_rows(), trainer.width
     viewmat, K, time = trainer.viewmats[index], trainer.Ks[index], float(trainer.scene.times[index])
-    travel = torch.zeros(len(model.gaussians), 1, device=trainer.device)
+    motion = torch.zeros(len(model.gaussians), 2, device=trainer.device)  # how far, and whether at all
     if places.shape[1]:
-        travel[rows, 0] = travelled(places, viewmat, K) / width
+        motion[rows, 0], motion[rows, 1] = travelled(places, viewmat, K) / width, 1.0
     out = render(
-        model.state_at(time), model.sh_degree, viewmat, K, width, trainer.height, colors=travel,
-        background=torch.cat([trainer.background, travel.new_zeros(1)]), with_depth=False, with_contributions=False,
+        model.state_at(time), model.sh_degree, viewmat, K, width, trainer.height, colors=motion,
+        background=torch.cat([trainer.background, motion.new_zeros(2)]), with_depth=False, with_contributions=False,
     )  # fmt: skip
     shown = model.exposure.apply(out.colors[0, ..., :3], time)
     plate = image.to(trainer.device, torch.float32)
     off = unexplained(plate, shown)
-    travels = out.colors[0, ..., 3].clamp_min(0.0).cpu()
+    far, share = out.colors[0, ..., 3:].cpu().unbind(-1)
+    travels = torch.where(share > MOVING_SHARE, far / share.clamp_min(MOVING_SHARE), 0.0).clamp_min(0.0)
     moving = travels[travels > STILL_SHARE].flatten()[::16]
     by_matte: list[float | None] = [None, None]
     if matte is not None:
@@ -138,7 +142,7 @@ def _look(
             there = _resized(matte == value, off.shape)
             by_matte[n] = float(off[there].float().mean()) if there.any() else None
     return FrameEvidence(
-        trainer.scene.frames[index], held_out, psnr(shown, plate), shares(off.float()), _cells(travels, 0.9),
+        trainer.scene.frames[index], held_out, psnr(shown, plate), shares(off.float()), _cells(travels, 0.97),
         moving.numpy(), *by_matte,
     )  # fmt: skip
 

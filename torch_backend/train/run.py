@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +20,13 @@ from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
+from ..solve.motion import load_motion
 from . import adam
 from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .device import choose_device, unused_card
-from .evidence import gather
+from .evidence import Mattes, gather
 from .extend import EXTENSION_FILE, pending
 from .model import DynamicModel
 from .needs import modelled
@@ -106,7 +108,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         metrics.add(t, test, held_out)
 
     trainer.run(checkpoint, evaluate)
-    summary = summarise(trainer, params.run, test, held_out, key)
+    summary = summarise(trainer, params.run, test, held_out, key, functools.partial(load_motion, shot))
     write_json(folder / SUMMARY_FILE, summary)
     if folder != run:
         take_place(run, folder)
@@ -157,7 +159,8 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         trainer.extend(params.extend, before["heldout_psnr_db"])
     metrics = Metrics(folder, report, trainer.iteration)
     trainer.run(beside, lambda t: metrics.add(t, test, held_out))
-    summary = summarise(trainer, params.run, test, held_out, facts["key"])
+    mattes = functools.partial(load_motion, shot)
+    summary = summarise(trainer, params.run, test, held_out, facts["key"], mattes)
     trainer.save(checkpoint)
     write_json(folder / SUMMARY_FILE, summary)
     beside.unlink(missing_ok=True)
@@ -279,10 +282,12 @@ def save_png(path: Path, image: Tensor) -> None:
     write_png(path, (image.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).contiguous().cpu().numpy())
 
 
-def summarise(trainer: Trainer, name: str, test: list[int], held_out: Tensor, key: str) -> dict[str, Any]:
+def summarise(
+    trainer: Trainer, name: str, test: list[int], held_out: Tensor, key: str, mattes: Mattes | None = None
+) -> dict[str, Any]:
     """The run's figures, units in the key names; what was modelled and what it cost."""
     value = trainer.heldout_psnr(test, held_out)
-    model, seen = trainer.model, gather(trainer, test, held_out)
+    model, seen = trainer.model, gather(trainer, test, held_out, mattes)
     return {
         "version": 1,
         "key": key,

@@ -35,8 +35,12 @@ class RunLimits:
     travels 0.04."""
     far_share: float = 0.002
     """Least share of the picture that travels that far, on average over the frames, to be told."""
-    moves: float = 0.003
-    """Share of the picture that moves at all, below which nothing does; the clips have 0.08 to 0.34."""
+    still_lost: float = 0.05
+    """Share of what the motion mattes call still that may be unexplained: above it the camera is to blame; the clips
+    have at most 0.01."""
+    still: float = 0.008
+    """Sway, as a share of the width, below which nothing moves: 0.004 in a world in which nothing does, 0.016 to 0.021
+    in the clips."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,6 @@ class RunFigures:
     """[F, GRID, GRID] as in `FrameEvidence`."""
     travel: NDArray[np.floating]
     """[F, GRID, GRID] as in `FrameEvidence`."""
-    moving: float
-    """Share of the picture that moves in the clip, on average."""
     sway: float
     """95th percentile of the travel of what moves, as a share of the width."""
     far: float
@@ -87,7 +89,6 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int, limits: R
         [one.frame for one in seen],
         np.stack([one.unexplained for one in seen]),
         np.stack([one.travel for one in seen]),
-        len(moving) / whole,
         float(np.percentile(moving, 95)) if len(moving) else 0.0,
         float((moving > limits.far).sum()) / whole,
         float(np.percentile(moving, 99)) if len(moving) else 0.0,
@@ -102,16 +103,21 @@ def judge(figures: RunFigures, limits: RunLimits | None = None) -> Verdict:
     """The verdict on a run."""
     limits = limits or RunLimits()
     lost = figures.unexplained > limits.lost
-    bad: NDArray[np.bool_] = np.asarray(lost.any(axis=(1, 2)))
+    bad = lost.any(axis=(1, 2))
     dim = not (figures.median_db >= limits.poor_median_db and figures.tenth_db >= limits.poor_tenth_db)
-    places = spans_of(figures.frames, figures.unexplained, lost)
-    walks = figures.far > limits.far_share
-    poor = dim or float(bad.mean()) > limits.poor_lost
+    places, walks = spans_of(figures.frames, figures.unexplained, lost), []
+    if figures.far > limits.far_share:
+        far = figures.travel > limits.far
+        walks, bad = spans_of(figures.frames, figures.travel, far, most=1), bad | far.any(axis=(1, 2))
+    poor = dim or float(lost.any(axis=(1, 2)).mean()) > limits.poor_lost
     word = "poor" if poor else "fair" if places or walks else "good"
-    return Verdict(word, _sentences(figures, limits, dim, places), places, _advice(figures, dim, bad, places, limits))
+    said = _sentences(figures, limits, dim, places, walks)
+    return Verdict(word, said, [*places, *walks], _advice(figures, dim, np.asarray(bad), places, walks, limits))
 
 
-def _sentences(figures: RunFigures, limits: RunLimits, dim: bool, places: list[dict[str, Any]]) -> list[str]:
+def _sentences(
+    figures: RunFigures, limits: RunLimits, dim: bool, places: list[dict[str, Any]], walks: list[dict[str, Any]]
+) -> list[str]:
     """What is so: how well it fits, what moves and how far, where it does not hold."""
     width, said = figures.width, []
     if dim:
@@ -123,32 +129,36 @@ def _sentences(figures: RunFigures, limits: RunLimits, dim: bool, places: list[d
     elif not places:
         said.append("It shows all of the clip.")
     said += [f"It does not hold in {where_words(place)}." for place in places]
-    if figures.moving < limits.moves:
+    if figures.sway < limits.still:
         said.append("Nothing moves in it.")
-    elif figures.far > limits.far_share:
-        farthest = round(figures.farthest * width)
-        said.append(f"Something travels up to {farthest} of {width} pixels: it does not hold still.")
+    elif walks:
+        farthest, place = round(figures.farthest * width), where_words(walks[0])
+        said.append(f"Something does not hold still: it travels up to {farthest} of {width} pixels in {place}.")
     else:
         said.append(f"What moves sways by up to {max(1, round(figures.sway * width))} of {width} pixels.")
     return said
 
 
 def _advice(
-    figures: RunFigures, dim: bool, bad: NDArray[np.bool_], places: list[dict[str, Any]], limits: RunLimits
-) -> list[str]:
+    figures: RunFigures, dim: bool, bad: NDArray[np.bool_], places: list[dict[str, Any]], walks: list[dict[str, Any]],
+    limits: RunLimits,
+) -> list[str]:  # fmt: skip
     """What to do about it."""
-    if figures.moving < limits.moves and not places and not dim:
+    if figures.sway < limits.still and not places and not dim:
         return ["Any frame will do as t*."]
     span = _longest_good(figures.frames, bad)
     if dim or (places and span is None):
-        return [_LOOK]
-    if span is not None and places:
+        still = figures.still_unexplained
+        return [_LOOK if still is None else _SOLVE if still > limits.still_lost else _HOLD]
+    if span is not None and (places or walks):
         return [f"Choose t* in frames {span[0]} to {span[1]}, or train on that range alone."]
-    if figures.far > limits.far_share:
+    if walks:
         return ["Paint who walks in the motion matte, or take a range in which all hold still."]
     return []
 
 
+_HOLD = "Somebody walks through: take a range in which all hold still."
+_SOLVE = "Even what stands still is not there: solve the camera again, or take a range that it follows well."
 _LOOK = (
     "Look at its previews. Somebody walks through, or the camera is wrong: take a range in which all hold still, "
     "or solve again."
@@ -180,11 +190,11 @@ def region_words(cells: NDArray[np.floating]) -> str:
 def spans_of(
     frames: Sequence[int], cells: NDArray[np.floating], lost: NDArray[np.bool_], most: int = 3
 ) -> list[dict[str, Any]]:
-    """Where something is lost: spans of frames, each with its region and `share`, that of its worst cell; worst first.
+    """Where something is lost: `first` and `last` frame of a span and the `region` of the picture; worst first.
 
     Args:
         frames: [F] ascending numbers.
-        cells: [F, GRID, GRID] shares.
+        cells: [F, GRID, GRID] how much is.
         lost: [F, GRID, GRID] which of them are too large.
         most: how many spans are told.
     """
@@ -192,18 +202,16 @@ def spans_of(
     if not len(bad):
         return []
     groups = np.split(bad, np.flatnonzero(np.diff(bad) > 2) + 1)  # one good frame between does not part them
-    spans = []
-    for group in groups:
-        weight = (cells[group] * lost[group]).sum(axis=0)
-        spans.append(
-            {
-                "first": int(frames[group[0]]),
-                "last": int(frames[group[-1]]),
-                "region": region_words(weight),
-                "share": round(float(cells[group].max()), 3),
-            }
-        )
-    return sorted(spans, key=lambda span: -span["share"] * (1 + span["last"] - span["first"]))[:most]
+    weights = [(cells[group] * lost[group]).sum(axis=0) for group in groups]
+    worst = sorted(range(len(groups)), key=lambda n: -float(weights[n].sum()))[:most]
+    return [
+        {
+            "first": int(frames[groups[n][0]]),
+            "last": int(frames[groups[n][-1]]),
+            "region": region_words(weights[n]),
+        }
+        for n in worst
+    ]
 
 
 def where_words(place: dict[str, Any]) -> str:

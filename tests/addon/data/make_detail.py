@@ -80,7 +80,7 @@ def main() -> None:
     import torch
 
     from torch_backend.freeze.exr import DetailLayers, FrameMetadata, linear_spec, write_exr, write_frozen_exr
-    from torch_backend.freeze.warp import WarpMetadata, close, write_warp
+    from torch_backend.freeze.warp import WarpMetadata, snap, write_warp
 
     ones, size = np.ones((HEIGHT, WIDTH), np.float32), np.array([WIDTH, HEIGHT])
     for frame in FRAMES:
@@ -94,9 +94,8 @@ def main() -> None:
             FrameMetadata(frame, 6.0, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)),
             detail=DetailLayers(splat, share, source(frame)),
         )  # fmt: skip
-        warp = close(*(torch.from_numpy(a) for a in (color, plate(frame), st.astype(np.float32), share)))
-        about = WarpMetadata(frame, frame, 6.0, WIDTH, HEIGHT)
-        write_warp(FOLDER / "warp" / name, *warp, alpha(), about)
+        fill, about = (alpha() - share)[..., None] * other(frame), WarpMetadata(frame, frame, 6.0, WIDTH, HEIGHT)
+        write_warp(FOLDER / "warp" / name, snap(torch.from_numpy(st), (WIDTH, HEIGHT)), share, fill, alpha(), about)
         spec = linear_spec(WIDTH, HEIGHT, ("R", "G", "B"), (oiio.FLOAT,) * 3)
         write_exr(FOLDER / "plate" / name, spec, [plate(frame)])
 

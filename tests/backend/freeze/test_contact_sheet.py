@@ -6,6 +6,7 @@ from torch_backend.freeze.contact_sheet import CELL, pick_columns, write_contact
 
 GROUND = (30, 30, 30)
 ACCENT = (250, 194, 76)
+ALARM = (226, 74, 51)
 
 
 def pictures(folder, name, count, height=48, width=64, dtype=np.uint8):
@@ -72,6 +73,30 @@ def test_the_frame_of_t_star_is_shown_and_outlined(tmp_path):
         assert is_colour(sheet[y, x], ACCENT)
     top, bottom, left, right = box(is_colour(sheet, (100, 0, 250)))
     assert is_colour(sheet[top - 2, left], GROUND)
+
+
+def test_frames_that_will_not_hold_lose_a_corner_of_the_frozen_picture(tmp_path):
+    plates, frozen = pictures(tmp_path, "plates", 3), pictures(tmp_path, "frozen", 3)
+    before = read_png(write_contact_sheet(tmp_path / "a.png", plates, frozen, [1, 2, 3], "t"))
+    after = read_png(write_contact_sheet(tmp_path / "b.png", plates, frozen, [1, 2, 3], "t", unsure={2, 9}))
+    top, _, _, right = box(is_colour(before, (110, 0, 250)))
+    changed = (before != after).any(axis=-1)
+    assert box(changed) == (top, top + 22, right - 22, right) and changed.sum() == 22 * 23 // 2
+    assert is_colour(after[top, right - 1], ALARM) and is_colour(after[top, right - 30], (110, 0, 250))
+
+
+def test_a_note_stands_under_the_title_in_as_many_lines_as_it_needs(tmp_path):
+    frozen = pictures(tmp_path, "frozen", 2)
+    sheets = {}
+    for count in (0, 3, 40):
+        note = "word " * count
+        sheets[count] = read_png(write_contact_sheet(tmp_path / f"{count}.png", None, frozen, [1, 2], "t", note=note))
+    bare, one, many = sheets[0], sheets[3], sheets[40]
+    assert len(bare) < len(one) < len(many) and bare.shape[1] == one.shape[1] == many.shape[1]
+    top = box(is_colour(one, (100, 0, 250)))[0]
+    title = box(is_colour(bare, (100, 0, 250)))[0] - 12  # where the pictures stand without a note
+    assert (one[title:top].max(axis=-1) > 120).any(), "the note is drawn"
+    assert is_colour(many[:, -16:], GROUND).all(), "and never over the border"
 
 
 def test_takes_portrait_and_16_bit_plates_of_another_size(tmp_path):

@@ -15,6 +15,8 @@ from torch_backend.solve import SolveConfig, foreign, load_points, solve_shot
 from torch_backend.solve.colmap_files import read_model, write_model
 from torch_backend.solve.export import export_cameras
 from torch_backend.solve.given import doubts, refuse_misfit
+from torch_backend.solve.plate_lens import load_plate_lenses
+from torch_backend.solve.undistort import Undistorter
 
 PLAIN = {"w": 640, "h": 480, "fl_x": 500.0, "fl_y": 510.0, "cx": 321.0, "cy": 239.0}
 
@@ -360,6 +362,12 @@ def test_two_lenses_in_one_clip(solved, tools, tmp_path):
     assert len({k[0] for k in Ks.tolist()}) == 2 and Ks[9, 0] != Ks[10, 0] and Ks[10, 0] == Ks[20, 0]
     assert len(load_points(shot)["xyz"]) > 200
     assert len(read_model(shot.solve / "colmap").cameras) == 21
+    lenses = load_plate_lenses(shot)
+    assert lenses[110].lens.params[4] != lenses[111].lens.params[4]
+    for frame in (105, 115):
+        undistort = Undistorter(lenses[frame].where(320, 240))
+        off = undistort(read_png(shot.frames / f"raw/{frame:06d}.png")).astype(int)
+        assert np.abs(off - read_png(shot.frames / f"{frame:06d}.png")).max() <= 1
 
 
 def test_cameras_of_another_clip_are_refused(solved, tools, tmp_path):

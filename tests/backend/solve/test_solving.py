@@ -190,6 +190,10 @@ def names(*frames):
             {"triangulation_angle_deg": 1.6},
             "The camera moves too little for depth: half of the points are seen under 1.6 degrees or less.",
         ),
+        (
+            {"registered": 13, "turning": True, "parts": [names(*range(3, 16))]},
+            "The camera only turns on the spot: there is nothing to tell depth by.",
+        ),
         ({"points": 40}, "Only 40 points of the scene could be placed: the clip is too blurred or too bare."),
     ],
 )

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_backend.solve.undistort import Undistorter
+from torch_backend.solve import foreign
+from torch_backend.solve.plate_lens import PlateLens
+from torch_backend.solve.undistort import BandUndistorter, Undistorter
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -64,6 +66,9 @@ LENSES = {
     "none": ("SIMPLE_RADIAL", [140.0, 82.0, 57.0, 0.0]),
     "pincushion": ("SIMPLE_RADIAL", [140.0, 82.0, 57.0, 0.08]),
     "tangential": ("OPENCV", [140.0, 150.0, 80.0, 60.0, -0.1, 0.02, 0.003, -0.002]),
+    "eight terms": ("FULL_OPENCV", [140.0, 150.0, 80.0, 60.0, -0.1, 0.02, 0.003, -0.002, 0.01, 0.05, -0.01, 0.002]),
+    "fisheye": ("OPENCV_FISHEYE", [90.0, 92.0, 82.0, 57.0, 0.03, -0.01, 0.004, -0.001]),
+    "plain fisheye": ("SIMPLE_RADIAL_FISHEYE", [90.0, 82.0, 57.0, 0.0]),
 }
 
 
@@ -118,6 +123,48 @@ def test_a_tangential_lens_keeps_its_pixel_aspect(maps):
     pinhole, where = maps("tangential")
     assert pinhole[1] / pinhole[0] == pytest.approx(150 / 140)
     assert_no_blank_pixels(where)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_plates_of_any_size_lose_the_lens_that_the_working_frames_lost(maps, name):
+    model, params = LENSES[name]
+    pinhole, where = maps(name)
+    lens = PlateLens(foreign.lens_from_colmap(model, 160, 120, params), tuple(pinhole))
+    assert lens.is_none == (name == "none")
+    np.testing.assert_allclose(lens.where(160, 120), where, atol=1e-4)
+    # A source of three times the size, but for a rounding: every third pixel centre is one of the working frame's.
+    wide = lens.where(480, 361)[:, 1::3] / [3.0, 361 / 120]
+    np.testing.assert_allclose(wide[..., 0].mean(0), lens.where(160, 361)[..., 0].mean(0, dtype=float), atol=1e-4)
+    np.testing.assert_allclose(lens.where(480, 360)[1::3, 1::3] / 3.0, where, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["bent", "beyond the border", "turned"])
+def test_bands_are_the_matrix_in_float(kind):
+    """Undistorter is exact and large, BandUndistorter is to give the same; also past the border, and over all bands."""
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 65536, (200, 90, 3), dtype=np.uint16)
+    at = identity(200, 90)
+    where = {
+        "bent": at + np.sin(at[..., ::-1] / 17.0) * np.float32([3.0, 5.0]),
+        "beyond the border": at * np.float32(1.4) - np.float32([20.3, 40.7]),
+        "turned": at[::-1] + np.float32(0.37),
+    }[kind].astype(np.float32)
+    got = BandUndistorter(where)(
+        picture, lambda x: x / np.float32(65535), lambda x: x, np.empty(picture.shape, np.float32)
+    )
+    want = Undistorter(where)(picture)
+    assert np.abs(np.clip(got, 0, 1) * 65535 - want).max() < 4
+    assert got.min() < 0 and got.max() > 1  # ringing is not cut
+    with pytest.raises(ValueError, match=r"\[H, W, 2\]"):
+        BandUndistorter(where[..., 0])
+
+
+def test_bands_change_nothing_where_nothing_moves_and_reach_other_sizes():
+    picture = np.random.default_rng(0).normal(0.5, 10.0, (70, 30, 3)).astype(np.float32)
+    same = BandUndistorter(identity(70, 30))(picture, lambda x: x, lambda x: x, np.empty_like(picture))
+    assert (same == picture).all()
+    part = BandUndistorter(identity(20, 10) + np.float32([5, 40]))
+    assert (part(picture, lambda x: x, lambda x: x, np.empty((20, 10, 3), np.float32)) == picture[40:60, 5:15]).all()
 
 
 @pytest.mark.parametrize("name", ["barrel", "pincushion"])

@@ -1,13 +1,118 @@
-"""A run that explains its frames badly says so; one that explains them does not."""
+"""A run says in words whether it holds: figures into sentences, figures against known motion, and whole small runs."""
 
+import dataclasses
 import sys
 
 import numpy as np
 import pytest
+import torch
 
-from torch_backend.contract import TrainParams, read_json
+from torch_backend.contract import TrainParams, read_json, verdict_lines
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.train import train_shot
+from torch_backend.train.evidence import GRID, travelled, unexplained
+from torch_backend.train.verdict import RunFigures, judge, region_words, spans_of, where_words
+
+FRAMES = list(range(1, 75, 3))
+
+
+def figures(**changes) -> RunFigures:
+    """Those of `sitting`'s preview, changed."""
+    none = np.zeros((len(FRAMES), GRID, GRID), np.float32)
+    still = RunFigures(640, FRAMES, none + 0.02, none + 0.01, 0.021, 0.0, 0.0256, 24.4, 22.8, True)
+    return dataclasses.replace(still, **changes)
+
+
+def lost_at(first: int, last: int, row: int, column: int, share: float = 0.8) -> np.ndarray:
+    cells = np.full((len(FRAMES), GRID, GRID), 0.02)
+    inside = [n for n, frame in enumerate(FRAMES) if first <= frame <= last]
+    cells[inside, row, column] = share
+    return cells
+
+
+def test_people_who_hold_still_are_good_and_their_sway_is_told_in_pixels():
+    verdict = judge(figures())
+    assert verdict.lines() == ["Good. It shows all of the clip.", "What moves sways by up to 13 of 640 pixels."]
+    assert verdict.where == []
+    assert judge(figures(width=1920)).sentences[-1] == "What moves sways by up to 40 of 1920 pixels."
+
+
+def test_a_still_world_is_told_as_one():
+    verdict = judge(figures(sway=0.0039, farthest=0.0045))
+    assert verdict.word == "good" and "Nothing moves in it." in verdict.sentences
+    assert verdict.advice == ["Any frame will do as t*."]
+
+
+def test_a_walker_is_told_with_frames_place_and_what_to_do():
+    travel = lost_at(10, 40, 1, 1, 0.22)
+    verdict = judge(figures(unexplained=lost_at(10, 31, 3, 0), travel=travel, far=0.02, farthest=0.22))
+    assert verdict.word == "fair"
+    assert verdict.where == [
+        {"first": 10, "last": 31, "region": "lower left"}, {"first": 10, "last": 40, "region": "middle"}
+    ]  # fmt: skip
+    assert verdict.sentences == [
+        "It does not hold in frames 10 to 31, lower left.",
+        "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 40, middle.",
+    ]
+    assert verdict.advice == ["Choose t* in frames 43 to 73, or train on that range alone."]
+
+
+def test_one_who_walks_and_is_followed_is_told_too():
+    verdict = judge(figures(travel=lost_at(1, 74, 2, 2, 0.22), far=0.02, farthest=0.22))
+    assert verdict.word == "fair" and "141 of 640" in verdict.sentences[-1] and "motion matte" in verdict.advice[0]
+    spot = judge(figures(travel=lost_at(1, 74, 2, 2, 0.22), far=0.0005, farthest=0.034))
+    assert spot.word == "good", "a few far pixels, as in `hall`, are nobody who walks"
+
+
+def test_what_holds_nowhere_is_poor_and_so_is_what_does_not_show_the_clip():
+    verdict = judge(figures(unexplained=lost_at(1, 74, 1, 1)))
+    assert verdict.word == "poor" and "frames 1 to 73, middle" in verdict.sentences[0]
+    assert "Somebody walks through, or the camera is wrong" in verdict.advice[0]
+    by_mattes = [judge(figures(unexplained=lost_at(1, 74, 1, 1), still_unexplained=off)).advice for off in (0.01, 0.2)]
+    assert "Somebody walks through: take" in by_mattes[0][0] and "solve the camera again" in by_mattes[1][0]
+    dim = judge(figures(median_db=18.9, tenth_db=17.6, held_out=False))
+    said = "It does not show the clip: 18.9 dB on half of its training frames, 17.6 dB on the worst tenth."
+    assert dim.word == "poor" and dim.sentences[0] == said
+    assert judge(figures(median_db=float("nan"))).word == "poor"
+
+
+def test_regions_and_frames_in_words():
+    cells = np.zeros((GRID, GRID))
+    for (row, column), expected in {
+        (0, 0): "upper left", (0, 2): "top", (0, 3): "upper right", (1, 1): "middle", (2, 0): "left",
+        (3, 1): "bottom", (3, 3): "lower right",
+    }.items():  # fmt: skip
+        one = cells.copy()
+        one[row, column] = 1.0
+        assert region_words(one) == expected
+    assert region_words(cells + 1.0) == region_words(cells) == "most of the picture"
+    shares = lost_at(4, 7, 0, 0) + lost_at(40, 61, 3, 3) - 0.02
+    shares[FRAMES.index(49)] = 0.0  # one good frame does not part a span
+    spans = spans_of(FRAMES, shares, shares > 0.3)
+    assert [where_words(span) for span in spans] == ["frames 40 to 61, lower right", "frames 4 to 7, upper left"]
+    assert where_words({"first": 4, "last": 4, "region": "top"}) == "frame 4, top"
+    assert spans_of(FRAMES, shares, shares > 2.0) == []
+
+
+def test_travel_is_measured_in_the_view_and_only_where_somebody_saw_it():
+    """A point that goes 0.5 units across at depth 2 with a focal length of 100 px: 25 px, in float64 by hand."""
+    places = torch.tensor([[0.0, 0.0, 2.0], [0.25, 0.0, 2.0], [0.5, 0.0, 2.0]])[:, None].repeat(1, 4, 1)
+    places[2, 1] = torch.nan  # seen at the first two times only
+    places[1:, 2] = torch.nan  # seen once
+    places[1, 3, 2] = -1.0  # behind the camera once
+    K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
+    assert travelled(places, torch.eye(4), K).tolist() == pytest.approx([25.0, 12.5, 0.0, 0.0], abs=1e-4)
+
+
+def test_edges_and_grain_are_explained_and_a_figure_that_is_missing_is_not():
+    g = torch.Generator().manual_seed(1)
+    plate = torch.rand(90, 160, 3, generator=g) * 0.2 + 0.4
+    moved = torch.roll(plate, 1, 1) + 0.05 * torch.randn(90, 160, 3, generator=g)
+    assert not unexplained(plate, moved).any()
+    missing = plate.clone()
+    missing[30:70, 60:90] += 0.4
+    found = unexplained(plate, missing)
+    assert found[35:65, 65:85].all() and not found[:20].any()
 
 
 def walk_through(shot):
@@ -22,10 +127,16 @@ def walk_through(shot):
         write_png(path, pixels)
 
 
-def test_a_run_of_people_who_hold_still_is_good(trained):
+def test_a_run_tells_how_far_things_travel(trained):
+    """The patch of the small world sways by 0.4 units at depth 3.2, of 64 pixels: more than people who hold still."""
     world, summary = trained
-    assert (summary["quality"], summary["quality_on"]) == ("Good", "held-out frames")
-    assert read_json(world.shot.run("main") / "summary.json")["quality"] == "Good"
+    there = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
+    true = float((there[0] - there[1])[0]) * 60.0 / 3.2
+    assert summary["travel_px"] == pytest.approx(true, rel=0.35)
+    assert (summary["quality"], summary["quality_on"]) == ("Fair", "held-out frames")
+    kept = read_json(world.shot.run("main") / "summary.json")
+    assert kept["verdict"] == summary["verdict"] and summary["unexplained_share"] < 0.01
+    assert f"{round(summary['farthest_px'])} of 64 pixels" in verdict_lines(kept)[1]
 
 
 @pytest.mark.parametrize("holdout", [8, 0])
@@ -38,6 +149,7 @@ def test_somebody_who_walks_through_is_told(tmp_path, quiet, holdout):
     assert summary["quality"] == "Poor"
     assert summary["worst_tenth_psnr_db"] <= summary["median_psnr_db"]
     assert summary["quality_on"] == ("held-out frames" if holdout else "training frames")
-    (told,) = [e for e in report.events if e[0] == "warning" and "poor" in e[1]]
+    (told,) = [e for e in report.events if e[0] == "warning" and e[1].startswith("Poor.")]
     assert f"{summary['median_psnr_db']:.1f} dB on half of its {summary['quality_on']}" in told[1]
     assert "walks through" in told[2] and "solve" in told[2]
+    assert "It does not hold in frame" in told[2], "frames and place are told"

@@ -1,0 +1,92 @@
+"""The panel shows what a run's and a take's verdict say; how frozen frames are made travels with the settings."""
+
+import json
+
+import pytest
+
+RUN = {"word": "fair", "sentences": ["It does not hold in frames 10 to 31, lower left."], "where": [],
+       "advice": ["Choose t* in frames 34 to 73, or train on that range alone."]}  # fmt: skip
+TAKE = {"word": "good", "sentences": ["98 % of the picture is plate, 2 % is a guess."]}
+
+
+@pytest.fixture
+def with_shot(scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    return scene
+
+
+def add(path, **more):
+    path.write_text(json.dumps(json.loads(path.read_text()) | more))
+
+
+def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_under_bake(addon, with_shot, shot):
+    panel, shots = addon("panel"), addon("shots")
+    add(shot / "runs" / "main" / "summary.json", verdict=RUN)
+    add(shot / "takes" / "freeze" / "take.json", verdict=TAKE, detail={"plate_share": 0.98})
+    state = shots.read(shot)
+    assert panel.view_train(with_shot, state).state[2:] == [
+        "Fair. It does not hold in frames 10 to 31, lower left.",
+        "Choose t* in frames 34 to 73, or train on that range alone.",
+    ]
+    assert panel.view_freeze(with_shot, state).state[-1] == "Good. 98 % of the picture is plate, 2 % is a guess."
+    addon("steps").insert_freeze(with_shot, shot, "freeze")
+    assert not any("plate, 2 %" in line for line in panel.view_bake(with_shot, state).state)
+    add(shot / "takes" / "freeze" / "take.json", verdict=TAKE | {"word": "poor"})
+    state = shots.read(shot)
+    assert "Poor. 98 % of the picture is plate, 2 % is a guess." in panel.view_bake(with_shot, state).state
+
+
+def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):
+    add(shot / "runs" / "main" / "summary.json", quality="Poor")
+    lines = addon("panel").view_train(with_shot, addon("shots").read(shot)).state
+    assert lines[2:] == ["It is poor: take a range in which nobody walks, or solve the camera again."]
+
+
+@pytest.mark.parametrize("damaged", [7, {"word": "good", "sentences": [1]}, {"word": "x", "sentences": ["a"]}])
+def test_a_damaged_verdict_is_left_out(addon, with_shot, shot, damaged):
+    for path in (shot / "runs" / "main" / "summary.json", shot / "takes" / "freeze" / "take.json"):
+        add(path, verdict=damaged)
+    state = addon("shots").read(shot)
+    assert len(addon("panel").view_train(with_shot, state).state) == 2
+    assert len(addon("panel").view_freeze(with_shot, state).state) == 2
+
+
+def test_what_the_verdict_tells_is_not_told_twice(addon):
+    unsaid = addon("panel").unsaid
+    warnings = [("Poor. It does not hold.", "Solve again."), ("Something else.", "")]
+    assert unsaid(warnings, ["Run main", "Poor. It does not hold."]) == ["Something else."]
+    assert unsaid(warnings, []) == ["Poor. It does not hold. Solve again.", "Something else."]
+
+
+def test_verdicts_are_told_in_german(addon):
+    said = addon("translations").translate
+    assert said("Fair. It does not hold in frames 10 to 31, lower left.", "de_DE") == (
+        "Brauchbar. Es hält nicht in den Bildern 10 bis 31, unten links."
+    )
+    assert said("Good. 98 % of the picture is plate, 2 % is a guess.", "de_DE") == (
+        "Gut. 98 % des Bildes sind Plate, 2 % sind geraten."
+    )
+    walker = "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 40, lower right."
+    assert said(walker, "de_DE") == (
+        "Etwas hält nicht still: es legt bis zu 141 von 640 Pixeln zurück in den Bildern 10 bis 40, unten rechts."
+    )
+    assert said("Mostly a guess in frame 7, middle.", "de_DE") == "Meist geraten in Bild 7, Mitte."
+
+
+def test_detail_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
+    steps = addon("steps")
+    assert steps.params_of(with_shot, "freeze").detail == "on"
+    with_shot.splannequin.detail = False
+    assert steps.params_of(with_shot, "freeze").detail == "off"
+    with_shot.splannequin.detail = True
+    assert steps.params_of(with_shot, "bake").detail == "off", "its frames are of before there was detail"
+    add(shot / "takes" / "freeze" / "take.json", detail={"plate_share": 0.9})
+    with_shot.splannequin.detail = False
+    assert steps.params_of(with_shot, "bake").detail == "on"
+
+
+def test_the_command_line_takes_detail(addon, tmp_path):
+    headless = addon("headless")
+    for words, expected in (([], "on"), (["--detail", "off"], "off")):
+        args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
+        assert headless._freeze_params(args).detail == expected
