@@ -59,8 +59,10 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
     real = {frames[0], frames[len(frames) // 2], frames[-1], *_around(frames, poses)}
     rng = np.random.default_rng(0)
     for row in record["frames"]:
+        name = frame_file(int(row["frame"]), ".png")
         if int(row["frame"]) in real:
-            _enlarge(copy / "frames" / row["file"], footage / frame_file(int(row["frame"]), ".png"), factor, rng)
+            raw = copy / "frames" / row["file"]
+            _enlarge(raw if raw.is_file() else copy / "frames" / name, footage / name, factor, rng)
     for frame in set(frames) - real:
         nearest = min(real, key=lambda other: abs(other - frame))
         os.link(footage / frame_file(nearest, ".png"), footage / frame_file(frame, ".png"))
