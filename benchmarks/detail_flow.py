@@ -240,10 +240,10 @@ def verdicts(freezes: Sequence[dict[str, Any]]) -> list[str]:
             continue
         mean, together = statistics.fmean(more), delivered["excess_px"]
         steady = delivered["moving"]["unsteady_255"] <= plate["still"]["unsteady_255"]
+        told = f"{mean:+.2f} px against still pixels of the same frame ({together:+.2f} over all frames together)"
         said.append(
-            f"t* {freeze['t_star']}: what moved reads {mean:+.2f} px against still pixels of the same frame (all frames "
-            f"together {together:+.2f}), which is {'within' if mean <= ALLOWED else 'more than'} {ALLOWED} px; it is "
-            f"{'no less' if steady else 'less'} steady than the plate's still pixels."
+            f"t* {freeze['t_star']}: what moved reads {told}, which is {'within' if mean <= ALLOWED else 'more than'} "
+            f"{ALLOWED} px; it is {'no less' if steady else 'less'} steady than the plate's still pixels."
         )
     return said
 

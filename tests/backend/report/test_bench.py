@@ -15,7 +15,7 @@ from benchmarks.sources import ROOT
 from torch_backend.contract import read_json
 from torch_backend.deformation import host_config, hosts
 from torch_backend.report.evaluate import last_third_step_ms
-from torch_backend.report.records import finished, load_record
+from torch_backend.report.records import DELIVERED, WITHHELD, finished, load_record
 from torch_backend.report.truth import RealScene, TruthFolder
 from torch_backend.report.write import write_report
 from torch_backend.scene import load_scene, split_frames
@@ -107,6 +107,15 @@ def test_a_record_holds_every_frame_and_its_regions(done, scene):
         assert record.frozen_fps > 0 and 1e4 < record.model_bytes < 1e7 and record.train_cpu_seconds > 0
         assert all((results / p.ours).is_file() and (results / p.truth).is_file() for p in record.pictures)
         assert [p.psnr_db for p in record.pictures] == sorted(p.psnr_db for p in record.pictures)
+        # The same with plate detail: t*'s own pose is t*'s own plate, and withheld it is not.
+        for shown in (WITHHELD, DELIVERED):
+            of = record.detailed[shown]
+            assert [(r.t_star, r.pose) for r in of.rows] == [(r.t_star, r.pose) for r in record.rows]
+        own = {shown: record.as_shown(shown).values("psnr_db")[*record.place, 103, 103] for shown in record.detailed}
+        assert own[DELIVERED] > 45 > own[WITHHELD] > 10 and "detail" not in record.missing
+        made = record.detailed[DELIVERED]
+        assert made.frozen_fps > 0 and made.pictures and all((results / p.ours).is_file() for p in made.pictures)
+        assert not {p.ours for p in made.pictures} & {p.ours for p in record.pictures}
         one, other = record.two_instants
         assert one.pose == other.pose and {one.t_star, other.t_star} == set(truth.t_stars) == {*map(int, record.plates)}
 

@@ -1,0 +1,227 @@
+"""What a frozen frame made of plates costs: `python -m benchmarks.detail_cost SHOT --results DIR`, on a quiet machine.
+
+SHOT is a trained shot folder; nothing is written into it. Its plates are taken as they are and enlarged, with grain, to
+numbered PNG files in a temporary folder; along the clip's poses, with two threads, splats and plate detail of one
+freeze are made and not written. Each size and number of frames has a process of its own, whose peak memory is told:
+more frames of the same size must not take more. DIR gets cost-NAME.json. Run it when nothing else runs: the spread says
+whether that was so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np
+import torch
+
+from benchmarks.detail import name_of
+from benchmarks.detail_clip import DetailClip, open_clip
+from benchmarks.sources import child_environ
+from torch_backend.contract import JobError, frame_file, read_json
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.shot import Shot, write_json
+
+THREADS = 2
+WIDTHS = (640, 1280, 3840)
+ALLOWED = {640: 0.4, 1280: 1.5, 3840: 14.0}
+"""Width of 16:9 frames -> seconds that one may take."""
+ALLOWED_MB = 2500
+"""Peak memory that the largest may take."""
+PATHS = {640: (24, 150), 1280: (12, 48), 3840: (6, 18)}
+"""Width -> frames along the path: memory must not grow with them."""
+_REAL = 3
+"""Plates before and after the path that are enlarged; others, rarely looked at, share their files."""
+
+
+def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Shot:
+    """A copy of the shot's solve and run whose footage is its frames `factor` times as wide, as numbered PNG files."""
+    copy = folder / shot.root.name
+    for part in ("solve", "runs"):
+        shutil.copytree(shot.root / part, copy / part)
+    shutil.copytree(shot.frames, copy / "frames")
+    shutil.copy2(shot.root / "shot.json", copy / "shot.json")
+    record = read_json(copy / "frames" / "frames.json")
+    footage, frames = folder / "footage", [int(row["frame"]) for row in record["frames"]]
+    footage.mkdir()
+    real = {frames[0], frames[len(frames) // 2], frames[-1], *_around(frames, poses)}
+    rng = np.random.default_rng(0)
+    for row in record["frames"]:
+        name = frame_file(int(row["frame"]), ".png")
+        if int(row["frame"]) in real:
+            raw = copy / "frames" / row["file"]
+            _enlarge(raw if raw.is_file() else copy / "frames" / name, footage / name, factor, rng)
+    for frame in set(frames) - real:
+        nearest = min(real, key=lambda other: abs(other - frame))
+        os.link(footage / frame_file(nearest, ".png"), footage / frame_file(frame, ".png"))
+    record |= {"source_size": [record["width"] * factor, record["height"] * factor], "extended": False}
+    # The footage was imported by nobody: its pictures are held against the working frames instead.
+    record |= {"key": "enlarged", "bits": 8, "beside": ""}
+    write_json(copy / "frames" / "frames.json", record)
+    made = Shot.open(copy)
+    made.update(source=str(footage))
+    return made
+
+
+def _around(frames: Sequence[int], poses: Sequence[int]) -> list[int]:
+    first, last = frames.index(poses[0]), frames.index(poses[-1])
+    return list(frames[max(0, first - _REAL) : last + _REAL + 1])
+
+
+def _enlarge(source: Path, target: Path, factor: int, rng: np.random.Generator) -> None:
+    """Each pixel becomes `factor` x `factor` of them, with grain: smooth pictures would be read faster than footage."""
+    pixels = read_png(source)
+    pixels = (pixels >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels
+    large = pixels.repeat(factor, 0).repeat(factor, 1).astype(np.int16)
+    large += rng.integers(-2, 3, large.shape, dtype=np.int16)
+    write_png(target, large.clip(0, 255).astype(np.uint8))
+
+
+def measure(shot: Path, run: str, width: int, poses: Sequence[int]) -> dict[str, Any]:
+    """In a process of its own: seconds of each frame, and peak memory before and after."""
+    import resource
+
+    torch.set_num_threads(THREADS)
+    clip = open_clip(shot, run, width)
+    t_star = clip.instants()[0]
+    clip.frozen(t_star)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    rows, sources = [], set[int]()
+    for pose in poses:
+        since = time.perf_counter()
+        image = clip.splats(pose, t_star)
+        splats = time.perf_counter() - since
+        view = clip.view(pose, t_star, image=image)
+        rows.append({"frame": pose, "splats": splats, "whole": time.perf_counter() - since})
+        sources |= {int(frame) for frame in view.detailed.source.unique().tolist()} - {0}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {
+        "width": clip.width,
+        "height": clip.height,
+        "plates": [clip.plates.width, clip.plates.height],
+        "frames": rows,
+        "sources": clip.detailer.config.sources,
+        "plates_used": sorted(sources),
+        "before_mb": _mb(before),
+        "peak_mb": _mb(peak),
+    }
+
+
+def _mb(rss: int) -> float:
+    """Megabytes of a ru_maxrss, which macOS gives in bytes."""
+    return rss / 1e6 if sys.platform == "darwin" else rss * 1024 / 1e6
+
+
+def in_child(shot: Shot, run: str, width: int, poses: Sequence[int]) -> dict[str, Any]:
+    """`measure` in a process of its own. RuntimeError with its last words if it fails."""
+    asked = json.dumps({"shot": str(shot.root), "run": run, "width": width, "poses": list(poses)})
+    threads = {f"{library}_NUM_THREADS": str(THREADS) for library in ("OMP", "MKL", "OPENBLAS")}
+    command = [sys.executable, "-P", "-m", "benchmarks.detail_cost", "--work", asked]
+    ran = subprocess.run(command, env=child_environ(**threads), capture_output=True, text=True)
+    if ran.returncode:
+        raise RuntimeError(f"{width} pixels could not be measured: {(ran.stderr.strip().splitlines() or ['-'])[-1]}")
+    return json.loads(ran.stdout.splitlines()[-1])
+
+
+def middle_poses(clip: DetailClip, count: int) -> list[int]:
+    """`count` neighbouring frames from the middle of the clip."""
+    frames = clip.frames
+    first = max(0, (len(frames) - count) // 2)
+    return frames[first : first + count]
+
+
+def summary(found: dict[str, Any]) -> dict[str, Any]:
+    """Median, least and greatest seconds of a frame over the second half of the path, and those of the first frame.
+
+    The first ones look at the plates around for all that follow.
+    """
+    whole = [row["whole"] for row in found["frames"]]
+    later = whole[len(whole) // 2 :]
+    splats = statistics.median(row["splats"] for row in found["frames"])
+    return {"first": whole[0], "median": statistics.median(later), "least": min(later), "most": max(later),
+            "splats": splats}  # fmt: skip
+
+
+def linear_fit(pixels: Sequence[float], seconds: Sequence[float]) -> tuple[float, float, float]:
+    """(seconds at no pixels, seconds per million pixels, greatest deviation as a share of the seconds measured).
+
+    Sizes count alike: deviations are taken relative to what was measured.
+    """
+    x, y = np.array(pixels) / 1e6, np.array(seconds)
+    design = np.stack([np.ones_like(x), x], axis=1) / y[:, None]
+    (base, slope), *_ = np.linalg.lstsq(design, np.ones_like(y), rcond=None)
+    return float(base), float(slope), float(np.abs((base + slope * x) / y - 1.0).max())
+
+
+def table(sizes: Sequence[dict[str, Any]]) -> list[str]:
+    """A row per size and number of frames in Markdown, and the line through the sizes."""
+    header = ["size", "frames", "s per frame, median", "least", "most", "the first", "of it splats", "allowed"]
+    header += ["peak MB", "before"]
+    lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
+    for of in sizes:
+        s, allowed = of["summary"], ALLOWED.get(of["width"])
+        cells = [f"{s[name]:.2f}" for name in ("median", "least", "most", "first", "splats")]
+        cells += ["–" if allowed is None else f"{allowed:g}", f"{of['peak_mb']:.0f}", f"{of['before_mb']:.0f}"]
+        lines.append(f"| {of['width']}x{of['height']} | {len(of['frames'])} | {' | '.join(cells)} |")
+    longest = list({of["width"]: of for of in sizes}.values())
+    if len(longest) > 1:
+        points = [of["width"] * of["height"] for of in longest], [of["summary"]["median"] for of in longest]
+        base, slope, off = linear_fit(*points)
+        lines += ["", f"{base:.2f} s + {slope:.2f} s per million pixels; off by {100 * off:.0f} % at most."]
+    return lines
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("shot", type=Path, nargs="?")
+    parser.add_argument("--run", default="main", metavar="NAME")
+    parser.add_argument("--results", type=Path, metavar="DIR")
+    parser.add_argument(
+        "--widths", type=int, nargs="+", default=list(WIDTHS), metavar="W", help="multiples of the clip's"
+    )
+    parser.add_argument("--frames", type=int, nargs="+", metavar="N", help="along the path (default: by width)")
+    parser.add_argument("--work", help=argparse.SUPPRESS)
+    args = parser.parse_args(argv)
+    if args.work:
+        print(json.dumps(measure(**json.loads(args.work))))
+        return 0
+    if args.shot is None or args.results is None:
+        parser.error("SHOT and --results are needed")
+    sizes: list[dict[str, Any]] = []
+    try:
+        clip = open_clip(args.shot, args.run)
+        for width in args.widths:
+            if width % clip.scene.width:
+                raise ValueError(f"{width} is no multiple of the clip's {clip.scene.width} pixels")
+            with tempfile.TemporaryDirectory(prefix="splannequin-cost-") as folder:
+                counts = args.frames or PATHS.get(width, (12, 36))
+                poses = middle_poses(clip, max(counts))
+                shot = enlarged(Shot.open(args.shot), Path(folder), width // clip.scene.width, poses)
+                for count in counts:
+                    found = in_child(shot, args.run, width, poses[:count])
+                    sizes.append(found | {"summary": summary(found)})
+                    print(f"{width}, {count} frames: {sizes[-1]['summary']}", flush=True)
+    except (JobError, OSError, RuntimeError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    name = name_of(args.shot)
+    write_json(args.results / f"cost-{name}.json", {"version": 1, "shot": str(args.shot), "sizes": sizes})
+    print("\n".join(["", *table(sizes)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,122 @@
+"""The benchmarks of plate detail on a trained shot whose moving patch is known."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import detail, detail_cost, detail_flow, detail_truth
+from benchmarks.detail_clip import open_clip
+from torch_backend.footage.images import read_png
+from torch_backend.footage.plates import Plates
+
+
+@pytest.fixture(scope="module")
+def shot(trained):
+    return trained[0].shot
+
+
+def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tmp_path):
+    clip = open_clip(shot.root)
+    assert (clip.width, clip.height) == (64, 48) and len(clip.held_out()) == 1
+    suggested, other = clip.instants()
+    assert abs(suggested - other) >= 7 and {suggested, other} <= set(clip.run.train_frames)
+    frames = [*clip.held_out(), clip.frames[3], clip.frames[12]]
+    found = detail.judge(clip, [suggested, other], frames, tmp_path / "strips", worst=1)
+    assert [f["t_star"] for f in found["freezes"]] == [suggested, other]
+    for freeze in found["freezes"]:
+        mean = freeze["mean"]
+        assert mean["delivered"]["still_db"] > 100 > mean["withheld"]["still_db"] > mean["splats"]["still_db"]
+        assert mean["delivered"]["best_90_db"] > mean["splats"]["best_90_db"] + 3
+        assert all(0.1 < row["still_share"] < 0.95 for row in freeze["frames"])
+    assert found["instants_differ_255"] < 1.0 and found["motion_from"].startswith("the gate")
+    strips = list((tmp_path / "strips").glob("*.png"))
+    assert len(strips) == 2 and read_png(strips[0]).shape == (48, 4 * 64, 3)
+    assert len(detail.table("tiny", found)) == 2 + 9 + 2
+
+
+def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
+    """The patch goes up to 7 pixels a frame, of frames that are 320 wide; frozen it does not."""
+    clip = open_clip(shot.root, width=320)
+    t_star = clip.frames[8]
+    found = detail_flow.judge_flow(clip, t_star, [(109, 110), (110, 111)])
+    restless = {what: of["moving"]["unsteady_255"] for what, of in found["clip"].items()}
+    steady = {what: of["still"]["unsteady_255"] for what, of in found["clip"].items()}
+    assert restless["plate"] > 1.5 * restless["delivered"] and restless["plate"] > 3 * restless["splats"]
+    assert restless["plate"] > 10 * steady["plate"] and steady["delivered"] == pytest.approx(steady["plate"], rel=1e-3)
+    assert all(found["clip"][what]["moving"]["pixels"] > 5000 for what in detail_flow.WHAT)
+    # The tiny world is smooth at this size: where no flow is to be had, none is told.
+    assert [(row["frame"], row["next"]) for row in found["frames"]] == [(109, 110), (110, 111)]
+    assert found["clip"]["delivered"]["excess_px"] is None
+    assert detail_flow.verdicts([found]) == ["t* 109: nothing moves in these frames, or nothing is still."]
+    assert "| t* 109, plate | – | – |" in detail_flow.table("tiny", [found])[2]
+
+
+def test_the_verdict_is_of_frames_and_of_all_together():
+    def freeze(moving: float, unsteady: float) -> dict:
+        rows = [{"delivered": {"excess": moving - 1.0}}, {"delivered": {"excess": None}}]
+        clip = {"delivered": {"excess_px": moving - 0.8, "moving": {"unsteady_255": unsteady}}}
+        return {"t_star": 9, "frames": rows, "clip": clip | {"plate": {"still": {"unsteady_255": 2.0}}}}
+
+    good, bad = detail_flow.verdicts([freeze(1.1, 1.5), freeze(1.5, 2.5)])
+    assert "+0.10 px" in good and "(+0.30 over" in good and "within 0.25" in good and "no less steady" in good
+    assert "+0.50 px" in bad and "more than 0.25" in bad and "it is less steady" in bad
+    assert detail_flow.worst_frames(freeze(1.1, 1.5)["frames"], 5) == [{"delivered": {"excess": 1.1 - 1.0}}]
+
+
+def test_a_frame_that_is_not_the_clips_is_refused_in_words(shot, tmp_path, capsys):
+    for module in (detail, detail_flow):
+        assert module.main([str(shot.root), "--results", str(tmp_path), "--frames", "999"]) == 1
+        assert "--frames" in capsys.readouterr().err
+    assert module.main([str(shot.root), "--run", "other", "--results", str(tmp_path)]) == 1
+    assert "Traceback" not in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_costs_are_of_plates_of_that_size(shot, tmp_path):
+    """A child reads plates twice as wide from footage, not the working frames, and tells seconds and memory."""
+    clip = open_clip(shot.root)
+    poses = detail_cost.middle_poses(clip, 2)
+    assert poses == [108, 109]
+    before = (shot.root / "frames" / "frames.json").read_bytes()
+    large = detail_cost.enlarged(shot, tmp_path, 2, poses)
+    assert (shot.root / "frames" / "frames.json").read_bytes() == before
+    plates = Plates(large)
+    assert (plates.width, plates.height) == (128, 96) and not plates.note
+    found = detail_cost.in_child(large, "main", 128, poses)
+    assert (found["width"], found["height"]) == (128, 96) == tuple(found["plates"])
+    assert [row["frame"] for row in found["frames"]] == poses and found["peak_mb"] >= found["before_mb"] > 100
+    assert all(row["whole"] > row["splats"] > 0 for row in found["frames"]) and set(poses) & set(found["plates_used"])
+    told = detail_cost.table([found | {"summary": detail_cost.summary(found)}])
+    assert told[-1].startswith("| 128x96 | 2 | ")
+    with pytest.raises(RuntimeError, match="256 pixels could not be measured: .*other"):
+        detail_cost.in_child(large, "other", 256, poses)
+
+
+def test_the_line_through_costs_and_how_far_off_it_is():
+    pixels = [640 * 360, 1280 * 720, 3840 * 2160]
+    seconds = [0.1 + 1.5 * p / 1e6 for p in pixels]
+    assert np.allclose(detail_cost.linear_fit(pixels, seconds), (0.1, 1.5, 0.0))
+    seconds[2] *= 1.5
+    assert detail_cost.linear_fit(pixels, seconds)[2] > 0.1
+    rows = [{"whole": s, "splats": 0.1} for s in (9.0, 5.0, 1.0, 2.0, 3.0)]
+    told = detail_cost.summary({"frames": rows})
+    assert (told["first"], told["median"], told["least"], told["most"]) == (9.0, 2.0, 1.0, 3.0)
+
+
+def test_regions_that_got_worse_are_named():
+    def pose(splats: float, withheld: float, delivered: float, moving: float | None) -> dict:
+        regions = {
+            name: {"whole": value, "moving": moving if name == "splats" or moving is None else moving - 1}
+            for name, value in (("splats", splats), ("withheld", withheld), ("delivered", delivered))
+        }
+        return {"t_star": 9, "pose": 1, **regions}
+
+    mean = detail_truth.means([pose(20, 23, 25, 22.0), pose(22, 23, 27, None)])
+    assert mean == {
+        "whole": {"splats": 21, "withheld": 23, "delivered": 26},
+        "moving": {"splats": 22, "withheld": 21, "delivered": 21},
+    }
+    said = detail_truth.shortfalls({"room": mean})
+    assert len(said) == 2 and all(s.startswith("WORSE: room, moving") for s in said)
+    assert "| room | whole | 21.00 -> 23.00 -> 26.00 | +2.00 | +5.00 |" in detail_truth.table({"room": mean})
+    json.dumps(mean)
