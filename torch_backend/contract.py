@@ -233,8 +233,6 @@ class FreezeParams:
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
     grain: bool = True
     """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
-    detail: str = "on"
-    """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
     device: str = "auto"
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
