@@ -45,7 +45,7 @@ class DetailConfig:
     """Plates that a frame is made of, at most: its own and that of t* among them."""
     reach: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
     """How many frames before and after a pose plates are looked for that see what its own hides."""
-    depth_error: float = 0.02
+    depth_error: float = 0.06
     """Share of the depth by which the model's surfaces are expected to be wrong: with the baseline, an error in
     pixels, at 1 of which a plate is believed by half."""
     margin: int = 4
@@ -54,6 +54,11 @@ class DetailConfig:
     """Sigma of the leading plate's matte along its border, pixels."""
     enough: float = 0.3
     """Sum of weights at which a pixel is all plate; below, splats are mixed in."""
+    best: float = 0.0
+    """How much more the best plate of a pixel counts than its weight says: 0 mixes by weights alone."""
+    travel: float = 1.0
+    """Pixels that the model moves a point by, from t* to the leading plate, from which on that plate is not believed
+    there: sways too small for the flow."""
     sway: float = 6.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.3
@@ -115,6 +120,8 @@ class _Shot:
     """[h, w]"""
     motion: Tensor
     """[h, w] in 0..1: what moves in the clip, at t*."""
+    gate: Tensor
+    """[h, w] in 0..1: what moves in the clip, by the model alone."""
     per_pixel: float
     """Pixels of decisions per pixel of the picture."""
 
@@ -223,7 +230,7 @@ class Detailer:
         points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
         t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
         motion = resized(image.motion, w, h)
-        return _Shot(output.viewmat, K, image, t, frozen, points, depth, motion, w / columns)
+        return _Shot(output.viewmat, K, image, t, frozen, points, depth, motion, motion, w / columns)
 
     def _is_own(self, output: OutputFrame) -> bool:
         """True if the frame is one of the clip's own, seen as its camera saw it."""
@@ -265,13 +272,23 @@ class Detailer:
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns), st, own
-        wrong = torch.maximum(shot.motion, lead.moving) > 0.5
+        if leading == shot.t and own:  # the instant itself: whatever it shows is right
+            return within, st, own
+        travel = self._travel(shot, leading)
+        wrong = (torch.maximum(shot.motion, lead.moving) > 0.5) | (travel > self.config.travel) | (shot.gate > 0.5)
         wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
         matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
         if not own:
             error = self._parallax(shot, leading, shot.depth)
             matte = matte * lead.visible * torch.exp(-(2.0 * error).square())
         return resized(matte, columns, rows) * within, st, own
+
+    def _travel(self, shot: _Shot, frame: int) -> Tensor:
+        """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
+        moved = self._displacements(shot, [frame])[0][0]
+        view = self.seen.view(frame)
+        ends = project(shot.points + moved, view.viewmat, view.K)[0]
+        return (ends - project(shot.points, view.viewmat, view.K)[0]).norm(dim=-1) / self.seen.unit
 
     def _places(self, shot: _Shot, leading: int, own: bool, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """(ST [H, W, 2] into the leading plate, [H, W] 1 within it): the identity on the clip's own poses."""
@@ -311,19 +328,25 @@ class Detailer:
         points = unproject(pixels, shot.image.depth[y, x], shot.viewmat, shot.K)
         motion, unknown = look_up(shot.motion, small), look_up(unknown, small)
         larger = torch.tensor([self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]])
-        total, best, carried = torch.zeros(count), torch.zeros(count), torch.zeros(count, 3)
         untold = 1.0 - self.seen.seen(shot.t, points).visible if shot.t in chosen else torch.ones(count)
-        untold = untold * (1.0 - unknown)
+        untold = torch.maximum(untold, torch.tensor(getattr(self, '_floor', 0.0))) * (1.0 - unknown)
+        weights, places = [], []
         for n, frame in enumerate(chosen):
             there = points if frame == shot.t else points + look_up(moved[n], small)
             sighting = self.seen.seen(frame, there)
-            weight = self._weight(shot, frame, sighting, motion, self._sway(frame, points, sighting) * untold)
-            carried += weight[:, None] * look_up(self.seen.residual(frame), sighting.pixels * larger, "bicubic")
-            total += weight
-            rest.source = torch.where(weight > best, float(frame), rest.source)
-            best = torch.maximum(best, weight)
-        rest.share = (total / self.config.enough).clamp(max=1.0)
-        rest.color += carried / total.clamp_min(1e-6)[:, None] * rest.share[:, None]
+            sway = self._sway(frame, points, sighting) * untold
+            weights.append(self._weight(shot, frame, sighting, motion, sway))
+            places.append(sighting.pixels * larger)
+        believed = torch.stack(weights)
+        best, which = believed.max(dim=0)
+        rest.source = torch.tensor([float(frame) for frame in chosen])[which]
+        rest.share = (believed.sum(dim=0) / self.config.enough).clamp(max=1.0)
+        # The best plate leads: a mean of several is softer than each, and each is off by another error of depth.
+        believed = believed * (believed / best.clamp_min(1e-6)).pow(self.config.best)
+        total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3)
+        for n, frame in enumerate(chosen):
+            carried += (believed[n] / total)[:, None] * look_up(self.seen.residual(frame), places[n], "bicubic")
+        rest.color += carried * rest.share[:, None]
         return rest
 
     def _sway(self, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
