@@ -1,6 +1,6 @@
 """From a solved clip to its motion mattes: key frames are tested, their scores follow surfaces through time, and areas.
 
-Keys are about ten frames a second, whatever the clip's rate; the frames between two keys take theirs by flow. Frames go
+Keys are about ten frames a second, more in a short clip; the frames between two keys take theirs by flow. Frames go
 through a window of a few seconds, so a clip of any length takes the same memory.
 """
 
@@ -22,7 +22,7 @@ from .stored import load_cameras, load_points
 
 _FLOW_WIDTH = 640
 _LARGEST_SCALE = 2.0
-_KEYS_PER_SECOND = 10.0
+_KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
@@ -90,8 +90,9 @@ class Clip:
 
 def _keys(seconds: list[float]) -> list[int]:
     """Indices of the key frames: evenly spaced, the first and the last frame among them."""
-    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    stride = max(1, round(1.0 / (_KEYS_PER_SECOND * step))) if step > 0 else 1
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    stride = round(1.0 / (_KEYS_PER_SECOND * step)) if step > 0 else 1
+    stride = max(1, min(stride, len(seconds) // _LEAST_KEYS))
     return sorted({*range(0, len(seconds), stride), len(seconds) - 1})
 
 
