@@ -26,40 +26,48 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class FlowConfig:
-    """What counts as motion. Lengths are in pixels of a picture 640 wide."""
+    """What counts as motion. Lengths are in pixels of a picture 640 wide, differences in steps of 255."""
 
     baselines: tuple[int, ...] = (1, 2, 4, 8)
     """A key frame is matched with those this many key frames before and after; each is double the one before."""
     links: int = 4
     """Matches over the longest baseline are chained this often: 4 links of 8 key frames reach 3 seconds."""
-    tolerance: float = 0.8
-    """A match this far from where the still point is seen tells of motion: flow and solve err by 0.5 to 1 each."""
-    per_link: float = 0.2
-    """So much more for each further link of a chain."""
-    noise: float = 2.0
-    """The tolerance of a pair is at least this many times the median distance in it: blur, shutter, a poor pose."""
-    most_noise: float = 2.0
-    """But at most this many times what it is otherwise, unless a pose was guessed: what moves may fill the picture."""
     round_trip: float = 1.2
     """Greatest distance between a pixel and where the flow there and back ends; above it the pixel is hidden there."""
-    contrast: float = 2.5
-    """A match off its place tells of motion if the picture changes over that distance by so many of 255 steps."""
-    better: float = 1.5
-    """A match off its place tells of motion if pictures differ by this factor more where a still point would be seen."""
-    haste: float = 0.3
-    """."""
-    sure: float = 4.0
-    """."""
-    doubt: float = 0.7
-    """."""
-    doubt2: float = 0.8
-    """."""
-    reach: int = 2
-    """."""
-    share: float = 0.4
-    """A surface moves if so much of what it is matched with says so: most of the time a mover stands where it is."""
+    tolerance: float = 1.0
+    """A match this far from where the still point is seen may tell of motion."""
+    per_link: float = 0.2
+    """So much more for each further link of a chain."""
+    noise: float = 2.2
+    """The tolerance of a pair is at least this many times the median distance in it: blur, shutter, a poor pose."""
+    most_noise: float = 4.0
+    """But at most this many times what it is otherwise, unless a pose was guessed: what moves may fill the picture."""
+    contrast: float = 3.0
+    """Only where the picture changes by so much over that distance is it more than an error of the flow."""
     likeness: float = 8.0
-    """Pictures that differ by less, in 255 steps and over a few pixels, show the same."""
+    """Pictures that differ by less show the same."""
+    better: float = 1.5
+    """By this factor the picture differs more (squared) where a still point would be seen than where it is matched."""
+    haste: float = 0.3
+    """Power of a pair's distance in time with which it counts for stillness: what sways is still for a moment."""
+    doubt: float = 1.0
+    """So many matches that tell of motion are taken for errors."""
+    share: float = 0.4
+    """A point moves for certain if so much of what it is matched with says so."""
+    sure: float = 4.0
+    """With so many matches a point is known as well as it can be."""
+    reach: int = 2
+    """Over so many of the longest baselines a surface's scores are gathered along it."""
+    radius: int = 4
+    """Scores are spread over so many points of the grid, stopping at edges of the picture."""
+    edge: float = 8.0
+    """Smaller differences are no edges."""
+    seed: float = 0.4
+    """An area moves if a point in it has this score,"""
+    grow: float = 0.15
+    """and reaches as far as points have this one."""
+    blob: float = 10.0
+    """Areas of less than this squared are noise, and holes of less are filled."""
 
 
 class Matches:

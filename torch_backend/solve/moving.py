@@ -1,6 +1,6 @@
 """From a solved clip to its motion mattes: key frames are tested, their scores follow surfaces through time, and areas.
 
-Keys are about ten frames a second, whatever the clip's rate; the frames between two keys take theirs by flow. Frames go
+Keys are about ten frames a second, more in a short clip; the frames between two keys take theirs by flow. Frames go
 through a window of a few seconds, so a clip of any length takes the same memory.
 """
 
@@ -22,8 +22,10 @@ from .stored import load_cameras, load_points
 
 _FLOW_WIDTH = 640
 _LARGEST_SCALE = 2.0
-_KEYS_PER_SECOND = 10.0
+_KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
+_ENOUGH, _UNKNOWN = 3.0, 0.1
+"""Weights: more than the one adds nothing, below the other nothing is known."""
 
 
 class Clip:
@@ -54,7 +56,6 @@ class Clip:
         points = load_points(shot)["xyz"].astype(np.float64)
         self.depths = [_typical_depth(points, viewmat) for viewmat in self.viewmats]
         """Of the keys: median depth of the sparse points before the camera."""
-        self.threshold=0.5;self.low=0.2;self.blob=10;self.radius=4;self.edge=8.0
         self._pictures: dict[int, NDArray[np.uint8]] = {}
         self._looks: dict[int, Look] = {}
 
@@ -89,8 +90,9 @@ class Clip:
 
 def _keys(seconds: list[float]) -> list[int]:
     """Indices of the key frames: evenly spaced, the first and the last frame among them."""
-    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    stride = max(1, round(1.0 / (_KEYS_PER_SECOND * step))) if step > 0 else 1
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    stride = round(1.0 / (_KEYS_PER_SECOND * step)) if step > 0 else 1
+    stride = max(1, min(stride, len(seconds) // _LEAST_KEYS))
     return sorted({*range(0, len(seconds), stride), len(seconds) - 1})
 
 
@@ -125,7 +127,7 @@ def mattes(
         for n in groups[key] if wanted[key] else ():
             if n not in written:
                 score = final[key] if n == keys[key] else _between(clip, matches, n, key, final)
-                yield n, _labels(clip, n, *score)
+                yield n, _labels(clip, n, *score, config)
         for store in (own, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
@@ -139,8 +141,8 @@ def _own_score(clip: Clip, matches: Matches, key: int, config: FlowConfig) -> tu
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
     on, off = evidence(test, key, seen, clip.depths[key], config)
     count = on + off
-    score = np.clip((off - config.doubt) / (count + config.doubt2) / config.share, 0.0, 1.0)
-    return score, np.clip(count / config.sure, 0.0, 1.0) * (count >= 1)
+    score = np.clip((off - config.doubt) / (count + config.doubt) / config.share, 0.0, 1.0)
+    return score, np.minimum(count / config.sure, 1.0) * (count >= 1.0)
 
 
 def _followed(
@@ -171,32 +173,34 @@ def _between(clip: Clip, matches: Matches, index: int, key: int, final: dict[int
     return total / np.maximum(weight, 1e-6), weight
 
 
-def _labels(clip: Clip, index: int, score: Map, weight: Map) -> NDArray[np.uint8]:
+def _labels(clip: Clip, index: int, score: Map, weight: Map, config: FlowConfig) -> NDArray[np.uint8]:
     """The labels [H, W] of a frame's score and weight on the grid."""
     grey = cv2.resize(clip.grey(index), score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
-    guide = _Guide(grey, clip.radius, clip.edge)
-    weight = np.minimum(weight, 3.0)
-    known = np.maximum(guide(weight), 0)
-    spread = guide(score * weight) / np.maximum(known, 1e-3)
+    spread = _Spread(grey, config.radius, config.edge)
+    weight = np.minimum(weight, _ENOUGH)
+    known = np.maximum(spread(weight), 0.0)
+    score = spread(score * weight) / np.maximum(known, 1e-3)
     size = clip.width, clip.height
-    spread = cv2.resize(spread, size, interpolation=cv2.INTER_LINEAR)
-    known = cv2.resize(known, size, interpolation=cv2.INTER_LINEAR)
-    moving = _blobs(spread > clip.low, spread > clip.threshold, round((clip.blob * clip.width / 640) ** 2))
-    still = _blobs(~moving, ~moving, round((clip.blob * clip.width / 640) ** 2))
-    return np.where(~still, 255, np.where(known < 0.1, 128, 0)).astype(np.uint8)
+    score, known = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (score, known))
+    least = round((config.blob * clip.width / 640) ** 2)
+    moving = _areas(score > config.grow, score > config.seed, least)
+    moving = ~_areas(~moving, ~moving, least)
+    unknown = known < _UNKNOWN
+    unknown = _areas(unknown, unknown, least)
+    return np.where(moving, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
 
 
-def _blobs(mask: Mask, seeds: Mask, least: int) -> Mask:
+def _areas(mask: Mask, seeds: Mask, least: int) -> Mask:
     """The connected areas of a mask that hold a seed and at least so many pixels."""
     count, numbers, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     keep = about[:, cv2.CC_STAT_AREA] >= least
     keep[0] = False
     seeded = np.zeros(count, bool)
-    seeded[np.unique(numbers[seeds & mask])] = True
-    return (keep & seeded)[numbers]
+    seeded[np.unique(np.asarray(numbers, np.int32)[seeds & mask])] = True
+    return (keep & seeded)[np.asarray(numbers, np.int32)]
 
 
-class _Guide:
+class _Spread:
     """Spreads values within the areas of a picture, stopping at its edges: a guided filter (He 2010), grey."""
 
     def __init__(self, picture: Map, radius: int, edge: float) -> None:

@@ -7,13 +7,18 @@ compared where the point would be seen if it stood still. Maps are on the grid o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .flow import FlowConfig, Map, Mask, Seen, sample
+
+_FEW = 50
+"""Fewer points say nothing of a picture."""
+_MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
+"""Square differences: above the one all are alike (hidden, or gone), by the other a point's own depth is preferred."""
 
 
 class Ray:
@@ -37,27 +42,6 @@ class Ray:
         return (self._shift[0] - at[0] * self._shift[2]) * over, (self._shift[1] - at[1] * self._shift[2]) * over
 
 
-def still_points(
-    rays: list[Ray], seen: list[Seen], limits: list[float], depth: float, unit: float, turns: int = 4
-) -> Map:
-    """Inverse depth [h, w] of the still point that explains the matches best, those far off hardly counting."""
-    inverse = np.full(seen[0].found.shape, 1.0 / depth, np.float32)
-    stiff = np.float32((0.3 * unit * depth) ** 2)
-    for turn in range(turns):
-        top, bottom = stiff * (np.float32(1.0 / depth) - inverse), np.full_like(inverse, stiff)
-        for ray, s, limit in zip(rays, seen, limits, strict=True):
-            at, over = ray.project(inverse)
-            slope = ray.slope(at, over)
-            x, y = s.at[0] - at[0], s.at[1] - at[1]
-            weight = s.found * np.float32(1.0 / limit**2)
-            if turn:
-                weight /= np.square(1.0 + (x * x + y * y) * np.float32(1.0 / limit**2))
-            top += weight * (x * slope[0] + y * slope[1])
-            bottom += weight * (slope[0] * slope[0] + slope[1] * slope[1])
-        inverse = np.maximum(inverse + top / bottom, 0.0)
-    return inverse
-
-
 class Look:
     """A key's picture prepared for comparison."""
 
@@ -72,13 +56,185 @@ class Look:
         half = np.float32(0.5)
         there = cv2.remap(self._smooth, at[0] - half, at[1] - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         beyond = values - np.float32(gain[1]) - there * np.float32(gain[0])
-        return cv2.blur(beyond * beyond, (5, 5))
+        return cv2.blur(beyond * beyond, (3, 3))
+
+
+@dataclass
+class StillTest:
+    """What the test of a key frame stands on."""
+
+    look: Callable[[int], Look]
+    """Of any key."""
+    viewmats: NDArray
+    """[K, 4, 4] world-to-camera of the keys, solve units."""
+    Ks: NDArray
+    """[K, 3, 3] in flow pixels."""
+    guessed: list[bool]
+    """Keys whose pose was not solved."""
+    grid: tuple[Map, Map]
+    """Positions of the grid's points."""
+    unit: float
+    """Flow pixels in one pixel of a picture 640 wide."""
+
+
+class _Texture:
+    """How a key frame's picture changes from place to place: where there is nothing to see, nothing can be told."""
+
+    def __init__(self, picture: Map, unit: float, config: FlowConfig) -> None:
+        # Derivatives per flow pixel: the grid's points are two apart.
+        gx, gy = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.0625), cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.0625)
+        self._xx, self._xy, self._yy = (cv2.blur(p, (3, 3)) for p in (gx * gx, gx * gy, gy * gy))
+        self._longest = 3.0 * unit
+        self.nearly = 0.5 * (self._xx + self._yy) * unit**2
+        """Mean square difference to a place one pixel aside."""
+        self.telling = self.nearly * config.tolerance**2 > config.contrast**2
+        """Where motion by the tolerance would be seen."""
+
+    def change(self, x: Map, y: Map, length: Map) -> Map:
+        """Mean square difference to the place that far aside, as far as it grows evenly."""
+        shorter = np.square(np.minimum(1.0, self._longest / np.maximum(length, 1e-6)))
+        return shorter * (self._xx * x * x + 2 * self._xy * x * y + self._yy * y * y)
+
+
+@dataclass
+class _Pair:
+    """A key frame and another one."""
+
+    seen: Seen
+    ray: Ray
+    limit: float
+    """Matches farther than this from where the still point is seen may tell of motion; flow pixels."""
+    there: Look
+    """The other's picture, and how its brightness becomes this one's."""
+    gain: tuple[float, float]
+    matched: Map
+    """Mean square difference of the pictures at the matches."""
+    right: Mask = field(init=False)
+    """Where they show the same."""
+
+    def miss(self, inverse: Map) -> tuple[tuple[Map, Map], Map, Map, Map]:
+        """Where still points are seen, and x, y and length of the matches' distance from there."""
+        at, _ = self.ray.project(inverse)
+        x, y = (_smoothed(self.seen.at[i] - at[i], self.seen.found) for i in (0, 1))
+        return at, x, y, np.hypot(x, y)
+
+
+def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: FlowConfig) -> tuple[Map, Map]:
+    """(on, off), [h, w] float32: how much of what a key frame's points are matched with says still, and moving.
+
+    `seen` are its matches, `depth` is the typical depth in its view, solve units.
+    """
+    look = test.look(key)
+    texture = _Texture(look.grid, test.unit, config)
+    pairs = [_pair(test, key, s, texture, config) for s in seen]
+    inverse = still_points(pairs, look.grid.shape, depth, test.unit)
+    agree = np.zeros_like(inverse)
+    for pair in pairs:
+        *_, length = pair.miss(inverse)
+        told = pair.seen.found & texture.telling
+        if np.count_nonzero(told) >= _FEW:
+            guessed = test.guessed[key] or test.guessed[pair.seen.key]
+            most = np.inf if guessed else config.most_noise * pair.limit
+            pair.limit = max(pair.limit, min(config.noise * float(np.median(length[told])), most))
+        agree += pair.seen.found & (length <= pair.limit)
+    inverse = _best_depth(look, pairs, _surroundings(inverse, agree >= 3))
+    return _counted(key, look, texture, pairs, inverse, config)
+
+
+def _pair(test: StillTest, key: int, seen: Seen, texture: _Texture, config: FlowConfig) -> _Pair:
+    """A key frame and one in which it is seen again."""
+    look, there = test.look(key), test.look(seen.key)
+    ray = Ray(test.grid, (test.viewmats[key], test.viewmats[seen.key]), (test.Ks[key], test.Ks[seen.key]))
+    limit = test.unit * (config.tolerance + config.per_link * (seen.links - 1))
+    gain = _gain(look.grid, sample(there.grid, seen.at), seen.found)
+    pair = _Pair(seen, ray, limit, there, gain, there.unlike(look.grid, seen.at, gain))
+    pair.right = pair.matched - texture.nearly < _like(pair.matched, seen.found & texture.telling, config)
+    return pair
+
+
+def still_points(pairs: list[_Pair], shape: tuple[int, ...], depth: float, unit: float, turns: int = 4) -> Map:
+    """Inverse depth of the still point that explains the matches best, those far off hardly counting.
+
+    [h, w], in 1 / solve units, at least 0; where the matches leave it open it is that of `depth`.
+    """
+    inverse = np.full(shape, 1.0 / depth, np.float32)
+    stiff = np.float32((0.3 * unit * depth) ** 2)
+    for turn in range(turns):
+        top, bottom = stiff * (np.float32(1.0 / depth) - inverse), np.full_like(inverse, stiff)
+        for pair in pairs:
+            at, over = pair.ray.project(inverse)
+            slope = pair.ray.slope(at, over)
+            x, y = pair.seen.at[0] - at[0], pair.seen.at[1] - at[1]
+            weight = pair.seen.found * np.float32(1.0 / pair.limit**2)
+            if turn:
+                weight /= np.square(1.0 + (x * x + y * y) * np.float32(1.0 / pair.limit**2))
+            top += weight * (x * slope[0] + y * slope[1])
+            bottom += weight * (slope[0] * slope[0] + slope[1] * slope[1])
+        inverse = np.maximum(inverse + top / bottom, 0.0)
+    return inverse
+
+
+def _counted(
+    key: int, look: Look, texture: _Texture, pairs: list[_Pair], inverse: Map, config: FlowConfig
+) -> tuple[Map, Map]:
+    """What the pairs say of still points at inverse depths, as `evidence`."""
+    on, off = np.zeros_like(inverse), np.zeros_like(inverse)
+    gone: dict[int, Mask] = {}
+    for pair in pairs:
+        found, after = pair.seen.found, pair.seen.key - key
+        at, x, y, length = pair.miss(inverse)
+        unlike = pair.there.unlike(look.grid, at, pair.gain)
+        away = found & (length > pair.limit)
+        alike = unlike - texture.nearly < _like(unlike, found & ~away & texture.telling, config)
+        inside = _inside(at, look.grid.shape)
+        better = pair.right & (unlike > config.better * pair.matched + config.contrast**2)
+        off += away & better & (texture.change(x, y, length) > config.contrast**2)
+        weight = min(1.0, abs(after) / config.baselines[-1]) ** config.haste
+        on += weight * ((found & ~away) + 0.5 * ((away & ~better) | (inside & alike & ~found)))
+        gone[after] = inside & ~found & ~alike
+    for step in config.baselines[:2]:
+        if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
+            off += gone[step] & gone[-step]  # behind something is so on one side as a rule.
+    return on, off
+
+
+def _smoothed(values: Map, found: Mask) -> Map:
+    """Mean of what is found around each point: a surface moves as one, flow errs here and there."""
+    weight = found.astype(np.float32)
+    return cv2.blur(values * weight, (5, 5)) / np.maximum(cv2.blur(weight, (5, 5)), 1e-3)
+
+
+def _like(unlike: Map, still: Mask, config: FlowConfig) -> float:
+    """Below how much pictures show the same: what is `still` tells how unlike a sharp and a blurred one are."""
+    usual = float(np.median(unlike[still])) if np.count_nonzero(still) >= _FEW else 0.0
+    return max(config.likeness**2, config.noise**2 * usual)
+
+
+def _best_depth(look: Look, pairs: list[_Pair], depths: list[Map]) -> Map:
+    """Of the inverse depths, for each point the one at which it looks the same in the most neighbours."""
+    best, least = depths[0], np.zeros_like(depths[0])
+    for number, inverse in enumerate(depths):
+        cost, count = np.zeros_like(inverse), np.full_like(inverse, 1e-6)
+        for pair in pairs:
+            if pair.seen.links == 1:
+                at, _ = pair.ray.project(inverse)
+                inside = _inside(at, inverse.shape)
+                cost += inside * np.minimum(pair.there.unlike(look.grid, at, pair.gain), _MOST_UNLIKE)
+                count += inside
+        cost = cost / count + (_OTHER_DEPTH if number else 0.0)
+        better = cost < least if number else np.ones(cost.shape, bool)
+        best, least = np.where(better, inverse, best), np.where(better, cost, least)
+    return best
+
+
+def _inside(at: tuple[Map, Map], shape: tuple[int, ...]) -> Mask:
+    return (at[0] >= 0) & (at[1] >= 0) & (at[0] < 2 * shape[1]) & (at[1] < 2 * shape[0])
 
 
 def _gain(values: Map, others: Map, found: Mask) -> tuple[float, float]:
     """Factor and offset that make `others` look like `values` where they are `found`: exposure drifts in a clip."""
     a, b = values[::4, ::4][found[::4, ::4]], others[::4, ::4][found[::4, ::4]]
-    if len(a) < 50:
+    if len(a) < _FEW:
         return 1.0, 0.0
     spread = float(b.var())
     factor = (
@@ -104,119 +260,3 @@ def _surroundings(inverse: Map, sure: Mask) -> list[Map]:
     filled[sure] = own[sure]
     block = np.ones((17, 17), np.uint8)
     return [filled, cv2.erode(filled, block), cv2.dilate(filled, block)]
-
-
-@dataclass
-class StillTest:
-    """What the test of a key frame stands on."""
-
-    look: Callable[[int], Look]
-    """Of any key."""
-    viewmats: NDArray
-    """[K, 4, 4] world-to-camera of the keys, solve units."""
-    Ks: NDArray
-    """[K, 3, 3] in flow pixels."""
-    guessed: list[bool]
-    """Keys whose pose was not solved."""
-    grid: tuple[Map, Map]
-    """Positions of the grid's points."""
-    unit: float
-    """Flow pixels in one pixel of a picture 640 wide."""
-
-
-def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: FlowConfig) -> tuple[Map, Map]:
-    """Tests the matches `seen` of a key frame against one still point per grid point.
-
-    `depth` is the typical depth in this view, solve units.
-    """
-    unit, look = test.unit, test.look(key)
-    xx, xy, yy = _tensor(look.grid)
-    nearly = 0.5 * (xx + yy) * unit**2  # what a pixel aside makes
-    telling = nearly * config.tolerance**2 > config.contrast**2
-    rays = [Ray(test.grid, (test.viewmats[key], test.viewmats[s.key]), (test.Ks[key], test.Ks[s.key])) for s in seen]
-    limits = [unit * (config.tolerance + config.per_link * (s.links - 1)) for s in seen]
-    gains, unlikes, rights = [], [], []
-    for s in seen:
-        there = test.look(s.key)
-        gains.append(_gain(look.grid, sample(there.grid, s.at), s.found))
-        unlikes.append(there.unlike(look.grid, s.at, gains[-1]))
-        rights.append(unlikes[-1] - nearly < _like(unlikes[-1], s.found & telling, config))
-    inverse = still_points(rays, seen, limits, depth, unit)
-    on = np.zeros_like(inverse)
-    for n, (ray, s) in enumerate(zip(rays, seen, strict=True)):
-        at, _ = ray.project(inverse)
-        length = np.hypot(_smoothed(s.at[0] - at[0], s.found), _smoothed(s.at[1] - at[1], s.found))
-        told = s.found & telling
-        if np.count_nonzero(told) > 50:
-            usual = config.noise * float(np.median(length[told]))
-            most = np.inf if test.guessed[key] or test.guessed[s.key] else config.most_noise * limits[n]
-            limits[n] = max(limits[n], min(usual, most))
-        on += s.found & (length <= limits[n])
-    inverse = _best_depth(test, look, rays, seen, gains, _surroundings(inverse, on >= 3))
-    on, off = np.zeros_like(inverse), np.zeros_like(inverse)
-    gone: dict[int, Mask] = {}
-    for ray, s, limit, gain, at_match, right in zip(rays, seen, limits, gains, unlikes, rights, strict=True):
-        at, _ = ray.project(inverse)
-        x, y = _smoothed(s.at[0] - at[0], s.found), _smoothed(s.at[1] - at[1], s.found)
-        length = np.hypot(x, y)
-        unlike = test.look(s.key).unlike(look.grid, at, gain)
-        inside = _inside(at, look.grid.shape)
-        away = s.found & (length > limit)
-        alike = inside & (unlike - nearly < _like(unlike, s.found & ~away & telling, config))
-        shorter = np.square(np.minimum(1.0, 3.0 * unit / np.maximum(length, 1e-6)))
-        change = shorter * (xx * x * x + 2 * xy * x * y + yy * y * y)
-        better = right & (unlike > config.better * at_match + config.contrast**2)
-        off += away & (change > config.contrast**2) & better
-        # The nearer in time, the less it says that something has not moved yet.
-        weight = min(1.0, abs(s.key - key) / config.baselines[-1]) ** config.haste
-        on += weight * ((s.found & ~away) + 0.5 * ((away & ~better) | (alike & ~s.found)))
-        gone[s.key - key] = inside & ~s.found & ~alike
-    for step in config.baselines[:2]:
-        if step in gone and -step in gone:
-            off += gone[step] & gone[-step]
-    return on, off
-
-
-def _smoothed(values: Map, found: Mask) -> Map:
-    """Mean of what is found around each point: a surface moves as one, flow errs here and there."""
-    weight = found.astype(np.float32)
-    return cv2.blur(values * weight, (5, 5)) / np.maximum(cv2.blur(weight, (5, 5)), 1e-3)
-
-
-def _like(unlike: Map, still: Mask, config: FlowConfig) -> float:
-    """Below how much pictures show the same: what is `still` tells how unlike a sharp and a blurred one are."""
-    usual = float(np.median(unlike[still])) if np.count_nonzero(still) > 50 else 0.0
-    return max(config.likeness**2, config.noise**2 * usual)
-
-
-def _best_depth(
-    test: StillTest, look: Look, rays: list[Ray], seen: list[Seen], gains: list[tuple[float, float]], depths: list[Map]
-) -> Map:
-    """Of the inverse depths, for each point the one at which it looks the same in the most neighbours."""
-    best, least = depths[0], None
-    for number, inverse in enumerate(depths):
-        cost, count = np.zeros_like(inverse), np.full_like(inverse, 1e-6)
-        for ray, s, gain in zip(rays, seen, gains, strict=True):
-            if s.links > 1:
-                continue
-            at, _ = ray.project(inverse)
-            inside = _inside(at, inverse.shape)
-            cost += inside * np.minimum(test.look(s.key).unlike(look.grid, at, gain), 400.0)
-            count += inside
-        cost = cost / count + (4.0 if number else 0.0)
-        if least is None:
-            least = cost
-        else:
-            better = cost < least
-            best, least = np.where(better, inverse, best), np.where(better, cost, least)
-    return best
-
-
-def _inside(at: tuple[Map, Map], shape: tuple[int, ...]) -> Mask:
-    return (at[0] >= 0) & (at[1] >= 0) & (at[0] < 2 * shape[1]) & (at[1] < 2 * shape[0])
-
-
-def _tensor(picture: Map) -> tuple[Map, Map, Map]:
-    """Mean of gx gx, gx gy, gy gy around each point of a grid [h, w], of steps per flow pixel."""
-    gx, gy = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.0625), cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.0625)
-    return cv2.boxFilter(gx * gx, -1, (5, 5)), cv2.boxFilter(gx * gy, -1, (5, 5)), cv2.boxFilter(gy * gy, -1, (5, 5))
