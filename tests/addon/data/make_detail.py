@@ -1,17 +1,17 @@
-"""Frames made of plates for the add-on's tests: in detail/ two frozen frames of 32 x 24 pixels, their warps in
+"""Frames made of plates for the add-on's tests: in detail/ two frozen frames of 56 x 42 pixels, their warps in
 detail/warp/, and the linear plates that they are made of, with values from -0.2 to 50, in detail/plate/.
 
     python tests/addon/data/make_detail.py      (with the backend's Python: it uses the backend's own EXR writers)
 
 Frame numbers 5 and 6. The left third is the plate as it is, the middle one the plate moved by parts of a pixel, the
-right one the plate at a share over something else.
+right one the plate at a share over something else. In float32, centres of 56 or 42 pixels are not where they should be.
 """
 
 from pathlib import Path
 
 import numpy as np
 
-WIDTH, HEIGHT = 32, 24
+WIDTH, HEIGHT = 56, 42
 FRAMES = (5, 6)
 FOLDER = Path(__file__).with_name("detail")
 
