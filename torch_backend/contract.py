@@ -233,8 +233,6 @@ class FreezeParams:
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
     grain: bool = True
     """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
-    detail: str = "on"
-    """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
     device: str = "auto"
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
@@ -1063,7 +1061,8 @@ def verdict_of(told: Mapping[str, Any]) -> Verdict | None:
 def verdict_lines(*told: Mapping[str, Any]) -> list[str]:
     """The lines of the verdicts that summaries or takes hold; none where there is no verdict."""
     found = (verdict_of(one) for one in told)
-    return [line for verdict in found if verdict is not None for line in verdict.lines()]
+    lines = (line for verdict in found if verdict is not None for line in verdict.lines())
+    return list(dict.fromkeys(lines))  # a take repeats what its run's verdict found amiss
 
 
 def summarise(

@@ -18,6 +18,7 @@ from torch_backend.contract import CameraFrame, CameraPath
 from torch_backend.footage.images import write_png
 from torch_backend.raster import rasterize
 from torch_backend.shot import Shot, write_json
+from torch_backend.solve.motion import MOVING, PAINTED, STILL, write_matte
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 16
 FIRST = 101
@@ -115,6 +116,22 @@ def build_world(root: Path) -> World:
     return world
 
 
+def paint_motion(world: World) -> None:
+    """Says where the patch is, as an artist paints it: at this size it travels too little for optical flow."""
+    for n in range(FRAMES):
+        state = world.at(n / (FRAMES - 1))
+        patch = rasterize(
+            **{name: value[world.moving] for name, value in state.items()},
+            viewmats=world.viewmats[n : n + 1],
+            Ks=world.K[None],
+            width=WIDTH,
+            height=HEIGHT,
+        )
+        path = world.shot.root / PAINTED / f"{FIRST + n:06d}.png"
+        path.parent.mkdir(exist_ok=True)
+        write_matte(path, np.where(patch.alphas[0].numpy() > 0.1, MOVING, STILL).astype(np.uint8))
+
+
 def _write(world: World) -> None:
     shot, rows, cameras = world.shot, [], []
     for n in range(FRAMES):
@@ -165,11 +182,13 @@ def world(tmp_path_factory) -> World:
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """The tiny shot with one finished run `main` (auto, support); tests may add takes, not change the run."""
+    """The tiny shot with one finished run `main` (auto, support) and a painted motion matte; tests may add takes, not
+    change the run."""
     from torch_backend.contract import TrainParams
     from torch_backend.train import train_shot
 
     world = build_world(tmp_path_factory.mktemp("trained"))
+    paint_motion(world)
     summary = train_shot(world.shot, TrainParams(iterations=900, holdout=8, max_gaussians=1500), Quiet())
     return world, summary
 

@@ -46,6 +46,8 @@ def test_summary_has_the_figures(frozen):
     assert abs(summary["t_star_frame"] - 10) <= 1
     assert summary["heldout_psnr_db"] > 19.0
     assert f"{summary['heldout_psnr_db']:.2f} dB" in printed
+    assert 0.5 < summary["plate_share"] <= 1.0 and 0.0 <= summary["invented_share"] < 0.5
+    assert any("of the picture is plate" in line for line in summary["verdict"])
     assert summary["verdict"] and all(f"\n{line}\n" in printed for line in summary["verdict"])
     assert set(summary["wall_seconds_by_stage"]) == {"import", "solve", "train", "freeze"}
 

@@ -69,7 +69,7 @@ SMALL = ("--iterations", "20", "--max-gaussians", "200")
         ("train {}/file", "file"),
         (f"train {{}}/{LONG}", "too long"),
         ("take {}/s --freeze-width -4", "width of the frozen frames is -4"),
-        ("take {}/s --freeze-width 1000000000", "16 to 16384, or 0 for the training's"),
+        ("take {}/s --freeze-width 1000000000", "16 to 16384, or 0 for the source's"),
         ("take {}/s --overscan 500", "0 to 100 percent, or lens"),
         ("take {}/s --overscan nan", "0 to 100 percent, or lens"),
         ("take {}/s --overscan wide", "0 to 100 percent, or lens"),

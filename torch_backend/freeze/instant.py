@@ -287,21 +287,22 @@ def _shell(
         stronger = soft > cover
         inverse[stronger], cover[stronger] = depths[stronger], soft[stronger]
         told.append(facts)
+    colors, cover = _matted(view.picture, image.color.numpy(), cover, bench.unit)
     rows, columns = np.nonzero(cover > 0.1)
     means = view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
-    return _gaussians(bench, frozen, means, rows, columns, inverse, cover), cover, told
+    return _gaussians(bench, frozen, means, rows, columns, inverse, cover, colors), cover, told
 
 
 def _gaussians(
     bench: _Bench, frozen: FrozenGaussians, means: NDArray[np.float64], rows: NDArray[np.intp],
-    columns: NDArray[np.intp], inverse: NDArray[np.float32], cover: NDArray[np.float32],
+    columns: NDArray[np.intp], inverse: NDArray[np.float32], cover: NDArray[np.float32], colors: NDArray[np.float32],
 ) -> dict[str, Tensor]:  # fmt: skip
     """Gaussians [M] at `means`, coloured by the pixels (rows, columns) of plate t*, one pixel apart on the screen."""
     like, c = frozen.state, bench.config
     count = len(means)
     size = c.sigma / (bench.view.K[0, 0] * np.maximum(inverse[rows, columns], 1e-9))
     opacity = torch.from_numpy(np.clip(c.opacity * cover[rows, columns], 1e-4, 1.0 - 1e-4))
-    color = _unexposed(torch.from_numpy(bench.view.picture[rows, columns]), bench.exposure, bench.time)
+    color = _unexposed(torch.from_numpy(colors[rows, columns]), bench.exposure, bench.time)
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1.0
     state = {
@@ -313,6 +314,27 @@ def _gaussians(
         "shN": torch.zeros(count, like["shN"].shape[1], 3),
     }
     return {name: state[name].to(value) for name, value in like.items()}
+
+
+def _matted(
+    picture: NDArray[np.float32], behind: NDArray[np.float32], cover: NDArray[np.float32], unit: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(colours [h, w, 3], cover [h, w]) of a layer, its outline taken apart into its own colour and what is behind.
+
+    A pixel of the outline is a mixture: how far it is on the way from the model's colour there to that of the inside
+    beside it is what the layer covers. From another pose what it has of the wall would be a rim around the hand.
+    """
+    import cv2
+
+    inside = np.asarray(cv2.erode((cover > 0.9).astype(np.float32), _disc(1.0 * unit)), np.float32)
+    weight = _blurred(inside, 1.5 * unit)
+    own = _blurred(picture * inside[..., None], 1.5 * unit) / np.maximum(weight, 1e-6)[..., None]
+    way, length = own - behind, np.square(own - behind).sum(-1)
+    share = np.clip(((picture - behind) * way).sum(-1) / np.maximum(length, 1e-6), 0.0, 1.0)
+    rim = (cover > 0.0) & (inside < 0.5) & (weight > 0.02) & (length > 0.15**2)
+    mixed = share[..., None] * picture + (1.0 - share[..., None]) * own
+    color = np.where(rim[..., None], mixed, picture).astype(np.float32)
+    return color, np.where(rim, np.minimum(cover, share), cover).astype(np.float32)
 
 
 def _unexposed(color: Tensor, exposure: Exposure, time: float) -> Tensor:

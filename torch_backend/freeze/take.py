@@ -13,7 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import NO_DEPTH, CameraPath, ExitCode, FreezeParams, JobError, Reporter, Verdict, frame_file, read_json
+from ..contract import (
+    NO_DEPTH,
+    CameraPath,
+    ExitCode,
+    FreezeParams,
+    JobError,
+    Reporter,
+    Verdict,
+    frame_file,
+    read_json,
+    verdict_of,
+)
 from ..footage.color import premultiplied_srgb_to_linear
 from ..footage.images import read_png
 from ..footage.plates import Plates
@@ -23,6 +34,7 @@ from ..shot import Shot, content_key, disk_error, is_disk_full, make_folder, nee
 from ..solve.motion import find_motion, motion_key
 from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
+from ..train.anew import SUMMARY_FILE
 from ..train.run import save_png
 from .contact_sheet import write_contact_sheet
 from .detail import DetailedFrame, Detailer
@@ -442,7 +454,7 @@ def _finish(
     previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
     made_of = _made_of(folder, numbers, look, shares)
     asked = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
-    verdict = judge_take({"t_star_frame": t_star, **asked, "detail": made_of.get("detail")})
+    verdict = judge_take({"t_star_frame": t_star, **asked, "detail": made_of.get("detail")}, run_verdict(run))
     title = f"{shot.info().name}: t* = frame {t_star}, run {params.run}"
     sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
     report.check_cancelled()
@@ -486,6 +498,14 @@ def _finish(
     report.image("contact sheet", sheet)
     report.progress("finishing the take", 3, 3, "done")
     return facts
+
+
+def run_verdict(run: LoadedRun) -> Verdict | None:
+    """The verdict on the run as it was trained last; None if its summary has none, or cannot be read."""
+    try:
+        return verdict_of(read_json(run.folder / SUMMARY_FILE))
+    except (OSError, ValueError):
+        return None
 
 
 def _made_of(folder: Path, numbers: list[int], look: Look, shares: dict[int, Tensor]) -> dict[str, Any]:

@@ -142,8 +142,8 @@ def write_warp(
 ) -> Path:
     """Writes one warp atomically: float32 ST, the rest half, ZIP. Arrays as in `Warp`, ST from `snap`.
 
-    Mattes in steps of 1/1024 are exact in half floats, and the fill is off by 2.5e-4 of itself: that is little of the
-    frame, too, for a fill that adds light to what the plate gives, instead of taking some away. With a `margin`
+    Mattes in steps of 1/1024 are exact in half floats, and the fill is off by 5e-4 of itself at most: that is little of
+    the frame, too, for a fill that adds light to what the plate gives, instead of taking some away. With a `margin`
     the arrays are the data window, as in `write_frozen_exr`.
 
     ValueError names the layer whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be

@@ -36,9 +36,9 @@ class FlowConfig:
     """A match this far from where the still point is seen tells of motion: flow and solve err by 0.5 to 1 each."""
     per_link: float = 0.2
     """So much more for each further link of a chain."""
-    noise: float = 2.5
+    noise: float = 2.0
     """The tolerance of a pair is at least this many times the median distance in it: blur, shutter, a poor pose."""
-    most_noise: float = 2.5
+    most_noise: float = 2.0
     """But at most this many times what it is otherwise, unless a pose was guessed: what moves may fill the picture."""
     round_trip: float = 1.2
     """Greatest distance between a pixel and where the flow there and back ends; above it the pixel is hidden there."""
@@ -46,6 +46,16 @@ class FlowConfig:
     """A match off its place tells of motion if the picture changes over that distance by so many of 255 steps."""
     better: float = 1.5
     """A match off its place tells of motion if pictures differ by this factor more where a still point would be seen."""
+    haste: float = 0.3
+    """."""
+    sure: float = 4.0
+    """."""
+    doubt: float = 0.7
+    """."""
+    doubt2: float = 0.8
+    """."""
+    reach: int = 2
+    """."""
     share: float = 0.4
     """A surface moves if so much of what it is matched with says so: most of the time a mover stands where it is."""
     likeness: float = 8.0

@@ -16,7 +16,7 @@ from ..contract import Reporter, frame_file
 from ..footage import load_frames
 from ..footage.images import read_frame
 from ..shot import Shot
-from .flow import FlowConfig, Map, Matches, neighbours, sample
+from .flow import FlowConfig, Map, Mask, Matches, neighbours, sample
 from .still import Look, StillTest, evidence
 from .stored import load_cameras, load_points
 
@@ -54,6 +54,7 @@ class Clip:
         points = load_points(shot)["xyz"].astype(np.float64)
         self.depths = [_typical_depth(points, viewmat) for viewmat in self.viewmats]
         """Of the keys: median depth of the sparse points before the camera."""
+        self.threshold=0.5;self.low=0.2;self.blob=10;self.radius=4;self.edge=8.0
         self._pictures: dict[int, NDArray[np.uint8]] = {}
         self._looks: dict[int, Look] = {}
 
@@ -104,7 +105,7 @@ def mattes(
     clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order."""
-    keys, reach = clip.keys, 2 * config.baselines[-1]
+    keys, reach = clip.keys, config.reach * config.baselines[-1]
     groups = [range(keys[k - 1] + 1 if k else 0, keys[k] + 1) for k in range(len(keys))]
     wanted = [any(n not in written for n in group) for group in groups]
     if not any(wanted):
@@ -138,8 +139,8 @@ def _own_score(clip: Clip, matches: Matches, key: int, config: FlowConfig) -> tu
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
     on, off = evidence(test, key, seen, clip.depths[key], config)
     count = on + off
-    score = np.clip(off / np.maximum(count, 1.0) / config.share, 0.0, 1.0)
-    return score, np.clip(count / 6.0, 0.0, 1.0) * (count >= 2)
+    score = np.clip((off - config.doubt) / (count + config.doubt2) / config.share, 0.0, 1.0)
+    return score, np.clip(count / config.sure, 0.0, 1.0) * (count >= 1)
 
 
 def _followed(
@@ -173,14 +174,26 @@ def _between(clip: Clip, matches: Matches, index: int, key: int, final: dict[int
 def _labels(clip: Clip, index: int, score: Map, weight: Map) -> NDArray[np.uint8]:
     """The labels [H, W] of a frame's score and weight on the grid."""
     grey = cv2.resize(clip.grey(index), score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
-    guide = _Guide(grey, 6, 10.0)
+    guide = _Guide(grey, clip.radius, clip.edge)
     weight = np.minimum(weight, 3.0)
     known = np.maximum(guide(weight), 0)
     spread = guide(score * weight) / np.maximum(known, 1e-3)
     size = clip.width, clip.height
     spread = cv2.resize(spread, size, interpolation=cv2.INTER_LINEAR)
     known = cv2.resize(known, size, interpolation=cv2.INTER_LINEAR)
-    return np.where(known < 0.1, 128, np.where(spread > 0.4, 255, 0)).astype(np.uint8)
+    moving = _blobs(spread > clip.low, spread > clip.threshold, round((clip.blob * clip.width / 640) ** 2))
+    still = _blobs(~moving, ~moving, round((clip.blob * clip.width / 640) ** 2))
+    return np.where(~still, 255, np.where(known < 0.1, 128, 0)).astype(np.uint8)
+
+
+def _blobs(mask: Mask, seeds: Mask, least: int) -> Mask:
+    """The connected areas of a mask that hold a seed and at least so many pixels."""
+    count, numbers, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    keep = about[:, cv2.CC_STAT_AREA] >= least
+    keep[0] = False
+    seeded = np.zeros(count, bool)
+    seeded[np.unique(numbers[seeds & mask])] = True
+    return (keep & seeded)[numbers]
 
 
 class _Guide:

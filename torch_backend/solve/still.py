@@ -130,13 +130,19 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
     `depth` is the typical depth in this view, solve units.
     """
     unit, look = test.unit, test.look(key)
+    xx, xy, yy = _tensor(look.grid)
+    nearly = 0.5 * (xx + yy) * unit**2  # what a pixel aside makes
+    telling = nearly * config.tolerance**2 > config.contrast**2
     rays = [Ray(test.grid, (test.viewmats[key], test.viewmats[s.key]), (test.Ks[key], test.Ks[s.key])) for s in seen]
     limits = [unit * (config.tolerance + config.per_link * (s.links - 1)) for s in seen]
+    gains, unlikes, rights = [], [], []
+    for s in seen:
+        there = test.look(s.key)
+        gains.append(_gain(look.grid, sample(there.grid, s.at), s.found))
+        unlikes.append(there.unlike(look.grid, s.at, gains[-1]))
+        rights.append(unlikes[-1] - nearly < _like(unlikes[-1], s.found & telling, config))
     inverse = still_points(rays, seen, limits, depth, unit)
     on = np.zeros_like(inverse)
-    xx, xy, yy = _tensor(look.grid)
-    telling = 0.5 * (xx + yy) * (unit * config.tolerance) ** 2 > config.contrast**2
-    gains = []
     for n, (ray, s) in enumerate(zip(rays, seen, strict=True)):
         at, _ = ray.project(inverse)
         length = np.hypot(_smoothed(s.at[0] - at[0], s.found), _smoothed(s.at[1] - at[1], s.found))
@@ -146,27 +152,24 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
             most = np.inf if test.guessed[key] or test.guessed[s.key] else config.most_noise * limits[n]
             limits[n] = max(limits[n], min(usual, most))
         on += s.found & (length <= limits[n])
-        gains.append(_gain(look.grid, sample(test.look(s.key).grid, s.at), s.found))
     inverse = _best_depth(test, look, rays, seen, gains, _surroundings(inverse, on >= 3))
     on, off = np.zeros_like(inverse), np.zeros_like(inverse)
     gone: dict[int, Mask] = {}
-    nearly = 0.5 * (xx + yy) * unit**2  # what a pixel aside makes
-    for ray, s, limit, gain in zip(rays, seen, limits, gains, strict=True):
+    for ray, s, limit, gain, at_match, right in zip(rays, seen, limits, gains, unlikes, rights, strict=True):
         at, _ = ray.project(inverse)
         x, y = _smoothed(s.at[0] - at[0], s.found), _smoothed(s.at[1] - at[1], s.found)
         length = np.hypot(x, y)
-        there = test.look(s.key)
-        unlike = there.unlike(look.grid, at, gain)
+        unlike = test.look(s.key).unlike(look.grid, at, gain)
         inside = _inside(at, look.grid.shape)
         away = s.found & (length > limit)
         alike = inside & (unlike - nearly < _like(unlike, s.found & ~away & telling, config))
         shorter = np.square(np.minimum(1.0, 3.0 * unit / np.maximum(length, 1e-6)))
         change = shorter * (xx * x * x + 2 * xy * x * y + yy * y * y)
-        better = unlike > config.better * there.unlike(look.grid, s.at, gain) + config.contrast**2
-        told = away & (change > config.contrast**2) & better
-        off += told
-        on += s.found & ~away
-        on += 0.5 * ((away & ~better) | (alike & ~s.found))
+        better = right & (unlike > config.better * at_match + config.contrast**2)
+        off += away & (change > config.contrast**2) & better
+        # The nearer in time, the less it says that something has not moved yet.
+        weight = min(1.0, abs(s.key - key) / config.baselines[-1]) ** config.haste
+        on += weight * ((s.found & ~away) + 0.5 * ((away & ~better) | (alike & ~s.found)))
         gone[s.key - key] = inside & ~s.found & ~alike
     for step in config.baselines[:2]:
         if step in gone and -step in gone:

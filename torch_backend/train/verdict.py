@@ -127,7 +127,7 @@ def _sentences(
             f"{figures.tenth_db:.1f} dB on the worst tenth."
         )
     elif not places:
-        said.append("It shows all of the clip.")
+        said.append(EXPLAINED)
     said += [f"It does not hold in {where_words(place)}." for place in places]
     if figures.sway < limits.still:
         said.append("Nothing moves in it.")
@@ -157,6 +157,7 @@ def _advice(
     return []
 
 
+EXPLAINED = "It shows all of the clip."
 _HOLD = "Somebody walks through: take a range in which all hold still."
 _SOLVE = "Even what stands still is not there: solve the camera again, or take a range that it follows well."
 _LOOK = (

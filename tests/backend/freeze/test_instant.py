@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_backend.footage.images import write_png
-from torch_backend.freeze.instant import InstantConfig, instant_layer, join
+from torch_backend.freeze.instant import InstantConfig, instant_layer, join, low_difference
 from torch_backend.freeze.query import FrozenGaussians, freeze_at, render_frozen
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
@@ -100,6 +100,9 @@ def scene_at(folder):
     # The camera sways on its way: a steady one cannot be told from a hand's steady motion.
     viewmats[:, 0, 3] = torch.linspace(0.7, -0.7, FRAMES)
     viewmats[:, 1, 3] = 0.06 * torch.sin(torch.arange(FRAMES) * 1.3)
+    tilt = 0.03 * torch.sin(torch.arange(FRAMES) * 0.9)
+    viewmats[:, 1, 1] = viewmats[:, 2, 2] = torch.cos(tilt)
+    viewmats[:, 2, 1], viewmats[:, 1, 2] = torch.sin(tilt), -torch.sin(tilt)
     K = torch.tensor([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1.0]])
     times = np.linspace(0, 1, FRAMES)
     return Scene(
@@ -189,6 +192,17 @@ def test_nothing_is_found_where_plate_and_model_agree(tmp_path):
 
 def test_a_model_that_is_merely_soft_is_no_disagreement(tmp_path):
     assert world(tmp_path, together(wall()), lambda n: wall(fine=0.25)).layer() is None
+
+
+def test_neither_lost_detail_nor_an_edge_out_of_place_is_a_difference_but_a_missing_thing_is():
+    y, x = np.mgrid[:80, :120]
+    soft = np.full((80, 120, 3), 0.5, np.float32)
+    detailed = soft + 0.3 * np.where((x // 2 + y // 2) % 2 > 0, 1, -1)[..., None].astype(np.float32)
+    edge, moved = (soft + 0.4 * np.sign(x - at)[..., None].astype(np.float32) for at in (60.5, 61.5))
+    thing = soft + 0.3 * (np.hypot(x - 60, y - 40) < 6)[..., None].astype(np.float32)
+    differences = [low_difference(a, b, 3.0, 1.0).max() for a, b in ((detailed, soft), (edge, moved), (thing, soft))]
+    assert max(differences[:2]) < InstantConfig().grow and differences[2] > InstantConfig().seed
+    assert np.abs(detailed - soft).max() > 0.25 and low_difference(edge, moved, 3.0, 0.0).max() > 0.09
 
 
 def test_what_the_motion_matte_calls_still_is_left_alone(waving):

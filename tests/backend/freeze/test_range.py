@@ -80,22 +80,28 @@ def test_a_newer_run_makes_every_frame_stale(trained, quiet):
     assert all(before[n] != t for n, t in times(folder).items())
 
 
-def test_a_take_of_before_frames_had_keys_stays_until_grain_is_wanted(trained, quiet):
+def test_a_take_of_before_frames_had_keys_stays_until_grain_or_plates_are_wanted(trained, quiet):
     world, _ = trained
     folder = world.shot.take("old")
     ask = dict(take="old", t_star=104, first=101, last=103, only_missing=True)
-    freeze_shot(world.shot, FreezeParams(**ask, grain=False), quiet())
+    old = FreezeParams(**ask, grain=False, detail="off")
+    for wanted in (FreezeParams(**ask, detail="off"), FreezeParams(**ask, grain=False)):
+        freeze_shot(world.shot, old, quiet())
+        _forget_keys(folder)
+        before = times(folder)
+        freeze_shot(world.shot, old, quiet())
+        assert times(folder) == before
+        freeze_shot(world.shot, wanted, quiet())
+        assert all(before[n] != t for n, t in times(folder).items())
+
+
+def _forget_keys(folder):
     for path in folder.glob("*.exr"):
         image = oiio.ImageBuf(str(path))
         image.read(0, 0, True)
         image.specmod().erase_attribute("splannequin:key")
         image.write(str(path))
         assert read_key(path) == ""
-    before = times(folder)
-    freeze_shot(world.shot, FreezeParams(**ask, grain=False), quiet())
-    assert times(folder) == before
-    freeze_shot(world.shot, FreezeParams(**ask), quiet())
-    assert all(before[n] != t for n, t in times(folder).items())
 
 
 def test_a_damaged_frame_is_rendered_again(trained, quiet):
@@ -112,10 +118,11 @@ def test_a_damaged_frame_is_rendered_again(trained, quiet):
 def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quiet, grain):
     world, _ = trained
     folder = world.shot.take(f"grain{grain}")
-    ask = FreezeParams(take=folder.name, t_star=104, first=101, last=102, grain=grain)
+    part = dict(t_star=104, first=101, last=102, detail="off")
+    ask = FreezeParams(take=folder.name, grain=grain, **part)
     facts = freeze_shot(world.shot, ask, quiet())
     one, other = (read_frozen_exr(folder / f"{n:06d}.exr") for n in (101, 102))
-    plain = freeze_shot(world.shot, FreezeParams(take="plain", t_star=104, first=101, last=101, grain=False), quiet())
+    plain = freeze_shot(world.shot, FreezeParams(take="plain", grain=False, **part), quiet())
     np.testing.assert_array_equal(one.rgba, read_frozen_exr(world.shot.take("plain") / "000101.exr").rgba)
     assert plain["grain"] is None
     names = oiio.ImageBuf(str(folder / "000101.exr")).spec().channelnames
@@ -127,3 +134,13 @@ def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quie
     assert one.grain.shape == one.rgba[..., :3].shape and other.grain.shape == one.grain.shape
     if np.max(facts["grain"]["deviation_8bit"]) > 0:
         assert one.grain.any() and not np.array_equal(one.grain, other.grain)
+
+
+def test_plates_bring_their_own_grain(trained, quiet):
+    world, _ = trained
+    ask = dict(t_star=104, first=112, last=112)
+    facts = freeze_shot(world.shot, FreezeParams(take="plates", **ask), quiet())
+    plates = read_frozen_exr(world.shot.take("plates") / "000112.exr")
+    assert np.max(facts["grain"]["deviation_8bit"]) > 0
+    assert plates.detail.plate.min() < 0.9 and (plates.detail.plate == 1.0).mean() > 0.5
+    assert not plates.grain[plates.detail.plate == 1.0].any()

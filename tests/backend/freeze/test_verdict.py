@@ -65,6 +65,22 @@ def test_a_take_of_splats_alone_says_so_and_one_of_before_says_nothing():
     assert judge_take({"t_star_frame": 8}) is None
 
 
+def test_a_take_is_no_better_than_its_run():
+    walker = "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 20, middle."
+    place = {"first": 10, "last": 20, "region": "middle"}
+    run = Verdict("fair", ["It shows all of the clip.", walker], [place], ["Paint who walks."])
+    verdict = judge_take(facts(), run)
+    assert verdict is not None
+    assert verdict.lines() == ["Fair. 98 % of the picture is plate, 2 % is a guess.", walker, "Paint who walks."]
+    assert unsure(verdict, FRAMES) == set(range(10, 21))
+    poor = judge_take(facts(), Verdict("poor", ["It does not show the clip."], [], ["Look at its previews."]))
+    assert poor is not None and poor.word == "poor"
+    good = Verdict("good", ["It shows all of the clip.", "What moves sways by up to 7 of 640 pixels."])
+    assert judge_take(facts(), good) == judge_take(facts())
+    summary = verdict_lines({"verdict": vars(run)}, {"verdict": vars(verdict)})
+    assert summary.count(walker) == 1, "the summary of both says it once"
+
+
 def results() -> dict:
     solve = {"frames": 40, "solved_frames": 40, "registered": 40, "reprojection_error_px": 0.5}
     train = {"gaussians": 1, "moving_share": 0.1, "train_seconds": 1.0, "iterations": 10, "heldout_psnr_db": None,
@@ -94,5 +110,6 @@ def test_a_verdict_that_is_none_is_not_shown(damaged):
 
 
 def test_a_verdict_from_a_strange_file_is_cut_and_has_no_control_characters():
-    (first, *rest) = verdict_lines({"verdict": {"word": "poor", "sentences": ["a\x1b[2J" + "b" * 999] * 50}})
+    sentences = [f"a\x1b[2J{n}" + "b" * 999 for n in range(50)]
+    (first, *rest) = verdict_lines({"verdict": {"word": "poor", "sentences": sentences}})
     assert len(rest) == 11 and "\x1b" not in first and len(first) < 320

@@ -96,12 +96,13 @@ def test_regions_and_frames_in_words():
 
 def test_travel_is_measured_in_the_view_and_only_where_somebody_saw_it():
     """A point that goes 0.5 units across at depth 2 with a focal length of 100 px: 25 px, in float64 by hand."""
-    places = torch.tensor([[0.0, 0.0, 2.0], [0.25, 0.0, 2.0], [0.5, 0.0, 2.0]])[:, None].repeat(1, 4, 1)
+    places = torch.tensor([[0.0, 0.0, 2.0], [0.25, 0.0, 2.0], [0.5, 0.0, 2.0]])[:, None].repeat(1, 5, 1)
     places[2, 1] = torch.nan  # seen at the first two times only
     places[1:, 2] = torch.nan  # seen once
     places[1, 3, 2] = -1.0  # behind the camera once
+    places[:, 4] = torch.nan  # never seen
     K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
-    assert travelled(places, torch.eye(4), K).tolist() == pytest.approx([25.0, 12.5, 0.0, 0.0], abs=1e-4)
+    assert travelled(places, torch.eye(4), K).tolist() == pytest.approx([25.0, 12.5, 0.0, 0.0, 0.0], abs=1e-4)
 
 
 def test_edges_and_grain_are_explained_and_a_figure_that_is_missing_is_not():
