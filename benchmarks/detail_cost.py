@@ -30,9 +30,12 @@ import torch
 from benchmarks.detail import name_of
 from benchmarks.detail_clip import DetailClip, open_clip
 from benchmarks.sources import child_environ
-from torch_backend.contract import JobError, frame_file, read_json
+from torch_backend.contract import JobError, frame_file, from_dict, read_json
+from torch_backend.footage import FootageConfig
 from torch_backend.footage.images import read_png, write_png
+from torch_backend.footage.importing import import_key
 from torch_backend.footage.plates import Plates
+from torch_backend.footage.sources import open_source
 from torch_backend.shot import Shot, write_json
 
 THREADS = 2
@@ -71,9 +74,10 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
         nearest = min(real, key=lambda other: abs(other - frame))
         os.link(footage / frame_file(nearest, ".png"), footage / frame_file(frame, ".png"))
     record |= {"source_size": [record["width"] * factor, record["height"] * factor], "extended": False}
-    # The footage was imported by nobody: its pictures are held against the working frames instead.
-    record |= {"key": "enlarged", "bits": 8, "beside": ""}
-    record["config"] = {**record.get("config", {}), "working_height": record["height"]}
+    told = {**record.get("config", {}), "working_height": record["height"]}
+    config = from_dict(FootageConfig, told)
+    key = import_key(open_source(str(footage), config.fps, config.layer).info, config)
+    record |= {"config": told, "key": key, "bits": 8, "beside": ""}
     write_json(copy / "frames" / "frames.json", record)
     made = Shot.open(copy)
     made.update(source=str(footage))
