@@ -30,8 +30,12 @@ import torch
 from benchmarks.detail import name_of
 from benchmarks.detail_clip import DetailClip, open_clip
 from benchmarks.sources import child_environ
-from torch_backend.contract import JobError, frame_file, read_json
+from torch_backend.contract import JobError, frame_file, from_dict, read_json
+from torch_backend.footage import FootageConfig
 from torch_backend.footage.images import read_png, write_png
+from torch_backend.footage.importing import import_key
+from torch_backend.footage.plates import Plates
+from torch_backend.footage.sources import open_source
 from torch_backend.shot import Shot, write_json
 
 THREADS = 2
@@ -47,7 +51,10 @@ _REAL = 3
 
 
 def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Shot:
-    """A copy of the shot's solve and run whose footage is its frames `factor` times as wide, as numbered PNG files."""
+    """A copy of the shot's solve and run whose footage is its frames `factor` times as wide, as numbered PNG files.
+
+    ValueError if the shot's plates cannot be read from there.
+    """
     copy = folder / shot.root.name
     for part in ("solve", "runs"):
         shutil.copytree(shot.root / part, copy / part)
@@ -55,7 +62,7 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
     shutil.copy2(shot.root / "shot.json", copy / "shot.json")
     record = read_json(copy / "frames" / "frames.json")
     footage, frames = folder / "footage", [int(row["frame"]) for row in record["frames"]]
-    footage.mkdir()
+    footage.mkdir(parents=True)
     real = {frames[0], frames[len(frames) // 2], frames[-1], *_around(frames, poses)}
     rng = np.random.default_rng(0)
     for row in record["frames"]:
@@ -67,11 +74,16 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
         nearest = min(real, key=lambda other: abs(other - frame))
         os.link(footage / frame_file(nearest, ".png"), footage / frame_file(frame, ".png"))
     record |= {"source_size": [record["width"] * factor, record["height"] * factor], "extended": False}
-    # The footage was imported by nobody: its pictures are held against the working frames instead.
-    record |= {"key": "enlarged", "bits": 8, "beside": ""}
+    told = {**record.get("config", {}), "working_height": record["height"]}
+    config = from_dict(FootageConfig, told)
+    key = import_key(open_source(str(footage), config.fps, config.layer).info, config)
+    record |= {"config": told, "key": key, "bits": 8, "beside": ""}
     write_json(copy / "frames" / "frames.json", record)
     made = Shot.open(copy)
     made.update(source=str(footage))
+    note = Plates(made).note
+    if note:
+        raise ValueError(f"the enlarged plates are not read: {note}")
     return made
 
 

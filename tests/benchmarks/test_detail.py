@@ -141,6 +141,16 @@ def test_a_mover_in_a_frozen_shot_is_caught_and_an_exposure_is_not(scene, grid):
     assert steady < 0.01 and restless > 5 * steady
 
 
+def test_light_that_wanders_over_a_wall_is_no_motion(scene):
+    """A poster on a plain wall, seen twice from one place, one side of the picture 7 % darker the second time."""
+    wall = torch.full((240, 320, 3), 0.6)
+    wall[60:180, 80:240] = scene
+    y, x = torch.meshgrid(torch.arange(240) + 0.5, torch.arange(320) + 0.5, indexing="ij")
+    darker = wall * torch.linspace(0.93, 1.0, 320)[None, :, None]
+    left = unexplained_flow(Flow(), wall, darker, torch.stack([x, y], dim=2), torch.ones(240, 320, dtype=torch.bool))
+    assert left[textured(wall)].quantile(0.99) < 0.2
+
+
 def test_a_flat_wall_is_not_judged_by_flow(scene):
     flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
     flat += torch.randn(flat.shape, generator=torch.Generator().manual_seed(0)) * 1.5 / 255

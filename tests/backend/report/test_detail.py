@@ -1,6 +1,7 @@
 """The benchmarks of plate detail on a trained shot whose moving patch is known."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from benchmarks import detail, detail_cost, detail_flow, detail_truth
 from benchmarks.detail_clip import open_clip
 from torch_backend.footage.images import read_png
 from torch_backend.footage.plates import Plates
+from torch_backend.shot import Shot, write_json
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +80,12 @@ def test_costs_are_of_plates_of_that_size(shot, tmp_path):
     poses = detail_cost.middle_poses(clip, 2)
     assert poses == [108, 109]
     before = (shot.root / "frames" / "frames.json").read_bytes()
-    large = detail_cost.enlarged(shot, tmp_path, 2, poses)
+    with pytest.raises(ValueError, match="not read: .*no cameras"):  # of a lens that is not told
+        detail_cost.enlarged(shot, tmp_path / "without", 2, poses)
+    solved = Shot.open(shutil.copytree(shot.root, tmp_path / shot.root.name))
+    lens = {"camera_model": "PINHOLE", "distortion": [], "focal_px": 60.0}
+    write_json(solved.solve / "solve.json", {"version": 1, "key": "", **lens})
+    large = detail_cost.enlarged(solved, tmp_path / "with", 2, poses)
     assert (shot.root / "frames" / "frames.json").read_bytes() == before
     plates = Plates(large)
     assert (plates.width, plates.height) == (128, 96) and not plates.note

@@ -179,7 +179,7 @@ def test_an_ablation_is_held_against_splats_alone(results, tmp_path):
     record = load_record(next(results.glob("*auto*.json")))
     record.pictures, record.two_instants, record.detailed[DELIVERED].pictures = [], [], []
     save_record(tmp_path, record)
-    record.run_id, record.variant = "without", "no exposure"
+    record.run_id, record.variant, record.supervision = "without", "gate, no anchors", "none"
     save_record(tmp_path, record)
     table = next(t for t in all_tables(load_records(tmp_path)) if t.title == "Ablations")
     assert {row[1] for row in table.rows} == {"auto (ours)"} and {row[3] for row in table.rows} == {"+0.000"}
