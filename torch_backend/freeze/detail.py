@@ -265,6 +265,8 @@ class Detailer:
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns), st, own
+        if own and leading == output.t_star:  # its own plate shows the instant itself
+            return within, st, own
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
         wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
         matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
