@@ -45,17 +45,15 @@ class DetailConfig:
     """Plates that a frame is made of, at most: its own and that of t* among them."""
     reach: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
     """How many frames before and after a pose plates are looked for that see what its own hides."""
-    depth_error: float = 0.06
-    """Share of the depth by which the model's surfaces are expected to be wrong: with the baseline, an error in
-    pixels, at 1 of which a plate is believed by half."""
+    depth_error: float = 0.15
+    """Share of the depth by which surfaces may be wrong: with the baseline, an error in pixels, at 1 of which a plate
+    is believed by half. A cautious figure: near plates are right where far ones only look so."""
     margin: int = 4
     """Pixels around what moves in which the leading plate is not believed: hair, motion blur, the flow's own error."""
     feather: float = 2.0
     """Sigma of the leading plate's matte along its border, pixels."""
     enough: float = 0.3
     """Sum of weights at which a pixel is all plate; below, splats are mixed in."""
-    best: float = 0.0
-    """How much more the best plate of a pixel counts than its weight says: 0 mixes by weights alone."""
     travel: float = 1.0
     """Pixels that the model moves a point by, from t* to the leading plate, from which on that plate is not believed
     there: sways too small for the flow."""
@@ -272,15 +270,21 @@ class Detailer:
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns), st, own
+<<<<<<< HEAD
         if leading == shot.t and own:  # the instant itself: whatever it shows is right
             return within, st, own
         travel = self._travel(shot, leading)
         wrong = (torch.maximum(shot.motion, lead.moving) > 0.5) | (travel > self.config.travel) | (shot.gate > 0.5)
+=======
+        if own and leading == output.t_star:  # its own plate shows the instant itself
+            return within, st, own
+        wrong = torch.maximum(shot.motion, lead.moving) > 0.5
+>>>>>>> h14-take
         wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
         matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
         if not own:
             error = self._parallax(shot, leading, shot.depth)
-            matte = matte * lead.visible * torch.exp(-(2.0 * error).square())
+            matte = matte * lead.visible * torch.exp(-error.square())
         return resized(matte, columns, rows) * within, st, own
 
     def _travel(self, shot: _Shot, frame: int) -> Tensor:
@@ -329,7 +333,7 @@ class Detailer:
         motion, unknown = look_up(shot.motion, small), look_up(unknown, small)
         larger = torch.tensor([self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]])
         untold = 1.0 - self.seen.seen(shot.t, points).visible if shot.t in chosen else torch.ones(count)
-        untold = torch.maximum(untold, torch.tensor(getattr(self, '_floor', 0.0))) * (1.0 - unknown)
+        untold = untold * (1.0 - unknown)
         weights, places = [], []
         for n, frame in enumerate(chosen):
             there = points if frame == shot.t else points + look_up(moved[n], small)
@@ -338,11 +342,8 @@ class Detailer:
             weights.append(self._weight(shot, frame, sighting, motion, sway))
             places.append(sighting.pixels * larger)
         believed = torch.stack(weights)
-        best, which = believed.max(dim=0)
-        rest.source = torch.tensor([float(frame) for frame in chosen])[which]
+        rest.source = torch.tensor([float(frame) for frame in chosen])[believed.argmax(dim=0)]
         rest.share = (believed.sum(dim=0) / self.config.enough).clamp(max=1.0)
-        # The best plate leads: a mean of several is softer than each, and each is off by another error of depth.
-        believed = believed * (believed / best.clamp_min(1e-6)).pow(self.config.best)
         total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3)
         for n, frame in enumerate(chosen):
             carried += (believed[n] / total)[:, None] * look_up(self.seen.residual(frame), places[n], "bicubic")
@@ -358,7 +359,7 @@ class Detailer:
 
     def _weight(self, shot: _Shot, frame: int, sighting: Sighting, motion: Tensor, sway: Tensor) -> Tensor:
         """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*."""
-        near = sighting.visible / (1.0 + self._parallax(shot, frame, sighting.depth).square())
+        near = sighting.visible / (1.0 + self._parallax(shot, frame, sighting.depth))
         if frame == shot.t:
             return near
         return near * ((1.0 - motion) * (1.0 - sighting.moving) + motion * sway)
