@@ -270,16 +270,10 @@ class Detailer:
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns), st, own
-<<<<<<< HEAD
-        if leading == shot.t and own:  # the instant itself: whatever it shows is right
+        if own and leading == output.t_star:  # its own plate shows the instant itself
             return within, st, own
         travel = self._travel(shot, leading)
         wrong = (torch.maximum(shot.motion, lead.moving) > 0.5) | (travel > self.config.travel) | (shot.gate > 0.5)
-=======
-        if own and leading == output.t_star:  # its own plate shows the instant itself
-            return within, st, own
-        wrong = torch.maximum(shot.motion, lead.moving) > 0.5
->>>>>>> h14-take
         wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
         matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
         if not own:
