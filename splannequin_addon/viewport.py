@@ -1,11 +1,13 @@
 """Scrubbing: the frozen instant drawn over the 3D view by the warm backend, in front of and behind what is there.
 
-A view asks for what it shows, at a size that is drawn at once; left alone, it asks again, sharper. What has arrived is
-drawn until something newer has. Nothing of bpy is kept between two draws but the handler.
+A view asks for what it shows, at a size that is drawn at once; left alone, it asks again, sharper, and then once more,
+made of the plates. What has arrived is drawn until something newer has. Nothing of bpy is kept between two draws but
+the handler.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -154,7 +156,10 @@ def _tick() -> float | None:
         _suggest(scene)
     state = (
         _session.drawn,
-        (bool(_session.facts), *((instant(s), s.splannequin.live_show, s.frame_current) for s in scenes)),
+        (
+            bool(_session.facts),
+            *((instant(s), s.splannequin.live_show, s.splannequin.detail, s.frame_current) for s in scenes),
+        ),
     )
     now = time.monotonic()
     resting = [v for v, moved in _moved.items() if 0 < now - moved - _REST_SECONDS < 2 * TICK_SECONDS]
@@ -196,7 +201,7 @@ def view_of(
 
 
 def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
-    """True if both show the same, at whatever size."""
+    """True if both show the same, at whatever size, made of plates or not."""
     if (one.t_star, one.show, one.exposed_like) != (other.t_star, other.show, other.exposed_like):
         return False
     ks = [np.array(v.K) / (v.width, v.height, v.width, v.height) for v in (one, other)]
@@ -221,6 +226,7 @@ def _draw() -> None:
     if view.view_perspective == "CAMERA" and scene.camera == cameras.find(scene, _session.shot, "CAMERA"):
         quick.exposed_like = sharp.exposed_like = float(scene.frame_current)
     quick.view = sharp.view = key
+    sharp.detail = scene.splannequin.detail and sharp.show == "color"
     _ask(key, quick, sharp)
     frame = _session.frames.get(key)
     if frame is not None:
@@ -228,15 +234,18 @@ def _draw() -> None:
 
 
 def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:
-    """Asks for the quick view if it shows something new, for the sharp one once it has rested."""
+    """Asks for the quick view if it shows something new; once that rests for the sharp one, then for its detail."""
     if _session is None:
         return
     asked, now = _session.wanted(key), time.monotonic()
     if asked is None or not _same(asked, quick):
         _moved[key] = now
         _session.ask(quick)
-    elif asked.width < sharp.width and now - _moved[key] > _REST_SECONDS and not _session.busy(key):
-        _session.ask(sharp)
+    elif now - _moved[key] > _REST_SECONDS and not _session.busy(key):
+        if asked.width < sharp.width:
+            _session.ask(dataclasses.replace(sharp, detail=asked.detail))
+        elif asked.detail != sharp.detail:
+            _session.ask(sharp)
 
 
 def _paint(key: int, frame: live.Frame, view: Any, scale: float) -> None:

@@ -565,6 +565,8 @@ class LiveView:
     """Frame number whose exposure the camera has; None: t*'s."""
     show: str = "color"
     """color; guesses: colour, tinted where nobody saw it near t*; support or motion: that matte as a grey picture."""
+    detail: bool = False
+    """Make it of the plates, as a take is: it takes longer, and waits for all views that are not. Of `color` alone."""
 
     def __post_init__(self) -> None:
         if len(self.viewmat) != 16 or len(self.K) != 4:

@@ -6,35 +6,116 @@ when that process ends, so does this one. Messages are those of `contract.write_
 | header | from | means |
 |---|---|---|
 | `ready` | backend | the run is loaded: its frames, what they are good for as instants, size |
-| a `LiveView` | Blender | draw this; a newer one for the same view replaces one that waits |
+| a `LiveView` | Blender | draw this; a newer one for the same view replaces one that waits or is being made of plates |
 | `frame` | backend | a view: float32 premultiplied display-referred RGBA, then float32 depth in solve units |
 | `error` | backend | message and hint; after one without `seq` the session ends |
 """
 
 from __future__ import annotations
 
+import functools
+import math
 import os
 import sys
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from .contract import NO_DEPTH, JobError, LiveView, from_dict, read_message, write_message
-from .freeze.query import FrozenGaussians, best_instants, freeze_at, rank_instants, render_frozen
+from .footage.plates import Plates
+from .freeze.detail import DetailedFrame, Detailer
+from .freeze.query import (
+    FrozenGaussians,
+    FrozenImage,
+    OutputFrame,
+    best_instants,
+    freeze_at,
+    rank_instants,
+    render_frozen,
+)
+from .freeze.sightings import motion_mattes
 from .freeze.take import span_of
-from .scene import frame_table, load_scene
+from .scene import Scene, frame_table, load_scene
 from .shot import Shot
-from .train import choose_device, load_run
+from .train import LoadedRun, choose_device, load_run
 
 _INSTANTS_KEPT = 8
 """Frozen scenes that are kept: going back and forth between keys costs no evaluation of the field."""
+_COARSER = 1.25
+"""Plates may be so many times as coarse as a view that is made of them."""
 _TINT, _TINTED = (1.0, 0.15, 0.55), 0.75
 """Display-referred colour of what is a guess, and how much of it covers what nobody saw at all."""
+
+
+class Superseded(Exception):
+    """A view that was being made of plates, which takes a while, gave way to something newer."""
+
+
+class _LivePlates:
+    """Plates as `Detailer` reads them, between whose reads a view can be given up."""
+
+    def __init__(self, shot: Shot, size: tuple[int, int]) -> None:
+        self._plates, self._moving = Plates(shot, size), motion_mattes(shot)
+        self.width, self.height, self.frames = self._plates.width, self._plates.height, self._plates.frames
+        self.deep = self._plates.deep
+        self.stop: Callable[[], bool] = lambda: False
+
+    def display(self, frame: int) -> Tensor:
+        self._go_on()
+        return self._plates.display(frame)
+
+    def linear(self, frame: int) -> Tensor:
+        self._go_on()
+        return self._plates.linear(frame)
+
+    def moving(self, frame: int) -> Tensor | None:
+        """As `sightings.MovingOf`."""
+        self._go_on()
+        return self._moving(frame)
+
+    def _go_on(self) -> None:
+        if self.stop():
+            raise Superseded
+
+
+class _Details:
+    """Makes views of plates. What is computed of a plate serves all views of about one scale."""
+
+    def __init__(self, shot: Shot, run: LoadedRun, scene: Scene) -> None:
+        self._shot, self._run, self._scene = shot, run, scene
+        self._made: tuple[tuple[int, int], _LivePlates, Detailer] | None = None
+        self._whole: tuple[int, int] | None = None
+
+    def frame(
+        self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, stop: Callable[[], bool]
+    ) -> DetailedFrame:
+        """A view of plates at its own scale. JobError if a plate cannot be read; Superseded once `stop` is true."""
+        height, width = image.alpha.shape
+        size = self._size(output)
+        if self._made is None or self._made[0] != size:
+            self._made = None  # before the next takes its room
+            plates = _LivePlates(self._shot, size)
+            self._made = size, plates, Detailer(self._run, self._scene, plates, moving=plates.moving)
+        _, plates, detailer = self._made
+        plates.stop = stop
+        return detailer.frame(output, frozen, image, width, height)
+
+    def _size(self, output: OutputFrame) -> tuple[int, int]:
+        """Width and height of plates that are about as fine as a view: the source's own, halved as often as it can."""
+        if self._whole is None:
+            whole = Plates(self._shot)
+            self._whole = whole.width, whole.height
+        focal = float(self._scene.Ks[0, 0, 0]) * self._whole[0] / self._scene.width
+        finer = focal / max(float(output.K[0, 0]), 1e-6)
+        halved = 2 ** max(0, math.floor(math.log2(finer * _COARSER)))
+        return max(16, round(self._whole[0] / halved)), max(16, round(self._whole[1] / halved))
 
 
 class LiveSession:
@@ -46,6 +127,7 @@ class LiveSession:
         self._span = span_of(self.scene, self.run)
         self._frozen: OrderedDict[float, FrozenGaussians] = OrderedDict()
         self._sharpness = {frame: row["sharpness"] for frame, row in frame_table(shot).items()}
+        self._details = _Details(shot, self.run, self.scene)
 
     def facts(self) -> dict[str, Any]:
         """Header of the `ready` message."""
@@ -68,22 +150,20 @@ class LiveSession:
             ],
         }
 
-    def draw(self, view: LiveView) -> tuple[dict[str, Any], bytes]:
-        """Header and body of the `frame` message for a view. t* snaps to the nearest trained frame."""
+    def draw(self, view: LiveView, stop: Callable[[], bool] = lambda: False) -> tuple[dict[str, Any], bytes]:
+        """Header and body of the `frame` message for a view. t* snaps to the nearest trained frame.
+
+        Made of plates it raises Superseded once `stop` is true, which is asked now and then, and JobError if a plate
+        cannot be read.
+        """
         since = time.perf_counter()
-        trained = self.run.train_frames
-        at = min(trained, key=lambda frame: abs(frame - view.t_star))
-        like = at if view.exposed_like is None else view.exposed_like
-        fx, fy, cx, cy = view.K
-        image = render_frozen(
-            self._at(float(at)),
-            self.scene.from_solve(np.reshape(view.viewmat, (4, 4))),
-            torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device="cpu"),
-            view.width,
-            view.height,
-            self.run.model.exposure,
-            self.scene.time_of_frame(like),
-        )
+        at = min(self.run.train_frames, key=lambda frame: abs(frame - view.t_star))
+        output = self._output(view, at)
+        frozen, exposed_at = self._at(float(at)), self.scene.time_of_frame(output.exposed_like)
+        exposure = self.run.model.exposure
+        image = render_frozen(frozen, output.viewmat, output.K, view.width, view.height, exposure, exposed_at)
+        if view.detail and view.show == "color":
+            image = self._details.frame(output, frozen, image, stop)
         alpha = image.alpha[..., None]
         if view.show == "color":
             shown = image.color
@@ -106,6 +186,20 @@ class LiveSession:
         }
         return header, body
 
+    def _output(self, view: LiveView, at: int) -> OutputFrame:
+        """The frame that a view is: one of the clip's own where it is seen as the clip's camera saw it."""
+        like = at if view.exposed_like is None else view.exposed_like
+        fx, fy, cx, cy = view.K
+        viewmat = self.scene.from_solve(np.reshape(view.viewmat, (4, 4)))
+        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device="cpu")
+        frame = round(like)
+        if frame == like and frame in self.scene.frames:
+            i = self.scene.frames.index(frame)
+            # Blender's matrices are off by rounding.
+            if torch.allclose(viewmat, self.scene.viewmats[i], atol=1e-4):
+                viewmat = self.scene.viewmats[i]
+        return OutputFrame(frame, viewmat, K, float(at), float(like))
+
     def _at(self, frame: float) -> FrozenGaussians:
         if frame not in self._frozen:
             time_at = self.scene.time_of_frame(frame)
@@ -117,7 +211,10 @@ class LiveSession:
 
 
 class _Waiting:
-    """Requests that wait: the newest of each view, oldest view first. Filled by a thread, emptied by the session."""
+    """Requests that wait: the newest of each view, oldest view first, those of plates after all others.
+
+    Filled by a thread, emptied by the session.
+    """
 
     def __init__(self) -> None:
         self._views: OrderedDict[int, LiveView] = OrderedDict()
@@ -154,7 +251,21 @@ class _Waiting:
             self._change.wait_for(lambda: self._ended or self._views or self._refused)
             if self._ended:
                 return None
-            return self._refused.pop(0) if self._refused else self._views.popitem(last=False)[1]
+            if self._refused:
+                return self._refused.pop(0)
+            first = next((n for n, view in self._views.items() if not view.detail), next(iter(self._views)))
+            return self._views.pop(first)
+
+    def better_than(self, view: LiveView) -> bool:
+        """True if something waits that a view of plates should give way to, or nobody waits for it any more."""
+        with self._change:
+            waits = any(not other.detail or other.view == view.view for other in self._views.values())
+            return self._ended or bool(self._refused) or waits
+
+    def put_back(self, view: LiveView) -> None:
+        """Has a view wait again, unless a newer one for the same view does."""
+        with self._change:
+            self._views.setdefault(view.view, view)
 
 
 def serve(session: LiveSession, requests: BinaryIO, answers: BinaryIO) -> None:
@@ -168,8 +279,11 @@ def serve(session: LiveSession, requests: BinaryIO, answers: BinaryIO) -> None:
                 write_message(answers, asked)
                 continue
             try:
-                header, body = session.draw(asked)
-            except (RuntimeError, ValueError) as error:
+                header, body = session.draw(asked, functools.partial(waiting.better_than, asked))
+            except Superseded:
+                waiting.put_back(asked)
+                continue
+            except (JobError, RuntimeError, ValueError) as error:
                 header, body = {"kind": "error", "seq": asked.seq, "message": str(error), "hint": ""}, b""
             write_message(answers, header, body)
     except BrokenPipeError:

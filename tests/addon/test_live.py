@@ -39,6 +39,60 @@ def test_a_view_through_the_solved_camera_is_the_solved_camera(addon, contract, 
         assert not viewport._same(whole, small)
 
 
+def _answer(session, asked):
+    """What the backend says when it has drawn a view."""
+    pixels = np.zeros(5 * asked.width * asked.height, np.float32).tobytes()
+    size = {"width": asked.width, "height": asked.height}
+    session._take_in({"kind": "frame", "seq": asked.seq, "t_star": 6, **size}, pixels)
+
+
+def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, contract, shot, monkeypatch):
+    """One request at a time, none while the view changes; the artist's switch is followed both ways."""
+    viewport, live = addon("viewport"), addon("live")
+    session = live.Session(shot, "main")
+    monkeypatch.setattr(viewport, "_session", session)
+    monkeypatch.setattr(viewport, "_moved", {})
+
+    def look(t_star=6.0, detail=True, rested=True):
+        """One drawing of the region; returns what it newly asked for, None if nothing."""
+        before = session.wanted(1)
+        if rested and 1 in viewport._moved:
+            viewport._moved[1] -= 1.0
+        quick, sharp = (contract.LiveView(1, 0, VIEWMAT, [f, f, 8 * n, 6 * n], 16 * n, 12 * n, t_star)
+                        for n, f in ((1, 9.0), (2, 18.0)))  # fmt: skip
+        sharp.detail = detail
+        viewport._ask(1, quick, sharp)
+        asked = session.wanted(1)
+        return None if asked is before else (asked.width, asked.detail)
+
+    assert look() == (16, False)
+    assert look() is None, "it is still being drawn"
+    _answer(session, session.wanted(1))
+    assert look(t_star=7.0) == (16, False)
+    _answer(session, session.wanted(1))
+    viewport._moved[1] = time.monotonic()
+    assert look(t_star=7.0, rested=False) is None, "it does not rest yet"
+    assert look(t_star=7.0) == (32, False)
+    assert look(t_star=7.0) is None
+    _answer(session, session.wanted(1))
+    assert look(t_star=7.0) == (32, True)
+    assert look(t_star=7.0) is None
+    assert look(t_star=8.0) == (16, False), "what is being made of plates is not waited for"
+    _answer(session, session.wanted(1))
+    assert not session.busy(1), "and will not be answered any more"
+    for wanted in ((32, False), (32, True)):
+        assert look(t_star=8.0) == wanted
+        _answer(session, session.wanted(1))
+    assert look(t_star=8.0) is None, "nothing is left to ask for"
+    assert look(t_star=8.0, detail=False) == (32, False)
+    _answer(session, session.wanted(1))
+    assert look(t_star=8.0, detail=False) is None
+    assert look(t_star=8.0) == (32, True)
+    seq = session.wanted(1).seq
+    session._take_in({"kind": "error", "seq": seq, "message": "no plates", "hint": ""}, b"")
+    assert look(t_star=8.0) is None and session.open, "not asked for over and over"
+
+
 def test_an_orthographic_view_is_not_asked_for(addon, shot, scene):
     scene.splannequin.shot_path = str(shot)
     assert addon("viewport").view_of(scene, shot, (64, 48), (Matrix(), Matrix()), 6.0, 10**9) is None

@@ -1,10 +1,13 @@
 """A live session as Blender holds one: a child process, views in, frames out."""
 
+import dataclasses
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
+from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +26,7 @@ from torch_backend.contract import (
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.live import _TINT, _TINTED, LiveSession, _Waiting
+from torch_backend.live import _TINT, _TINTED, LiveSession, Superseded, _Waiting
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -100,6 +103,101 @@ def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
     for show in ("support", "motion"):
         matte, _ = picture(ask(session[0], view_of(world, 105, 112, show=show)))
         assert np.abs(matte[..., 0] - getattr(want, show) * want.rgba[..., 3]).max() < 4e-3
+
+
+def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, trained, quiet):
+    world, _ = trained
+    freeze_shot(world.shot, FreezeParams(take="plates", t_star=112, first=105, last=105), quiet())
+    want = read_frozen_exr(world.shot.take("plates") / "000105.exr")
+    asked = view_of(world, 105, 112.2, exposed_like=105.0)
+    asked["viewmat"] = [v + 1e-6 for v in asked["viewmat"]]  # as from Blender
+    splats, made = (picture(ask(session[0], {**asked, "detail": detail})) for detail in (False, True))
+    shown = linear_to_srgb(want.rgba[..., :3]).clip(0, 1)
+    assert np.abs(made[0][..., :3] - shown).max() < 4e-3
+    assert np.abs(made[0][..., 3] - want.rgba[..., 3]).max() < 1e-3
+    seen = want.rgba[..., 3] > 0.99
+    assert np.abs(made[1][seen] / want.depth[seen] - 1).max() < 1e-3
+    assert np.abs(splats[0][..., :3] - shown).max() > 0.1
+    for show in ("guesses", "support", "motion"):
+        plain, same = (picture(ask(session[0], {**asked, "show": show, "detail": d}))[0] for d in (False, True))
+        np.testing.assert_array_equal(plain, same)
+
+
+@pytest.mark.parametrize("size", [(64, 48), (150, 60), (20, 30)])
+def test_a_view_of_any_size_is_made_of_plates(trained, size):
+    world, _ = trained
+    session = LiveSession(world.shot, "main", "cpu")
+    width, height = size
+    k = [width * 60 / 64, width * 60 / 64, 0.4 * width, 0.6 * height]
+    asked = {**view_of(world, 105, 105, *size, exposed_like=105.0), "K": k}
+    del asked["kind"]
+    splats, made = (picture(session.draw(LiveView(**asked, detail=detail)))[0] for detail in (False, True))
+    assert made.shape == (height, width, 4)
+    covered = splats[..., 3] > 0.99
+    # The same view: the splats know the place, and are soft in it.
+    assert np.abs(made - splats)[covered].mean() < 0.03
+    assert np.abs(made - splats)[covered].max() > 1e-3
+
+
+def test_a_view_of_plates_gives_way_to_a_newer_one_and_is_made_after_it(session, trained):
+    world, _ = trained
+    child, _ = session
+    asked = [
+        {"view": 1, "seq": 1, "detail": True},
+        {"view": 2, "seq": 2},
+        {"view": 3, "seq": 3, "detail": True},
+        {"view": 3, "seq": 4, "detail": True},
+        {"view": 2, "seq": 5},
+    ]
+    for change in asked:
+        write_message(child.stdin, {**view_of(world, 105, 108, exposed_like=105.0), **change})
+    came = []
+    while not {1, 4, 5} <= set(came):
+        header, _ = read_message(child.stdout)
+        assert header["kind"] == "frame"
+        came.append(header["seq"])
+    assert len(set(came)) == len(came)
+    assert came.index(5) < max(came.index(1), came.index(4))
+
+
+def test_what_is_being_made_of_plates_stops_between_two_plates(trained):
+    world, _ = trained
+    session = LiveSession(world.shot, "main", "cpu")
+    asked = {k: v for k, v in view_of(world, 105, 112, exposed_like=105.0).items() if k != "kind"}
+    view = LiveView(**asked, detail=True)
+    turns = iter([False, False, True])
+    with pytest.raises(Superseded):
+        session.draw(view, lambda: next(turns))
+    again, fresh = session.draw(view)[1], LiveSession(world.shot, "main", "cpu").draw(view)[1]
+    assert again == fresh, "what was given up leaves nothing behind"
+    newer = dataclasses.replace(view, seq=9)
+    waiting = _Waiting()
+    for waits, better in ((newer, True), (dataclasses.replace(newer, view=2), False),
+                          (dataclasses.replace(newer, view=2, detail=False), True)):  # fmt: skip
+        waiting._views = OrderedDict({waits.view: waits})
+        assert waiting.better_than(view) == better
+    waiting._views = OrderedDict({1: newer, 2: dataclasses.replace(view, view=2, detail=False)})
+    waiting.put_back(view)
+    assert waiting.next().view == 2
+    assert waiting.next() is newer
+
+
+def test_without_its_footage_a_view_of_plates_says_so_and_splats_go_on(trained, tmp_path):
+    world, _ = trained
+    shutil.copytree(world.shot.root, tmp_path / "torn.splannequin")
+    child = start(tmp_path / "torn.splannequin")
+    try:
+        read_message(child.stdout)
+        for picture_file in (tmp_path / "torn.splannequin" / "frames").glob("*.png"):
+            picture_file.write_bytes(b"torn")
+        header, _ = ask(child, view_of(world, 105, 108, detail=True))
+        assert (header["kind"], header["seq"]) == ("error", 7)
+        assert "damaged" in header["message"] or "cannot be read" in header["message"]
+        picture(ask(child, view_of(world, 105, 108)))
+    finally:
+        child.stdin.close()
+        assert child.wait(20) == 0
+        child.stdout.close()
 
 
 def test_guesses_are_tinted_by_how_ill_they_were_seen(trained):

@@ -109,6 +109,8 @@ class _Shot:
     K: Tensor
     """[3, 3] in pixels of the picture with its overscan."""
     image: FrozenImage
+    own: bool
+    """True if it is one of the clip's own frames, seen as its camera saw it."""
     t: int
     """Frame whose plate shows the instant."""
     frozen: FrozenGaussians
@@ -216,9 +218,7 @@ class Detailer:
                 self._layers.popitem(last=False)
         return self._layers[key]
 
-    def _shot(
-        self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, width: int, height: int
-    ) -> _Shot:
+    def _shot(self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, width: int, height: int) -> _Shot:
         rows, columns = image.alpha.shape
         K = _with_overscan(output.K, image, width, height)
         per_pixel = min(1.0, self.config.sightings.width / width)
@@ -228,21 +228,24 @@ class Detailer:
         points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
         t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
         motion = resized(image.motion, w, h)
-        return _Shot(output.viewmat, K, image, t, frozen, points, depth, motion, motion, w / columns)
+        own = self._is_own(output, width, height)
+        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, motion, w / columns)
 
-    def _is_own(self, output: OutputFrame) -> bool:
-        """True if the frame is one of the clip's own, seen as its camera saw it."""
+    def _is_own(self, output: OutputFrame, width: int, height: int) -> bool:
+        """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
         i = self.seen.index.get(output.frame)
         return (
             i is not None
+            and (width, height) == (self.plates.width, self.plates.height)
             and output.frame in self.seen.frames
             and output.exposed_like == float(output.frame)
             and torch.equal(output.viewmat, self.scene.viewmats[i])
+            and torch.allclose(output.K, self.scene.camera_at(width, height)[i], rtol=1e-4)
         )
 
     def _leading(self, output: OutputFrame, shot: _Shot, usable: list[int]) -> int:
         """The frame's own plate, else the nearest in pose of those usable: in travel over depth, and in direction."""
-        if self._is_own(output) and output.frame in usable:
+        if shot.own and output.frame in usable:
             return output.frame
         at = torch.tensor([self.seen.index[frame] for frame in usable])
         solid = shot.depth[shot.depth < 1e9]
@@ -260,7 +263,7 @@ class Detailer:
         """
         rows, columns = shot.image.alpha.shape
         lead = self.seen.seen(leading, shot.points)
-        own = self._is_own(output)
+        own = shot.own
         truth = self.seen.seen(shot.t, shot.points) if shot.t in usable else None
         hidden = torch.minimum(shot.motion, lead.moving) if own else shot.motion
         if truth is not None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, map_coordinates
 
 from torch_backend.contract import CameraFrame, CameraPath
 from torch_backend.deformation import Deformation, Deltas
@@ -197,8 +198,6 @@ def made(world):
 
 
 def widened(mask, by):
-    from scipy.ndimage import binary_dilation
-
     return binary_dilation(mask, np.ones((2 * by + 1,) * 2))
 
 
@@ -338,6 +337,21 @@ def test_a_camera_of_ones_own_at_a_pose_of_the_clip_is_that_plate(still_world):
     # A depth that is wrong moves nothing between two cameras in one place.
     assert (result.st - identity()).abs().max() < 0.02 / W
     assert off(result.color, still_world.seen_at(9)[0], np.ones((H, W), bool)) < 2e-3
+
+
+def test_another_lens_at_a_pose_of_the_clip_is_not_that_plate(still_world):
+    output = still_world.output(9, 9)
+    output.K = output.K * torch.tensor([[1.5], [1.5], [1.0]])
+    output.K[:2, 2] = torch.tensor([W / 2, H / 2])
+    result = still_world.make(output)
+    middle = (slice(H // 2 - H // 8, H // 2 + H // 8), slice(W // 2 - W // 8, W // 2 + W // 8))
+    rows, columns = np.mgrid[:H, :W]
+    shown, _ = still_world.seen_at(9)
+    at = ((rows + 0.5 - H / 2) / 1.5 + H / 2 - 0.5, (columns + 0.5 - W / 2) / 1.5 + W / 2 - 0.5)
+    truth = np.stack([map_coordinates(shown[..., c], at, order=3) for c in range(3)], -1)
+    inside = np.zeros((H, W), bool)
+    inside[middle] = True
+    assert off(result.color, truth, inside) < 0.3 * off(result.splat, truth, inside)
 
 
 def test_far_from_every_plate_a_frame_fades_to_splats(still_world):
