@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torch_backend.contract import CameraFrame, CameraPath, Cancelled, JobError, read_json
+from torch_backend.contract import CameraFrame, CameraPath, Cancelled, JobError
 from torch_backend.footage.images import is_whole_png, read_png, write_png
 from torch_backend.shot import Shot, write_json
 from torch_backend.solve.motion import (
