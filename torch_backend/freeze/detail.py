@@ -48,15 +48,17 @@ class DetailConfig:
     depth_error: float = 0.15
     """Share of the depth by which surfaces may be wrong: with the baseline, an error in pixels, at 1 of which a plate
     is believed by half. A cautious figure: near plates are right where far ones only look so."""
-    margin: int = 4
+    margin: int = 2
     """Pixels around what moves in which the leading plate is not believed: hair, motion blur, the flow's own error."""
-    feather: float = 2.0
+    feather: float = 1.5
     """Sigma of the leading plate's matte along its border, pixels."""
     enough: float = 0.3
     """Sum of weights at which a pixel is all plate; below, splats are mixed in."""
     travel: float = 1.0
-    """Pixels that the model moves a point by, from t* to the leading plate, from which on that plate is not believed
-    there: sways too small for the flow."""
+    """Pixels that the model moves a point by, from t* to the frame's own plate, from which on that plate is not
+    believed there if it bears the motion out: sways too small for the flow."""
+    borne_out: float = 0.03
+    """By how much, display-referred, the plate's own time must explain it better than t* does."""
     sway: float = 6.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.3
@@ -120,8 +122,6 @@ class _Shot:
     """[h, w]"""
     motion: Tensor
     """[h, w] in 0..1: what moves in the clip, at t*."""
-    gate: Tensor
-    """[h, w] in 0..1: what moves in the clip, by the model alone."""
     per_pixel: float
     """Pixels of decisions per pixel of the picture."""
 
@@ -229,7 +229,7 @@ class Detailer:
         t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
         motion = resized(image.motion, w, h)
         own = self._is_own(output, width, height)
-        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, motion, w / columns)
+        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns)
 
     def _is_own(self, output: OutputFrame, width: int, height: int) -> bool:
         """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
@@ -275,14 +275,31 @@ class Detailer:
             return torch.zeros(rows, columns), st, own
         if own and leading == output.t_star:  # its own plate shows the instant itself
             return within, st, own
-        travel = self._travel(shot, leading)
-        wrong = (torch.maximum(shot.motion, lead.moving) > 0.5) | (travel > self.config.travel) | (shot.gate > 0.5)
+        wrong = torch.maximum(shot.motion, lead.moving) > 0.5
+        if own:
+            wrong = wrong | self._swayed(shot, leading, size)
         wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
         matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
         if not own:
             error = self._parallax(shot, leading, shot.depth)
             matte = matte * lead.visible * torch.exp(-error.square())
         return resized(matte, columns, rows) * within, st, own
+
+    def _swayed(self, shot: _Shot, frame: int, size: tuple[int, int]) -> Tensor:
+        """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
+
+        That is, the render of t* differs from the plate by more than the render of the plate's own time does. A
+        textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways that are.
+        """
+        h, w = shot.depth.shape
+        view = self.seen.view(frame)
+        inner_h, inner_w = view.missed.shape
+        top, left = (h - inner_h) // 2, (w - inner_w) // 2
+        shown = resized(shot.image.color, w, h)[top : top + inner_h, left : left + inner_w]
+        gained = self.seen.difference(view.picture.float(), shown) - view.missed.float()
+        out = torch.zeros(h, w, dtype=torch.bool)
+        out[top : top + inner_h, left : left + inner_w] = gained > self.config.borne_out
+        return out & (self._travel(shot, frame) > self.config.travel)
 
     def _travel(self, shot: _Shot, frame: int) -> Tensor:
         """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""

@@ -65,6 +65,10 @@ class PlateView:
     """[h, w] in 0..1: something that moves in the clip is seen there."""
     explained: Tensor
     """[h, w] in 0..1: the model shows there what the plate shows, but for detail."""
+    picture: Tensor
+    """[h, w, 3] float16, the plate, display-referred."""
+    missed: Tensor
+    """[h, w] float16 in 0..1: low-passed difference between plate and the model's own render of it."""
     offsets: Tensor
     """[M, 3] means of the open Gaussians in that frame, scene units."""
 
@@ -148,7 +152,7 @@ class Sightings:
         if frame not in self._views:
             self._views[frame] = self._look(frame)
             width, height = self.size
-            each = 12.0 * width * height + 12.0 * len(self.rows)
+            each = 20.0 * width * height + 12.0 * len(self.rows)
             while len(self._views) > max(12, _VIEWS_BYTES / each):
                 self._views.popitem(last=False)
         self._views.move_to_end(frame)
@@ -163,6 +167,10 @@ class Sightings:
                 self._residuals.popitem(last=False)
         self._residuals.move_to_end(frame)
         return self._residuals[frame]
+
+    def difference(self, a: Tensor, b: Tensor) -> Tensor:
+        """[h, w] greatest difference over channels of two pictures [h, w, 3] of decisions, under a small low-pass."""
+        return blurred(a - b, 0.5 * self.config.lowpass * self.unit).abs().amax(dim=-1)
 
     def seen(self, frame: int, points: Tensor) -> Sighting:
         """Where plate `frame` shows world points [..., 3]."""
@@ -189,6 +197,7 @@ class Sightings:
         moving = image.motion if told is None else resized(told, width, height)
         # The working frame will do, and need not be decoded from 4K footage.
         plate = read_image(self.scene.image_path(self.index[frame]), width, height)
+        missed = self.difference(plate, image.color)
         off = blurred(plate - image.color, self.config.lowpass * self.unit).abs().amax(dim=-1)
         region = round(self.config.region * self.unit)
         off = blurred(widened(off, region), 0.5 * region)
@@ -197,6 +206,8 @@ class Sightings:
             image.depth,
             widened(moving, round(self.config.margin * self.unit)),
             torch.exp(-(off / self.config.unexplained).square()),
+            plate.half(),
+            missed.half(),
             frozen.state["means"].cpu()[self.rows],
         )
 
