@@ -34,11 +34,11 @@ class FlowConfig:
     """Matches over the longest baseline are chained this often: 4 links of 8 key frames reach 3 seconds."""
     round_trip: float = 1.2
     """Greatest distance between a pixel and where the flow there and back ends; above it the pixel is hidden there."""
-    tolerance: float = 1.0
+    tolerance: float = 0.9
     """A match this far from where the still point is seen may tell of motion."""
     per_link: float = 0.2
     """So much more for each further link of a chain."""
-    noise: float = 2.2
+    noise: float = 2.0
     """The tolerance of a pair is at least this many times the median distance in it: blur, shutter, a poor pose."""
     most_noise: float = 4.0
     """But at most this many times what it is otherwise, unless a pose was guessed: what moves may fill the picture."""
@@ -52,6 +52,8 @@ class FlowConfig:
     """Power of a pair's distance in time with which it counts for stillness: what sways is still for a moment."""
     doubt: float = 1.0
     """So many matches that tell of motion are taken for errors."""
+    outline: float = 1.0
+    """So much more of that at outlines, where flow is a mixture of two surfaces."""
     share: float = 0.4
     """A point moves for certain if so much of what it is matched with says so."""
     sure: float = 4.0
@@ -64,7 +66,7 @@ class FlowConfig:
     """Smaller differences are no edges."""
     seed: float = 0.4
     """An area moves if a point in it has this score,"""
-    grow: float = 0.15
+    grow: float = 0.1
     """and reaches as far as points have this one."""
     blob: float = 10.0
     """Areas of less than this squared are noise, and holes of less are filled."""

@@ -141,7 +141,7 @@ def _own_score(clip: Clip, matches: Matches, key: int, config: FlowConfig) -> tu
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
     on, off = evidence(test, key, seen, clip.depths[key], config)
     count = on + off
-    score = np.clip((off - config.doubt) / (count + config.doubt) / config.share, 0.0, 1.0)
+    score = np.clip(off / (count + config.doubt) / config.share, 0.0, 1.0)
     return score, np.minimum(count / config.sure, 1.0) * (count >= 1.0)
 
 

@@ -17,6 +17,8 @@ from .flow import FlowConfig, Map, Mask, Seen, sample
 
 _FEW = 50
 """Fewer points say nothing of a picture."""
+_OUTLINE = 0.25
+"""Depths that differ by this share are two surfaces."""
 _MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
 """Square differences: above the one all are alike (hidden, or gone), by the other a point's own depth is preferred."""
 
@@ -137,8 +139,13 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
             most = np.inf if guessed else config.most_noise * pair.limit
             pair.limit = max(pair.limit, min(config.noise * float(np.median(length[told])), most))
         agree += pair.seen.found & (length <= pair.limit)
-    inverse = _best_depth(look, pairs, _surroundings(inverse, agree >= 3))
-    return _counted(key, look, texture, pairs, inverse, config)
+    depths = _surroundings(inverse, agree >= 3)
+    inverse = _best_depth(look, pairs, depths)
+    on, off = _counted(key, look, texture, pairs, inverse, config)
+    block = np.ones((7, 7), np.uint8)
+    jump = cv2.dilate(depths[0], block) / np.maximum(cv2.erode(depths[0], block), 1e-9) - 1.0
+    outline = np.clip(jump / _OUTLINE, 0.0, 1.0)
+    return on, np.maximum(off - config.doubt * (1.0 + config.outline * outline), 0.0)
 
 
 def _pair(test: StillTest, key: int, seen: Seen, texture: _Texture, config: FlowConfig) -> _Pair:
