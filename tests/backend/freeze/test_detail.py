@@ -102,8 +102,9 @@ class World:
     def plates(self):
         return Plates(self.shot)
 
-    def detailer(self, plates=None, **config):
-        return Detailer(self.run, self.scene, plates or self.plates(), DetailConfig(**config))
+    def detailer(self):
+        # Surfaces are where they are: a real model's are not, which the default minds.
+        return Detailer(self.run, self.scene, self.plates(), DetailConfig(depth_error=0.01))
 
     def output(self, frame, t_star):
         """A frame of a take at the clip's own pose."""

@@ -44,9 +44,9 @@ solve_shot(shot, SolveConfig(), Report(), sys.argv[4])
 
 
 def contents(shot):
-    """{name: hash} of what readers of a solved shot read."""
+    """{name: hash} of what readers of a solved shot read; the motion matte comes after, and knows whose it is."""
     files = [p for folder in (shot.frames, shot.solve) for p in folder.rglob("*") if p.is_file()]
-    read = [p for p in files if p.name != "colmap.log" and "scratch" not in p.parts]
+    read = [p for p in files if p.name != "colmap.log" and not {"scratch", "motion"} & {*p.parts}]
     return {p.relative_to(shot.root).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in read}
 
 

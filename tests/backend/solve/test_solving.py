@@ -1,6 +1,7 @@
 """The whole solve, by COLMAP, of a rendered room: against the cameras it was rendered from."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from torch_backend.shot import Shot, write_json
 from torch_backend.solve import SolveConfig, load_points, solve_shot
 from torch_backend.solve.child import run_worker
 from torch_backend.solve.floor import floor_of
+from torch_backend.solve.motion import load_motion
 from torch_backend.solve.poses import camera_centre
 from torch_backend.solve.solving import filter_points, lens_remarks, quality_words, refuse_poor
 
@@ -100,14 +102,15 @@ def test_solve_json_says_how_good_it_is(solved):
     assert record["quality"] == f"Good: 11 of 11 frames registered, {record['reprojection_error_px']:.2f} px."
     assert record["points"] == len(load_points(solved.shot)["xyz"])
     assert record["warnings"] == []
-    assert solved.result == record["result"]
+    shares = {"motion_pixels_share", "unknown_share"}
+    assert {name: value for name, value in solved.result.items() if name not in shares} == record["result"]
     path = CameraPath.load(solved.shot.solve / "cameras.json")
     assert record["floor"] == floor_of(path, load_points(solved.shot)["xyz"])
 
 
 def test_the_model_is_kept_and_the_scratch_is_not(solved):
     names = {p.name for p in solved.shot.solve.iterdir()}
-    assert names == {"cameras.json", "points.npz", "solve.json", "colmap", "colmap.log"}
+    assert names == {"cameras.json", "points.npz", "solve.json", "colmap", "colmap.log", "motion"}
     assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in (solved.shot.solve / "colmap").iterdir()}
 
 
@@ -121,6 +124,7 @@ def test_progress_names_the_stages_in_order(solved):
         "other features",
         "other matches",
         "undistort",
+        "motion",
     ]
     assert all(0 <= done <= total for _, done, total in solved.report.steps)
 
@@ -130,6 +134,28 @@ def test_a_solved_shot_is_left_alone(solved, tools):
     report = tools.recorder()
     assert solve_shot(solved.shot, SolveConfig(features=1500), report) == solved.result
     assert {p: p.stat().st_mtime_ns for p in solved.shot.root.rglob("*") if p.is_file()} == before
+
+
+def test_every_frame_of_a_solve_has_a_motion_matte(solved):
+    """Those that the step left out too. Nothing moves in the room."""
+    path = cameras(solved.shot)
+    for camera in path.frames:
+        labels = load_motion(solved.shot, camera.frame)
+        assert labels is not None and labels.shape == (path.height, path.width)
+    assert solved.result["motion_pixels_share"] < 0.01 and solved.result["unknown_share"] < 0.05
+
+
+def test_a_solve_holds_without_its_motion_matte_and_the_next_one_finds_it(solved, tools, tmp_path):
+    shot = Shot(shutil.copytree(solved.shot.root, tmp_path / "a.splannequin"))
+    shutil.rmtree(shot.solve / "motion")
+    (shot.solve / "motion").write_bytes(b"in the way")
+    report = tools.recorder()
+    result = solve_shot(shot, SolveConfig(features=1500), report)
+    assert "motion_pixels_share" not in result and result["registered"] == 11
+    (said,) = report.warnings
+    assert said.startswith("What moves by itself could not be told from the pictures: ") and "is not a folder" in said
+    (shot.solve / "motion").unlink()
+    assert solve_shot(shot, SolveConfig(features=1500), tools.recorder()) == solved.result
 
 
 def test_the_same_frames_give_the_same_cameras(solved, tools, tmp_path):
