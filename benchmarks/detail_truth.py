@@ -2,8 +2,8 @@
 
 SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot, with exact
 cameras, and an `auto` run are made in DIR if they are not there. Printed is the mean PSNR of all poses and instants
-that have a truth, splats -> plate of the pose withheld -> delivered, by region, and what got worse. DIR gets
-truth-NAME.json.
+that have a truth, splats -> plate of the pose withheld -> delivered, by region, and what got worse. The pose of t*
+itself does not count: plate t* is its truth. DIR gets truth-NAME.json.
 """
 
 from __future__ import annotations
@@ -52,12 +52,15 @@ def trained(truth: TruthScene, source: str, args: argparse.Namespace) -> str:
 
 
 def judge(truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1) -> list[dict[str, Any]]:
-    """PSNR in dB of every pose: [{t_star, pose, variant: {region: dB or None}}]."""
+    """PSNR in dB of every pose: [{t_star, pose, variant: {region: dB or None}}].
+
+    But for that of t* itself: what is delivered there is plate t*, which is the truth to the byte.
+    """
     run, scene = load_run(truth.shot, run_name, torch.device("cpu")), load_scene(truth.shot)
     detailer, size, rows = plate_detail(truth.shot, run, scene, Log()), (run.width, run.height), []
     for t_star in t_stars:
         frozen = freeze_run(run, scene, t_star, "nearest", detailer)
-        for pose in truth.poses(t_star, [])[::every]:
+        for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
             row: dict[str, Any] = {"t_star": t_star, "pose": pose}
             rows.append(row | {v: psnr_by_region(frozen.view(pose, v), target, regions) for v in VARIANTS})

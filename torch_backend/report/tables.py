@@ -40,7 +40,7 @@ QUERY_NOTE = (
 DETAIL_NOTE = (
     "A method alone is splats alone; with *plate detail* the frames are what a take delivers: the plates' own pixels, "
     "carried to t*, where they can be believed. *Plate withheld*: without the plate of the pose that is judged, which "
-    "on what never moves is the answer itself."
+    "on what never moves is the answer itself. What is delivered at t*'s own pose is the truth itself, and not counted."
 )
 _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
 NONE = "–"

@@ -28,8 +28,9 @@ def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tm
     assert [f["t_star"] for f in found["freezes"]] == [suggested, other]
     for freeze in found["freezes"]:
         mean = freeze["mean"]
-        assert mean["delivered"]["still_db"] > 100 > mean["withheld"]["still_db"] > mean["splats"]["still_db"]
-        assert mean["delivered"]["best_90_db"] > mean["splats"]["best_90_db"] + 3
+        still = [mean[variant]["still_db"] for variant in ("splats", "withheld", "delivered")]
+        assert still == sorted(still) and still[2] > max(45, still[1] + 3)
+        assert mean["delivered"]["best_90_db"] > mean["splats"]["best_90_db"]
         assert all(0.1 < row["still_share"] < 0.95 for row in freeze["frames"])
     assert found["instants_differ_255"] < 1.0 and found["motion_from"].startswith("the gate")
     strips = list((tmp_path / "strips").glob("*.png"))
