@@ -176,10 +176,11 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _in_editor(context: Any, image: Any, mode: str) -> Any | None:
-    """Shows an image in an Image Editor of this window, else of a window of its own; None without windows."""
+    """Shows an image in an Image Editor, the one in this window first, else in a new window; None without windows."""
     if bpy.app.background:
         return None
-    areas = [area for area in context.window.screen.areas if area.type == "IMAGE_EDITOR"]
+    windows = sorted(context.window_manager.windows, key=lambda window: window != context.window)
+    areas = [area for window in windows for area in window.screen.areas if area.type == "IMAGE_EDITOR"]
     if not areas:
         bpy.ops.wm.window_new()
         areas = [context.window_manager.windows[-1].screen.areas[0]]

@@ -7,6 +7,11 @@ Freeze; guesses: Geratenes; support: Stützung. Nobody is addressed: infinitives
 MESSAGES: dict[str, str] = {
     # ------------------------------------------------------------------------------------------ the motion matte
     "Motion Matte": "Bewegungsmatte",
+    "What moves by itself could not be told from the pictures: {}": "Was sich von selbst bewegt, war den Bildern nicht zu entnehmen: {}",
+    "The cameras are whole; solve again to try once more.": "Die Kameras sind ganz; neu lösen, um es noch einmal zu versuchen.",
+    "The motion matte {} is damaged.": "Die Bewegungsmatte {} ist beschädigt.",
+    "The painted motion matte {} is damaged or no PNG.": "Die gemalte Bewegungsmatte {} ist beschädigt oder kein PNG.",
+    "Paint it again, or remove it.": "Noch einmal malen oder entfernen.",
     "Show Motion": "Bewegung zeigen",
     "Paint Motion": "Bewegung malen",
     "Save Motion Paint": "Gemalte Bewegung speichern",
