@@ -24,6 +24,7 @@ from . import (
     listing,
     made,
     markers,
+    mattes,
     ops_align,
     ops_jobs,
     pictures,
@@ -384,6 +385,9 @@ class SPLANNEQUIN_PT_camera(_StepPanel, bpy.types.Panel):
         """The step's body, and where the solve stands in the scene."""
         super().draw(context)
         watch = self._watch(context)
+        body = sub_panel(self.layout, "camera_motion", "Motion Matte")  # type: ignore[attr-defined]
+        if body is not None:
+            mattes.draw(body)
         if watch is None or cameras.find(context.scene, watch.shot, "EMPTY") is None:
             return
         if not ops_align.scaled(context.scene, watch.shot):

@@ -6,6 +6,7 @@ import bpy
 
 from . import (
     cli,
+    mattes,
     menu,
     ops_align,
     ops_clip,
@@ -34,6 +35,7 @@ _CLASSES = (
     *ops_shots.CLASSES,
     *ops_solves.CLASSES,
     *stmaps.CLASSES,
+    *mattes.CLASSES,
     *panel.CLASSES,
 )
 

@@ -31,7 +31,7 @@ from ..train import LoadedRun
 from ..train.model import render
 from .instant import InstantLayer, instant_layer, join
 from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
-from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
+from .reproject import blurred, look_up, narrowed, pixel_centres, project, resized, unproject, widened
 from .sightings import MovingOf, PlateReader, Sighting, SightingConfig, Sightings
 from .transfer import to_display, to_linear
 from .warp import sample, snap
@@ -59,6 +59,8 @@ class DetailConfig:
     believed there if it bears the motion out: sways too small for the flow."""
     borne_out: float = 0.03
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
+    thin: int = 3
+    """Half the width in pixels below which such a spot is an outline, which a wrong depth explains."""
     sway: float = 6.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.3
@@ -299,7 +301,10 @@ class Detailer:
         gained = self.seen.difference(view.picture.float(), shown) - view.missed.float()
         out = torch.zeros(h, w, dtype=torch.bool)
         out[top : top + inner_h, left : left + inner_w] = gained > self.config.borne_out
-        return out & (self._travel(shot, frame) > self.config.travel)
+        out = (out & (self._travel(shot, frame) > self.config.travel)).float()
+        # Outlines are errors of depth; what moves is a region.
+        thin = round(self.config.thin * self.seen.unit)
+        return widened(narrowed(out, thin), thin) > 0.5
 
     def _travel(self, shot: _Shot, frame: int) -> Tensor:
         """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""

@@ -90,13 +90,13 @@ def blurred(picture: Tensor, sigma: float) -> Tensor:
 
 
 def widened(matte: Tensor, by: int) -> Tensor:
-    """[H, W] with every value spread `by` pixels to all sides: the greatest one around."""
+    """[H, W] float, every value spread `by` pixels to all sides: the greatest one around."""
     if by <= 0:
         return matte
-    return -narrowed_all(-matte[None], by)[0]
-
-
-def narrowed_all(mattes: Tensor, by: int) -> Tensor:
-    """[N, H, W] mattes, each the least value within `by` pixels; beyond the border nothing counts."""
     side = 2 * by + 1
-    return -F.max_pool2d(F.max_pool2d(-mattes[:, None], (side, 1), 1, (by, 0)), (1, side), 1, (0, by))[:, 0]
+    return F.max_pool2d(F.max_pool2d(matte[None, None], (side, 1), 1, (by, 0)), (1, side), 1, (0, by))[0, 0]
+
+
+def narrowed(matte: Tensor, by: int) -> Tensor:
+    """[H, W] float, the least value within `by` pixels; beyond the border nothing counts."""
+    return -widened(-matte, by)

@@ -126,8 +126,9 @@ def mattes(
         final[key] = _followed(matches, key, own, len(keys), reach, config)
         for n in groups[key] if wanted[key] else ():
             if n not in written:
-                score = final[key] if n == keys[key] else _between(clip, matches, n, key, final)
-                yield n, _labels(clip, n, *score, config)
+                picture = clip.picture(key) if n == keys[key] else clip.grey(n)
+                score = final[key] if n == keys[key] else _between(clip, matches, picture, key, final)
+                yield n, _labels(clip, picture, *score, config)
         for store in (own, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
@@ -160,9 +161,10 @@ def _followed(
     return total / np.maximum(weight, 1e-6), weight
 
 
-def _between(clip: Clip, matches: Matches, index: int, key: int, final: dict[int, tuple[Map, Map]]) -> tuple[Map, Map]:
+def _between(
+    clip: Clip, matches: Matches, picture: NDArray[np.uint8], key: int, final: dict[int, tuple[Map, Map]]
+) -> tuple[Map, Map]:
     """Score and weight of a frame between key - 1 and key, by flow to both."""
-    picture = clip.grey(index)
     total = np.zeros(picture.shape, np.float32)[::2, ::2]
     weight = np.zeros_like(total)
     for other in (key - 1, key):
@@ -173,9 +175,9 @@ def _between(clip: Clip, matches: Matches, index: int, key: int, final: dict[int
     return total / np.maximum(weight, 1e-6), weight
 
 
-def _labels(clip: Clip, index: int, score: Map, weight: Map, config: FlowConfig) -> NDArray[np.uint8]:
+def _labels(clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, config: FlowConfig) -> NDArray[np.uint8]:
     """The labels [H, W] of a frame's score and weight on the grid."""
-    grey = cv2.resize(clip.grey(index), score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+    grey = cv2.resize(picture, score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
     spread = _Spread(grey, config.radius, config.edge)
     weight = np.minimum(weight, _ENOUGH)
     known = np.maximum(spread(weight), 0.0)

@@ -1,0 +1,157 @@
+"""The motion matte in Blender: shown as a sequence, painted on a copy, kept in the shot whole or not at all."""
+
+import os
+import struct
+import zlib
+
+import bpy
+import numpy as np
+import pytest
+
+WIDTH, HEIGHT = 16, 12
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """A PNG of [H, W] or [H, W, C] uint8, top row first."""
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    height, width, channels = pixels.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
+    body = zlib.compress(rows.tobytes())
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+def unpacked(data: bytes) -> np.ndarray:
+    """[H, W, C] uint8 of a PNG whose rows have filter 0."""
+    width, height, depth, kind = struct.unpack(">IIBB", data[16:26])
+    start = data.index(b"IDAT")
+    size = struct.unpack(">I", data[start - 4 : start])[0]
+    rows = np.frombuffer(zlib.decompress(data[start + 4 : start + 4 + size]), np.uint8).reshape(height, -1)
+    assert depth == 8 and not rows[:, 0].any()
+    return rows[:, 1:].reshape(height, width, {0: 1, 4: 2}[kind])
+
+
+def labels(frame: int) -> np.ndarray:
+    """A still frame with a mover at the top left, of another size in each frame."""
+    found = np.zeros((HEIGHT, WIDTH), np.uint8)
+    found[:frame, :4] = 255
+    found[-2:, -2:] = 128
+    return found
+
+
+@pytest.fixture
+def matted(scene, shot):
+    """The shot with mattes, chosen in the scene."""
+    (shot / "solve" / "motion").mkdir()
+    for frame in (5, 6, 7):
+        (shot / "solve" / "motion" / f"{frame:06d}.png").write_bytes(png(labels(frame)))
+    scene.splannequin.shot_path = str(shot)
+    scene.frame_set(6)
+    return shot
+
+
+def values(image) -> np.ndarray:
+    """[H, W] uint8, top row first."""
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    width, height = image.size
+    return np.rint(pixels.reshape(height, width, -1)[::-1, :, 0] * 255).astype(np.uint8)
+
+
+def test_the_mattes_are_shown_as_a_sequence(matted):
+    assert bpy.ops.splannequin.show_motion() == {"FINISHED"}
+    (image,) = [i for i in bpy.data.images if i.source == "SEQUENCE"]
+    assert os.path.abspath(bpy.path.abspath(image.filepath)) == str(matted / "solve" / "motion" / "000005.png")
+
+
+def test_what_is_painted_lands_in_the_shot_and_only_there(matted, addon):
+    mattes = addon("mattes")
+    found = {p: p.read_bytes() for p in (matted / "solve" / "motion").iterdir()}
+    assert bpy.ops.splannequin.paint_motion() == {"FINISHED"}
+    image = mattes.find_image(matted, 6)
+    assert (values(image) == labels(6)).all()
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    pixels.reshape(HEIGHT, WIDTH, 4)[:3, :, :3] = 1.0  # the three lowest rows
+    image.pixels.foreach_set(pixels)
+    assert bpy.ops.splannequin.save_motion() == {"FINISHED"}
+    wanted = labels(6)
+    wanted[-3:] = 255
+    assert (unpacked((matted / "motion_paint" / "000006.png").read_bytes())[..., 0] == wanted).all()
+    assert [p.name for p in (matted / "motion_paint").iterdir()] == ["000006.png"]
+    assert {p: p.read_bytes() for p in (matted / "solve" / "motion").iterdir()} == found
+    assert not image.is_dirty and (values(image) == wanted).all()
+
+
+def test_painting_goes_on_where_it_was_saved(matted, addon):
+    mattes = addon("mattes")
+    (matted / "motion_paint").mkdir()
+    painted = np.full((HEIGHT, WIDTH, 2), 255, np.uint8)
+    painted[:, 8:, 1] = 0  # nothing is painted there
+    (matted / "motion_paint" / "000006.png").write_bytes(png(painted))
+    image = mattes.paint_image(matted, 6)
+    assert (values(image)[:, :8] == 255).all() and (values(image)[:, 8:] == labels(6)[:, 8:]).all()
+    assert mattes.paint_image(matted, 6) == image, "one image per frame"
+    assert mattes.paint_image(matted, 7) != image
+
+
+def test_transparent_paint_stays_transparent(addon):
+    pixels = np.ones((HEIGHT, WIDTH, 4), np.float32)
+    pixels[:, 8:, 3] = 0.25
+    data = unpacked(addon("mattes").packed(pixels))
+    assert data.shape == (HEIGHT, WIDTH, 2)
+    assert (data[:, :8, 1] == 255).all() and (data[:, 8:, 1] == 64).all()
+
+
+def test_clear_takes_the_painted_matte_from_the_shot(matted, addon):
+    mattes = addon("mattes")
+    bpy.ops.splannequin.paint_motion()
+    bpy.ops.splannequin.save_motion()
+    assert mattes.painted_file(matted, 6).is_file()
+    assert bpy.ops.splannequin.clear_motion() == {"FINISHED"}
+    assert not mattes.painted_file(matted, 6).exists() and mattes.found_file(matted, 6).is_file()
+    with pytest.raises(RuntimeError, match=r"Nothing is painted on frame 6"):
+        bpy.ops.splannequin.clear_motion()
+
+
+def test_refusals_are_sentences(matted, scene):
+    with pytest.raises(RuntimeError, match=r"Nothing is painted on frame 6\. Press Paint Motion first"):
+        bpy.ops.splannequin.save_motion()
+    scene.frame_set(99)
+    with pytest.raises(RuntimeError, match=r"Frame 99 of my shot é has no motion matte"):
+        bpy.ops.splannequin.paint_motion()
+    for path in (matted / "solve" / "motion").iterdir():
+        path.unlink()
+    with pytest.raises(RuntimeError, match=r"my shot é has no motion matte here"):
+        bpy.ops.splannequin.show_motion()
+
+
+def test_buttons_are_off_without_a_solve(scene, tmp_path):
+    assert not bpy.ops.splannequin.paint_motion.poll()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
+def test_nothing_is_written_through_a_link(matted, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (matted / "motion_paint").symlink_to(tmp_path / "elsewhere")
+    bpy.ops.splannequin.paint_motion()
+    with pytest.raises(RuntimeError, match=r"Cannot write to .*its folder is a link"):
+        bpy.ops.splannequin.save_motion()
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_paint_is_found_after_the_file_was_saved_and_opened(matted, addon, tmp_path):
+    """Its shot is remembered relative to the .blend."""
+    mattes = addon("mattes")
+    bpy.ops.splannequin.paint_motion()
+    bpy.ops.splannequin.save_motion()
+    image = mattes.find_image(matted, 6)
+    image.use_fake_user = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(matted.parent / "scene.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(matted.parent / "scene.blend"))
+    image = mattes.find_image(matted, 6)
+    assert image is not None and (values(image) == labels(6)).all()
