@@ -36,6 +36,8 @@ _shown: dict[int, tuple[int, Any, Any]] = {}
 """View -> (seq of the frame, texture of its colour, of its depth)."""
 _moved: dict[int, float] = {}
 """View -> when it last showed something else, monotonic seconds."""
+_rested: set[int] = set()
+"""Views that have been drawn again since they came to rest."""
 
 
 def session() -> live.Session | None:
@@ -77,6 +79,7 @@ def end() -> None:
         _handler = None
     _shown.clear()
     _moved.clear()
+    _rested.clear()
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
     redraw()
@@ -162,7 +165,9 @@ def _tick() -> float | None:
         ),
     )
     now = time.monotonic()
-    resting = [v for v, moved in _moved.items() if 0 < now - moved - _REST_SECONDS < 2 * TICK_SECONDS]
+    # However late this timer is: without a graphics card one drawing may take longer than many of its turns.
+    resting = {v for v, moved in _moved.items() if now - moved > _REST_SECONDS} - _rested
+    _rested.update(resting)
     if state != _last or resting:
         _last = state
         redraw(("WINDOW",))
@@ -240,6 +245,7 @@ def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:
     asked, now = _session.wanted(key), time.monotonic()
     if asked is None or not _same(asked, quick):
         _moved[key] = now
+        _rested.discard(key)
         _session.ask(quick)
     elif now - _moved[key] > _REST_SECONDS and not _session.busy(key):
         if asked.width < sharp.width:

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from .contract import NO_DEPTH, JobError, LiveView, from_dict, read_message, write_message
 from .footage.plates import Plates
-from .freeze.detail import DetailedFrame, Detailer
+from .freeze.detail import DetailConfig, DetailedFrame, Detailer
 from .freeze.query import (
     FrozenGaussians,
     FrozenImage,
@@ -40,7 +40,7 @@ from .freeze.query import (
     rank_instants,
     render_frozen,
 )
-from .freeze.sightings import motion_mattes
+from .freeze.sightings import SightingConfig, motion_mattes
 from .freeze.take import span_of
 from .scene import Scene, frame_table, load_scene
 from .shot import Shot
@@ -50,6 +50,8 @@ _INSTANTS_KEPT = 8
 """Frozen scenes that are kept: going back and forth between keys costs no evaluation of the field."""
 _COARSER = 1.25
 """Plates may be so many times as coarse as a view that is made of them."""
+_DETAIL = DetailConfig(sources=4, reach=(1, 3, 9), sightings=SightingConfig(width=320))
+"""A take looks at more plates, more finely: there a plate serves a frame and its neighbours, here perhaps one view."""
 _TINT, _TINTED = (1.0, 0.15, 0.55), 0.75
 """Display-referred colour of what is a guess, and how much of it covers what nobody saw at all."""
 
@@ -102,7 +104,7 @@ class _Details:
         if self._made is None or self._made[0] != size:
             self._made = None  # before the next takes its room
             plates = _LivePlates(self._shot, size)
-            self._made = size, plates, Detailer(self._run, self._scene, plates, moving=plates.moving)
+            self._made = size, plates, Detailer(self._run, self._scene, plates, _DETAIL, plates.moving)
         _, plates, detailer = self._made
         plates.stop = stop
         return detailer.frame(output, frozen, image, width, height)

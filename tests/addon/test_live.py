@@ -93,6 +93,27 @@ def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, cont
     assert look(t_star=8.0) is None and session.open, "not asked for over and over"
 
 
+def test_a_view_that_came_to_rest_is_drawn_once_more_however_late_the_timer_is(addon, shot, scene, monkeypatch):
+    viewport, drawn = addon("viewport"), []
+    scene.splannequin.shot_path, scene.splannequin.run_name = str(shot), "main"
+    session = addon("live").Session(addon("steps").shot_folder(scene), "main")
+    monkeypatch.setattr(viewport, "_session", session)
+    monkeypatch.setattr(viewport, "_rested", set())
+    monkeypatch.setattr(viewport, "_moved", {1: time.monotonic()})
+    monkeypatch.setattr(viewport, "redraw", lambda kinds=(): drawn.append(kinds))
+    viewport._tick()
+    drawn.clear()
+    viewport._tick()
+    assert ("WINDOW",) not in drawn, "nothing has changed, and it does not rest yet"
+    viewport._moved[1] -= 10.0
+    for count in (1, 1, 1):
+        viewport._tick()
+        assert drawn.count(("WINDOW",)) == count
+    scene.splannequin.detail = not scene.splannequin.detail
+    viewport._tick()
+    assert drawn.count(("WINDOW",)) == 2, "the switch is followed"
+
+
 def test_an_orthographic_view_is_not_asked_for(addon, shot, scene):
     scene.splannequin.shot_path = str(shot)
     assert addon("viewport").view_of(scene, shot, (64, 48), (Matrix(), Matrix()), 6.0, 10**9) is None

@@ -4,14 +4,14 @@
 
 BLENDER has the extension installed, as for press_steps.py, and SPLANNEQUIN_PYTHON (or a checkout's .venv) names the
 backend. SPLANNEQUIN_WINDOW=960x600 asks for a smaller window. Prints the figures as JSON; pictures: the camera's view,
-a free view with a cube among the people, the guesses.
+made of plates, a free view with a cube among the people, the guesses.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     scene.splannequin.choose_t_star = True
     trained = session.facts["trained"]
     scene.splannequin.t_star = trained[len(trained) // 2]
-    yield 3.0
+    told["detail_seconds"] = [(yield from _detailed(session))]
     yield from press._shoot(work, "8-scrub-camera")
     told["sharp_width"] = max(frame.rgba.shape[1] for frame in session.frames.values())
     told["covered"] = round(min(float(frame.rgba[..., 3].mean()) for frame in session.frames.values()), 3)
@@ -66,7 +66,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     told["main_thread_ms"] = {name: round(1000 * max(times), 1) for name, times in stalls.items()}
     told["main_thread_mean_ms"] = {name: round(1000 * sum(t) / len(t), 2) for name, t in stalls.items()}
     told["sweep_size"] = min((f.rgba.shape[1], f.rgba.shape[0]) for f in session.frames.values())
-    yield from _free_view(scene, work)
+    yield from _free_view(scene, work, session, told)
     scene.splannequin.live_show = "guesses"
     yield 2.0
     yield from press._shoot(work, "8-scrub-guesses")
@@ -90,7 +90,19 @@ def _sweeps(scene: Any, trained: list[int]) -> list[tuple[str, Callable[[int], N
     return [("sweep_t_star", instants), ("sweep_camera", poses)]
 
 
-def _free_view(scene: Any, work: Path) -> Iterator[float]:
+def _detailed(session: Any) -> Generator[float, None, float]:
+    """Waits until what the view shows is made of plates; returns for how many seconds."""
+    since, before = time.monotonic(), {frame.asked.seq for frame in session.frames.values()}
+    while not any(f.asked.detail and f.asked.seq not in before for f in session.frames.values()):
+        if time.monotonic() - since > 120:
+            raise RuntimeError("the view at rest never was made of plates")
+        yield 0.05
+    spent = time.monotonic() - since
+    yield 0.5
+    return round(spent, 2)
+
+
+def _free_view(scene: Any, work: Path, session: Any, told: dict[str, Any]) -> Iterator[float]:
     """A view of its own, with a cube that stands in the middle of what is seen."""
     import bpy
     from mathutils import Vector
@@ -109,7 +121,7 @@ def _free_view(scene: Any, work: Path) -> Iterator[float]:
         turn.view_location = middle
         turn.view_rotation = scene.camera.matrix_world.to_quaternion()
         turn.view_distance = 0.9 * (scene.camera.matrix_world.translation - middle).length
-    yield 2.5
+    told["detail_seconds"].append((yield from _detailed(session)))
     yield from press._shoot(work, "8-scrub-free")
 
 

@@ -286,6 +286,16 @@ def test_the_plate_of_the_instant_is_its_own_frame(world, made):
         assert made(frame, frame).motion.numpy()[~widened(~world.seen_at(frame)[1], 3)].min() > 0.9
 
 
+def test_stripes_of_what_sways_come_from_other_plates_moved_as_the_model_moves_it(world):
+    """At the end of its way the board moves by 2 pixels from one frame to the next: half a stripe."""
+    output = world.output(12, 13)
+    result = world.make(output, withheld=[13])
+    truth, on = world.truth(output)
+    inner = ~widened(~on, 6)
+    assert off(result.color, truth, inner) < 0.6 * off(result.splat, truth, inner)
+    assert set(np.unique(result.source.numpy()[inner])) <= {10.0, 11.0, 12.0}
+
+
 def test_withheld_plates_are_not_used(tmp_path, quiet):
     world = build(tmp_path, quiet())
     assert 3 not in (1, FRAMES // 2 + 1, FRAMES), "those are looked at to know the footage"
