@@ -36,6 +36,8 @@ from .sightings import MovingOf, PlateReader, Sighting, SightingConfig, Sighting
 from .transfer import to_display, to_linear
 from .warp import sample, snap
 
+_ROWS = 256
+
 
 @dataclass(frozen=True)
 class DetailConfig:
@@ -316,17 +318,18 @@ class Detailer:
     def _places(self, shot: _Shot, leading: int, own: bool, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """(ST [H, W, 2] into the leading plate, [H, W] 1 within it): the identity on the clip's own poses."""
         rows, columns = shot.image.alpha.shape
-        pixels = pixel_centres(columns, rows)
         if own:
-            pixels = pixels - torch.tensor([(columns - size[0]) // 2, (rows - size[1]) // 2])
-            share = pixels / torch.tensor(size)
+            x = (torch.arange(columns) + 0.5 - (columns - size[0]) // 2) / size[0]
+            y = (torch.arange(rows) + 0.5 - (rows - size[1]) // 2) / size[1]
+            share = torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1)
         else:
+            pixels = pixel_centres(columns, rows)
             points = unproject(pixels, shot.image.depth, shot.viewmat, shot.K)
             viewmat, K = self.seen.camera(leading, self.plates.width, self.plates.height)
             share = project(points, viewmat, K)[0] / torch.tensor([self.plates.width, self.plates.height])
         within = ((share > 0.0) & (share < 1.0)).all(dim=-1).float()
-        st = torch.stack([share[..., 0], 1.0 - share[..., 1]], dim=-1).clamp(-4.0, 5.0)
-        return snap(st, (self.plates.width, self.plates.height)), within
+        share[..., 1] = 1.0 - share[..., 1]
+        return snap(share.clamp_(-4.0, 5.0), (self.plates.width, self.plates.height)), within
 
     def _parallax(self, shot: _Shot, frame: int, depth: Tensor) -> Tensor:
         """Pixels of 640 by which a wrong depth moves points at `depth`, against this camera, in a plate."""
@@ -456,15 +459,20 @@ class Detailer:
         if bool(matte.any()):
             plate = self.plates.linear(leading)
             lead = _placed(plate, rows, columns) if own else sample(plate, st)
+            del plate
             linear = torch.addcmul(fill, matte[..., None], lead)
+            del lead
         share = matte.clone()
         share[rest.y, rest.x] += left * rest.share
         source = torch.full((rows, columns), float(leading))
         source[rest.y, rest.x] = torch.where(left > 0.5, rest.source, float(leading))
         source[share <= 0.0] = 0.0
         motion = resized(shot.motion, columns, rows)
+        shown = torch.empty_like(linear)
+        for top in range(0, rows, _ROWS):  # the curve needs four times the memory of what it is given
+            shown[top : top + _ROWS] = to_display(linear[top : top + _ROWS])
         return DetailedFrame(
-            to_display(linear), linear, alpha, splat.color, splat.alpha, share, source, image.depth, image.support,
+            shown, linear, alpha, splat.color, splat.alpha, share, source, image.depth, image.support,
             motion, leading, st, matte, fill,
         )  # fmt: skip
 

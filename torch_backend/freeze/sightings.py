@@ -18,7 +18,7 @@ from ..shot import Shot
 from ..solve.motion import MOVING, UNKNOWN, load_motion
 from ..train import LoadedRun
 from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen
-from .reproject import blurred, inside, look_up, project, resized, same_surface, widened
+from .reproject import blurred, inside, look_up, pixel_centres, project, resized, same_surface, widened
 
 MovingOf = Callable[[int], "Tensor | None"]
 """Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
@@ -26,7 +26,10 @@ DOUBT = 0.4
 """How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
 _LENGTHS_OF = 640.0
 _VIEWS_BYTES = 400e6
-_RESIDUALS_BYTES = 400e6
+_RESIDUALS_BYTES = 250e6
+_FINEST = 1280
+"""Width at which the model's own render of a plate is made at most: splats show no more, and 4K costs memory."""
+_ROWS = 256
 
 
 class PlateReader(Protocol):
@@ -161,16 +164,21 @@ class Sightings:
     def residual(self, frame: int) -> Tensor:
         """[H, W, 3] float16: plate `frame` less the model's own render of it, display-referred, at the plates' size."""
         if frame not in self._residuals:
-            self._residuals[frame] = (self.plates.display(frame) - self._missed_by(frame)).half()
+            self._residuals[frame] = self._missed(frame)
             each = 6.0 * self.plates.width * self.plates.height
-            while len(self._residuals) > max(6, min(16, _RESIDUALS_BYTES / each)):
+            while len(self._residuals) > max(5, min(16, _RESIDUALS_BYTES / each)):
                 self._residuals.popitem(last=False)
         self._residuals.move_to_end(frame)
         return self._residuals[frame]
 
-    def difference(self, a: Tensor, b: Tensor) -> Tensor:
-        """[h, w] greatest difference over channels of two pictures [h, w, 3] of decisions, under a small low-pass."""
-        return blurred(a - b, 0.5 * self.config.lowpass * self.unit).abs().amax(dim=-1)
+    def difference(self, a: Tensor, b: Tensor, lowpass: float = 0.5) -> Tensor:
+        """[h, w] greatest difference over channels of two pictures [h, w, 3] of decisions, under `lowpass` of ours."""
+        h, w = a.shape[:2]
+        sigma = lowpass * self.config.lowpass * self.unit
+        if sigma < 1.5:
+            return blurred(a - b, sigma).abs().amax(dim=-1)
+        half = resized(a - b, (w + 1) // 2, (h + 1) // 2)  # what is left needs no more pixels
+        return resized(blurred(half, 0.5 * sigma).abs().amax(dim=-1), w, h)
 
     def seen(self, frame: int, points: Tensor) -> Sighting:
         """Where plate `frame` shows world points [..., 3]."""
@@ -181,8 +189,20 @@ class Sightings:
         looks = look_up(torch.stack([view.moving, view.explained], dim=-1), pixels)
         return Sighting(pixels, depth, visible, within, looks[..., 0], looks[..., 1])
 
-    def _missed_by(self, frame: int) -> Tensor:
-        return self._own_render(frame, self.plates.width, self.plates.height)[1].color
+    def _missed(self, frame: int) -> Tensor:
+        width, height = self.plates.width, self.plates.height
+        fine = min(1.0, _FINEST / width)
+        shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
+        plate = self.plates.display(frame)
+        out = torch.empty(height, width, 3, dtype=torch.float16)
+        if fine == 1.0:
+            return torch.sub(plate, shown).half()
+        for top in range(0, height, _ROWS):  # a second picture of 4K would be another 100 MB
+            rows = plate[top : top + _ROWS]
+            at = pixel_centres(width, len(rows))
+            at[..., 1] += top
+            out[top : top + _ROWS] = (rows - look_up(shown, at * fine)).half()
+        return out
 
     def _own_render(self, frame: int, width: int, height: int) -> tuple[FrozenGaussians, FrozenImage]:
         time = self.scene.time_of_frame(frame)
@@ -198,7 +218,7 @@ class Sightings:
         # The working frame will do, and need not be decoded from 4K footage.
         plate = read_image(self.scene.image_path(self.index[frame]), width, height)
         missed = self.difference(plate, image.color)
-        off = blurred(plate - image.color, self.config.lowpass * self.unit).abs().amax(dim=-1)
+        off = self.difference(plate, image.color, 1.0)
         region = round(self.config.region * self.unit)
         off = blurred(widened(off, region), 0.5 * region)
         return PlateView(

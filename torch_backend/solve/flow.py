@@ -19,6 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+_OUTSIDE = 16.0
+"""Flow leads at most so many flow pixels out of the picture."""
 Map = NDArray[Any]
 """float32 [h, w], or as said; typed as loosely as OpenCV types what it returns."""
 Mask = NDArray[np.bool_]
@@ -97,12 +99,21 @@ class Matches:
                 first = self.flow(a, middle).astype(np.float32)
                 at = self.grid[0] + first[0], self.grid[1] + first[1]
                 rest = self.flow(middle, b)
-                start = np.stack([first[i] + sample(rest[i], at) for i in (0, 1)], -1)
-                start = cv2.resize(start, one.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            found = self._dis.calc(one, two, start)  # type: ignore[call-overload]
-            small = cv2.resize(found, self.size, interpolation=cv2.INTER_AREA)
-            self._flows[a, b] = np.ascontiguousarray(small.transpose(2, 0, 1)).astype(np.float16)
+                start = np.stack([first[i] + sample(rest[i], at) for i in (0, 1)])
+            self._flows[a, b] = self._computed(one, two, start).astype(np.float16)
         return self._flows[a, b]
+
+    def _computed(self, one: NDArray[np.uint8], two: NDArray[np.uint8], start: Map | None = None) -> Map:
+        """[2, h, w], from `start` of the same shape if there is one; nothing leads farther than just outside."""
+        whole = None
+        if start is not None:
+            # Past the border DIS runs off to any number, and a start that is one reads what is not the picture's.
+            start = np.stack([np.clip(start[i], -self.grid[i], 2 * self.size[i] - self.grid[i]) for i in (0, 1)], -1)
+            whole = cv2.resize(start, one.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        found = self._dis.calc(one, two, whole)  # type: ignore[call-overload]
+        small = np.nan_to_num(cv2.resize(found, self.size, interpolation=cv2.INTER_AREA))
+        ranges = [(-_OUTSIDE - self.grid[i], 2 * self.size[i] + _OUTSIDE - self.grid[i]) for i in (0, 1)]
+        return np.stack([np.clip(small[..., i], *ranges[i]) for i in (0, 1)])
 
     def match(self, a: int, b: int) -> tuple[Map, Map, Mask]:
         """Positions x, y in b of a's points, and which are found: inside, and back again."""
@@ -116,11 +127,7 @@ class Matches:
 
     def loose(self, one: NDArray[np.uint8], two: NDArray[np.uint8]) -> tuple[tuple[Map, Map], Mask]:
         """Positions in `two` of `one`'s points, and which are found, of pictures that are no keys; nothing is kept."""
-        flows = [
-            cv2.resize(self._dis.calc(a, b, None), self.size, interpolation=cv2.INTER_AREA)  # type: ignore[call-overload]
-            for a, b in ((one, two), (two, one))
-        ]
-        (x, y), (back_x, back_y) = (tuple(np.ascontiguousarray(f.transpose(2, 0, 1))) for f in flows)
+        (x, y), (back_x, back_y) = self._computed(one, two), self._computed(two, one)
         at = self.grid[0] + x, self.grid[1] + y
         gap = (x + sample(back_x, at)) ** 2 + (y + sample(back_y, at)) ** 2
         return at, self.inside(at) & (gap <= (self._config.round_trip * self._unit) ** 2)

@@ -6,6 +6,7 @@ import torch
 
 from torch_backend.report.real import far_from, motion_shares, near
 from torch_backend.report.truth import RealScene
+from torch_backend.shot import Shot
 from torch_backend.solve.motion import MOVING, PAINTED, STILL, UNKNOWN, write_matte
 
 
@@ -34,13 +35,13 @@ def test_unknown_pixels_are_neither_moving_nor_static(shot):
     assert bool((found["static"] == (labels == STILL)).all())
 
 
-def test_rigid_pixels_keep_away_from_movers(shot):
-    labels = painted(shot, 108)
-    height, width = labels.shape
-    share = motion_shares(shot, 108, width, height)["rigid"].numpy()
+def test_rigid_pixels_keep_eight_pixels_away_from_movers(tmp_path):
+    shot = Shot.create(tmp_path / "wide.splannequin")
+    shot.update(width=640, height=12)
+    labels = painted(shot, 1)
+    share = motion_shares(shot, 1, 640, 12)["rigid"].numpy()
     edge = int(np.flatnonzero(labels[0] == MOVING)[-1])
-    margin = int(8 * width / 640)
-    assert not share[:, : edge + 1 + margin].any() and share[:, edge + 1 + margin].all()
+    assert not share[:, : edge + 9].any() and share[:, edge + 9 : 480].all() and not share[:, 480:].any()
 
 
 def test_a_repainted_matte_is_another_scene(shot):
