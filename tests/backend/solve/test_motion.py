@@ -186,7 +186,8 @@ def test_frames_between_keys_have_a_matte_too(tmp_path, quiet):
     labels = mattes(shot, numbers) == MOVING
     between = range(7, 25, 2)  # the board is in the picture
     assert min(labels[n][inner(board)[n]].mean() for n in between) > 0.7
-    assert np.mean([np.linalg.norm(middle(labels[n]) - middle(board[n])) for n in between]) < 1.0
+    # Its key's matte, left where it is, would be 7 pixels off.
+    assert np.mean([np.linalg.norm(middle(labels[n]) - middle(board[n])) for n in between]) < 3.0
 
 
 def test_mattes_that_are_there_are_left_alone(swaying, quiet):
