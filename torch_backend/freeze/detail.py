@@ -228,7 +228,7 @@ class Detailer:
         per_pixel = min(1.0, self.config.sightings.width / width)
         w, h = max(8, round(columns * per_pixel)), max(8, round(rows * per_pixel))
         small = pixel_centres(w, h)
-        depth = look_up(image.depth, small * torch.tensor([columns / w, rows / h]), "nearest")
+        depth = look_up(image.depth, small * torch.tensor([columns / w, rows / h], device="cpu"), "nearest")
         points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
         t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
         motion = resized(image.motion, w, h)
@@ -251,7 +251,7 @@ class Detailer:
         """The frame's own plate, else the nearest in pose of those usable: in travel over depth, and in direction."""
         if shot.own and output.frame in usable:
             return output.frame
-        at = torch.tensor([self.seen.index[frame] for frame in usable])
+        at = torch.tensor([self.seen.index[frame] for frame in usable], device="cpu")
         solid = shot.depth[shot.depth < 1e9]
         depth = float(solid.median()) if len(solid) else 1.0
         travel = (self.seen.centres[at] - shot.centre).norm(dim=1) / max(depth, 1e-6)
@@ -276,7 +276,7 @@ class Detailer:
             shot.motion = torch.maximum(shot.motion, lead.moving) if own else shot.motion
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
-            return torch.zeros(rows, columns), st, own
+            return torch.zeros(rows, columns, device="cpu"), st, own
         if own and leading == output.t_star:  # its own plate shows the instant itself
             return within, st, own
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
@@ -301,7 +301,7 @@ class Detailer:
         top, left = (h - inner_h) // 2, (w - inner_w) // 2
         shown = resized(shot.image.color, w, h)[top : top + inner_h, left : left + inner_w]
         gained = self.seen.difference(view.picture.float(), shown) - view.missed.float()
-        out = torch.zeros(h, w, dtype=torch.bool)
+        out = torch.zeros(h, w, dtype=torch.bool, device="cpu")
         out[top : top + inner_h, left : left + inner_w] = gained > self.config.borne_out
         out = (out & (self._travel(shot, frame) > self.config.travel)).float()
         # Outlines are errors of depth; what moves is a region.
@@ -319,14 +319,14 @@ class Detailer:
         """(ST [H, W, 2] into the leading plate, [H, W] 1 within it): the identity on the clip's own poses."""
         rows, columns = shot.image.alpha.shape
         if own:
-            x = (torch.arange(columns) + 0.5 - (columns - size[0]) // 2) / size[0]
-            y = (torch.arange(rows) + 0.5 - (rows - size[1]) // 2) / size[1]
+            x = (torch.arange(columns, device="cpu") + 0.5 - (columns - size[0]) // 2) / size[0]
+            y = (torch.arange(rows, device="cpu") + 0.5 - (rows - size[1]) // 2) / size[1]
             share = torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1)
         else:
             pixels = pixel_centres(columns, rows)
             points = unproject(pixels, shot.image.depth, shot.viewmat, shot.K)
             viewmat, K = self.seen.camera(leading, self.plates.width, self.plates.height)
-            share = project(points, viewmat, K)[0] / torch.tensor([self.plates.width, self.plates.height])
+            share = project(points, viewmat, K)[0] / torch.tensor([self.plates.width, self.plates.height], device="cpu")
         within = ((share > 0.0) & (share < 1.0)).all(dim=-1).float()
         share[..., 1] = 1.0 - share[..., 1]
         return snap(share.clamp_(-4.0, 5.0), (self.plates.width, self.plates.height)), within
@@ -344,7 +344,7 @@ class Detailer:
         at = (matte < 0.999).nonzero()
         y, x = at[:, 0], at[:, 1]
         count = len(at)
-        rest = _Rest(y, x, shot.image.color[y, x], *(torch.zeros(count) for _ in range(2)))
+        rest = _Rest(y, x, shot.image.color[y, x], *(torch.zeros(count, device="cpu") for _ in range(2)))
         if not count:
             return rest
         small = torch.stack([x + 0.5, y + 0.5], dim=-1) * shot.per_pixel
@@ -353,8 +353,10 @@ class Detailer:
         pixels = torch.stack([x + 0.5, y + 0.5], dim=-1)
         points = unproject(pixels, shot.image.depth[y, x], shot.viewmat, shot.K)
         motion, unknown = look_up(shot.motion, small), look_up(unknown, small)
-        larger = torch.tensor([self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]])
-        untold = 1.0 - self.seen.seen(shot.t, points).visible if shot.t in chosen else torch.ones(count)
+        larger = torch.tensor(
+            [self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]], device="cpu"
+        )
+        untold = 1.0 - self.seen.seen(shot.t, points).visible if shot.t in chosen else torch.ones(count, device="cpu")
         untold = untold * (1.0 - unknown)
         weights, places = [], []
         for n, frame in enumerate(chosen):
@@ -364,9 +366,9 @@ class Detailer:
             weights.append(self._weight(shot, frame, sighting, motion, sway))
             places.append(sighting.pixels * larger)
         believed = torch.stack(weights)
-        rest.source = torch.tensor([float(frame) for frame in chosen])[believed.argmax(dim=0)]
+        rest.source = torch.tensor([float(frame) for frame in chosen], device="cpu")[believed.argmax(dim=0)]
         rest.share = (believed.sum(dim=0) / self.config.enough).clamp(max=1.0)
-        total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3)
+        total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
         for n, frame in enumerate(chosen):
             carried += (believed[n] / total)[:, None] * look_up(self.seen.residual(frame), places[n], "bicubic")
         rest.color += carried * rest.share[:, None]
@@ -430,7 +432,7 @@ class Detailer:
             for n, frame in enumerate(chosen):
                 extra[rows, 3 * n : 3 * n + 3] = (self.seen.view(frame).offsets - now).to(extra.device)
         if not len(rows) and known == count:
-            return [torch.zeros(h, w, 3) for _ in chosen], torch.zeros(h, w)
+            return [torch.zeros(h, w, 3, device="cpu") for _ in chosen], torch.zeros(h, w, device="cpu")
         rows_full, columns = shot.image.alpha.shape
         K = resize_intrinsics(shot.K[None], columns, rows_full, w, h)[0]
         out = render(
@@ -452,7 +454,7 @@ class Detailer:
         alpha = torch.maximum(alpha, matte)
         color = rest.color if self.plates.deep else rest.color.clamp(0.0, 1.0)
         covered = alpha[rest.y, rest.x].clamp_min(1e-4)[:, None]
-        fill = torch.zeros(rows, columns, 3)
+        fill = torch.zeros(rows, columns, 3, device="cpu")
         left = 1.0 - matte[rest.y, rest.x]
         fill[rest.y, rest.x] = left[:, None] * covered * to_linear(color / covered)
         linear = fill
@@ -464,7 +466,7 @@ class Detailer:
             del lead
         share = matte.clone()
         share[rest.y, rest.x] += left * rest.share
-        source = torch.full((rows, columns), float(leading))
+        source = torch.full((rows, columns), float(leading), device="cpu")
         source[rest.y, rest.x] = torch.where(left > 0.5, rest.source, float(leading))
         source[share <= 0.0] = 0.0
         motion = resized(shot.motion, columns, rows)
@@ -490,7 +492,7 @@ def _placed(plate: Tensor, rows: int, columns: int) -> Tensor:
     """A plate [h, w, 3] in the middle of [rows, columns, 3], 0 around it."""
     if plate.shape[:2] == (rows, columns):
         return plate
-    out = torch.zeros(rows, columns, 3)
+    out = torch.zeros(rows, columns, 3, device="cpu")
     top, left = (rows - plate.shape[0]) // 2, (columns - plate.shape[1]) // 2
     out[top : top + plate.shape[0], left : left + plate.shape[1]] = plate
     return out

@@ -303,7 +303,7 @@ def _gaussians(
     size = c.sigma / (bench.view.K[0, 0] * np.maximum(inverse[rows, columns], 1e-9))
     opacity = torch.from_numpy(np.clip(c.opacity * cover[rows, columns], 1e-4, 1.0 - 1e-4))
     color = _unexposed(torch.from_numpy(colors[rows, columns]), bench.exposure, bench.time)
-    quats = torch.zeros(count, 4)
+    quats = torch.zeros(count, 4, device="cpu")
     quats[:, 0] = 1.0
     state = {
         "means": torch.from_numpy(means),
@@ -311,7 +311,7 @@ def _gaussians(
         "log_scales": torch.from_numpy(np.log(np.repeat(size[:, None], 3, axis=1))),
         "opacity_logits": torch.logit(opacity),
         "sh0": ((color - 0.5) / SH_C0)[:, None, :],
-        "shN": torch.zeros(count, like["shN"].shape[1], 3),
+        "shN": torch.zeros(count, like["shN"].shape[1], 3, device="cpu"),
     }
     return {name: state[name].to(value) for name, value in like.items()}
 
@@ -370,7 +370,7 @@ def _ghosts(bench: _Bench, frozen: FrozenGaussians, image: FrozenImage) -> tuple
 
     A ghost is seen where the render without all that moves is nearer to the plate, by a low-pass, than with it.
     """
-    kept = torch.ones(len(frozen.motion))
+    kept = torch.ones(len(frozen.motion), device="cpu")
     nothing = np.zeros((bench.height, bench.width), bool)
     moves = frozen.motion > 0.5
     if not bool(moves.any()):

@@ -194,7 +194,7 @@ class Sightings:
         fine = min(1.0, _FINEST / width)
         shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
         plate = self.plates.display(frame)
-        out = torch.empty(height, width, 3, dtype=torch.float16)
+        out = torch.empty(height, width, 3, dtype=torch.float16, device="cpu")
         if fine == 1.0:
             return torch.sub(plate, shown).half()
         for top in range(0, height, _ROWS):  # a second picture of 4K would be another 100 MB
@@ -239,7 +239,7 @@ def motion_mattes(shot: Shot) -> MovingOf:
         told = load_motion(shot, frame)
         if told is None:
             return None
-        matte = torch.zeros(told.shape)
+        matte = torch.zeros(told.shape, device="cpu")
         codes = torch.from_numpy(told)
         matte[codes == UNKNOWN] = DOUBT
         matte[codes == MOVING] = 1.0
