@@ -345,6 +345,7 @@ def _render_all(
         _write_warp(folder, output, made, look, keys[output.frame])
         _write_frame(folder, output, made, scene, look, keys[output.frame])
         shares[output.frame] = small_share(made.plate)
+        del made, image  # at 4K the next frame needs their gigabyte
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
     return shares
 
