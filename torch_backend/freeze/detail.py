@@ -10,7 +10,8 @@ nothing that moves is seen, at t* or in the plate; so a still world is the plate
 filled: what the model missed in other plates (texture, edges, light) is carried along the surface point that x shows
 to where plate m shows the same point, moved from t* to m as the model moves it. Plate t* is believed even where the
 model cannot explain it, because what it shows is the truth of the frozen instant; others where nothing moves, or where
-they agree with the model. b fades to the splats alone where no plate can be believed.
+they agree with the model. b fades to the splats alone where no plate can be believed. Residuals are carried in display
+space, in which splats blend; A mixes scene-linear light, so that the same mix of an artist's plate gives the frame.
 
 Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023, "DynIBaR"; figures: docs/benchmarks.md.
 """
