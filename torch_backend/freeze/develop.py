@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..gaussians import DensifyConfig, Densifier, Gaussians
+from ..gaussians import Densifier, DensifyConfig, Gaussians
 from ..scene import Scene, read_image
 from ..train import LoadedRun
 from ..train.adam import FusedAdam
