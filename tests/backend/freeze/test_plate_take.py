@@ -164,7 +164,8 @@ def test_a_ramp_that_runs_is_the_clip(trained, quiet):
     """Each frame at its own instant: plates, bit for bit but for half floats; then time stands still."""
     world, _ = trained
     ramp = {str(n): float(min(n, 105)) for n in range(101, 117)}
-    freeze_shot(world.shot, FreezeParams(take="runs", develop="off", t_star_per_frame=ramp, first=104, last=106), quiet())
+    part = dict(t_star_per_frame=ramp, first=104, last=106, develop="off")
+    freeze_shot(world.shot, FreezeParams(take="runs", **part), quiet())
     plates = Plates(world.shot)
     for n in (104, 105):
         frame = read_frozen_exr(world.shot.take("runs") / f"{n:06d}.exr")

@@ -39,10 +39,11 @@ def test_only_frames_whose_instant_changed_are_stale(trained, quiet):
     world, _ = trained
     folder = world.shot.take("held")
     ramp = {str(101 + n): 104.0 for n in range(16)}
-    freeze_shot(world.shot, FreezeParams(take="held", develop="off", t_star_per_frame=ramp, only_missing=True), quiet())
+    ask = dict(take="held", develop="off", only_missing=True)
+    freeze_shot(world.shot, FreezeParams(**ask, t_star_per_frame=ramp), quiet())
     before = times(folder)
     released = ramp | {"115": 105.0, "116": 106.0}
-    freeze_shot(world.shot, FreezeParams(take="held", develop="off", t_star_per_frame=released, only_missing=True), quiet())
+    freeze_shot(world.shot, FreezeParams(**ask, t_star_per_frame=released), quiet())
     after = times(folder)
     assert {n for n in after if after[n] != before[n]} == {115, 116}
     assert json.loads((folder / "take.json").read_text())["t_star_per_frame"] == released

@@ -190,7 +190,8 @@ def test_wrong_requests_are_sentences(trained, quiet, params, word):
 def test_t_star_snaps_to_a_trained_frame_and_says_so(trained, quiet):
     world, _ = trained
     report = quiet()
-    assert freeze_shot(world.shot, FreezeParams(take="snap", t_star=109, develop="off"), report)["t_star_frame"] in (108, 110)
+    facts = freeze_shot(world.shot, FreezeParams(take="snap", t_star=109, develop="off"), report)
+    assert facts["t_star_frame"] in (108, 110)
     assert any(e[0] == "warning" and "109" in e[1] for e in report.events)
 
 
