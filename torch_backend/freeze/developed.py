@@ -1,4 +1,4 @@
-"""Instants of a run, developed once and kept in its folder: one safetensors file each, known by what it was made from."""
+"""Instants of a run, developed once and kept in its folder: a file each, known by what it was made from."""
 
 from __future__ import annotations
 
@@ -53,7 +53,8 @@ def load_developed(
         return None
     device, known = frozen.support.device, len(frozen.support)
     base = {name: tensors[f"base.{name}"].to(device) for name in PARAM_NAMES}
-    before = FrozenGaussians(base, frozen.sh_degree, *(_grown(v, len(base["means"])) for v in _facts(frozen)))
+    count = len(base["means"])
+    before = FrozenGaussians(base, frozen.sh_degree, _grown(frozen.support, count), _grown(frozen.motion, count))
     if len(before.support) < known:
         return None
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
@@ -99,10 +100,6 @@ def _save(shot: Shot, run: LoadedRun, t_star: int, made: FrozenGaussians, key: s
 
 def _path(shot: Shot, run: LoadedRun, t_star: int) -> Path:
     return shot.own(run.folder / FOLDER) / frame_file(t_star, ".safetensors")
-
-
-def _facts(frozen: FrozenGaussians) -> tuple[Tensor, Tensor]:
-    return frozen.support, frozen.motion
 
 
 def _grown(values: Tensor, count: int) -> Tensor:
