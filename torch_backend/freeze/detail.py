@@ -486,9 +486,13 @@ class Detailer:
     ) -> DetailedFrame:
         image = shot.image
         rows, columns = image.alpha.shape
-        plate = self.plates.linear(leading) if bool((matte > _NOTHING).any()) else None
+        gives = bool((matte > _NOTHING).any())
+        plate = self.plates.linear(leading) if gives and not own else None
+        # A render that is not the splats' layer is no longer needed once it is mixed.
+        ours = image is not splat
         made = DetailedFrame(
-            torch.empty(rows, columns, 3, device="cpu"), image.alpha.clone(), splat.color, splat.alpha,
+            image.color if ours else torch.empty(rows, columns, 3, device="cpu"),
+            image.alpha if ours else image.alpha.clone(), splat.color, splat.alpha,
             torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
             image.support, resized(shot.motion, columns, rows), leading, st, matte,
             torch.zeros(rows, columns, 3, device="cpu"),
@@ -496,11 +500,24 @@ class Detailer:
         for band in bands(rows, columns):
             rest = None if fillers is None else self._rest(shot, fillers, matte, band)
             matte[band] = (matte[band] * 1024.0).round() / 1024.0
-            lead = None
-            if plate is not None:
-                lead = _placed(plate, rows, columns, band) if own else sample(plate, st[band])
+            lead = sample(plate, st[band]) if plate is not None else None
+            if gives and own:
+                lead = self._placed(leading, rows, columns, band)
             self._mix(made, rest, lead, band)
         return made
+
+    def _placed(self, frame: int, rows: int, columns: int, band: slice) -> Tensor:
+        """[h, columns, 3] scene-linear: some rows of a plate in the middle of `rows` x `columns`, 0 around it."""
+        height, width = self.plates.height, self.plates.width
+        if (height, width) == (rows, columns):
+            return self.plates.linear(frame, band)
+        out = torch.zeros(band.stop - band.start, columns, 3, device="cpu")
+        top, left = (rows - height) // 2, (columns - width) // 2
+        first, last = max(band.start, top), min(band.stop, top + height)
+        if first < last:
+            part = self.plates.linear(frame, slice(first - top, last - top))
+            out[first - band.start : last - band.start, left : left + width] = part
+        return out
 
     def _mix(self, made: DetailedFrame, rest: _Rest | None, lead: Tensor | None, rows: slice) -> None:
         """Fills some rows of a frame whose `matte` is settled and whose `alpha` is the splats'.
@@ -532,15 +549,3 @@ def _with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Te
     wide[0, 2] += (columns - width) // 2
     wide[1, 2] += (rows - height) // 2
     return wide
-
-
-def _placed(plate: Tensor, rows: int, columns: int, band: slice) -> Tensor:
-    """Some rows of a plate [h, w, 3] in the middle of [rows, columns, 3], 0 around it."""
-    if plate.shape[:2] == (rows, columns):
-        return plate[band]
-    out = torch.zeros(band.stop - band.start, columns, 3, device="cpu")
-    top, left = (rows - plate.shape[0]) // 2, (columns - plate.shape[1]) // 2
-    first, last = max(band.start, top), min(band.stop, top + plate.shape[0])
-    if first < last:
-        out[first - band.start : last - band.start, left : left + plate.shape[1]] = plate[first - top : last - top]
-    return out

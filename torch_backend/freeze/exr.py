@@ -131,8 +131,8 @@ def write_frozen_exr(
     path: str | Path,
     rgba: ArrayLike | Made,  # [H,W,4]
     depth: ArrayLike | Made,  # [H,W]
-    support: ArrayLike,  # [H,W]
-    motion: ArrayLike,  # [H,W]
+    support: ArrayLike | Made,  # [H,W]
+    motion: ArrayLike | Made,  # [H,W]
     metadata: FrameMetadata,
     margin: tuple[int, int] = (0, 0),
     grain: ArrayLike | Made | None = None,  # [H,W,3]
@@ -331,7 +331,8 @@ def check_finite(name: str, layer: NDArray[np.float32], top: int = 0) -> None:
     finite = np.isfinite(layer)
     if not finite.all():
         y, x, *_ = np.argwhere(~finite)[0]
-        raise ValueError(f"{name} has {finite.size - finite.sum()} NaN or infinite values, the first at ({x}, {top + y})")
+        count, place = finite.size - finite.sum(), (int(x), int(top + y))
+        raise ValueError(f"{name} has {count} NaN or infinite values, the first at {place}")
 
 
 def _spec(

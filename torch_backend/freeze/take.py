@@ -157,14 +157,11 @@ def plate_detail(
         return None
     find_motion(shot, report)  # of shots solved before the solve looked for it
     plates = Plates(shot)
-    # At 4K a plate held takes 50 MB; what is made of it is held as well.
-    held = min(11, max(3, int(250e6 / (6.0 * plates.width * plates.height))))
-    plates = Plates(shot, keep=held)
     scale = float(first.K[0, 0]) / float(scene.Ks[0, 0, 0] * plates.width / scene.width)
     if not params.camera_path and size != (plates.width, plates.height):
-        plates = Plates(shot, size, held)
+        plates = Plates(shot, size)
     elif params.camera_path and scale < 0.99:
-        plates = Plates(shot, (max(16, round(plates.width * scale)), max(16, round(plates.height * scale))), held)
+        plates = Plates(shot, (max(16, round(plates.width * scale)), max(16, round(plates.height * scale))))
     if plates.note:
         report.warning(plates.note)
     return Detailer(run, scene, plates)
