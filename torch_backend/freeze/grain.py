@@ -141,9 +141,7 @@ class Brush:
         alpha = rgba[..., 3:4]
         color = np.clip(rgba[..., :3] / np.where(alpha > 0.0, alpha, 1.0), 0.0, 1.0).astype(np.float32)
         middles = (np.arange(BINS) + 0.5) / BINS
-        response = np.stack(
-            [np.interp(color[..., c], middles, self._grain.deviation[c]) for c in range(3)], axis=-1
-        )
+        response = np.stack([np.interp(color[..., c], middles, self._grain.deviation[c]) for c in range(3)], axis=-1)
         grainy = np.clip(color + response * noise, 0.0, 1.0)
         return ((srgb_to_linear(grainy) - srgb_to_linear(color)) * alpha).astype(np.float32)
 
@@ -163,8 +161,7 @@ def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float3
 
 
 def _resized(noise: NDArray[np.float32], axis: int, wanted: int, part: slice = slice(None)) -> NDArray[np.float32]:
-    """`noise` with `wanted` pixels along an axis, or a part of them: averaged where it shrinks, blended where it grows.
-    """
+    """`noise` with `wanted` pixels along an axis, or a part: averaged where it shrinks, blended where it grows."""
     there = noise.shape[axis]
     along = [-1 if n == axis else 1 for n in range(3)]
     if there == wanted:
