@@ -348,10 +348,14 @@ class Detailer:
             y = (torch.arange(rows, device="cpu") + 0.5 - (rows - size[1]) // 2) / size[1]
             share = torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1)
         else:
-            pixels = pixel_centres(columns, rows)
-            points = unproject(pixels, shot.image.depth, shot.viewmat, shot.K)
             viewmat, K = self.seen.camera(leading, self.plates.width, self.plates.height)
-            share = project(points, viewmat, K)[0] / torch.tensor([self.plates.width, self.plates.height], device="cpu")
+            whole = torch.tensor([self.plates.width, self.plates.height], device="cpu")
+            share = torch.empty(rows, columns, 2, device="cpu")
+            for band in bands(rows, columns):
+                pixels = pixel_centres(columns, band.stop - band.start)
+                pixels[..., 1] += band.start
+                points = unproject(pixels, shot.image.depth[band], shot.viewmat, shot.K)
+                share[band] = project(points, viewmat, K)[0] / whole
         within = ((share > 0.0) & (share < 1.0)).all(dim=-1).float()
         share[..., 1] = 1.0 - share[..., 1]
         return snap(share.clamp_(-4.0, 5.0), (self.plates.width, self.plates.height)), within
