@@ -30,7 +30,7 @@ from ..shot import Shot
 from ..solve.motion import load_motion
 from ..train import LoadedRun
 from ..train.model import render
-from .bands import bands, look_up_near
+from .bands import bands, hand_back, look_up_near
 from .instant import InstantLayer, instant_layer, join
 from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
 from .reproject import blurred, look_up, narrowed, pixel_centres, project, resized, unproject, widened
@@ -490,6 +490,9 @@ class Detailer:
     ) -> DetailedFrame:
         image = shot.image
         rows, columns = image.alpha.shape
+        parts = bands(rows, columns)
+        if len(parts) > 1:
+            hand_back()
         gives = bool((matte > _NOTHING).any())
         plate = self.plates.linear(leading) if gives and not own else None
         # A render that is not the splats' layer is no longer needed once it is mixed.
@@ -501,7 +504,7 @@ class Detailer:
             image.support, resized(shot.motion, columns, rows), leading, st, matte,
             torch.zeros(rows, columns, 3, device="cpu"),
         )  # fmt: skip
-        for band in bands(rows, columns):
+        for band in parts:
             rest = None if fillers is None else self._rest(shot, fillers, matte, band)
             matte[band] = (matte[band] * 1024.0).round() / 1024.0
             lead = sample(plate, st[band]) if plate is not None else None
