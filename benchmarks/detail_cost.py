@@ -118,6 +118,7 @@ def measure(shot: Path, run: str, width: int, poses: Sequence[int]) -> dict[str,
         view = clip.view(pose, t_star, image=image)
         rows.append({"frame": pose, "splats": splats, "whole": time.perf_counter() - since})
         sources |= {int(frame) for frame in view.detailed.source.unique().tolist()} - {0}
+        del image, view  # as a take does: a frame is written and let go before the next is made
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "width": clip.width,

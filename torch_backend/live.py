@@ -74,9 +74,9 @@ class _LivePlates:
         self._go_on()
         return self._plates.display(frame)
 
-    def linear(self, frame: int) -> Tensor:
+    def linear(self, frame: int, rows: slice = slice(None)) -> Tensor:
         self._go_on()
-        return self._plates.linear(frame)
+        return self._plates.linear(frame, rows)
 
     def moving(self, frame: int) -> Tensor | None:
         """As `sightings.MovingOf`."""

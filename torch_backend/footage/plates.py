@@ -26,6 +26,7 @@ from .importing import FootageConfig, import_key, load_frames
 from .sources import Known, Source, open_source
 
 PLATES_VERSION = 1
+_KEPT, _KEPT_BYTES = 11, 150e6
 _NO_LARGER = 720
 """Import leaves clips of fewer lines than this at their size unless it is told otherwise."""
 _AGREE = 4.0 / 255.0
@@ -52,17 +53,18 @@ class Plates:
     key: str
     """Changes with the footage, the solve, and the size."""
 
-    def __init__(self, shot: Shot, size: tuple[int, int] | None = None, keep: int = 11) -> None:
+    def __init__(self, shot: Shot, size: tuple[int, int] | None = None, keep: int = 0) -> None:
         """`size` is width and height in pixels, None the source's; `keep` the most plates held.
 
-        The default holds what a frozen frame and the next one ask for: itself, two before and two after it at every
-        other frame, and t*. JobError (FOOTAGE, SOLVE) if the shot is not imported and solved.
+        The default, 0, holds what a frozen frame and the next one ask for: itself, two before and two after it at
+        every other frame, and t*; of large plates fewer, as many as `_KEPT_BYTES` hold, but three. JobError (FOOTAGE,
+        SOLVE) if the shot is not imported and solved.
         """
         load_cameras(shot)
         record = load_frames(shot)
         # Cameras may come without the record of a solve: a scene of truth has none.
         solved = load_record(shot) if (shot.solve / "solve.json").is_file() else {}
-        self._shot, self._keep = shot, max(1, keep)
+        self._shot = shot
         self._files = {int(row["frame"]): str(row["file"]) for row in record["frames"]}
         self.frames = sorted(self._files)
         self._working = int(record["width"]), int(record["height"])
@@ -70,6 +72,7 @@ class Plates:
         source, self.note = self._find(record)
         info = source.info if source is not None else None
         self.width, self.height = size or ((info.width, info.height) if info is not None else self._working)
+        self._keep = keep or min(_KEPT, max(3, int(_KEPT_BYTES / (6.0 * self.width * self.height))))
         self.deep = info is not None and info.extended
         if not self.deep and (self.width, self.height) == self._working:
             source = None  # the working frames are just that
@@ -86,9 +89,9 @@ class Plates:
         """
         return torch.from_numpy(codes.display(self._codes(frame)))
 
-    def linear(self, frame: int) -> Tensor:
-        """The same in scene-linear Rec.709."""
-        return torch.from_numpy(codes.linear(self._codes(frame)))
+    def linear(self, frame: int, rows: slice = slice(None)) -> Tensor:
+        """The same in scene-linear Rec.709: all of it, or some rows, which at 4K spares 100 MB."""
+        return torch.from_numpy(codes.linear(self._codes(frame)[rows]))
 
     @property
     def kept(self) -> int:

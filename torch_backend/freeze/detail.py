@@ -30,6 +30,7 @@ from ..shot import Shot
 from ..solve.motion import load_motion
 from ..train import LoadedRun
 from ..train.model import render
+from .bands import bands, hand_back, look_up_near
 from .instant import InstantLayer, instant_layer, join
 from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
 from .reproject import blurred, look_up, narrowed, pixel_centres, project, resized, unproject, widened
@@ -37,7 +38,10 @@ from .sightings import MovingOf, PlateReader, Sighting, SightingConfig, Sighting
 from .transfer import to_display, to_linear
 from .warp import sample, snap
 
-_ROWS = 256
+_ALL = 0.999
+"""Matte from which on the leading plate gives the whole pixel."""
+_NOTHING = 0.5 / 1024.0
+"""Matte up to which it rounds to nothing."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +82,8 @@ class DetailConfig:
 class DetailedFrame:
     """One frozen frame made of plates, on the CPU, with overscan if the render had it."""
 
-    color: Tensor
-    """[H, W, 3] premultiplied, extended display-referred."""
     linear: Tensor
-    """[H, W, 3] the same, scene-linear: matte * plate(st) + fill."""
+    """[H, W, 3] premultiplied, scene-linear: matte * plate(st) + fill."""
     alpha: Tensor
     """[H, W] in 0..1."""
     splat: Tensor
@@ -106,6 +108,14 @@ class DetailedFrame:
     """[H, W] in 0..1: how much of the pixel the leading plate gives."""
     fill: Tensor
     """[H, W, 3] scene-linear, premultiplied by 1 - matte: the rest of the pixel."""
+
+    @property
+    def color(self) -> Tensor:
+        """[H, W, 3] `linear`, extended display-referred; made anew each time, because few need it whole."""
+        out = torch.empty_like(self.linear)
+        for rows in bands(*self.alpha.shape):
+            out[rows] = to_display(self.linear[rows])
+        return out
 
 
 @dataclass
@@ -136,11 +146,25 @@ class _Shot:
 
 
 @dataclass
+class _Fillers:
+    """The plates that fill what the leading one does not give."""
+
+    chosen: list[int]
+    """Their frame numbers."""
+    moved: list[Tensor]
+    """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
+    unknown: Tensor
+    """[h, w] in 0..1: share of it whose way nobody knows."""
+    residuals: list[Tensor]
+    """[H, W, 3] float16 each, as `Sightings.residual`."""
+
+
+@dataclass
 class _Rest:
-    """Pixels that the leading plate does not give, P of them."""
+    """Pixels of some rows that the leading plate does not give, P of them."""
 
     y: Tensor
-    """[P] int64 row."""
+    """[P] int64 row, from the first of these rows."""
     x: Tensor
     """[P] int64 column."""
     color: Tensor
@@ -196,8 +220,8 @@ class Detailer:
         usable = [frame for frame in self.seen.frames if frame not in withheld]
         leading = self._leading(output, shot, usable)
         matte, st, own = self._lead(output, shot, leading, usable, (width, height))
-        rest = self._fill(shot, matte, leading, usable)
-        return self._mixed(shot, splat, leading, matte, st, own, rest)
+        fillers = self._fillers(shot, matte, leading, usable)
+        return self._mixed(shot, splat, leading, matte, st, own, fillers)
 
     # ------------------------------------------------------------------------------------------------- the frame
 
@@ -334,10 +358,14 @@ class Detailer:
             y = (torch.arange(rows, device="cpu") + 0.5 - (rows - size[1]) // 2) / size[1]
             share = torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1)
         else:
-            pixels = pixel_centres(columns, rows)
-            points = unproject(pixels, shot.image.depth, shot.viewmat, shot.K)
             viewmat, K = self.seen.camera(leading, self.plates.width, self.plates.height)
-            share = project(points, viewmat, K)[0] / torch.tensor([self.plates.width, self.plates.height], device="cpu")
+            whole = torch.tensor([self.plates.width, self.plates.height], device="cpu")
+            share = torch.empty(rows, columns, 2, device="cpu")
+            for band in bands(rows, columns):
+                pixels = pixel_centres(columns, band.stop - band.start)
+                pixels[..., 1] += band.start
+                points = unproject(pixels, shot.image.depth[band], shot.viewmat, shot.K)
+                share[band] = project(points, viewmat, K)[0] / whole
         within = ((share > 0.0) & (share < 1.0)).all(dim=-1).float()
         share[..., 1] = 1.0 - share[..., 1]
         return snap(share.clamp_(-4.0, 5.0), (self.plates.width, self.plates.height)), within
@@ -350,38 +378,44 @@ class Detailer:
 
     # ------------------------------------------------------------------------------------------------- the fill
 
-    def _fill(self, shot: _Shot, matte: Tensor, leading: int, usable: list[int]) -> _Rest:
-        """What the leading plate does not give: the splats, with what they missed from other plates."""
-        at = (matte < 0.999).nonzero()
+    def _fillers(self, shot: _Shot, matte: Tensor, leading: int, usable: list[int]) -> _Fillers | None:
+        """The plates for what the leading one does not give; None if it gives everything."""
+        if not bool((matte < _ALL).any()):
+            return None
+        chosen = self._chosen(shot, matte, leading, usable)
+        return _Fillers(chosen, *self._displacements(shot, chosen), [self.seen.residual(frame) for frame in chosen])
+
+    def _rest(self, shot: _Shot, fillers: _Fillers, matte: Tensor, rows: slice) -> _Rest:
+        """What the leading plate does not give of some rows: the splats, with what they missed from other plates."""
+        at = (matte[rows] < _ALL).nonzero()
         y, x = at[:, 0], at[:, 1]
         count = len(at)
-        rest = _Rest(y, x, shot.image.color[y, x], *(torch.zeros(count, device="cpu") for _ in range(2)))
+        rest = _Rest(y, x, shot.image.color[rows][y, x], *(torch.zeros(count, device="cpu") for _ in range(2)))
         if not count:
             return rest
-        small = torch.stack([x + 0.5, y + 0.5], dim=-1) * shot.per_pixel
-        chosen = self._chosen(shot, matte, leading, usable)
-        moved, unknown = self._displacements(shot, chosen)
-        pixels = torch.stack([x + 0.5, y + 0.5], dim=-1)
-        points = unproject(pixels, shot.image.depth[y, x], shot.viewmat, shot.K)
-        motion, unknown = look_up(shot.motion, small), look_up(unknown, small)
+        pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
+        small = pixels * shot.per_pixel
+        points = unproject(pixels, shot.image.depth[rows][y, x], shot.viewmat, shot.K)
+        motion, unknown = look_up(shot.motion, small), look_up(fillers.unknown, small)
         larger = torch.tensor(
             [self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]], device="cpu"
         )
-        untold = 1.0 - self.seen.seen(shot.t, points).visible if shot.t in chosen else torch.ones(count, device="cpu")
+        told = shot.t in fillers.chosen
+        untold = 1.0 - self.seen.seen(shot.t, points).visible if told else torch.ones(count, device="cpu")
         untold = untold * (1.0 - unknown)
         weights, places = [], []
-        for n, frame in enumerate(chosen):
-            there = points if frame == shot.t else points + look_up(moved[n], small)
+        for n, frame in enumerate(fillers.chosen):
+            there = points if frame == shot.t else points + look_up(fillers.moved[n], small)
             sighting = self.seen.seen(frame, there)
             sway = self._sway(frame, points, sighting) * untold
             weights.append(self._weight(shot, frame, sighting, motion, sway))
             places.append(sighting.pixels * larger)
         believed = torch.stack(weights)
-        rest.source = torch.tensor([float(frame) for frame in chosen], device="cpu")[believed.argmax(dim=0)]
+        rest.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]
         rest.share = (believed.sum(dim=0) / self.config.enough).clamp(max=1.0)
         total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
-        for n, frame in enumerate(chosen):
-            carried += (believed[n] / total)[:, None] * look_up(self.seen.residual(frame), places[n], "bicubic")
+        for n, residual in enumerate(fillers.residuals):
+            carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
         rest.color += carried * rest.share[:, None]
         return rest
 
@@ -455,39 +489,74 @@ class Detailer:
     # ------------------------------------------------------------------------------------------------- the mix
 
     def _mixed(
-        self, shot: _Shot, splat: FrozenImage, leading: int, matte: Tensor, st: Tensor, own: bool, rest: _Rest
+        self,
+        shot: _Shot,
+        splat: FrozenImage,
+        leading: int,
+        matte: Tensor,
+        st: Tensor,
+        own: bool,
+        fillers: _Fillers | None,
     ) -> DetailedFrame:
         image = shot.image
         rows, columns = image.alpha.shape
-        matte = (matte * 1024.0).round() / 1024.0
-        alpha = image.alpha.clone()
-        alpha[rest.y, rest.x] += (1.0 - alpha[rest.y, rest.x]) * rest.share
-        alpha = torch.maximum(alpha, matte)
-        color = rest.color if self.plates.deep else rest.color.clamp(0.0, 1.0)
-        covered = alpha[rest.y, rest.x].clamp_min(1e-4)[:, None]
-        fill = torch.zeros(rows, columns, 3, device="cpu")
-        left = 1.0 - matte[rest.y, rest.x]
-        fill[rest.y, rest.x] = left[:, None] * covered * to_linear(color / covered)
-        linear = fill
-        if bool(matte.any()):
-            plate = self.plates.linear(leading)
-            lead = _placed(plate, rows, columns) if own else sample(plate, st)
-            del plate
-            linear = torch.addcmul(fill, matte[..., None], lead)
-            del lead
-        share = matte.clone()
-        share[rest.y, rest.x] += left * rest.share
-        source = torch.full((rows, columns), float(leading), device="cpu")
-        source[rest.y, rest.x] = torch.where(left > 0.5, rest.source, float(leading))
-        source[share <= 0.0] = 0.0
-        motion = resized(shot.motion, columns, rows)
-        shown = torch.empty_like(linear)
-        for top in range(0, rows, _ROWS):  # the curve needs four times the memory of what it is given
-            shown[top : top + _ROWS] = to_display(linear[top : top + _ROWS])
-        return DetailedFrame(
-            shown, linear, alpha, splat.color, splat.alpha, share, source, image.depth, image.support,
-            motion, leading, st, matte, fill,
+        parts = bands(rows, columns)
+        if len(parts) > 1:
+            hand_back()
+        gives = bool((matte > _NOTHING).any())
+        plate = self.plates.linear(leading) if gives and not own else None
+        # A render that is not the splats' layer is no longer needed once it is mixed.
+        ours = image is not splat
+        made = DetailedFrame(
+            image.color if ours else torch.empty(rows, columns, 3, device="cpu"),
+            image.alpha if ours else image.alpha.clone(), splat.color, splat.alpha,
+            torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
+            image.support, resized(shot.motion, columns, rows), leading, st, matte,
+            torch.zeros(rows, columns, 3, device="cpu"),
         )  # fmt: skip
+        for band in parts:
+            rest = None if fillers is None else self._rest(shot, fillers, matte, band)
+            matte[band] = (matte[band] * 1024.0).round() / 1024.0
+            lead = sample(plate, st[band]) if plate is not None else None
+            if gives and own:
+                lead = self._placed(leading, rows, columns, band)
+            self._mix(made, rest, lead, band)
+        return made
+
+    def _placed(self, frame: int, rows: int, columns: int, band: slice) -> Tensor:
+        """[h, columns, 3] scene-linear: some rows of a plate in the middle of `rows` x `columns`, 0 around it."""
+        height, width = self.plates.height, self.plates.width
+        if (height, width) == (rows, columns):
+            return self.plates.linear(frame, band)
+        out = torch.zeros(band.stop - band.start, columns, 3, device="cpu")
+        top, left = (rows - height) // 2, (columns - width) // 2
+        first, last = max(band.start, top), min(band.stop, top + height)
+        if first < last:
+            part = self.plates.linear(frame, slice(first - top, last - top))
+            out[first - band.start : last - band.start, left : left + width] = part
+        return out
+
+    def _mix(self, made: DetailedFrame, rest: _Rest | None, lead: Tensor | None, rows: slice) -> None:
+        """Fills some rows of a frame whose `matte` is settled and whose `alpha` is the splats'.
+
+        `lead` [h, W, 3] are the leading plate's pixels there, scene-linear; None where it gives nothing.
+        """
+        matte, alpha, fill = made.matte[rows], made.alpha[rows], made.fill[rows]
+        share = matte.clone()
+        source = torch.full_like(share, float(made.leading))
+        if rest is not None:
+            at = rest.y, rest.x
+            left = 1.0 - matte[at]
+            alpha[at] += (1.0 - alpha[at]) * rest.share
+            covered = torch.maximum(alpha, matte)[at].clamp_min(1e-4)[:, None]
+            color = rest.color if self.plates.deep else rest.color.clamp(0.0, 1.0)
+            fill[at] = left[:, None] * covered * to_linear(color / covered)
+            share[at] += left * rest.share
+            source[at] = torch.where(left > 0.5, rest.source, float(made.leading))
+        torch.maximum(alpha, matte, out=alpha)
+        source[share <= 0.0] = 0.0
+        made.plate[rows], made.source[rows] = share, source
+        made.linear[rows] = fill if lead is None else torch.addcmul(fill, matte[..., None], lead)
 
 
 def _with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Tensor:
@@ -497,13 +566,3 @@ def _with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Te
     wide[0, 2] += (columns - width) // 2
     wide[1, 2] += (rows - height) // 2
     return wide
-
-
-def _placed(plate: Tensor, rows: int, columns: int) -> Tensor:
-    """A plate [h, w, 3] in the middle of [rows, columns, 3], 0 around it."""
-    if plate.shape[:2] == (rows, columns):
-        return plate
-    out = torch.zeros(rows, columns, 3, device="cpu")
-    top, left = (rows - plate.shape[0]) // 2, (columns - plate.shape[1]) // 2
-    out[top : top + plate.shape[0], left : left + plate.shape[1]] = plate
-    return out

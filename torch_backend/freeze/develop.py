@@ -67,6 +67,12 @@ class DevelopConfig:
     """Of the constant colour."""
     lr_sh_rest: float = 2e-4
     """Of the other harmonics."""
+    warm: float = 0.15
+    """Share of the steps over which the rates rise: Adam has no memory of the gradients at first."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Of Adam."""
+    rigid: tuple[str, ...] = ("means", "quats", "log_scales")
+    """Parameters of what moves at t* that stay: one plate sees it, which says nothing of depth."""
     opacity_weight: float = 1e-3
     """Weight of the mean opacity."""
     seed: int = 0
@@ -128,9 +134,9 @@ class _Darkroom:
         initial = len(self.model)
         room = max(initial, round(config.density * self.width * self.height))
         budget = min(room, round(config.grow * initial))
-        every = max(1, config.steps // 10)
-        self.densifier = Densifier(DensifyConfig(budget=budget, start=0.0, stop=0.6, every=every), initial, self.device)
-        self.initial = initial
+        growth = DensifyConfig(budget=budget, start=0.0, stop=0.5, every=max(1, config.steps // 12))
+        self.densifier, self.initial = Densifier(growth, initial, self.device), initial
+        self.grows = budget > initial
         self._pictures: dict[int, Tensor] = {}
         self._mattes: dict[int, Tensor] = {}
         self.mover = self._movers()
@@ -141,10 +147,10 @@ class _Darkroom:
         for n in range(steps):
             if check is not None:
                 check(n, steps)
-            if n and n % self.densifier.config.every == 0 and n < 0.9 * steps:
+            if self.grows and n and n % self.densifier.config.every == 0 and n / steps < self.densifier.config.stop:
                 self.densifier.step(self.model, self.optimizer, self.initial, n / steps)
             for group in self.optimizer.param_groups:
-                group["lr"] = group["first"] * 0.1 ** (n / steps)
+                group["lr"] = group["first"] * 0.1 ** (n / steps) * min(1.0, (n + 1) / (self.config.warm * steps + 1))
             if float(torch.rand(1, generator=self.generator)) < self.config.instant_share:
                 frame = self.t_star
             else:
@@ -173,6 +179,12 @@ class _Darkroom:
         total = loss + self.config.opacity_weight * torch.sigmoid(self.model.params["opacity_logits"]).mean()
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
+        if self.config.rigid:
+            movers = torch.nonzero(self.mover[self.model.origin] > 0.5).flatten()
+            for name in self.config.rigid:
+                grad = self.model.params[name].grad
+                if grad is not None:
+                    grad[movers] = 0.0
         self.optimizer.step(guard=[total])
         self.densifier.observe(out.means2d_absgrad[0], out.radii[0])
 
@@ -220,6 +232,7 @@ class _Darkroom:
             )  # fmt: skip
             gained = out.colors[0, ..., 3:]
             ((gained[..., 0] * matte).sum() + gained[..., 1].sum()).backward()
+        assert probe.grad is not None
         inside, whole = probe.grad.unbind(1)
         share = torch.where(whole > 0.05, inside / whole.clamp_min(1e-6), 0.0)
         return torch.maximum(flags, (share > 0.5).float())
@@ -231,7 +244,8 @@ class _Darkroom:
             "sh0": c.lr_sh0, "shN": c.lr_sh_rest,
         }  # fmt: skip
         return FusedAdam(
-            [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()], eps=1e-15
+            [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()],
+            betas=c.betas, eps=1e-15
         )
 
 

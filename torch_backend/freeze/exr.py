@@ -12,12 +12,14 @@ so the mattes are not on the same node); a lone `.R` or `.A` in a matte (aborts 
 from __future__ import annotations
 
 import errno
+import functools
 import math
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import OpenImageIO as oiio
@@ -43,7 +45,7 @@ COLOR_SPACE = "lin_rec709_scene"
 _FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) + (oiio.HALF,) * 2
 # A half counts frames up to 2048 only.
 _DETAIL_FORMATS = (oiio.HALF,) * 5 + (oiio.FLOAT,)
-_COLOURS = ("rgba", "splat")
+_CHANNELS_OF = {"rgba": (4,), "splat": (4,), "grain": (3,)}
 _ROWS = 64
 _PLATE_STEPS = 256.0
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -70,11 +72,33 @@ class FrameMetadata:
     """What the frame was rendered from, to tell a stale one; empty in frames of before it was noted."""
 
 
+class Rows(Protocol):
+    """A layer [H,W,...] of which some rows can be had: an array, or `Made`."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    def __getitem__(self, rows: slice, /) -> NDArray: ...
+
+
+@dataclass(frozen=True)
+class Made:
+    """A layer that is made when it is written, a few rows at a time: as a whole it would take up memory."""
+
+    shape: tuple[int, ...]
+    """[H,W] or [H,W,C]."""
+    rows: Callable[[slice], NDArray]
+    """Those rows of it, any float; asked for once each, from the top."""
+
+    def __getitem__(self, rows: slice, /) -> NDArray:
+        return self.rows(rows)
+
+
 @dataclass(frozen=True, eq=False)
 class DetailLayers:
     """Where the pixels of a frame come from that is made of plates as well as of splats."""
 
-    splat: ArrayLike
+    splat: ArrayLike | Made
     """[H,W,4] scene-linear, premultiplied: the frame as the splats alone show it."""
     plate: ArrayLike
     """[H,W] in 0..1: share of the pixel that is plate; 0 where splats invented it."""
@@ -105,13 +129,13 @@ class FrozenFrame:
 
 def write_frozen_exr(
     path: str | Path,
-    rgba: ArrayLike,  # [H,W,4]
-    depth: ArrayLike,  # [H,W]
-    support: ArrayLike,  # [H,W]
-    motion: ArrayLike,  # [H,W]
+    rgba: ArrayLike | Made,  # [H,W,4]
+    depth: ArrayLike | Made,  # [H,W]
+    support: ArrayLike | Made,  # [H,W]
+    motion: ArrayLike | Made,  # [H,W]
     metadata: FrameMetadata,
     margin: tuple[int, int] = (0, 0),
-    grain: ArrayLike | None = None,  # [H,W,3]
+    grain: ArrayLike | Made | None = None,  # [H,W,3]
     detail: DetailLayers | None = None,
 ) -> Path:
     """Writes one frame atomically: half colour and mattes, float32 depth and `source`, ZIP. Arrays as in `FrozenFrame`.
@@ -129,20 +153,19 @@ def write_frozen_exr(
     inside of them. Blender 4.2 to 5.2 reads the whole data window and puts its middle in the middle of the render,
     wherever the display window lies; so margins are the same on opposite sides.
 
-    ValueError names the layer whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be
-    written (errno ENOSPC when the disk is full).
+    Layers that are `Made` are made while they are written. ValueError names the layer whose shape is wrong or that
+    holds NaN or infinity; OSError if the file cannot be written (errno ENOSPC when the disk is full).
     """
     path = Path(path)
-    parts: list[NDArray] = _checked({"rgba": rgba, "depth": depth, "support": support, "motion": motion})
+    layers = {"rgba": rgba, "depth": depth, "support": support, "motion": motion}
     names, formats = CHANNELS, _FORMATS
     if grain is not None:
-        parts.append(_coarse(grain, parts[0].shape[:2]))
+        layers["grain"] = grain
         names, formats = names + GRAIN_CHANNELS, formats + (oiio.HALF,) * len(GRAIN_CHANNELS)
     if detail is not None:
-        layers = {"rgba": rgba, "splat": detail.splat, "plate": detail.plate, "source": detail.source}
-        _, splat, plate, source = _checked(layers)
-        parts += [_eight_bits(splat), np.round(plate * _PLATE_STEPS) / _PLATE_STEPS, source]
+        layers |= {"splat": detail.splat, "plate": detail.plate, "source": detail.source}
         names, formats = names + DETAIL_CHANNELS, formats + _DETAIL_FORMATS
+    parts = [_changed(layer, _STORED[name]) if name in _STORED else layer for name, layer in _checked(layers).items()]
     spec = _spec(parts[0].shape[1], parts[0].shape[0], names, formats, metadata)
     set_margin(spec, margin)
     return write_exr(path, spec, parts)
@@ -161,8 +184,8 @@ def set_margin(spec: oiio.ImageSpec, margin: tuple[int, int]) -> None:
     spec.full_width, spec.full_height = spec.width - 2 * across, spec.height - 2 * down
 
 
-def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[NDArray]) -> Path:
-    """Writes layers [H,W,c], whose channels are those of `spec` one after the other, whole or not at all.
+def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[Rows]) -> Path:
+    """Writes layers [H,W,c] or [H,W], whose channels are those of `spec` one after the other, whole or not at all.
 
     What is stored as half is clamped to +-65504. A few rows at a time: a 4K frame of all layers has half a gigabyte.
     OSError with the system's reason, as `write_frozen_exr`.
@@ -174,14 +197,24 @@ def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[NDArray]) -> Pat
         if output is None:
             raise OSError(errno.EIO, f"OpenImageIO cannot write EXR: {oiio.geterror()}", str(path))
         good = output.open(str(beside), spec)
-        for top in range(0, spec.height, _ROWS) if good else ():
-            rows = np.concatenate([part[top : top + _ROWS] for part in parts], axis=2, dtype=np.float32)
-            np.clip(rows, -most, most, out=rows)
-            begin = spec.y + top
-            good = good and output.write_scanlines(begin, begin + len(rows), 0, rows)
+        try:
+            for top in range(0, spec.height, _ROWS) if good else ():
+                rows = _rows_of(parts, slice(top, min(top + _ROWS, spec.height)), spec.width)
+                np.clip(rows, -most, most, out=rows)
+                begin = spec.y + top
+                good = good and output.write_scanlines(begin, begin + len(rows), 0, rows)
+        except BaseException:
+            output.close()  # a file that is open cannot be removed everywhere
+            raise
         if not (good and output.close()):
             raise _os_error(output.geterror(), path, spec.height * spec.width * 4 * spec.nchannels)
     return path
+
+
+def _rows_of(parts: Sequence[Rows], rows: slice, width: int) -> NDArray[np.float32]:
+    """[h,W,C] float32: some rows of all layers."""
+    height = rows.stop - rows.start
+    return np.concatenate([part[rows].reshape(height, width, -1) for part in parts], axis=2, dtype=np.float32)
 
 
 def read_frozen_exr(path: str | Path) -> FrozenFrame:
@@ -235,16 +268,12 @@ def read_key(path: str | Path) -> str | None:
         image.close()
 
 
-def _coarse(grain: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float16]:
-    """Grain [H,W,3], checked, as half floats whose eight lowest bits are 0, and an alpha of 0: [H,W,4]."""
-    half = np.asarray(grain, dtype=np.float32).astype(np.float16)
-    if half.shape != (*shape, 3):
-        raise ValueError(f"grain should be {[*shape, 3]} like rgba, got shape {list(half.shape)}")
-    if not np.isfinite(half).all():
-        raise ValueError("grain has NaN or infinite values")
+def _coarse(grain: NDArray) -> NDArray[np.float16]:
+    """Grain [h,W,3] as half floats whose eight lowest bits are 0, and an alpha of 0: [h,W,4]."""
+    half = np.clip(grain, -HALF_MAX, HALF_MAX).astype(np.float16)
     # Rounded to the nearest: cut off, it would lose a tenth of its strength.
     half = ((half.view(np.uint16) + np.uint16(0x80)) & np.uint16(0xFF00)).view(np.float16)
-    return np.concatenate([half, np.zeros((*shape, 1), np.float16)], axis=2)
+    return np.concatenate([half, np.zeros((*half.shape[:2], 1), np.float16)], axis=2)
 
 
 def _eight_bits(values: NDArray[np.float32]) -> NDArray[np.float16]:
@@ -253,27 +282,57 @@ def _eight_bits(values: NDArray[np.float32]) -> NDArray[np.float16]:
     return ((bits + np.uint32(0x4000)) & np.uint32(0xFFFF8000)).view(np.float32).clip(-HALF_MAX, HALF_MAX).astype("f2")
 
 
-def _checked(layers: dict[str, ArrayLike]) -> list[NDArray]:
-    """[H,W,c] float32: `rgba` and layers like it. ValueError names the one that is wrong."""
+def _in_steps(plate: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.round(plate * _PLATE_STEPS) / _PLATE_STEPS
+
+
+_STORED: dict[str, Callable[[NDArray], NDArray]] = {"grain": _coarse, "splat": _eight_bits, "plate": _in_steps}
+"""What becomes of a layer's rows as they are written."""
+
+
+def _changed(layer: Rows, change: Callable[[NDArray], NDArray]) -> Made:
+    return Made(layer.shape, lambda rows: change(layer[rows]))
+
+
+def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
+    """`rgba` and layers like it as float32, those that are `Made` checked when they are. ValueError names a wrong one.
+
+    Each has the size of `rgba`.
+    """
     with np.errstate(over="ignore"):
-        arrays = {name: np.asarray(layer, dtype=np.float32) for name, layer in layers.items()}
-    colour = arrays["rgba"]
-    if colour.ndim != 3 or colour.shape[2] != 4 or not colour.size:
-        raise ValueError(f"rgba should be [H,W,4], got shape {colour.shape}")
-    for name, layer in arrays.items():
-        wanted = colour.shape if name in _COLOURS else colour.shape[:2]
-        if layer.shape != wanted:
+        found: dict[str, Rows] = {
+            name: layer if isinstance(layer, Made) else np.asarray(layer, dtype=np.float32)
+            for name, layer in layers.items()
+        }
+    colour = found["rgba"].shape
+    if len(colour) != 3 or colour[2] != 4 or not math.prod(colour):
+        raise ValueError(f"rgba should be [H,W,4], got shape {tuple(colour)}")
+    for name, layer in found.items():
+        wanted = (*colour[:2], *_CHANNELS_OF.get(name, ()))
+        if tuple(layer.shape) != wanted:
             raise ValueError(f"{name} should be {list(wanted)} like rgba, got shape {list(layer.shape)}")
-        check_finite(name, layer)
-    return [layer.reshape(*colour.shape[:2], -1) for layer in arrays.values()]
+        if isinstance(layer, Made):
+            found[name] = Made(layer.shape, functools.partial(_made, name, layer))
+        elif isinstance(layer, np.ndarray):
+            check_finite(name, layer)
+    return found
 
 
-def check_finite(name: str, layer: NDArray[np.float32]) -> None:
-    """ValueError names a layer [H,W,...] with NaN or infinity in it, and the first place."""
+def _made(name: str, layer: Made, rows: slice) -> NDArray[np.float32]:
+    """Some rows of a layer, float32. ValueError if they are not finite."""
+    with np.errstate(over="ignore"):
+        made = np.asarray(layer[rows], dtype=np.float32)
+    check_finite(name, made, rows.start)
+    return made
+
+
+def check_finite(name: str, layer: NDArray[np.float32], top: int = 0) -> None:
+    """ValueError names a layer [H,W,...] with NaN or infinity in it, and the first place; it begins in row `top`."""
     finite = np.isfinite(layer)
     if not finite.all():
         y, x, *_ = np.argwhere(~finite)[0]
-        raise ValueError(f"{name} has {finite.size - finite.sum()} NaN or infinite values, the first at ({x}, {y})")
+        count, place = finite.size - finite.sum(), (int(x), int(top + y))
+        raise ValueError(f"{name} has {count} NaN or infinite values, the first at {place}")
 
 
 def _spec(

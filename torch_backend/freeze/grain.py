@@ -118,16 +118,32 @@ def draw(grain: Grain, frame: int, rgba: NDArray, size: tuple[int, int]) -> NDAr
     Returns:
         [H, W, 3] scene-linear, premultiplied like the picture; its mean is 0 but for what black and white cut off.
     """
-    height, width = rgba.shape[:2]
-    if not grain.deviation.any():
-        return np.zeros((height, width, 3), np.float32)
-    noise = _resized(_noise(grain, frame, size), width, height)
-    alpha = rgba[..., 3:4]
-    color = np.clip(rgba[..., :3] / np.where(alpha > 0.0, alpha, 1.0), 0.0, 1.0).astype(np.float32)
-    middles = (np.arange(BINS) + 0.5) / BINS
-    response = np.stack([np.interp(color[..., c], middles, grain.deviation[c]) for c in range(3)], axis=-1)
-    grainy = np.clip(color + response * noise, 0.0, 1.0)
-    return ((srgb_to_linear(grainy) - srgb_to_linear(color)) * alpha).astype(np.float32)
+    brush = Brush(grain, frame, rgba.shape[:2], size)
+    return brush.rows(slice(0, len(rgba)), rgba)
+
+
+class Brush:
+    """`draw` for some rows at a time: of a picture that would be large as a whole."""
+
+    def __init__(self, grain: Grain, frame: int, shape: tuple[int, ...], size: tuple[int, int]) -> None:
+        """`shape` is [H, W] of the whole picture; the rest as for `draw`."""
+        self._grain, (self._height, self._width) = grain, shape
+        self._noise = _noise(grain, frame, size) if grain.deviation.any() else None
+        if self._noise is not None and self._noise.shape[0] > self._height:
+            self._noise = _resized(self._noise, 0, self._height)
+
+    def rows(self, rows: slice, rgba: NDArray) -> NDArray[np.float32]:
+        """[h, W, 3] as `draw`, of `rgba` [h, W, 4]: these rows of the picture."""
+        if self._noise is None:
+            return np.zeros((*rgba.shape[:2], 3), np.float32)
+        noise = _resized(self._noise, 0, self._height, rows)
+        noise = _resized(noise, 1, self._width)
+        alpha = rgba[..., 3:4]
+        color = np.clip(rgba[..., :3] / np.where(alpha > 0.0, alpha, 1.0), 0.0, 1.0).astype(np.float32)
+        middles = (np.arange(BINS) + 0.5) / BINS
+        response = np.stack([np.interp(color[..., c], middles, self._grain.deviation[c]) for c in range(3)], axis=-1)
+        grainy = np.clip(color + response * noise, 0.0, 1.0)
+        return ((srgb_to_linear(grainy) - srgb_to_linear(color)) * alpha).astype(np.float32)
 
 
 def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float32]:
@@ -144,26 +160,25 @@ def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float3
     return np.asarray(soft @ root.astype(np.float32), np.float32)
 
 
-def _resized(noise: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """Brought to another size as a picture is: averaged where it shrinks, blended where it grows."""
-    for axis, wanted in ((0, height), (1, width)):
-        there = noise.shape[axis]
-        if there == wanted:
-            continue
-        if wanted > there:
-            at = np.clip((np.arange(wanted) + 0.5) * there / wanted - 0.5, 0.0, there - 1.0)
-            low = np.minimum(at.astype(int), max(there - 2, 0))
-            part = (at - low).reshape([-1, 1, 1] if axis == 0 else [1, -1, 1]).astype(np.float32)
-            noise = noise.take(low, axis) * (1.0 - part) + noise.take(np.minimum(low + 1, there - 1), axis) * part
-            continue
-        # Integral along the axis, read at the edges of the wanted pixels: exact means over them.
-        total = np.concatenate([np.zeros_like(noise.take([0], axis)), np.cumsum(noise, axis, dtype=np.float64)], axis)
-        at = np.linspace(0.0, there, wanted + 1)
-        low = np.minimum(at.astype(int), there - 1)
-        part = (at - low).reshape([-1, 1, 1] if axis == 0 else [1, -1, 1])
-        edges = total.take(low, axis) * (1.0 - part) + total.take(low + 1, axis) * part
-        noise = (np.diff(edges, axis=axis) * (wanted / there)).astype(np.float32)
-    return noise
+def _resized(noise: NDArray[np.float32], axis: int, wanted: int, part: slice = slice(None)) -> NDArray[np.float32]:
+    """`noise` with `wanted` pixels along an axis, or a part: averaged where it shrinks, blended where it grows."""
+    there = noise.shape[axis]
+    along = [-1 if n == axis else 1 for n in range(3)]
+    if there == wanted:
+        return noise[part] if axis == 0 else noise[:, part]
+    if wanted > there:
+        at = np.clip((np.arange(wanted)[part] + 0.5) * there / wanted - 0.5, 0.0, there - 1.0)
+        low = np.minimum(at.astype(int), max(there - 2, 0))
+        share = (at - low).reshape(along).astype(np.float32)
+        return noise.take(low, axis) * (1.0 - share) + noise.take(np.minimum(low + 1, there - 1), axis) * share
+    # Integral along the axis, read at the edges of the wanted pixels: exact means over them.
+    total = np.concatenate([np.zeros_like(noise.take([0], axis)), np.cumsum(noise, axis, dtype=np.float64)], axis)
+    at = np.linspace(0.0, there, wanted + 1)
+    low = np.minimum(at.astype(int), there - 1)
+    share = (at - low).reshape(along)
+    edges = total.take(low, axis) * (1.0 - share) + total.take(low + 1, axis) * share
+    shrunk = (np.diff(edges, axis=axis) * (wanted / there)).astype(np.float32)
+    return shrunk[part] if axis == 0 else shrunk[:, part]
 
 
 def _kernel(softness: float) -> NDArray[np.float32]:

@@ -13,6 +13,7 @@ from ..supervision import nearest_bin, support_confidence
 from ..train import LoadedRun
 from ..train.exposure import Exposure
 from ..train.model import DynamicModel, render
+from .bands import bands
 
 SUPPORT_SECONDS = 2.0
 """The support matte of a moving Gaussian falls to 1/e at this distance from the nearest time it was seen."""
@@ -137,17 +138,40 @@ def render_frozen(
         with_depth=True,
         with_contributions=False,
     )
-    alpha = out.alphas[0].clamp(0.0, 1.0)
+    if out.depth_median is None:
+        raise RuntimeError("the rasteriser returned no depth")
+    colors, alphas, depth = out.colors[0], out.alphas[0], out.depth_median[0]
+    del out  # the mean depth is not needed, and 4K takes its room
+    parts = bands(height, width)
+    if len(parts) == 1:
+        color, alpha, support, motion = _shown(colors, alphas, exposure, exposed_at)
+        return FrozenImage(color, alpha, depth, support, motion).cpu()
+    made = FrozenImage(
+        torch.empty(height, width, 3, device="cpu"),
+        torch.empty(height, width, device="cpu"),
+        depth.cpu(),
+        torch.empty(height, width, device="cpu"),
+        torch.empty(height, width, device="cpu"),
+    )
+    for rows in parts:
+        color, alpha, support, motion = _shown(colors[rows], alphas[rows], exposure, exposed_at)
+        made.color[rows], made.alpha[rows] = color, alpha
+        made.support[rows], made.motion[rows] = support, motion
+    return made
+
+
+def _shown(
+    colors: Tensor, alphas: Tensor, exposure: Exposure | None, exposed_at: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(color [h, w, 3], alpha, support, motion [h, w]) of rows as rasterised: colors [h, w, 5], alphas [h, w]."""
+    alpha = alphas.clamp(0.0, 1.0)
     # Mattes are shares of what is seen: undo the premultiplication, keep nothing where nothing is.
     covered = alpha.clamp_min(1e-4)
-    mattes = torch.where(alpha[..., None] > 1e-3, out.colors[0, ..., 3:] / covered[..., None], 0.0).clamp(0.0, 1.0)
-    depth = out.depth_median
-    if depth is None:
-        raise RuntimeError("the rasteriser returned no depth")
-    color = out.colors[0, ..., :3]
+    mattes = torch.where(alpha[..., None] > 1e-3, colors[..., 3:] / covered[..., None], 0.0).clamp(0.0, 1.0)
+    color = colors[..., :3]
     if exposure is not None:
         color = exposure.apply(color, exposed_at, alpha)
-    return FrozenImage(color.clamp_min(0.0), alpha, depth[0], mattes[..., 0], mattes[..., 1]).cpu()
+    return color.clamp_min(0.0), alpha, mattes[..., 0], mattes[..., 1]
 
 
 @dataclass

@@ -26,7 +26,7 @@ MovingOf = Callable[[int], "Tensor | None"]
 DOUBT = 0.4
 """How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
 _LENGTHS_OF = 640.0
-_VIEWS_BYTES = 400e6
+_VIEWS, _VIEWS_BYTES = 72, 400e6
 _RESIDUALS_BYTES = 250e6
 _FINEST = 1280
 """Width at which the model's own render of a plate is made at most: splats show no more, and 4K costs memory."""
@@ -50,8 +50,8 @@ class PlateReader(Protocol):
         """[height, width, 3] float32, extended display-referred."""
         ...
 
-    def linear(self, frame: int) -> Tensor:
-        """The same, scene-linear."""
+    def linear(self, frame: int, rows: slice = ...) -> Tensor:
+        """The same, scene-linear: all of it, or some rows."""
         ...
 
 
@@ -68,7 +68,7 @@ class PlateView:
     moving: Tensor
     """[h, w] in 0..1: something that moves in the clip is seen there."""
     explained: Tensor
-    """[h, w] in 0..1: the model shows there what the plate shows, but for detail."""
+    """[h, w] float16 in 0..1: the model shows there what the plate shows, but for detail."""
     picture: Tensor
     """[h, w, 3] float16, the plate, display-referred."""
     missed: Tensor
@@ -162,8 +162,8 @@ class Sightings:
         if frame not in self._views:
             self._views[frame] = self._look(frame)
             width, height = self.size
-            each = 20.0 * width * height + 12.0 * len(self.rows)
-            while len(self._views) > max(12, _VIEWS_BYTES / each):
+            each = 18.0 * width * height + 12.0 * len(self.rows)
+            while len(self._views) > max(12, min(_VIEWS, _VIEWS_BYTES / each)):
                 self._views.popitem(last=False)
         self._views.move_to_end(frame)
         return self._views[frame]
@@ -232,7 +232,7 @@ class Sightings:
             *self.camera(frame, width, height),
             image.depth,
             widened(moving, round(self.config.margin * self.unit)),
-            torch.exp(-(off / self.config.unexplained).square()),
+            torch.exp(-(off / self.config.unexplained).square()).half(),
             plate.half(),
             missed.half(),
             frozen.state["means"].cpu()[self.rows],

@@ -26,7 +26,7 @@ from ..contract import (
     verdict_of,
 )
 from ..footage.color import premultiplied_srgb_to_linear
-from ..footage.images import read_png
+from ..footage.images import read_png, write_png
 from ..footage.plates import Plates
 from ..gaussians.ply import write_ply
 from ..scene import Scene, frame_table, load_scene
@@ -35,14 +35,15 @@ from ..solve.motion import find_motion, motion_key
 from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
 from ..train.anew import SUMMARY_FILE
-from ..train.run import save_png
+from .bands import bands
 from .contact_sheet import write_contact_sheet
 from .detail import DetailedFrame, Detailer
 from .developed import Instants
-from .exr import DetailLayers, FrameMetadata, read_frozen_exr, read_key, write_frozen_exr
-from .grain import Grain, draw, measure_plate
+from .exr import DetailLayers, FrameMetadata, Made, read_frozen_exr, read_key, write_frozen_exr
+from .grain import Brush, Grain, measure_plate
 from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen, suggest_t_star
 from .reproject import resized
+from .transfer import to_display
 from .verdict import judge_take, unsure
 from .video import write_video
 from .warp import FOLDER as WARPS
@@ -163,14 +164,11 @@ def plate_detail(
     if params.detail == "off":
         return None
     plates = Plates(shot)
-    # At 4K a plate held takes 50 MB; what is made of it is held as well.
-    held = min(11, max(3, int(250e6 / (6.0 * plates.width * plates.height))))
-    plates = Plates(shot, keep=held)
     scale = float(first.K[0, 0]) / float(scene.Ks[0, 0, 0] * plates.width / scene.width)
     if not params.camera_path and size != (plates.width, plates.height):
-        plates = Plates(shot, size, held)
+        plates = Plates(shot, size)
     elif params.camera_path and scale < 0.99:
-        plates = Plates(shot, (max(16, round(plates.width * scale)), max(16, round(plates.height * scale))), held)
+        plates = Plates(shot, (max(16, round(plates.width * scale)), max(16, round(plates.height * scale))))
     if plates.note:
         report.warning(plates.note)
     return Detailer(run, scene, plates)
@@ -357,38 +355,68 @@ def _render_all(
 def _write_frame(
     folder: Path, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, look: Look, key: str
 ) -> None:
-    shown = image.color + (1.0 - image.alpha[..., None]) * 0.5
-    (width, height), beyond = look.size, look.beyond
-    # Previews, and so contact sheet and video, show the frame as it stands over the plate.
-    shown = shown[beyond[1] : beyond[1] + height, beyond[0] : beyond[0] + width]
-    save_png(folder / "preview" / frame_file(output.frame, ".png"), shown)
+    """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
+    write_png(folder / "preview" / frame_file(output.frame, ".png"), _preview(image, look))
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ torch.from_numpy(scene.centre)
-    depth = torch.where(image.depth < NO_DEPTH, image.depth / scene.scale, NO_DEPTH)
-    layers = None
+    size = tuple(image.alpha.shape)
     alpha = image.alpha.numpy()
+
+    def depth(rows: slice) -> np.ndarray:
+        return torch.where(image.depth[rows] < NO_DEPTH, image.depth[rows] / scene.scale, NO_DEPTH).numpy()
+
+    def rgba(rows: slice) -> np.ndarray:
+        if isinstance(image, DetailedFrame):
+            return np.concatenate([image.linear[rows].numpy(), alpha[rows][..., None]], axis=2)
+        return scene_linear(image.color[rows].numpy(), alpha[rows])
+
+    layers = None
     if isinstance(image, DetailedFrame):
-        rgba = np.concatenate([image.linear.numpy(), alpha[..., None]], axis=2)
-        layers = DetailLayers(scene_linear(image.splat.numpy(), image.splat_alpha.numpy()), image.plate, image.source)
-    else:
-        rgba = scene_linear(image.color.numpy(), alpha)
-    grain = None
-    if look.grain is not None:
-        shown = np.concatenate([image.color.numpy(), alpha[..., None]], axis=2)
-        grain = draw(look.grain, output.frame, shown, look.whole_grain_size)
-        if isinstance(image, DetailedFrame):  # plates have theirs
-            grain = grain * (1.0 - image.plate.numpy()[..., None])
+        splat, covered = image.splat.numpy(), image.splat_alpha.numpy()
+        shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows]))
+        layers = DetailLayers(shown, image.plate, image.source)
     write_frozen_exr(
         folder / frame_file(output.frame, ".exr"),
-        rgba,
-        depth.numpy(),
+        Made((*size, 4), rgba),
+        Made(size, depth),
         image.support.numpy(),
         image.motion.numpy(),
         FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy(), key=key),
         look.beyond,
-        grain,
+        None if look.grain is None else _grain(look.grain, output.frame, image, look),
         layers,
     )
+
+
+def _grain(grain: Grain, frame: int, image: FrozenImage | DetailedFrame, look: Look) -> Made:
+    """The layer of a frame's grain, [H, W, 3] scene-linear, premultiplied."""
+    brush = Brush(grain, frame, image.alpha.shape, look.whole_grain_size)
+
+    def drawn(rows: slice) -> np.ndarray:
+        shown = torch.cat([_display(image, rows), image.alpha[rows][..., None]], dim=2)
+        made = brush.rows(rows, shown.numpy())
+        if isinstance(image, DetailedFrame):  # plates have theirs
+            made = made * (1.0 - image.plate[rows].numpy()[..., None])
+        return made
+
+    return Made((*image.alpha.shape, 3), drawn)
+
+
+def _display(image: FrozenImage | DetailedFrame, rows: slice) -> Tensor:
+    """[h, W, 3] some rows of a frame, premultiplied, display-referred."""
+    return to_display(image.linear[rows]) if isinstance(image, DetailedFrame) else image.color[rows]
+
+
+def _preview(image: FrozenImage | DetailedFrame, look: Look) -> np.ndarray:
+    """[H, W, 3] uint8 the frame without overscan as it stands over the plate; so contact sheet and video show it."""
+    (width, height), (left, top) = look.size, look.beyond
+    out = np.empty((height, width, 3), np.uint8)
+    for part in bands(height, width):
+        rows = slice(part.start + top, part.stop + top)
+        shown = _display(image, rows) + (1.0 - image.alpha[rows][..., None]) * 0.5
+        shown = shown[:, left : left + width].clamp(0.0, 1.0) * 255.0 + 0.5
+        out[part] = shown.to(torch.uint8).numpy()
+    return out
 
 
 def _write_warp(folder: Path, output: OutputFrame, made: DetailedFrame, look: Look, key: str) -> None:

@@ -102,6 +102,7 @@ def test_a_larger_clip_is_read_at_its_own_size(tmp_path, shot_of, pan, write_vid
         assert ((plates.display(frame) * 255).round().numpy() == want[frame]).all()
         small = resize_float(plates.display(frame).numpy(), 64, 48)
         assert np.abs(small - working_of(shot, frame)).mean() < 1 / 255
+    assert (plates.linear(8, slice(20, 90)) == plates.linear(8)[20:90]).all()
     with pytest.raises(ValueError, match="no frame 2"):
         plates.display(2)
     at_working = Plates(shot, size=(64, 48))

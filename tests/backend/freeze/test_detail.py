@@ -16,6 +16,7 @@ from torch_backend.deformation import Deformation, Deltas
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
+from torch_backend.freeze import bands
 from torch_backend.freeze.detail import DetailConfig, Detailer
 from torch_backend.freeze.query import OutputFrame, freeze_at, render_frozen
 from torch_backend.freeze.warp import sample, snap
@@ -403,3 +404,20 @@ def test_a_frame_does_not_depend_on_those_made_before(world, made):
         for name in vars(want):
             a, b = getattr(alone, name), getattr(want, name)
             assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, (key, name)
+
+
+@pytest.mark.parametrize("case", ["own", "wide", "withheld", "elsewhere"])
+def test_a_frame_made_some_rows_at_a_time_is_the_same(world, monkeypatch, case):
+    output = world.output(9, 4)
+    if case == "elsewhere":
+        output = replace_pose(output, [0.1, -0.2, 0.3])
+    told = {"beyond": (24, 16) if case == "wide" else (0, 0), "withheld": (9,) if case == "withheld" else ()}
+    whole = world.make(output, **told)
+    monkeypatch.setattr(bands, "BAND_PIXELS", 23 * W)
+    parts = world.make(output, **told)
+    assert len(bands.bands(H, W)) == 11
+    assert (parts.source != whole.source).float().mean() < 1e-4, "but where two plates give the same"
+    for name in [*vars(whole), "color"]:
+        a, b = getattr(parts, name), getattr(whole, name)
+        if isinstance(a, torch.Tensor) and name != "source":
+            np.testing.assert_allclose(a, b, atol=1e-4, err_msg=name)  # a half float at 0.5 is off by 2.4e-4

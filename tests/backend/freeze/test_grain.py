@@ -5,7 +5,7 @@ import pytest
 
 from torch_backend.footage.color import linear_to_srgb, srgb_to_linear
 from torch_backend.footage.images import write_png
-from torch_backend.freeze.grain import BINS, Grain, draw, measure, measure_plate
+from torch_backend.freeze.grain import BINS, Brush, Grain, draw, measure, measure_plate
 
 AGREEMENT = np.array([[1.0, 0.6, 0.2], [0.6, 1.0, 0.3], [0.2, 0.3, 1.0]], np.float32)
 HEIGHT, WIDTH = 192, 320
@@ -118,3 +118,12 @@ def test_a_smaller_frame_has_the_grain_of_the_plate_made_smaller():
     np.testing.assert_allclose(linear_to_srgb(grey + small), means, atol=1e-5)
     odd = draw(GRAIN, 1, flat(0.5, size=(401, 97)), (WIDTH, HEIGHT))
     assert odd.shape == (97, 401, 3) and 0.3 < odd.std() / large.std() < 1.1
+
+
+@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (2 * WIDTH + 3, 3 * HEIGHT), (WIDTH // 2, HEIGHT // 2)])
+def test_grain_drawn_some_rows_at_a_time_is_the_same(size):
+    width, height = size
+    picture = np.random.default_rng(0).uniform(size=(height, width, 4)).astype(np.float32)
+    brush = Brush(GRAIN, 5, (height, width), (WIDTH, HEIGHT))
+    parts = [brush.rows(slice(top, top + 50), picture[top : top + 50]) for top in range(0, height, 50)]
+    np.testing.assert_array_equal(np.concatenate(parts), draw(GRAIN, 5, picture, (WIDTH, HEIGHT)))
