@@ -1,8 +1,4 @@
-<<<<<<< HEAD
 """Instants of a run, developed once and kept in its folder: one safetensors file each, known by what made it."""
-=======
-"""Instants of a run, developed once and kept in its folder: a file each, known by what it was made from."""
->>>>>>> h15-develop
 
 from __future__ import annotations
 
@@ -148,15 +144,8 @@ def load_developed(
         return None
     device = frozen.support.device
     base = {name: tensors[f"base.{name}"].to(device) for name in PARAM_NAMES}
-<<<<<<< HEAD
     support, motion = (_grown(v, len(base["means"])) for v in (frozen.support, frozen.motion))
     before = FrozenGaussians(base, frozen.sh_degree, support, motion)
-=======
-    count = len(base["means"])
-    before = FrozenGaussians(base, frozen.sh_degree, _grown(frozen.support, count), _grown(frozen.motion, count))
-    if len(before.support) < known:
-        return None
->>>>>>> h15-develop
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
     origin = tensors["origin"].to(device)
     return FrozenGaussians(
@@ -221,17 +210,10 @@ def _save(shot: Shot, run: LoadedRun, t_star: int, made: FrozenGaussians, key: s
     tensors |= {f"base.{name}": made.descent.frozen.state[name] for name in PARAM_NAMES}
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)
-<<<<<<< HEAD
     for other in folder.glob("*.safetensors"):
         with contextlib.suppress(OSError):  # known by its key, it does no harm but take room
             if _NAME.fullmatch(other.stem) and other != path and read_meta(other).get("run") != run.stamp:
                 other.unlink()
-=======
-
-
-def _path(shot: Shot, run: LoadedRun, t_star: int) -> Path:
-    return shot.own(run.folder / FOLDER) / frame_file(t_star, ".safetensors")
->>>>>>> h15-develop
 
 
 def _grown(values: Tensor, count: int) -> Tensor:
