@@ -183,6 +183,14 @@ class ShotSettings:
         default=True,
         options=set(),
     )
+    develop: BoolProperty(
+        name="Develop",
+        description="Train the frozen instant on as the still scene that it is, before it is rendered: what moves is "
+        "there as the plate at t* shows it, and what stands still is sharper. Takes a few minutes once for each t*. "
+        "Off: the instant as the training left it",
+        default=True,
+        options=set(),
+    )
     freeze_width: IntProperty(
         name="Width",
         description="Width in pixels of the frozen frames; 0: the source's own, or as the scene renders from a camera "

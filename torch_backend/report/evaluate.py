@@ -17,8 +17,7 @@ from ..contract import JobError, Reporter, frame_file, read_json
 from ..footage.images import write_png
 from ..footage.plates import Plates
 from ..freeze.detail import Detailer
-from ..freeze.query import FrozenGaussians, OutputFrame, freeze_at, render_frozen
-from ..freeze.take import span_of
+from ..freeze.query import FrozenGaussians, OutputFrame, freeze_at, render_frozen, span_of
 from ..scene import Scene, load_scene, read_image, split_frames
 from ..shot import Shot
 from ..solve.motion import find_motion
