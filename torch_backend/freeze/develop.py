@@ -79,11 +79,11 @@ def develop(
     moving: MovingOf,
     config: DevelopConfig | None = None,
     check: Check | None = None,
-) -> FrozenGaussians | None:
+) -> FrozenGaussians:
     """Trains a frozen scene on as the static scene that it is.
 
-    Returns what became of it; None if frames that were left out got worse where nothing moves, or plate t* did not
-    gain: a run that is as sharp as the pictures already is better left alone.
+    Returns what became of it; or the scene as it was, if frames that were left out got worse where nothing moves, or
+    plate t* did not gain: a run that is as sharp as the pictures already is better left alone.
 
     Args:
         frozen: the run's scene at t*, and behind its Gaussians those of an instant's layer, if it has one.
@@ -120,7 +120,7 @@ class _Darkroom:
         self._mattes: dict[int, Tensor] = {}
         self.mover = self._movers()
 
-    def run(self, check: Check | None) -> FrozenGaussians | None:
+    def run(self, check: Check | None) -> FrozenGaussians:
         """All steps, and the judgement."""
         steps, order, before = self.config.steps, [], self._judged()
         for n in range(steps):
@@ -136,8 +136,9 @@ class _Darkroom:
             self._step(frame)
         after = self._judged()
         if after[0] < before[0] - self.config.harm or after[1] <= before[1]:
-            return None
-        state = {name: p.detach() for name, p in self.params.items()}
+            state = dict(self.frozen.state)
+        else:
+            state = {name: p.detach() for name, p in self.params.items()}
         was = self.frozen
         return FrozenGaussians(state, was.sh_degree, was.support, was.motion, Descent(was, self.origin))
 
