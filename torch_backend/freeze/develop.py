@@ -1,23 +1,21 @@
 """Develop: a frozen instant is trained on as the static scene that it is, until it shows what plate t* shows.
 
 The field has to explain a whole clip; a freeze needs one instant of it. So the frozen Gaussians, with what plate t*
-shows and the field lost (`instant.py`), become parameters of their own: still pixels are learnt from all trained
-frames, what moves from plate t*, and from frames around it as far as the field knows how it moved. They may grow in
-number, so that the frozen scene is as sharp as the plates it is trained on, whatever the run was trained at.
+shows and the field lost (`instant.py`), become parameters of their own. Still pixels are learnt from all trained
+frames, in each of which what moves stands where the field has it; what moves at t* is learnt from plate t* alone. The
+pictures are larger than those of a preview run, so the frozen scene becomes sharper than the run.
 
-Source: design/method; figures in docs/benchmarks.md, "Developed instants".
+Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/benchmarks.md, "Developed instants").
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ..gaussians import Densifier, DensifyConfig, Gaussians
 from ..scene import Scene, read_image
 from ..train import LoadedRun
 from ..train.adam import FusedAdam
@@ -37,20 +35,18 @@ Check = Callable[[int, int], None]
 class DevelopConfig:
     """How an instant is developed. Rates are those of a run's end (`TrainConfig`), in scene units."""
 
-    steps: int = 500
+    steps: int = 300
     """Training steps, of one frame each."""
     width: int = 640
     """Pixels of the pictures that are trained on, at most; never above the working frames'."""
-    grow: float = 1.5
-    """How many Gaussians there may be in the end, over those there were; no more than `density` allows."""
-    density: float = 0.25
-    """Gaussians to a pixel of the pictures, at most, that growth goes to."""
     frames: int = 160
-    """Frames that are trained on, at most: the nearest in time first thinned out where there are more."""
-    instant_share: float = 0.15
+    """Frames that are trained on, at most, evenly over the clip."""
+    probes: int = 6
+    """Trained frames that are left out, at most, to see whether developing helped."""
+    harm: float = 0.02
+    """Loss on the still pixels of those, in dB, from which on the instant stays as it was."""
+    instant_share: float = 0.1
     """Share of the steps that are taken on plate t* itself."""
-    reach: float = 0.0
-    """Seconds from t* at which what moves in other frames is learnt from with a probability of 1/e; 0: never."""
     margin: int = 2
     """Pixels of pictures 640 wide around what moves that are left out with it."""
     dssim: float = 0.2
@@ -69,26 +65,10 @@ class DevelopConfig:
     """Of the other harmonics."""
     warm: float = 0.15
     """Share of the steps over which the rates rise: Adam has no memory of the gradients at first."""
-    betas: tuple[float, float] = (0.9, 0.99)
-    """Of Adam."""
-    rigid: tuple[str, ...] = ("means", "quats", "log_scales")
-    """Parameters of what moves at t* that stay: one plate sees it, which says nothing of depth."""
     opacity_weight: float = 1e-3
     """Weight of the mean opacity."""
     seed: int = 0
     """Of the order of frames."""
-
-
-class _Descendants(Gaussians):
-    """Gaussians that remember from which of the scene before they descend."""
-
-    def __init__(self, params: dict[str, Tensor]) -> None:
-        super().__init__(params, 1)
-        self.origin = torch.arange(len(self), device=self.open.device)
-
-    def rebuild(self, parent: Tensor, fresh: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        super().rebuild(parent, fresh, optimizer)
-        self.origin = self.origin[parent]
 
 
 def develop(
@@ -100,7 +80,10 @@ def develop(
     config: DevelopConfig | None = None,
     check: Check | None = None,
 ) -> FrozenGaussians:
-    """Trains a frozen scene on as the static scene that it is; returns what became of it.
+    """Trains a frozen scene on as the static scene that it is.
+
+    Returns what became of it; or the scene as it was, if frames that were left out got worse where nothing moves, or
+    plate t* did not gain: a run that is as sharp as the pictures already is better left alone.
 
     Args:
         frozen: the run's scene at t*, and behind its Gaussians those of an instant's layer, if it has one.
@@ -123,81 +106,84 @@ class _Darkroom:
         self.width = min(scene.width, config.width)
         self.height = max(16, round(scene.height * self.width / scene.width))
         self.index = {frame: i for i, frame in enumerate(scene.frames)}
-        self.frames = _thinned(run.train_frames, t_star, config.frames)
-        self.seconds = {frame: float(scene.seconds[self.index[frame]]) for frame in self.frames}
+        frames = [frame for frame in _spread(run.train_frames, config.frames) if frame != t_star]
+        self.probes = _spread(frames[1:-1], min(config.probes, len(frames) // 4))
+        self.frames = sorted({*frames, t_star} - {*self.probes})
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
         self.viewmats = scene.viewmats.to(self.device)
         self.moving, self.travel = moving, Travel(run, scene, frozen)
         self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
-        self.model = _Descendants({name: value.detach().clone() for name, value in frozen.state.items()})
+        self.params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in frozen.state.items()}
+        self.origin = torch.arange(len(frozen.support), device=self.device)
         self.optimizer = self._optimizer()
-        initial = len(self.model)
-        room = max(initial, round(config.density * self.width * self.height))
-        budget = min(room, round(config.grow * initial))
-        growth = DensifyConfig(budget=budget, start=0.0, stop=0.5, every=max(1, config.steps // 12))
-        self.densifier, self.initial = Densifier(growth, initial, self.device), initial
-        self.grows = budget > initial
         self._pictures: dict[int, Tensor] = {}
         self._mattes: dict[int, Tensor] = {}
         self.mover = self._movers()
 
     def run(self, check: Check | None) -> FrozenGaussians:
-        """All steps."""
-        steps, order = self.config.steps, []
+        """All steps, and the judgement."""
+        steps, order, before = self.config.steps, [], self._judged()
         for n in range(steps):
             if check is not None:
                 check(n, steps)
-            if self.grows and n and n % self.densifier.config.every == 0 and n / steps < self.densifier.config.stop:
-                self.densifier.step(self.model, self.optimizer, self.initial, n / steps)
             for group in self.optimizer.param_groups:
                 group["lr"] = group["first"] * 0.1 ** (n / steps) * min(1.0, (n + 1) / (self.config.warm * steps + 1))
-            if float(torch.rand(1, generator=self.generator)) < self.config.instant_share:
+            if float(torch.rand(1, generator=self.generator, device="cpu")) < self.config.instant_share:
                 frame = self.t_star
             else:
-                order = order or torch.randperm(len(self.frames), generator=self.generator).tolist()
+                order = order or torch.randperm(len(self.frames), generator=self.generator, device="cpu").tolist()
                 frame = self.frames[order.pop()]
             self._step(frame)
-        state = {name: p.detach() for name, p in self.model.params.items()}
-        origin, before = self.model.origin, self.frozen
-        descent = Descent(before, origin)
-        return FrozenGaussians(state, before.sh_degree, before.support[origin], before.motion[origin], descent)
+        after = self._judged()
+        if after[0] < before[0] - self.config.harm or after[1] <= before[1]:
+            state = dict(self.frozen.state)
+        else:
+            state = {name: p.detach() for name, p in self.params.items()}
+        was = self.frozen
+        return FrozenGaussians(state, was.sh_degree, was.support, was.motion, Descent(was, self.origin))
+
+    @torch.no_grad()
+    def _judged(self) -> tuple[float, float]:
+        """(PSNR in dB of the still pixels of the probes, of plate t*)."""
+        still = torch.zeros(2, dtype=torch.float64, device=self.device)
+        for frame in self.probes:
+            shown, learnt = self._shown(frame)
+            error = (shown.clamp(0.0, 1.0) - self._picture(frame)).square().mean(-1)[learnt]
+            still += torch.stack([error.double().sum(), torch.tensor(float(error.numel()), device=self.device)])
+        at = (self._shown(self.t_star)[0].clamp(0.0, 1.0) - self._picture(self.t_star)).square().mean().double()
+        errors = torch.stack([still[0] / still[1].clamp_min(1.0), at]).clamp_min(1e-12)
+        return tuple((-10.0 * errors.log10()).tolist())
 
     def _step(self, frame: int) -> None:
-        i, time = self.index[frame], self.scene.time_of_frame(frame)
-        state = self.travel.moved(dict(self.model.params), self.model.origin, frame)
-        background = torch.rand(3, generator=self.generator, device="cpu").to(self.device)
-        flags = self.mover[self.model.origin][:, None]
-        out = render(
-            state, self.frozen.sh_degree, self.viewmats[i], self.Ks[i], self.width, self.height,
-            background=torch.cat([background, background.new_zeros(1)]), colors=flags, with_contributions=False,
-        )  # fmt: skip
-        exposure = self.trained.model.exposure
-        shown = exposure.apply(out.colors[0, ..., :3], time)
-        learnt = self._learnt(frame, out.colors[0, ..., 3].detach())
+        shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
         target = torch.where(learnt[..., None], self._picture(frame), shown.detach())
         loss = photometric(shown, target, self.config.dssim)
-        total = loss + self.config.opacity_weight * torch.sigmoid(self.model.params["opacity_logits"]).mean()
+        total = loss + self.config.opacity_weight * torch.sigmoid(self.params["opacity_logits"]).mean()
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        if self.config.rigid:
-            movers = torch.nonzero(self.mover[self.model.origin] > 0.5).flatten()
-            for name in self.config.rigid:
-                grad = self.model.params[name].grad
-                if grad is not None:
-                    grad[movers] = 0.0
         self.optimizer.step(guard=[total])
-        self.densifier.observe(out.means2d_absgrad[0], out.radii[0])
+
+    def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """A frame as the scene has it, [H, W, 3], and bool [H, W]: what it says of the frozen scene.
+
+        What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
+        """
+        i, time = self.index[frame], self.scene.time_of_frame(frame)
+        background = torch.full((3,), 0.5, device=self.device) if background is None else background
+        state = self.travel.moved(dict(self.params), self.origin, frame)
+        out = render(
+            state, self.frozen.sh_degree, self.viewmats[i], self.Ks[i], self.width, self.height,
+            background=torch.cat([background, background.new_zeros(1)]), colors=self.mover[:, None],
+            with_contributions=False,
+        )  # fmt: skip
+        shown = self.trained.model.exposure.apply(out.colors[0, ..., :3], time)
+        return shown, self._learnt(frame, out.colors[0, ..., 3].detach())
 
     def _learnt(self, frame: int, mover: Tensor) -> Tensor:
         """bool [H, W]: which pixels of a frame say what the frozen scene should show there."""
         matte = self._matte(frame)
         if frame == self.t_star:
             return torch.ones_like(matte, dtype=torch.bool)
-        reach = self.config.reach
-        if reach > 0:
-            away = abs(self.seconds[frame] - self.seconds[self.t_star])
-            if float(torch.rand(1, generator=self.generator)) < math.exp(-away / reach):
-                return torch.ones_like(matte, dtype=torch.bool)
         return (matte < 0.5) & (mover < 0.1)
 
     def _picture(self, frame: int) -> Tensor:
@@ -209,8 +195,7 @@ class _Darkroom:
     def _matte(self, frame: int) -> Tensor:
         if frame not in self._mattes:
             found = self.moving(frame)
-            if found is None:
-                found = torch.zeros(self.height, self.width, device="cpu")
+            found = torch.zeros(self.height, self.width, device="cpu") if found is None else found
             found = resized(found.float(), self.width, self.height)
             self._mattes[frame] = widened(found, round(self.config.margin * self.width / 640)).half()
         return self._mattes[frame].to(self.device).float()
@@ -238,20 +223,18 @@ class _Darkroom:
         return torch.maximum(flags, (share > 0.5).float())
 
     def _optimizer(self) -> FusedAdam:
-        c, p = self.config, self.model.params
+        c, p = self.config, self.params
         rates = {
             "means": c.lr_means, "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities,
             "sh0": c.lr_sh0, "shN": c.lr_sh_rest,
         }  # fmt: skip
-        return FusedAdam(
-            [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()],
-            betas=c.betas, eps=1e-15
-        )
+        groups = [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()]
+        return FusedAdam(groups, eps=1e-15)
 
 
-def _thinned(frames: list[int], t_star: int, most: int) -> list[int]:
-    """At most so many of ascending frames, evenly, t* among them."""
+def _spread(frames: list[int], most: int) -> list[int]:
+    """At most so many of ascending frames, evenly."""
     if len(frames) <= most:
-        return sorted({*frames, t_star})
-    at = torch.linspace(0, len(frames) - 1, most, device="cpu").round().long().unique().tolist()
-    return sorted({*(frames[n] for n in at), t_star})
+        return list(frames)
+    step = len(frames) / max(1, most)
+    return [frames[int((n + 0.5) * step)] for n in range(most)]
