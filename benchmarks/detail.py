@@ -2,9 +2,10 @@
 
 SHOT is a trained shot folder; nothing is written into it. For t* as suggested and one half a clip away, on frames held
 out of training: splats alone as the run has them (splats) and of the developed instant (developed), of that plate
-detail with the plate of the same pose withheld, and what is delivered, each against that plate: PSNR whole, of the best 90 % of the pixels, of still pixels, and gradients over the plate's. Whole
-frames hold people who moved since, whom no freeze at another instant can match. Then what two instants differ by where
-nothing moves. DIR gets detail-NAME.json and strips (plate, splats, developed, withheld, delivered) at 100 %.
+detail with the plate of the same pose withheld, and what is delivered, each against that plate: PSNR whole, of the best
+90 % of the pixels, of still pixels, and gradients over the plate's. Whole frames hold people who moved since, whom no
+freeze at another instant can match. Then what two instants differ by where nothing moves. DIR gets detail-NAME.json and
+strips (plate, splats, developed, withheld, delivered) at 100 %.
 """
 
 from __future__ import annotations
@@ -193,7 +194,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (JobError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return 1
-    result |= {"version": 1, "shot": str(args.shot), "run": args.run, "develop": args.develop, "seconds": time.perf_counter() - since}
+    result |= {"version": 1, "shot": str(args.shot), "run": args.run, "develop": args.develop}
+    result["seconds"] = time.perf_counter() - since
     write_json(args.results / f"detail-{name}.json", result)
     print("\n".join(["", *table(name, result)]))
     return 0

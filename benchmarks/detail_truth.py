@@ -2,8 +2,8 @@
 
 SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot, with exact
 cameras, and an `auto` run are made in DIR if they are not there. Printed is the mean PSNR of all poses and instants
-that have a truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and what got worse. The pose of t*
-itself does not count: plate t* is its truth. DIR gets truth-NAME.json.
+that have a truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and what got worse. The
+pose of t* itself does not count: plate t* is its truth. DIR gets truth-NAME.json.
 """
 
 from __future__ import annotations
@@ -106,7 +106,8 @@ def shortfalls(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
         for region, of in regions.items():
             for v in VARIANTS[1:]:
                 gain = of[v] - of[SPLATS]
-                wanted = WANTED.get(region) if v == DELIVERED else WITHHELD_WANTED if (v, region) == (WITHHELD, WHOLE) else None
+                wanted = WANTED.get(region) if v == DELIVERED else None
+                wanted = WITHHELD_WANTED if (v, region) == (WITHHELD, WHOLE) else wanted
                 if gain < 0:
                     said.append(f"WORSE: {scene}, {region}, {v}: {gain:+.2f} dB.")
                 elif wanted is not None and gain < wanted:
