@@ -44,7 +44,8 @@ def made(trained, quiet):
     instants = Instants(world.shot, run, scene, "nearest", [T_STAR])
     instants.prepare([T_STAR], report)
     stages = [event[1:4] for event in report.events if event[0] == "progress"]
-    assert stages in ([], [("developing", n, 500) for n in range(500)] + [("developing", 1, 1)])
+    steps = config_for(run).steps
+    assert stages in ([], [("developing", n, steps) for n in range(steps)] + [("developing", 1, 1)])
     return run, scene, field(run, scene), instants.at(T_STAR, report)
 
 
