@@ -206,7 +206,8 @@ def _save(shot: Shot, run: LoadedRun, t_star: int, made: FrozenGaussians, key: s
     path = developed_path(run, t_star)
     folder = shot.own(path.parent)
     tensors: dict[str, Tensor] = {"origin": made.descent.origin}
-    tensors |= {f"state.{name}": made.state[name] for name in PARAM_NAMES}
+    # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
+    tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
     tensors |= {f"base.{name}": made.descent.frozen.state[name] for name in PARAM_NAMES}
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)
