@@ -15,7 +15,7 @@ from torch import Tensor
 from ..contract import JobError, Reporter, frame_file
 from ..gaussians.model import PARAM_NAMES
 from ..scene import Scene
-from ..shot import Shot, content_key
+from ..shot import Shot, content_key, path_error
 from ..solve.motion import load_motion, motion_key
 from ..train import LoadedRun
 from ..train.checkpoint import load_checkpoint, read_meta, save_checkpoint
@@ -100,7 +100,8 @@ class Instants:
             _save(self.shot, self.run, int(t_star), made, self.keys[t_star])
         except (OSError, JobError) as error:
             self._held[t_star] = made
-            why = error.message if isinstance(error, JobError) else f"{error.strerror or error}."
+            said = error if isinstance(error, JobError) else path_error(error)
+            why = f"{error}." if said is None else said.message
             report.warning(f"The developed instant is not kept: {why}", "The next freeze at this t* develops it again.")
         return made
 
