@@ -196,7 +196,7 @@ MESSAGES: dict[str, str] = {
     "Detail": "Detail",
     "Make frozen frames of the plates, where they can be believed: as sharp as the plate. Off: of the splats alone, soft throughout": "Eingefrorene Bilder aus den Plates machen, wo ihnen zu trauen ist: so scharf wie die Plate. Aus: aus den Splats allein, durchweg weich",
     "Develop": "Entwickeln",
-    "Train the frozen instant on as the still scene that it is, before it is rendered: what moves is there as the plate at t* shows it, and what stands still is sharper. Takes a few minutes once for each t*. Off: the instant as the training left it": "Den eingefrorenen Zeitpunkt vor dem Rendern als die stillstehende Szene, die er ist, weitertrainieren: was sich bewegt, ist da, wie die Plate bei t* es zeigt, und was stillsteht, ist schärfer. Dauert einmal je t* einige Minuten. Aus: der Zeitpunkt, wie das Training ihn hinterließ",
+    "Train the frozen instant on as the still scene that it is, before it is rendered: what moves is there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each t*. Off: the instant as the training left it": "Den eingefrorenen Zeitpunkt vor dem Rendern als die stillstehende Szene, die er ist, weitertrainieren: was sich bewegt, ist da, wie die Plate bei t* es zeigt, und was stillsteht, ist schärfer. Dauert bis zu einige Minuten, einmal je t*. Aus: der Zeitpunkt, wie das Training ihn hinterließ",
     "Developing": "Entwickeln",
     "t* {}, step {} of {}": "t* {}, Schritt {} von {}",
     "The developed instant is not kept: {}": "Der entwickelte Zeitpunkt wird nicht aufgehoben: {}",
