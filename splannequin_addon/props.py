@@ -186,8 +186,8 @@ class ShotSettings:
     develop: BoolProperty(
         name="Develop",
         description="Train the frozen instant on as the still scene that it is, before it is rendered: what moves is "
-        "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each t*. "
-        "Off: the instant as the training left it",
+        "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each "
+        "t*. Off: the instant as the training left it",
         default=True,
         options=set(),
     )
