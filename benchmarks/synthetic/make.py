@@ -167,7 +167,7 @@ def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seco
         "seed": seed,
         "kind": kind,
         "size": size.name,
-        "place": place_of(seed),
+        "place": place_of(seed, kind),
         "camera_move": camera_move_of(seed, kind),
         "width": size.width,
         "height": size.height,
