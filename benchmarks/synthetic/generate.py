@@ -19,7 +19,7 @@ from torch_backend.shot import atomic_path, write_json
 
 from .cameras import FOCAL_PER_WIDTH, CameraMove, intrinsics
 from .geometry import Builder, Mesh, turn
-from .hard import Staging, apple, arm_of, hair_of, share_in_view, stage
+from .hard import Staging, Thing, apple, arm_of, hair_of, share_in_view, stage
 from .noise import Array, stream
 from .panes import GLASS, GLASS_INDEX, MIRROR, MIRROR_SHARE
 from .places import Furnisher, Keepout, Place
@@ -85,7 +85,9 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
     kept = [Keepout(*p.place, 0.45) for p in people] + staging.clear
     kept += [Keepout(x, p.place[1], 0.45) for p in people if p.walks for x in np.linspace(*_ends(p), 8)]
     furnisher = Furnisher(seed, path, kept, staging.ahead)
-    movers, thing = [], None
+    movers: list[Mover] = []
+    made: tuple[Array, Mesh, Thing] | None = None
+    thing: Thing | None = None
     for person in people:
         body = bodies.make(person, seed, seconds)
         if kind == "still":
@@ -97,24 +99,21 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
         write_png(folder / "textures" / f"{person.name}.png", body.texture)
         if body.seat:
             furnisher.stool(*body.seat, person.heading)
-        if kind == "arm" and person.gesture:
+        if person.gesture:
             thing = arm_of(bodies, person.name)
-        elif kind == "hair" and thing is None:
-            vertices, mesh, thing = hair_of(folder, bodies, body, seed, seconds)
-            movers.append(Mover("hair", vertices.astype(np.float32), mesh, "hair.png"))
+        if kind == "hair" and person is people[0]:
+            made = hair_of(folder, bodies, body, seed, seconds)
     if staging.apple:
-        vertices, mesh, thing = apple(folder, seed, seconds, staging.apple, path)
-        movers.append(Mover("apple", vertices.astype(np.float32), mesh, "apple.png"))
+        made = apple(folder, seed, seconds, staging.apple, path)
+    if made:
+        vertices, mesh, thing = made
+        movers.append(Mover(thing.mover, vertices.astype(np.float32), mesh, f"{thing.mover}.png"))
     place, static = furnisher.room() if place_of(seed, kind) == "room" else furnisher.ground()
     if kind == "fast-mover":
         movers.append(_thrown_ball(folder, seed, seconds))
     if kind == "moving-shadow":
         movers.append(_shadow_board(folder, place, seconds, camera.duration))
-    for material in place.materials:
-        texture, rng = TEXTURES[material.texture], stream(seed, "picture", material.texture, material.variant)
-        write_png(
-            folder / "textures" / material.file, halved(texture.draw(rng, 2 * texture.pixels // size.texture_step))
-        )
+    _write_textures(folder, seed, size, place)
     _write_mesh(folder / "geometry" / "static.npz", static)
     for mover in movers:
         _write_mesh(folder / "geometry" / f"{mover.name}.npz", mover.mesh)
@@ -123,6 +122,21 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
     if thing:
         with atomic_path(folder / "geometry" / "thing.npz") as beside:
             np.savez(beside, faces=thing.faces, gone=thing.gone)
+    write_json(folder / "plan.json", _plan(key, seed, kind, size, camera, people, movers, thing, place))
+
+
+def _plan(
+    key: str,
+    seed: int,
+    kind: str,
+    size: Size,
+    camera: CameraMove,
+    people: list[Person],
+    movers: list[Mover],
+    thing: Thing | None,
+    place: Place,
+) -> dict[str, Any]:
+    """What render_bpy.py reads."""
     plan: dict[str, Any] = {
         "key": key,
         "seed": seed,
@@ -150,7 +164,15 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
         if thing.gone.any():
             mover = next(m for m in movers if m.name == thing.mover)
             plan["jobs"] = _with_behind(plan["jobs"], size, mover, thing.faces)
-    write_json(folder / "plan.json", plan)
+    return plan
+
+
+def _write_textures(folder: Path, seed: int, size: Size, place: Place) -> None:
+    for material in place.materials:
+        texture, rng = TEXTURES[material.texture], stream(seed, "picture", material.texture, material.variant)
+        write_png(
+            folder / "textures" / material.file, halved(texture.draw(rng, 2 * texture.pixels // size.texture_step))
+        )
 
 
 def _write_mesh(path: Path, mesh: Mesh) -> None:
@@ -180,12 +202,12 @@ def _people(seed: int, kind: str, path: Array, camera: CameraMove, staging: Stag
         if walks:
             x, y = float(np.copysign(0.5 * WALK_METRES, path[-1, 0] - path[0, 0])), 0.0
         of_the_scene = staging.first is not None and not people
-        if of_the_scene and staging.first:
-            x, y = staging.first
+        x, y = staging.first if staging.first and of_the_scene else (x, y)
         clear = np.hypot(path[:, 0] - x, path[:, 1] - y).min() > 0.85
         clear &= of_the_scene or all(np.hypot(k.x - x, k.y - y) > k.radius + 0.35 for k in staging.clear)
         apart = all(np.hypot(p.place[0] - x, p.place[1] - y) > 0.95 for p in people)
-        if not walks and not of_the_scene and (not clear or not apart or share_in_view(views, np.array([x, y, 1.0])) < 0.5):
+        placed = clear and apart and share_in_view(views, np.array([x, y, 1.0])) >= 0.5
+        if not walks and not of_the_scene and not placed:
             continue
         to_camera = path[len(path) // 2] - [x, y]
         heading = float(np.arctan2(to_camera[0], -to_camera[1]) + np.radians(rng.normal(0.0, 40.0)))

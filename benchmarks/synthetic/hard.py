@@ -1,8 +1,8 @@
 """What the hard scenes have that others have not: where it stands, how it moves, and which triangles are it.
 
 `glass`: a window with a pane and a mirror in the wall ahead. `swinging`: an apple of 2 % of the picture's width on a
-thread. `arm`: somebody stands still and one arm waves (even seeds) or points (odd). `hair`: loose strands on a head that
-stands before a bright window. Metres, z up.
+thread. `arm`: somebody stands still and one arm waves (even seeds) or points (odd). `hair`: loose strands on a head
+that stands before a bright window. Metres, z up.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ APPLE_HEIGHT, THREAD_TOP, THREAD_RADIUS = 1.35, 3.1, 0.0015
 SWING_METRES = (0.25, 0.05)
 """How far it swings to the side and in depth."""
 GRAVITY = 9.81
-BRIGHT_WINDOW, BRIGHT_SKY = 3.4, 3.0
+BRIGHT_WINDOW, BRIGHT_SKY = 3.4, 6.0
 """Width in metres of the window behind the hair, and strength of the sky there (other rooms: 1.6)."""
 EVENING_SKY = 0.5
 """Strength of the sky behind glass: as bright as the room, so that a reflection is seen."""
-STRANDS, STRAND_STEPS, STRAND_SIDES = 700, 6, 3
-STRAND_METRES, STRAND_RADIUS = (0.08, 0.24), 0.0012
+STRANDS, STRAND_STEPS, STRAND_SIDES = 1500, 6, 3
+STRAND_METRES, STRAND_RADIUS = (0.12, 0.32), 0.0012
 """Shortest and longest, and half the width at the root: a wisp, a sixth of a pixel wide at `quick`."""
 _HEAD_HEIGHT, _BACK_WALL = 1.6, 3.8
 """About where heads and the wall ahead are."""
@@ -123,14 +123,17 @@ def _line_of_sight(path: Array, target: tuple[float, float], at: tuple[int, ...]
     for eye in path[list(at)]:
         away = np.asarray(target) - eye
         length = float(np.hypot(*away))
-        discs += [Keepout(*(eye + away * s / length), 0.25) for s in np.arange(0.5, length - 0.5, 0.3)]
+        points = eye + away * np.arange(0.5, length - 0.5, 0.3)[:, None] / length
+        discs += [Keepout(float(x), float(y), 0.25) for x, y in points]
     return discs
 
 
 # ------------------------------------------------------------------------------------------------- what is in them
 
 
-def apple(folder: Path, seed: int, seconds: Array, place: tuple[float, float], path: Array) -> tuple[Array, Mesh, Thing]:
+def apple(
+    folder: Path, seed: int, seconds: Array, place: tuple[float, float], path: Array
+) -> tuple[Array, Mesh, Thing]:
     """(vertices [T, V, 3], mesh, thing) of an apple that swings on its thread; textures/apple.png is written."""
     rng = stream(seed, "apple")
     write_png(folder / "textures" / "apple.png", _apple_skin(rng))
@@ -146,16 +149,24 @@ def apple(folder: Path, seed: int, seconds: Array, place: tuple[float, float], p
     mesh.uv[~faces] = 0.02  # the texture's dark corner: the stalk, and the thread
     turn, phase = 2 * np.pi * seconds / (2 * np.pi * np.sqrt(length / GRAVITY)), rng.uniform(0.0, 2 * np.pi, 2)
     sideways, deep = (m / length * np.sin(turn + p) for m, p in zip(SWING_METRES, phase, strict=True))
-    cs, ss, cd, sd = np.cos(sideways), np.sin(sideways), np.cos(deep), np.sin(deep)
-    about_y = np.array([[cs, 0 * cs, -ss], [0 * cs, 0 * cs + 1, 0 * cs], [ss, 0 * cs, cs]]).transpose(2, 0, 1)
-    about_x = np.array([[0 * cd + 1, 0 * cd, 0 * cd], [0 * cd, cd, -sd], [0 * cd, sd, cd]]).transpose(2, 0, 1)
-    vertices = np.einsum("tij,tjk,vk->tvi", about_y, about_x, mesh.vertices) + [*place, THREAD_TOP]
+    turns = _turns((2, 0), sideways) @ _turns((1, 2), deep)
+    vertices = np.einsum("tij,vj->tvi", turns, mesh.vertices) + np.array([*place, THREAD_TOP])
     return vertices, mesh, Thing("swinging", "apple", faces, np.ones(len(faces), bool))
+
+
+def _turns(axes: tuple[int, int], angles: Array) -> Array:
+    """[T, 3, 3] rotations by angles [T] in radians, from the first of two axes towards the second."""
+    a, b = axes
+    matrices = np.tile(np.eye(3), (len(angles), 1, 1))
+    matrices[:, a, a] = matrices[:, b, b] = np.cos(angles)
+    matrices[:, b, a] = np.sin(angles)
+    matrices[:, a, b] = -matrices[:, b, a]
+    return matrices
 
 
 def _apple_skin(rng: np.random.Generator) -> NDArray[np.uint8]:
     """Red with a yellow cheek, and a dark corner."""
-    cheek = np.clip(2.5 * (fractal(rng, 128, 1.8) - 0.55), 0.0, 1.0)[..., None]
+    cheek = np.clip(2.5 * (fractal(rng, 128, 1.8) - 0.65), 0.0, 1.0)[..., None]
     skin = hsv(0.0, 0.85, 0.75) * (1 - cheek) + hsv(0.13, 0.7, 0.85) * cheek
     skin = skin * (0.85 + 0.3 * fractal(rng, 128, 0.8))[..., None]
     skin[-8:, :8] = 0.06
@@ -211,7 +222,7 @@ def _spines(roots: Array, out: Array, rng: np.random.Generator) -> Array:
     length = rng.uniform(*STRAND_METRES, len(roots))[:, None] / STRAND_STEPS
     heading, at = out.copy(), roots - 0.004 * out
     points = [at]
-    weight = rng.uniform(0.05, 0.3, (len(roots), 1))
+    weight = rng.uniform(0.25, 0.6, (len(roots), 1))
     for _ in range(STRAND_STEPS):
         heading = heading + weight * [0.0, 0.0, -1.0] + 0.18 * rng.normal(size=heading.shape)
         heading /= np.linalg.norm(heading, axis=1, keepdims=True)

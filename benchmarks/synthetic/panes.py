@@ -1,7 +1,7 @@
 """Flat panes: window glass, and mirrors. Where a ray meets one, and what it shows there by reflection.
 
-A pane is no part of the scene's triangles: the world behind it is rendered without it, its reflection by itself, and the
-two are mixed by how much it reflects (render_bpy.py). World in metres.
+A pane is no part of the scene's triangles: the world behind it is rendered without it, its reflection by itself, and
+the two are mixed by how much it reflects (render_bpy.py). World in metres.
 """
 
 from __future__ import annotations

@@ -6,12 +6,13 @@ and open). It *moves* if the projection of its surface point into this very view
 than MOVING_PX from where it is at t*: a still wall before which somebody moves does not. Shadows, exposure and the
 rolling shutter are no motion in this sense; the views are those of the exact cameras, all rows at the frame's time.
 
-In a mirror what is reflected counts: it is seen at t* if the mirror shows it there, and moves as its image moves. On glass
-either layer may move; seen is what stands behind it. Depth is that of the mirror itself, and of what is behind glass.
+In a mirror what is reflected counts: it is seen at t* if the mirror shows it there, and moves as its image moves. On
+glass either layer may move; seen is what stands behind it. Depth is that of the mirror itself, and of what is behind
+glass.
 
 Hard scenes have masks of their things (`Regions.things`). `glass` and `mirror` are the pixels of panes in which nothing
-moves, `wall` those of the still wall that they are in, within `WALL_METRES` of one. `swinging`, `arm` and `hair` are the
-pixels whose centre shows the thing; hair is thinner than a pixel, so a pixel is hair if at least `HAIR_SHARE` of
+moves, `wall` those of the still wall that they are in, within `WALL_METRES` of one. `swinging`, `arm` and `hair` are
+the pixels whose centre shows the thing; hair is thinner than a pixel, so a pixel is hair if at least `HAIR_SHARE` of
 `HAIR_RAYS` squared rays through it meet a strand.
 """
 
@@ -208,9 +209,7 @@ class Shown:
     """[R] whether the pane shows it in the clip's own frame, too."""
 
 
-def show_pane(
-    geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index: int, view: View, own: View
-) -> Shown:
+def show_pane(geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index: int, view: View, own: View) -> Shown:
     """What a pane reflects in a view of frame `index`, where nothing stands before it; `hits` are the view's own."""
     rays = view.rays()
     distance = pane.met(view.eye, rays)

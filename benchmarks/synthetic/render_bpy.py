@@ -162,7 +162,8 @@ class Stage:
         for number, pane in enumerate(self.plan["panes"]):
             origin, along, up = (np.array(pane[name]) for name in ("origin", "along", "up"))
             mesh = bpy.data.meshes.new(f"pane{number}")
-            mesh.from_pydata([list(p) for p in (origin, origin + along, origin + along + up, origin + up)], [], [range(4)])
+            corners = (origin, origin + along, origin + along + up, origin + up)
+            mesh.from_pydata([corner.tolist() for corner in corners], [], [range(4)])
             mesh.materials.append(self._pane_material(pane["kind"]))
             made = bpy.data.objects.new(mesh.name, mesh)
             for ray in ("diffuse", "glossy", "transmission", "shadow", "volume_scatter"):

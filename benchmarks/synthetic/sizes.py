@@ -12,8 +12,8 @@ LIMITS = ("moving-shadow", "exposure-ramp", "fast-mover", "rolling-shutter")
 VERDICTS = ("walker", "still", "tripod")
 """Kinds of scenes that the verdict is tried on: somebody walks through, nothing moves, the camera only turns."""
 HARD = ("glass", "swinging", "arm", "hair")
-"""Kinds of scenes each with a thing that a freeze loses: a window and a mirror, an apple on a thread, an arm that waves or
-points, fine hair before a bright window."""
+"""Kinds of scenes each with a thing that a freeze loses: a window and a mirror, an apple on a thread, an arm that waves
+or points, fine hair before a bright window."""
 THING = "thing_"
 """What the names of a hard scene's masks begin with in its .npz files."""
 KINDS = ("plain", *LIMITS, *VERDICTS, *HARD)
