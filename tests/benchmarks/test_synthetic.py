@@ -22,10 +22,11 @@ if importlib.util.find_spec("anny") is None:
 
 from benchmarks.synthetic import make
 from benchmarks.synthetic.__main__ import main
+from benchmarks.synthetic.cameras import intrinsics
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.generate import EXPOSURE_RAMP_STOPS, SHUTTER_SECONDS, write_geometry
 from benchmarks.synthetic.people import Bodies
-from benchmarks.synthetic.regions import Geometry, region_maps, views_of
+from benchmarks.synthetic.regions import Geometry, View, region_maps, views_of
 from benchmarks.synthetic.shot import (
     SolvedPixels,
     exact_cameras,
@@ -328,14 +329,25 @@ def hard(bodies, tmp_path_factory):
     return folders
 
 
+FINER = 4
+"""An apple of 2 % is two pixels wide at `tiny`: masks are looked at in views of so many times its size."""
+
+
+def seen_from(folder: Path, kind: str, time: int, pose: int) -> dict[str, np.ndarray]:
+    """`region_maps` of a hard scene of the size `tiny`, finer."""
+    geometry, views = Geometry.load(folder), views_of(SEED, TINY, kind)
+    width, height = FINER * TINY.width, FINER * TINY.height
+    own, other = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
+    return region_maps(geometry, geometry.at(time), time, other, own)
+
+
 @pytest.mark.parametrize("kind", HARD)
 def test_a_hard_scene_has_its_thing_in_view(kind, hard):
-    geometry, views = Geometry.load(hard[kind]), views_of(SEED, TINY, kind)
-    maps = region_maps(geometry, geometry.at(8), 8, views[4], views[8])
+    maps = seen_from(hard[kind], kind, 8, 4)
     things = {name.removeprefix(THING): mask for name, mask in maps.items() if name.startswith(THING)}
     assert set(things) == ({"glass", "mirror", "wall"} if kind == "glass" else {kind})
     for mask in things.values():
-        assert 3 / mask.size < mask.mean() < 0.5
+        assert 1e-4 < mask.mean() < 0.5
     if kind == "glass":
         assert not (things["glass"] & things["mirror"]).any() and not (things["wall"] & maps["moving"]).any()
         assert not ((things["glass"] | things["mirror"]) & maps["moving"]).any()
@@ -343,7 +355,7 @@ def test_a_hard_scene_has_its_thing_in_view(kind, hard):
         assert maps["moving"][things[kind]].mean() > 0.7
     if kind == "hair":
         # Most of it is seen before the window, which is open to the sky, or before more hair.
-        around = ndimage.binary_dilation(things["hair"], iterations=3)
+        around = ndimage.binary_dilation(things["hair"], iterations=12)
         assert (maps["depth_mm"][around] == 0).mean() > 0.2
 
 
@@ -365,12 +377,11 @@ def test_an_apple_swings_and_an_arm_gestures(hard):
 @pytest.mark.parametrize("kind", ["swinging", "arm"])
 def test_what_is_behind_a_thing_is_rendered_around_it(kind, hard):
     plan = json.loads((hard[kind] / "plan.json").read_text())
-    geometry, views = Geometry.load(hard[kind]), views_of(SEED, TINY, kind)
     behind = {Path(job["out"]).name: job for job in plan["jobs"] if "box" in job}
     assert set(behind) == {"000001.png", "000005.png", "000009.png"}
     for pose in (0, 4, 8):
-        mask = region_maps(geometry, geometry.at(8), 8, views[pose], views[8])[THING + kind]
-        left, top, right, bottom = behind[f"{pose + 1:06d}.png"]["box"]
+        mask = seen_from(hard[kind], kind, 8, pose)[THING + kind]
+        left, top, right, bottom = FINER * np.array(behind[f"{pose + 1:06d}.png"]["box"])
         inside = np.zeros_like(mask)
         inside[top:bottom, left:right] = True
         assert mask.any() and not (mask & ~inside).any() and (inside & ~mask).any()
@@ -387,7 +398,7 @@ def test_a_mirror_shows_the_room_and_a_thing_can_be_taken_away(hard, tmp_path):
         jobs = plan["jobs"][:1] if kind == "glass" else [j for j in plan["jobs"] if "box" in j][-1:]
         if kind == "arm":
             jobs = [next(j for j in plan["jobs"] if j["out"] == "truth/000009/000009.png"), *jobs]
-        write_json(folder / "plan.json", {**plan, "jobs": jobs, **changes})
+        write_json(folder / "plan.json", {**plan, "jobs": jobs, "oversize": 1, **changes})
         write_json(folder / "meter.json", {"stops": 0.5, "bpy": "", "threads": 0})
         make._render(folder, make.find_bpy(None), lambda text: None)
         return [read_png(folder / job["out"]).astype(float) for job in jobs]
