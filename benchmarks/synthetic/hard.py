@@ -33,13 +33,14 @@ APPLE_HEIGHT, THREAD_TOP, THREAD_RADIUS = 1.35, 3.1, 0.0015
 SWING_METRES = (0.25, 0.05)
 """How far it swings to the side and in depth."""
 GRAVITY = 9.81
-BRIGHT_WINDOW, BRIGHT_SKY = 3.4, 6.0
-"""Width in metres of the window behind the hair, and strength of the sky there (other rooms: 1.6)."""
+BRIGHT_WINDOW, BRIGHT_SKY = 3.4, 3.5
+"""Width in metres of the window behind the hair, and strength of the sky there (other rooms: 1.6): near white, yet mostly
+not clipped, for else a strand would have to cover most of a pixel to be seen."""
 EVENING_SKY = 0.5
 """Strength of the sky behind glass: as bright as the room, so that a reflection is seen."""
-STRANDS, STRAND_STEPS, STRAND_SIDES = 1500, 6, 3
-STRAND_METRES, STRAND_RADIUS = (0.12, 0.32), 0.0012
-"""Shortest and longest, and half the width at the root: a wisp, a sixth of a pixel wide at `quick`."""
+STRANDS, STRAND_STEPS, STRAND_SIDES = 800, 6, 3
+STRAND_METRES, STRAND_RADIUS = (0.1, 0.3), 0.0008
+"""Shortest and longest, and half the width at the root: a wisp, a tenth of a pixel wide at `quick`."""
 _HEAD_HEIGHT, _BACK_WALL = 1.6, 3.8
 """About where heads and the wall ahead are."""
 
