@@ -141,8 +141,6 @@ class RunRecord:
     """One pose at two instants."""
     plates: dict[str, str] = field(default_factory=dict)
     """Frame number -> plate on disk, of those two instants."""
-    matte: dict[str, Any] = field(default_factory=dict)
-    """{pane: {"moving", "unknown": share of it}} by the solve's motion matte, over all frames of a hard scene."""
     missing: dict[str, str] = field(default_factory=dict)
     """Metric -> sentence why it was not measured."""
     machine: dict[str, Any] = field(default_factory=dict)
@@ -157,6 +155,8 @@ class RunRecord:
     """`WITHHELD` and `DELIVERED` -> the same freezes made so; `rows` and what else is here are of splats alone."""
     shown: str = SPLATS
     """What the frames of this record show; on disk always splats, see `as_shown`."""
+    matte: dict[str, Any] = field(default_factory=dict)
+    """{pane: {"moving", "unknown": share of it}} by the solve's motion matte, over all frames of a hard scene."""
     version: int = RECORD_VERSION
 
     @property
