@@ -34,8 +34,8 @@ SWING_METRES = (0.25, 0.05)
 """How far it swings to the side and in depth."""
 GRAVITY = 9.81
 BRIGHT_WINDOW, BRIGHT_SKY = 3.4, 3.5
-"""Width in metres of the window behind the hair, and strength of the sky there (other rooms: 1.6): near white, yet mostly
-not clipped, for else a strand would have to cover most of a pixel to be seen."""
+"""Width in metres of the window behind the hair, and strength of the sky there (other rooms: 1.6): near white, yet
+mostly not clipped, for else a strand would have to cover most of a pixel to be seen."""
 EVENING_SKY = 0.5
 """Strength of the sky behind glass: as bright as the room, so that a reflection is seen."""
 STRANDS, STRAND_STEPS, STRAND_SIDES = 800, 6, 3

@@ -36,6 +36,12 @@ def world() -> Geometry:
     return Geometry(fixed.vertices, vertices, triangles, panes, "", np.zeros(len(triangles), bool))
 
 
+def with_board(world: Geometry, moved: list[float]) -> Geometry:
+    """The same world with the board elsewhere."""
+    moving = world.moving + np.array(moved, np.float32)
+    return Geometry(world.static, moving, world.triangles, world.panes, world.thing, world.thing_faces)
+
+
 def view(yaw: float = 0.0, eye: np.ndarray = EYE) -> View:
     """Looks along y, turned to the right by `yaw` radians."""
     ahead = np.array([np.sin(yaw), np.cos(yaw), 0.0])
@@ -93,13 +99,34 @@ def test_a_mirror_was_seen_where_the_other_view_saw_the_same_in_it(world):
     assert seen[:3].mean() < 0.1 and seen[-3:].mean() > 0.9
 
 
+def test_what_hides_a_point_from_the_mirror_hides_it_from_the_eye(world):
+    """From 0.7 aside it shows a place of the wall behind that the board, now at 0.8, covers for the other eye."""
+    near = with_board(world, [0.0, 2.3, 0.0])
+    of, other = view(), view(0.0, EYE - np.array([0.7, 0, 0]))
+    maps = region_maps(near, near.at(1), 1, other, of)
+    shown = (other.rays() * 8.96 + other.eye).reshape(90, 160, 3)  # images of the wall at -3, 2.98 before the mirror
+    x, y = np.moveaxis(of.project(shown)[0], 2, 0)
+    board = box(of, [-1.3, 2 * 2.98 - 0.8, 1.6], [-0.9, 2 * 2.98 - 0.8, 2.0])
+    inside = (x > 0) & (x < 160) & (y > 0) & (y < 90)
+    covered = np.zeros_like(board)
+    covered[inside] = board[y[inside].astype(int), x[inside].astype(int)]
+    covered &= maps[THING + "mirror"]
+    assert covered.any() and not maps["seen"][covered].any()
+    assert maps["seen"][maps[THING + "mirror"] & ~covered].any()
+
+
+def test_what_moves_in_glass_moves_however_still_the_garden_is(world):
+    of = view(0.0, EYE + np.array([2.07, 0, 0]))
+    maps = region_maps(world, world.at(1), 1, of, of)
+    image = box(of, [-1.3, 7.5, 1.6], [-0.9, 7.5, 2.0])
+    assert image.any() and maps["moving"][image].all() and not maps[THING + "glass"][image].any()
+    assert maps[THING + "glass"].any() and (maps["depth_mm"][image] == 6000).all()
+
+
 def test_a_board_before_a_mirror_hides_it(world):
     """Frame 2's board stands where the way from the other eye to the mirror is."""
     of = view()
-    near = Geometry(
-        world.static, world.moving + np.array([0.3, 3.5, -0.3], np.float32), world.triangles, world.panes, "",
-        world.thing_faces,
-    )  # fmt: skip
+    near = with_board(world, [0.3, 3.5, -0.3])
     maps = region_maps(near, near.at(1), 1, of, of)
     hidden = box(of, [-1.0, 2.0, 1.3], [-0.6, 2.0, 1.7])
     assert hidden.any() and not maps[THING + "mirror"][hidden].any() and (maps["depth_mm"][hidden] == 2000).all()
