@@ -17,6 +17,7 @@ from ..footage import load_frames
 from ..footage.images import read_frame
 from ..shot import Shot
 from .flow import FlowConfig, Map, Mask, Matches, neighbours, sample
+from .leftover import Leftover
 from .still import Look, StillTest, evidence
 from .stored import load_cameras, load_points
 
@@ -140,10 +141,12 @@ def _own_score(clip: Clip, matches: Matches, key: int, config: FlowConfig) -> tu
     """How much of what a key frame's points are matched with says that they move, 0 to 1, and how sure that is."""
     seen = neighbours(matches, key, len(clip.keys), config)
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
-    on, off = evidence(test, key, seen, clip.depths[key], config)
+    on, off, inverse = evidence(test, key, seen, clip.depths[key], config)
     count = on + off
     score = np.clip(off / (count + config.doubt) / config.share, 0.0, 1.0)
-    return score, np.minimum(count / config.sure, 1.0) * (count >= 1.0)
+    left, known = Leftover(clip.picture, test, config).score(key, len(clip.keys), inverse, clip.depths[key])
+    sure = np.minimum(count / config.sure, 1.0) * (count >= 1.0)
+    return np.maximum(score, left), np.maximum(sure, known * (left > score))
 
 
 def _followed(
