@@ -68,6 +68,8 @@ class FlowConfig:
     """or of so many times its median where that is more, up to `most_noise`."""
     most: float = 1.2
     """More of these units than that tell no more."""
+    visible: float = 3.0
+    """A picture that changes by so much over what is left shows it."""
     bearing: float = 0.3
     """By so much, of what it is at the match, the picture differs more where nothing moved, if it bears a match out."""
     rim: float = 1.5

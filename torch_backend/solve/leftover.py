@@ -19,6 +19,7 @@ from .flow import FlowConfig, Map, Mask, Seen, sample
 from .still import FEW, Look, Pair, StillTest, Texture, brightness, inside, outlines, still_points
 
 _FINEST, _STRIDE, _DESCENTS, _REFINEMENTS = 1, 4, 16, 2
+_SPARSE, _TURNS = 4, 6
 _FLOOR = 2.0
 """Square difference of pictures that is less than any noise."""
 
@@ -61,9 +62,10 @@ class Leftover:
         inverse = still_points(pairs, inverse, depth, self._test.unit)
         told, known = [], np.zeros_like(inverse)
         for each in laid:
-            *_, length = each.pair.miss(inverse)
+            _, x, y, length = each.pair.miss(inverse)
             limit = self._limit(length, (each.pair.weight > 0.5) & texture.telling)
-            told.append(np.minimum(length / limit, config.most) * each.gained * each.pair.weight)
+            seen = np.minimum(texture.change(x, y, length) / config.visible**2, 1.0)
+            told.append(np.minimum(length / limit, config.most) * seen * each.gained * each.pair.weight)
             known += each.pair.weight
         second = np.partition(np.stack(told), -2, axis=0)[-2]  # one alone is what is hidden there
         faint = config.faint
@@ -94,13 +96,38 @@ class Leftover:
         left = cv2.resize(flow, inverse.shape[::-1], interpolation=cv2.INTER_AREA)
         moved = test.grid[0] + left[..., 0], test.grid[1] + left[..., 1]
         match = sample(at[0], moved), sample(at[1], moved)
+        drift = _drift([match[i] - at[i] for i in (0, 1)], within & texture.telling, self._config.least * test.unit)
         pair.gain = brightness(look.grid, sample(pair.there.grid, match), within)
         still, found = (pair.there.unlike(look.grid, place, pair.gain) for place in (at, match))
         sharp = within & texture.telling
         usual = float(np.median(found[sharp])) if np.count_nonzero(sharp) >= FEW else 0.0
         likeness = within / (1.0 + found / (4.0 * usual + 8.0 * _FLOOR))
         gained = (still - found) / (found + usual + _FLOOR) / self._config.bearing
-        pair.seen = Seen(other, match, within, 1)
+        pair.seen = Seen(other, (match[0] - drift[0], match[1] - drift[1]), within, 1)
         pair.weight = likeness.astype(np.float32)
         return _Laid(pair, np.clip(gained, 0.0, 1.0))
 
+
+
+def _drift(left: list[Map], told: Mask, unit: float) -> list[Map]:
+    """By how much x and y of the whole picture are off, [h, w] each: a poor pose, a rolling shutter, a lens.
+
+    A second-order polynomial through what is `told` of what is `left`, those far from it hardly counting. What moves
+    by itself does so here and there and not evenly over the picture.
+    """
+    height, width = told.shape
+    y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j].astype(np.float32)
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    few = told[::_SPARSE, ::_SPARSE]
+    if np.count_nonzero(few) < FEW:
+        return [np.zeros_like(part) for part in left]
+    design = terms[::_SPARSE, ::_SPARSE][few].astype(np.float64)
+    wanted = np.stack([part[::_SPARSE, ::_SPARSE][few] for part in left], axis=-1).astype(np.float64)
+    found = np.zeros((6, 2))
+    found[0] = np.median(wanted, axis=0)
+    for _ in range(_TURNS):
+        gap = np.sum((wanted - design @ found) ** 2, axis=1)
+        weight = 1.0 / np.square(1.0 + gap / max(unit**2, float(np.median(gap))))
+        normal = design.T @ (design * weight[:, None]) + 1e-3 * len(design) * np.eye(6)
+        found = np.linalg.solve(normal, design.T @ (wanted * weight[:, None]))
+    return [(terms @ found[:, i].astype(np.float32)) for i in (0, 1)]
