@@ -65,11 +65,14 @@ class FlowConfig:
     least: float = 0.67
     """What is left counts in units of this length,"""
     unusual: float = 3.0
-    """or of so many times its median where that is more, up to `most_noise`."""
+    """or of so many times its median where that is more, up to `most_left`."""
+    most_left: float = 12.0
+    """Of the least: what moves may fill the picture."""
     most: float = 1.2
     """More of these units than that tell no more."""
-    visible: float = 3.0
-    """A picture that changes by so much over what is left shows it."""
+    visible: tuple[float, float] = (2.0, 3.5)
+    """A picture that changes by so much over what is left shows it: by the noise of the pair, from the one to the
+    other."""
     bearing: float = 0.3
     """By so much, of what it is at the match, the picture differs more where nothing moved, if it bears a match out."""
     rim: float = 1.5

@@ -32,6 +32,8 @@ class _Laid:
     """Its weight says how alike the pictures are at the match."""
     gained: Map
     """[h, w] 0..1: how far the pictures bear the match out against the still point."""
+    visible: float
+    """Square difference of the pictures that shows more than noise."""
 
 
 class Leftover:
@@ -64,7 +66,7 @@ class Leftover:
         for each in laid:
             _, x, y, length = each.pair.miss(inverse)
             limit = self._limit(length, (each.pair.weight > 0.5) & texture.telling)
-            seen = np.minimum(texture.change(x, y, length) / config.visible**2, 1.0)
+            seen = np.minimum(texture.change(x, y, length) / each.visible, 1.0)
             told.append(np.minimum(length / limit, config.most) * seen * each.gained * each.pair.weight)
             known += each.pair.weight
         second = np.partition(np.stack(told), -2, axis=0)[-2]  # one alone is what is hidden there
@@ -79,7 +81,7 @@ class Leftover:
         """The distance that may tell of motion, from how far matches are off as a rule."""
         least = self._config.least * self._test.unit
         noise = float(np.median(length[told])) if np.count_nonzero(told) >= FEW else 0.0
-        return float(np.clip(self._config.unusual * noise, least, self._config.most_noise * least))
+        return float(np.clip(self._config.unusual * noise, least, self._config.most_left * least))
 
     def _laid(self, key: int, other: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
         test = self._test
@@ -105,7 +107,9 @@ class Leftover:
         gained = (still - found) / (found + usual + _FLOOR) / self._config.bearing
         pair.seen = Seen(other, (match[0] - drift[0], match[1] - drift[1]), within, 1)
         pair.weight = likeness.astype(np.float32)
-        return _Laid(pair, np.clip(gained, 0.0, 1.0))
+        noise = float(np.quantile(found[within], 0.3)) if np.count_nonzero(within) >= FEW else 0.0
+        visible = np.clip(noise, *(v**2 for v in self._config.visible))
+        return _Laid(pair, np.clip(gained, 0.0, 1.0), float(visible))
 
 
 
