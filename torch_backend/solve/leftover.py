@@ -61,7 +61,7 @@ class Leftover:
         if len(laid) < 2:
             return np.zeros_like(inverse), np.zeros_like(inverse)
         pairs = [each.pair for each in laid]
-        inverse = still_points(pairs, inverse, depth, self._test.unit)
+        inverse = still_points(pairs, inverse, depth, self._test.unit, turns=3)
         told, known = [], np.zeros_like(inverse)
         for each in laid:
             _, x, y, length = each.pair.miss(inverse)
