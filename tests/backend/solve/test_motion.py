@@ -134,6 +134,28 @@ def test_motion_along_epipolar_lines_is_found(tmp_path, quiet):
     assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
 
 
+def test_a_slow_sway_of_a_pixel_is_found(tmp_path, quiet):
+    """Between neighbouring frames it is less than any flow can tell from its own noise."""
+    numbers = list(range(1, 41))
+    where = lambda share: (0.012 * np.sin(4 * share), 0.02 * np.sin(6 * share))  # noqa: E731
+    shot, board = build(tmp_path, where, numbers=numbers)
+    find_motion(shot, quiet())
+    labels = mattes(shot, numbers)
+    assert (labels[inner(board)] == MOVING).mean() > 0.8
+    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
+
+
+def test_what_is_too_fast_for_the_flow_is_found_whole(tmp_path, quiet):
+    """A board that is elsewhere in every frame: nothing of it is matched, and none of it may be left out."""
+    at = np.random.default_rng(5).uniform(-0.55, 0.55, (FRAMES, 2))
+    shot, board = build(tmp_path, lambda share: tuple(at[round(share * (FRAMES - 1))]), travel=0.4)
+    find_motion(shot, quiet())
+    labels = mattes(shot)
+    told = slice(4, FRAMES - 4)
+    assert (labels[told][inner(board, 1)[told]] == MOVING).mean() > 0.9
+    assert (labels[told][~grown(board, 10)[told]] == MOVING).mean() < 0.02
+
+
 def test_a_still_world_is_still(tmp_path, quiet):
     shot, _ = build(tmp_path)
     result = find_motion(shot, quiet())
