@@ -21,6 +21,8 @@ _OUTLINE = 0.25
 """Depths that differ by this share are two surfaces."""
 _HARDLY = 0.95
 """Share of still points that look no more unlike than what counts as lost."""
+_AROUND = 4
+"""In so many pictures around its own, on both sides, a thing has to be lost."""
 _MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
 """Square differences: above the one all are alike (hidden, or gone), by the other a point's own depth is preferred."""
 
@@ -223,9 +225,9 @@ def _counted(
     for step in config.baselines[:2]:
         if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
             off += gone[step] & gone[-step]  # behind something is so on one side as a rule.
-    around = [side * step for step in config.baselines[:3] for side in (-1, 1)]
-    if all(after in lost for after in around):  # and what flow finds there, if anything, is not what is seen here
-        off += len(around) / 2 * np.logical_and.reduce([lost[after] for after in around])
+    around = [side * step for step in config.baselines[:3] for side in (-1, 1) if side * step in lost]
+    if len(around) >= _AROUND and min(around) < 0 < max(around):  # what flow finds there is not what is seen here
+        off += 3.0 * np.logical_and.reduce([lost[after] for after in around])
     return on, off
 
 

@@ -134,10 +134,10 @@ def test_motion_along_epipolar_lines_is_found(tmp_path, quiet):
     assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
 
 
-def test_a_slow_sway_of_a_pixel_is_found(tmp_path, quiet):
+def test_a_slow_sway_of_half_a_pixel_is_found(tmp_path, quiet):
     """Between neighbouring frames it is less than any flow can tell from its own noise."""
     numbers = list(range(1, 41))
-    where = lambda share: (0.012 * np.sin(4 * share), 0.02 * np.sin(6 * share))  # noqa: E731
+    where = lambda share: (0.004 * np.sin(4 * share), 0.008 * np.sin(6 * share))  # noqa: E731
     shot, board = build(tmp_path, where, numbers=numbers)
     find_motion(shot, quiet())
     labels = mattes(shot, numbers)
@@ -152,7 +152,7 @@ def test_what_is_too_fast_for_the_flow_is_found_whole(tmp_path, quiet):
     find_motion(shot, quiet())
     labels = mattes(shot)
     told = slice(4, FRAMES - 4)
-    assert (labels[told][inner(board, 1)[told]] == MOVING).mean() > 0.9
+    assert (labels[told][inner(board, 1)[told]] == MOVING).mean() > 0.8
     assert (labels[told][~grown(board, 10)[told]] == MOVING).mean() < 0.02
 
 
