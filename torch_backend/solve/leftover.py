@@ -19,7 +19,9 @@ from .flow import FlowConfig, Map, Mask, Seen, sample
 from .still import FEW, Look, Pair, StillTest, Texture, brightness, inside, outlines, still_points
 
 _FINEST, _STRIDE, _DESCENTS, _REFINEMENTS = 1, 4, 16, 2
+"""Of DIS: at half the size of the pictures and not finer, every fourth pixel."""
 _SPARSE, _TURNS = 4, 6
+"""Every so manieth point tells of the whole picture, and so often what moves in it is weighed less."""
 _FLOOR = 2.0
 """Square difference of pictures that is less than any noise."""
 
@@ -83,19 +85,24 @@ class Leftover:
         noise = float(np.median(length[told])) if np.count_nonzero(told) >= FEW else 0.0
         return float(np.clip(self._config.unusual * noise, least, self._config.most_left * least))
 
-    def _laid(self, key: int, other: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
-        test = self._test
-        pair = Pair.between(test, key, Seen(other, test.grid, np.zeros(inverse.shape, bool), 1), self._config)
-        at, _ = pair.ray.project(inverse)
-        within = inside(at, inverse.shape)
+    def _left(self, key: int, other: int, at: tuple[Map, Map], within: Mask) -> Map:
+        """[h, w, 2] flow of a key frame to another one that is laid over it: its points are seen `at` places there."""
         one = self._picture(key)
         x, y = (cv2.resize(p, one.shape[::-1], interpolation=cv2.INTER_LINEAR) - np.float32(0.5) for p in at)
         brought = cv2.remap(self._picture(other), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         # Past the border there is nothing: the picture itself, that flow stays at rest there.
         outside = cv2.resize((~within).astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST)
         cv2.copyTo(one, outside, brought)
-        flow = self._dis.calc(one, brought, None)  # type: ignore[call-overload]
-        left = cv2.resize(flow, inverse.shape[::-1], interpolation=cv2.INTER_AREA)
+        flow = np.nan_to_num(self._dis.calc(one, brought, None))  # type: ignore[call-overload]
+        return cv2.resize(flow, within.shape[::-1], interpolation=cv2.INTER_AREA)
+
+    def _laid(self, key: int, other: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
+        """The other key frame, laid over a key frame by inverse depths."""
+        test = self._test
+        pair = Pair.between(test, key, Seen(other, test.grid, np.zeros(inverse.shape, bool), 1), self._config)
+        at, _ = pair.ray.project(inverse)
+        within = inside(at, inverse.shape)
+        left = self._left(key, other, at, within)
         moved = test.grid[0] + left[..., 0], test.grid[1] + left[..., 1]
         match = sample(at[0], moved), sample(at[1], moved)
         drift = _drift([match[i] - at[i] for i in (0, 1)], within & texture.telling, self._config.least * test.unit)
@@ -108,9 +115,8 @@ class Leftover:
         pair.seen = Seen(other, (match[0] - drift[0], match[1] - drift[1]), within, 1)
         pair.weight = likeness.astype(np.float32)
         noise = float(np.quantile(found[within], 0.3)) if np.count_nonzero(within) >= FEW else 0.0
-        visible = np.clip(noise, *(v**2 for v in self._config.visible))
-        return _Laid(pair, np.clip(gained, 0.0, 1.0), float(visible))
-
+        least, most = self._config.visible
+        return _Laid(pair, np.clip(gained, 0.0, 1.0), min(max(noise, least**2), most**2))
 
 
 def _drift(left: list[Map], told: Mask, unit: float) -> list[Map]:

@@ -136,7 +136,7 @@ def test_motion_along_epipolar_lines_is_found(tmp_path, quiet):
 
 def test_a_slow_sway_of_half_a_pixel_is_found(tmp_path, quiet):
     """Between neighbouring frames it is less than any flow can tell from its own noise."""
-    numbers = list(range(1, 41))
+    numbers = list(range(1, 31))
     where = lambda share: (0.004 * np.sin(4 * share), 0.008 * np.sin(6 * share))  # noqa: E731
     shot, board = build(tmp_path, where, numbers=numbers)
     find_motion(shot, quiet())
