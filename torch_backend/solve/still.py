@@ -19,10 +19,6 @@ FEW = 50
 """Fewer points say nothing of a picture."""
 _OUTLINE = 0.25
 """Depths that differ by this share are two surfaces."""
-_HARDLY = 0.95
-"""Share of still points that look no more unlike than what counts as lost."""
-_AROUND = 4
-"""In so many pictures around its own, on both sides, a thing has to be lost."""
 _MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
 """Square differences: above the one all are alike (hidden, or gone), by the other a point's own depth is preferred."""
 
@@ -207,7 +203,6 @@ def _counted(
     """What the pairs say of still points at inverse depths, as `evidence`."""
     on, off = np.zeros_like(inverse), np.zeros_like(inverse)
     gone: dict[int, Mask] = {}
-    lost: dict[int, Mask] = {}
     for pair in pairs:
         found, after = pair.seen.found, pair.seen.key - key
         at, x, y, length = pair.miss(inverse)
@@ -219,15 +214,10 @@ def _counted(
         off += away & better & (texture.change(x, y, length) > config.contrast**2)
         weight = min(1.0, abs(after) / config.baselines[-1]) ** config.haste
         on += weight * ((found & ~away) + 0.5 * ((away & ~better) | (within & alike & ~found)))
-        gone[after] = within & ~alike & ~found
-        at_most = _at_most(unlike, found & ~away & texture.telling)
-        lost[after] = within & ~alike & (unlike > at_most) & (away | ~found)
+        gone[after] = within & ~found & ~alike
     for step in config.baselines[:2]:
         if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
             off += gone[step] & gone[-step]  # behind something is so on one side as a rule.
-    around = [side * step for step in config.baselines[:3] for side in (-1, 1) if side * step in lost]
-    if len(around) >= _AROUND and min(around) < 0 < max(around):  # what flow finds there is not what is seen here
-        off += 3.0 * np.logical_and.reduce([lost[after] for after in around])
     return on, off
 
 
@@ -240,11 +230,6 @@ def _like(unlike: Map, still: Mask, config: FlowConfig) -> float:
     """Below how much pictures show the same: what is `still` tells how unlike a sharp and a blurred one are."""
     usual = float(np.median(unlike[still])) if np.count_nonzero(still) >= FEW else 0.0
     return max(config.likeness**2, config.noise**2 * usual)
-
-
-def _at_most(unlike: Map, still: Mask) -> float:
-    """What hardly any still point is as unlike as: in a blurred picture edges are, and they do not move."""
-    return float(np.quantile(unlike[still], _HARDLY)) if np.count_nonzero(still) >= FEW else np.inf
 
 
 def _best_depth(look: Look, pairs: list[Pair], depths: list[Map]) -> Map:
