@@ -853,7 +853,7 @@ def bench(arguments: Sequence[str], output: Path) -> int:
 def _own_scenes(arguments: Sequence[str]) -> bool:
     """True if a benchmark's arguments ask for no synthetic scene."""
     named = {word.partition("=")[0] for word in arguments}
-    return bool(named & {"--truth", "--shot"}) and not named & {"--size", "--quick", "--limits"}
+    return bool(named & {"--truth", "--shot"}) and not named & {"--size", "--quick", "--limits", "--hard"}
 
 
 class Leg:

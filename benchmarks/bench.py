@@ -440,10 +440,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     quick = {"max_gaussians": args.max_gaussians or QUICK_GAUSSIANS} if args.quick else {}
     sources = [f"truth:{Path(p).absolute()}" for p in args.truth] + [f"shot:{Path(p).absolute()}" for p in args.shot]
     try:
-        if not sources or args.size or args.quick or args.limits:
+        if not sources or args.size or args.quick or args.limits or args.hard:
             cameras = ("exact", "solved") if args.cameras == "both" else (args.cameras,)
             size = args.size or ("quick" if args.quick else "medium")
-            sources += make_scenes(size, args.tuning, cameras, Path(args.scenes).absolute(), args.bpy, args.limits)
+            folder = Path(args.scenes).absolute()
+            sources += make_scenes(size, args.tuning, cameras, folder, args.bpy, args.limits, args.hard)
         runs, said = plan(
             sources,
             results,
@@ -489,6 +490,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--scenes", default=str(default_folder()), metavar="DIR", help="of synthetic scenes")
     parser.add_argument("--tuning", action="store_true", help="scenes to tune on instead of those to report on")
     parser.add_argument("--limits", action="store_true", help="the four scenes that break an assumption, alone")
+    parser.add_argument("--hard", action="store_true", help="the scenes with what a freeze loses in view, alone")
     parser.add_argument("--truth", action="append", default=[], metavar="FOLDER", help="scene with rendered truth")
     parser.add_argument("--shot", action="append", default=[], metavar="SHOT", help="solved shot of a real clip")
     parser.add_argument("--results", default="output/bench", metavar="DIR", help="records, pictures and report")

@@ -20,10 +20,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.synthetic.folder import Regions, SyntheticScene
+from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, solved_shot
-from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
+from benchmarks.synthetic.sizes import HARD, LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import read_json
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key
@@ -73,24 +73,33 @@ class SyntheticTruth:
 
     def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
         """The rendered truth, through the undistortion that the clip's frames went through."""
-        pixels = self._pixels.picture(self._scene.truth(t_star, pose))
-        image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]
+        return self._resampled(self._scene.truth(t_star, pose), width, height)
+
+    def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """By truth: seen at t* or not, moving or static, and a hard scene's things; of the nearest pixel."""
+        regions = self._pixels.regions(self._scene.regions(t_star, pose))
+        seen, moving = (_nearest(mask, width, height) for mask in (regions.seen, regions.moving))
+        things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
+        return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving, **things}
+
+    def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """What was rendered without the scene's thing, as `truth` is."""
+        pixels = self._scene.behind(t_star, pose)
+        name = self._scene.info.get("thing")
+        return {} if pixels is None or name is None else {name: self._resampled(pixels, width, height)}
+
+    def _resampled(self, pixels: NDArray[np.uint8], width: int, height: int) -> Tensor:
+        image = torch.from_numpy(self._pixels.picture(pixels).astype(np.float32) / 255.0).permute(2, 0, 1)[None]
         if image.shape[-2:] != (height, width):
             image = torch.nn.functional.interpolate(image, (height, width), mode="bicubic", antialias=True)
         return image[0].permute(1, 2, 0).clamp(0.0, 1.0)
 
-    def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """By truth: seen at t* or not, moving or static; of the nearest pixel."""
-        regions = self._pixels.regions(self._scene.regions(t_star, pose))
-        seen, moving = (_nearest(mask, width, height) for mask in (regions.seen, regions.moving))
-        return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving}
-
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """Moving or static in the clip's own frame, by truth; of the nearest pixel."""
-        moving = self._scene.frame_moving(frame)
-        of_frame = Regions(self._scene.frame_depth(frame), moving, np.ones_like(moving))
-        moving = _nearest(self._pixels.regions(of_frame).moving, width, height)
-        return {"moving": moving, "static": ~moving}
+        """Moving or static in the clip's own frame and a hard scene's things, by truth; of the nearest pixel."""
+        regions = self._pixels.regions(self._scene.frame_regions(frame))
+        moving = _nearest(regions.moving, width, height)
+        things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
+        return {"moving": moving, "static": ~moving, **things}
 
 
 def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
@@ -100,16 +109,22 @@ def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
 
 
 def make_scenes(
-    size: str, tuning: bool, cameras: Sequence[str], folder: Path, bpy: str | None = None, limits: bool = False
+    size: str,
+    tuning: bool,
+    cameras: Sequence[str],
+    folder: Path,
+    bpy: str | None = None,
+    limits: bool = False,
+    hard: bool = False,
 ) -> list[str]:
     """Sources of the synthetic scenes of a size, rendered first where they are not there (a child process).
 
-    With `limits` those of the first seed that break an assumption of the method, instead of the plain ones. `bpy` is a
-    Python with Blender's module, found beside the repository if it is not given. RuntimeError with the child's own last
-    words if a scene cannot be made.
+    With `limits` those of the first seed that break an assumption of the method, with `hard` those that have a thing in
+    view that a freeze loses, instead of the plain ones. `bpy` is a Python with Blender's module, found beside the
+    repository if it is not given. RuntimeError with the child's own last words if a scene cannot be made.
     """
     seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: 1 if limits else SIZES[size].scenes]
-    kinds = LIMITS if limits else ("plain",)
+    kinds = (LIMITS if limits else ()) + (HARD if hard else ()) or ("plain",)
     command = [sys.executable, "-P", "-m", "benchmarks.sources", "--size", size, "--out", str(folder)]
     command += [*(["--bpy", bpy] if bpy else []), "--seeds", *map(str, seeds), "--kinds", *kinds]
     with subprocess.Popen(

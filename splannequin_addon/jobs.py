@@ -22,6 +22,8 @@ from typing import Any
 from ..torch_backend import contract
 
 _SCRUBBED = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "PYTHONEXECUTABLE", "__PYVENV_LAUNCHER__", "VIRTUAL_ENV")
+_LAST_WORD_SECONDS = 10.0
+"""How long a job's process is waited for after it told its end."""
 _START_SECONDS = 30.0
 """A job without a status this long after it was made never started."""
 _LOG_LINES = 6
@@ -258,6 +260,10 @@ def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> 
             time.sleep(0.0 if job.ended else 0.05)
         except KeyboardInterrupt:
             cancel(job)
+    if job.process is not None:
+        # After its last word it lets go of the shot's lock; on a busy machine whoever goes on at once would meet it.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            job.process.wait(_LAST_WORD_SECONDS)
     raise_if_failed(job)
     return job.result
 

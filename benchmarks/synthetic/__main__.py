@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from torch_backend.contract import JobError
 
 from .make import BpyMissingError, default_folder, find_bpy, make_scene
-from .sizes import KINDS, LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
+from .sizes import HARD, KINDS, LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
 
 if TYPE_CHECKING:
     from .people import Bodies
@@ -31,6 +31,7 @@ def arguments(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--kinds", choices=KINDS, nargs="+", default=["plain"])
     parser.add_argument("--limits", action="store_true", help="the four limit scenes as well, of the first seed")
+    parser.add_argument("--hard", action="store_true", help="the four hard scenes as well, of every seed")
     parser.add_argument("--out", type=Path, default=default_folder(), help="default: %(default)s")
     parser.add_argument("--bpy", help="Python with bpy, or its environment (default: .venv-bpy-5.0)")
     return parser.parse_args(argv)
@@ -44,6 +45,8 @@ def main(argv: list[str] | None = None) -> int:
     scenes = [(seed, kind) for kind in options.kinds for seed in seeds]
     if options.limits:
         scenes += [(seeds[0], kind) for kind in LIMITS if (seeds[0], kind) not in scenes]
+    if options.hard:
+        scenes += [(seed, kind) for kind in HARD for seed in seeds if (seed, kind) not in scenes]
     began = time.perf_counter()
 
     def say(text: str) -> None:

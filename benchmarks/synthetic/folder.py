@@ -5,12 +5,16 @@ frames/NNNNNN.png        the clip: 8-bit sRGB, frame n at time n, numbered from 
 masks/NNNNNN.npz         depth_mm, moving: of the clip's frame
 truth/<t*>/NNNNNN.png    the scene frozen at t*, from the camera of frame NNNNNN
 truth/<t*>/NNNNNN.npz    depth_mm, seen, moving: of that picture
+truth/<t*>/behind/NNNNNN.png   in scenes of some kinds: what stands behind the thing that the scene is about
+
+Masks and truth of a hard scene also hold thing_<name>, see regions.py.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,7 @@ from numpy.typing import NDArray
 
 from torch_backend.footage.images import read_png
 
-from .sizes import FORMAT_VERSION
+from .sizes import FORMAT_VERSION, THING
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,16 @@ class Regions:
     """[H, W] the surface point is at some frame of the clip elsewhere in this view, by more than `moving_px`."""
     seen: NDArray[np.bool_]
     """[H, W] the surface point is visible in the clip's own frame t*."""
+    things: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    """name -> [H, W]: what a hard scene is about: glass, mirror and the wall beside them, swinging, arm, hair."""
+
+    @classmethod
+    def of(cls, data: Mapping[str, NDArray]) -> Regions:
+        """From the arrays of a scene's .npz file; of a frame of the clip, which has no `seen`, all of it is."""
+        moving = data["moving"]
+        things = {name.removeprefix(THING): data[name] for name in data if name.startswith(THING)}
+        seen = data["seen"] if "seen" in data else np.ones_like(moving)
+        return cls(_metres(data["depth_mm"]), moving, seen, things)
 
 
 @dataclass(frozen=True)
@@ -107,17 +121,29 @@ class SyntheticScene:
     def regions(self, t_star: int, pose: int) -> Regions:
         """Depth and regions of a picture of the truth."""
         with np.load(self.truth_path(t_star, pose).with_suffix(".npz"), allow_pickle=False) as data:
-            return Regions(_metres(data["depth_mm"]), data["moving"], data["seen"])
+            return Regions.of(data)
+
+    def frame_regions(self, frame: int) -> Regions:
+        """Depth and regions of a frame of the clip."""
+        with np.load(self.root / "masks" / f"{frame:06d}.npz", allow_pickle=False) as data:
+            return Regions.of(data)
+
+    def behind(self, t_star: int, pose: int) -> NDArray[np.uint8] | None:
+        """[H, W, 3] uint8 sRGB: the truth without the thing that the scene is about, black away from it.
+
+        None if the kind has none, or that view does not show it.
+        """
+        path = self.truth_path(t_star, pose)
+        path = path.parent / "behind" / path.name
+        return read_png(path) if path.is_file() else None
 
     def frame_depth(self, frame: int) -> NDArray[np.float32]:
         """[H, W] metres, inf for sky, of a frame of the clip."""
-        with np.load(self.root / "masks" / f"{frame:06d}.npz", allow_pickle=False) as data:
-            return _metres(data["depth_mm"])
+        return self.frame_regions(frame).depth
 
     def frame_moving(self, frame: int) -> NDArray[np.bool_]:
         """[H, W] what moves in a frame of the clip: see Regions.moving."""
-        with np.load(self.root / "masks" / f"{frame:06d}.npz", allow_pickle=False) as data:
-            return data["moving"]
+        return self.frame_regions(frame).moving
 
     def centres(self) -> NDArray[np.float64]:
         """[T, 3] exact camera centres in metres, in the order of `frames`."""

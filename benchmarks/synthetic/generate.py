@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from torch_backend.footage.images import write_png
 from torch_backend.shot import atomic_path, write_json
 
-from .cameras import FOCAL_PER_WIDTH, CameraMove
+from .cameras import FOCAL_PER_WIDTH, CameraMove, intrinsics
 from .geometry import Builder, Mesh, turn
+from .hard import Staging, Thing, apple, arm_of, hair_of, share_in_view, stage
 from .noise import Array, stream
+from .panes import GLASS, GLASS_INDEX, MIRROR, MIRROR_SHARE
 from .places import Furnisher, Keepout, Place
 from .sizes import Size, camera_move_of, place_of
 from .textures import TEXTURES, halved
@@ -32,6 +34,8 @@ EXPOSURE_RAMP_STOPS = 1.2
 SHUTTER_SECONDS = 0.06
 """Time between the first and the last row of a frame in `rolling-shutter`."""
 SHUTTER_BANDS = 9
+BEHIND_MARGIN = 6
+"""Pixels around a thing that are rendered without it."""
 WALK_METRES = 3.2
 """How far the one in `walker` goes, against the camera: one who goes along with it looks like one who stands nearer."""
 
@@ -76,11 +80,14 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
     seconds = frame_seconds(size)
     camera = camera_of(seed, size, kind)
     path = camera.eyes_and_targets(np.linspace(0.0, camera.duration, 60))[0][:, :2]
-    people = _people(seed, kind, path, camera)
-    kept = [Keepout(*p.place, 0.45) for p in people]
+    staging = stage(kind, seed, path, camera.world_to_camera(np.linspace(0.0, camera.duration, 12)))
+    people = _people(seed, kind, path, camera, staging)
+    kept = [Keepout(*p.place, 0.45) for p in people] + staging.clear
     kept += [Keepout(x, p.place[1], 0.45) for p in people if p.walks for x in np.linspace(*_ends(p), 8)]
-    furnisher = Furnisher(seed, path, kept)
-    movers = []
+    furnisher = Furnisher(seed, path, kept, staging.ahead)
+    movers: list[Mover] = []
+    made: tuple[Array, Mesh, Thing] | None = None
+    thing: Thing | None = None
     for person in people:
         body = bodies.make(person, seed, seconds)
         if kind == "still":
@@ -92,22 +99,45 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
         write_png(folder / "textures" / f"{person.name}.png", body.texture)
         if body.seat:
             furnisher.stool(*body.seat, person.heading)
-    place, static = furnisher.room() if place_of(seed) == "room" else furnisher.ground()
+        if person.gesture:
+            thing = arm_of(bodies, person.name)
+        if kind == "hair" and person is people[0]:
+            made = hair_of(folder, bodies, body, seed, seconds)
+    if staging.apple:
+        made = apple(folder, seed, seconds, staging.apple, path)
+    if made:
+        vertices, mesh, thing = made
+        movers.append(Mover(thing.mover, vertices.astype(np.float32), mesh, f"{thing.mover}.png"))
+    place, static = furnisher.room() if place_of(seed, kind) == "room" else furnisher.ground()
     if kind == "fast-mover":
         movers.append(_thrown_ball(folder, seed, seconds))
     if kind == "moving-shadow":
         movers.append(_shadow_board(folder, place, seconds, camera.duration))
-    for material in place.materials:
-        texture, rng = TEXTURES[material.texture], stream(seed, "picture", material.texture, material.variant)
-        write_png(
-            folder / "textures" / material.file, halved(texture.draw(rng, 2 * texture.pixels // size.texture_step))
-        )
+    _write_textures(folder, seed, size, place)
     _write_mesh(folder / "geometry" / "static.npz", static)
     for mover in movers:
         _write_mesh(folder / "geometry" / f"{mover.name}.npz", mover.mesh)
         with atomic_path(folder / "geometry" / f"{mover.name}.npy") as beside:
             np.save(beside, mover.vertices, allow_pickle=False)
-    plan = {
+    if thing:
+        with atomic_path(folder / "geometry" / "thing.npz") as beside:
+            np.savez(beside, faces=thing.faces, gone=thing.gone)
+    write_json(folder / "plan.json", _plan(key, seed, kind, size, camera, people, movers, thing, place))
+
+
+def _plan(
+    key: str,
+    seed: int,
+    kind: str,
+    size: Size,
+    camera: CameraMove,
+    people: list[Person],
+    movers: list[Mover],
+    thing: Thing | None,
+    place: Place,
+) -> dict[str, Any]:
+    """What render_bpy.py reads."""
+    plan: dict[str, Any] = {
         "key": key,
         "seed": seed,
         "kind": kind,
@@ -125,7 +155,24 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
         "people": [{"name": p.name, "pose": p.pose, "phenotype": p.phenotype, "place": p.place} for p in people],
         "jobs": _jobs(seed, kind, size, camera),
     }
-    write_json(folder / "plan.json", plan)
+    # Scenes without these have the same plan, to the byte, as before there were any.
+    if place.panes:
+        plan["panes"] = [pane.to_json() for pane in place.panes]
+        plan["reflects"] = {GLASS: GLASS_INDEX, MIRROR: MIRROR_SHARE}
+    if thing:
+        plan["thing"] = {"name": thing.name, "mover": thing.mover}
+        if thing.gone.any():
+            mover = next(m for m in movers if m.name == thing.mover)
+            plan["jobs"] = _with_behind(plan["jobs"], size, mover, thing.faces)
+    return plan
+
+
+def _write_textures(folder: Path, seed: int, size: Size, place: Place) -> None:
+    for material in place.materials:
+        texture, rng = TEXTURES[material.texture], stream(seed, "picture", material.texture, material.variant)
+        write_png(
+            folder / "textures" / material.file, halved(texture.draw(rng, 2 * texture.pixels // size.texture_step))
+        )
 
 
 def _write_mesh(path: Path, mesh: Mesh) -> None:
@@ -136,7 +183,7 @@ def _write_mesh(path: Path, mesh: Mesh) -> None:
 # --------------------------------------------------------------------------------------------------- who and what
 
 
-def _people(seed: int, kind: str, path: Array, camera: CameraMove) -> list[Person]:
+def _people(seed: int, kind: str, path: Array, camera: CameraMove, staging: Staging) -> list[Person]:
     """Two to five people in view and out of the camera's way."""
     from .people import POSES, Person
 
@@ -154,9 +201,13 @@ def _people(seed: int, kind: str, path: Array, camera: CameraMove) -> list[Perso
         walks = kind == "walker" and not people
         if walks:
             x, y = float(np.copysign(0.5 * WALK_METRES, path[-1, 0] - path[0, 0])), 0.0
+        of_the_scene = staging.first is not None and not people
+        x, y = staging.first if staging.first and of_the_scene else (x, y)
         clear = np.hypot(path[:, 0] - x, path[:, 1] - y).min() > 0.85
+        clear &= of_the_scene or all(np.hypot(k.x - x, k.y - y) > k.radius + 0.35 for k in staging.clear)
         apart = all(np.hypot(p.place[0] - x, p.place[1] - y) > 0.95 for p in people)
-        if not walks and (not clear or not apart or _share_in_view(views, np.array([x, y, 1.0])) < 0.5):
+        placed = clear and apart and share_in_view(views, np.array([x, y, 1.0])) >= 0.5
+        if not walks and not of_the_scene and not placed:
             continue
         to_camera = path[len(path) // 2] - [x, y]
         heading = float(np.arctan2(to_camera[0], -to_camera[1]) + np.radians(rng.normal(0.0, 40.0)))
@@ -170,11 +221,15 @@ def _people(seed: int, kind: str, path: Array, camera: CameraMove) -> list[Perso
         }
         accents = {"spine03": tuple(rng.normal(0.0, 2.0, 3)), "head": tuple(rng.normal(0.0, 5.0, 3))}
         waves = kind == "fast-mover" and not people
-        pose = "wave" if waves else "stand" if walks else poses[len(people)]
+        pose = "wave" if waves else "stand" if walks or of_the_scene else poses[len(people)]
         heading = float(np.copysign(np.pi / 2, -x)) if walks else heading
         name = f"person{len(people)}"
         restless = float(rng.uniform(0.7, 1.4))
-        people.append(Person(name, phenotype, pose, (x, y), heading, restless, waves, accents, walks))
+        gesture = ""
+        if of_the_scene:
+            restless, heading = 0.4 * restless, float(np.arctan2(to_camera[0], -to_camera[1]))
+            gesture = ("wave", "point")[seed % 2] if kind == "arm" else ""
+        people.append(Person(name, phenotype, pose, (x, y), heading, restless, waves, accents, gesture, walks))
     return people
 
 
@@ -189,12 +244,6 @@ def _walk(person: Person, seconds: Array, duration: float) -> NDArray[np.float32
 def _ends(person: Person) -> tuple[float, float]:
     """x in metres where one who walks begins and ends."""
     return person.place[0], person.place[0] - float(np.copysign(WALK_METRES, person.place[0]))
-
-
-def _share_in_view(views: Array, point: Array) -> float:
-    """Share of world-to-camera poses [C, 4, 4] in which a point lies well inside the width of the picture."""
-    local = views[:, :3, :3] @ point + views[:, :3, 3]
-    return float(((local[:, 2] > 0.5) & (np.abs(local[:, 0]) * FOCAL_PER_WIDTH < 0.42 * local[:, 2])).mean())
 
 
 def _thrown_ball(folder: Path, seed: int, seconds: Array) -> Mover:
@@ -256,6 +305,32 @@ def _jobs(seed: int, kind: str, size: Size, camera: CameraMove) -> list[dict[str
             folder = f"truth/{frame_number(index):06d}"
             jobs += [_job(f"{folder}/{frame_name(p)}", seed, kind, size, index, p, views) for p in poses]
     return jobs
+
+
+def _with_behind(
+    jobs: list[dict[str, Any]], size: Size, mover: Mover, faces: NDArray[np.bool_]
+) -> list[dict[str, Any]]:
+    """After each truth that shows the scene's thing, what stands behind it there: only the pixels around it."""
+    K, found = intrinsics(size.width, size.height), []
+    for job in jobs:
+        found.append(job)
+        if not job["out"].startswith("truth/"):
+            continue
+        band = job["bands"][0]
+        view = np.array(band["world_to_camera"])
+        points = mover.vertices[round(band["time"])][np.unique(mover.mesh.triangles[faces])]
+        local = points @ view[:3, :3].T + view[:3, 3]
+        pixels = (local[:, :2] / np.maximum(local[:, 2:], 0.05) * K[[0, 1], [0, 1]] + K[:2, 2])[local[:, 2] > 0.05]
+        if len(pixels) == 0:
+            continue
+        least, most = np.zeros(2), np.array([size.width, size.height])
+        low = np.clip(np.floor(pixels.min(axis=0)) - BEHIND_MARGIN, least, most).astype(int)
+        high = np.clip(np.ceil(pixels.max(axis=0)) + BEHIND_MARGIN, least, most).astype(int)
+        if (high > low).all():
+            name = Path(job["out"])
+            out = (name.parent / "behind" / name.name).as_posix()
+            found.append({**job, "out": out, "box": [*map(int, low), *map(int, high)]})
+    return found
 
 
 def _job(out: str, seed: int, kind: str, size: Size, time: int, pose: int, views: Array) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from torch_backend.shot import content_key, need_disk, write_json
 
 from .cameras import intrinsics
 from .generate import EXPOSURE_RAMP_STOPS, SHUTTER_SECONDS, frame_number, frame_seconds, write_geometry
+from .panes import GLASS, MIRROR, MIRROR_SHARE
 from .regions import views_of, write_regions
 from .sizes import FORMAT_VERSION, MOVING_PX, Size, camera_move_of, place_of
 
@@ -167,7 +168,7 @@ def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seco
         "seed": seed,
         "kind": kind,
         "size": size.name,
-        "place": place_of(seed),
+        "place": place_of(seed, kind),
         "camera_move": camera_move_of(seed, kind),
         "width": size.width,
         "height": size.height,
@@ -190,6 +191,8 @@ def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seco
             "size": asdict(size),
         },
     }
+    if "thing" in plan:
+        record["thing"] = plan["thing"]["name"]
     write_json(folder / "scene.json", record)
 
 
@@ -199,6 +202,8 @@ def _limits(kind: str) -> dict[str, Any]:
         return {"exposure_stops_over_clip": EXPOSURE_RAMP_STOPS, "truth": "with the exposure of frame t*"}
     if kind == "rolling-shutter":
         return {"readout_seconds": SHUTTER_SECONDS, "truth": "all rows at the time and the camera of the middle row"}
+    if kind == "glass":
+        return {"reflected": {GLASS: "16 % straight on", MIRROR: f"{MIRROR_SHARE:.0%}"}}
     if kind == "moving-shadow":
         return {"truth": "with the shadow of frame t*"}
     return {}

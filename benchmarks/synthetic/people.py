@@ -28,6 +28,8 @@ WAIST, KNEE = -0.06, -0.42
 SKIN, SHIRT, TROUSERS, SHOES, HAIR, EYES = range(6)
 FACE = ("eyeBlinkLeft", "eyeBlinkRight", "jawOpen", "mouthSmileLeft", "mouthSmileRight")
 BLINK_SECONDS, FLIP_SECONDS = 0.3, 0.35
+WAVE_HERTZ, POINT_HERTZ = 0.45, 0.3
+"""How often a gesture is made."""
 
 Pose = dict[str, tuple[float, float, float]]
 
@@ -93,6 +95,8 @@ class Person:
     """Swings the right arm up and down all the time: a limit of the method."""
     accents: Pose = field(default_factory=dict)
     """Added to the pose."""
+    gesture: str = ""
+    """wave or point: what the right arm does all the time, from the pose `stand`; empty: nothing."""
     walks: bool = False
     """Swings legs and arms as in walking: the case in which a freeze does not hold."""
 
@@ -139,11 +143,12 @@ class Bodies:
         """{group: [V] skinning weight} of groups of bones."""
         weights, bones = self.model.vertex_bone_weights.numpy(), self.model.vertex_bone_indices.numpy()
 
-        def of(*stems: str) -> Array:
-            wanted = np.array([bone.startswith(stems) for bone in self.bones])
+        def of(*stems: str, end: str = "") -> Array:
+            wanted = np.array([bone.startswith(stems) and bone.endswith(end) for bone in self.bones])
             return np.where(wanted[bones], weights, 0.0).sum(axis=1)
 
         return {
+            "right_arm": of("upperarm", "lowerarm", "wrist", "finger", "metacarpal", end=".R"),
             "arms": of("upperarm", "lowerarm", "wrist", "finger", "metacarpal"),
             "chest": of("spine01", "spine02", "spine03"),
             "hips": of("root", "pelvis"),
@@ -245,6 +250,8 @@ class Bodies:
             swing = np.sin(2 * np.pi * 0.9 * seconds)[:, None]
             add("upperarm01.R", np.array([-10.0, 45.0, 0.0]) * (0.5 + 0.5 * swing))
             add("lowerarm01.R", np.array([-20.0, 35.0, 0.0]) * swing)
+        for bone, degrees in _gesture(person.gesture, seconds).items():
+            add(bone, degrees)
         if person.walks:
             swing = np.sin(2 * np.pi * 0.9 * seconds)[:, None]
             for side, sign in ((".L", 1.0), (".R", -1.0)):
@@ -330,6 +337,19 @@ class Clothes:
     """0 none, 1 to the elbow, 2 to the wrist."""
     dress: bool
     bald: bool
+
+
+def _gesture(gesture: str, seconds: Array) -> dict[str, Array]:
+    """{bone: [T, 3] degrees added to the pose `stand`}: a hand that waves, or an arm that points and sinks."""
+    if not gesture:
+        return {}
+    of_arm = {bone: np.subtract(POSES[gesture][bone], _ARMS_DOWN[bone]) for bone in ("upperarm01.R", "lowerarm01.R")}
+    if gesture == "point":
+        share = 0.6 - 0.4 * np.cos(2 * np.pi * POINT_HERTZ * seconds)
+        return {bone: share[:, None] * degrees for bone, degrees in of_arm.items()}
+    swing = np.sin(2 * np.pi * WAVE_HERTZ * seconds)[:, None]
+    swings = {"upperarm01.R": np.array([0.0, 14.0, 0.0]), "lowerarm01.R": np.array([0.0, 32.0, 0.0])}
+    return {bone: degrees + swing * swings[bone] for bone, degrees in of_arm.items()}
 
 
 def _rotations(vectors: Array) -> Array:

@@ -9,8 +9,13 @@ import numpy as np
 
 from .geometry import Builder, Mesh
 from .noise import Array, stream
+from .panes import GLASS, MIRROR, Pane
 from .textures import TEXTURES
 
+WINDOW_WIDTH, WINDOW_LOW, WINDOW_HIGH = 2.2, 0.85, 2.25
+"""Metres: how wide a window is, where it begins and ends above the floor."""
+MIRROR_SIZE, MIRROR_LOW = (1.1, 1.5), 0.65
+"""Metres: width and height of a mirror, and where it begins above the floor."""
 MAX_VARIANTS = 10
 """Pictures of one kind in a scene: after that they are used again."""
 ROOM_SKIES = ("courtyard", "city", "forest")
@@ -42,6 +47,22 @@ class Keepout:
     radius: float
 
 
+@dataclass(frozen=True)
+class WallAhead:
+    """What the wall shows that the camera looks at; x in metres, 0 in the middle of it."""
+
+    window_x: float
+    """Middle of the window, which is then in this wall and in no other."""
+    window_width: float = WINDOW_WIDTH
+    mirror_x: float | None = None
+    """Middle of a mirror; None: there is none."""
+    glazed: bool = False
+    """Whether the window has a pane that reflects."""
+    garden: bool = False
+    """Whether something stands outside, not only sky."""
+    sky_strength: float = 1.6
+
+
 @dataclass
 class Place:
     """The still part of a scene, before anybody walks in."""
@@ -54,13 +75,16 @@ class Place:
     sky_strength: float = 1.0
     sky_turn: float = 0.0
     """Radians about z."""
+    panes: list[Pane] = field(default_factory=list)
+    """Glass and mirrors, which are not part of the mesh."""
 
 
 class Furnisher:
     """Puts things into a place, where the camera's path and the people leave room."""
 
-    def __init__(self, seed: int, path: Array, people: list[Keepout]) -> None:
+    def __init__(self, seed: int, path: Array, people: list[Keepout], ahead: WallAhead | None = None) -> None:
         self.seed = seed
+        self.ahead = ahead
         self.rng = stream(seed, "furniture")
         self.path = path
         self.taken = list(people)
@@ -218,7 +242,7 @@ class Furnisher:
         spans = [(0.0, length, 0.0, height)]
         if window:
             a, b = window
-            low, high = 0.85, 2.25
+            low, high = WINDOW_LOW, WINDOW_HIGH
             spans = [(0.0, a, 0.0, height), (b, length, 0.0, height), (a, b, 0.0, low), (a, b, high, height)]
             normal = np.array([along[1], -along[0], 0.0])
             yaw = float(np.arctan2(along[1], along[0]))
@@ -246,6 +270,8 @@ class Furnisher:
         self.build.rect([-half, front, 0], [2 * half, 0, 0], [0, depth, 0], floor)
         self.build.rect([-half, back, height], [2 * half, 0, 0], [0, -depth, 0], self.material("plaster"))
         window_wall = int(rng.integers(3))
+        if self.ahead:
+            window_wall = 0
         walls = [
             (np.array([-half, back, 0.0]), np.array([1.0, 0.0, 0.0]), 2 * half),
             (np.array([half, back, 0.0]), np.array([0.0, -1.0, 0.0]), depth),
@@ -256,23 +282,56 @@ class Furnisher:
             window = None
             if index == window_wall:
                 middle = length * (0.5 if index == 0 else 0.35 if index == 1 else 0.65)
-                window = (middle - 1.1, middle + 1.1)
+                middle += self.ahead.window_x if self.ahead else 0.0
+                width = self.ahead.window_width if self.ahead else WINDOW_WIDTH
+                window = (middle - width / 2, middle + width / 2)
                 inward = np.array([along[1], -along[0], 0.0])
                 centre = origin + along * middle - inward * 0.05 + [0, 0, 1.55]
-                place.lights.append(_portal(centre, inward, 2.2, 1.4))
+                place.lights.append(_portal(centre, inward, width, 1.4))
             self.wall(origin, along, length, height, window)
-            self.posters(origin, along, length, 4 if index < 3 else 2, [window] if window else [])
+            taken = [window] if window else []
+            if self.ahead and index == 0:
+                taken += self._panes(self.ahead, origin, half)
+            self.posters(origin, along, length, 4 if index < 3 else 2, taken)
         for x, y in ((-0.45 * half, -2.2), (0.45 * half, -2.2), (-0.45 * half, 1.6), (0.45 * half, 1.6)):
             place.lights.append(_panel([x, y, height - 0.06], 1.3, 0.5, 75.0))
             self.build.box([x, y, height - 0.025], [1.36, 0.56, 0.05], self.material("plaster", False, 6.0))
         if rng.uniform() < 0.7:
             w, d = rng.uniform(2.0, 3.0), rng.uniform(1.6, 2.4)
             self.build.rect([-w / 2, 0.2 - d / 2, 0.006], [w, 0, 0], [0, d, 0], self.material("rug"))
+        if self.ahead:
+            for x in (self.ahead.window_x, self.ahead.mirror_x):
+                self.taken += [Keepout(x + dx, back - 0.4, 0.3) for dx in (-0.7, 0.0, 0.7)] if x is not None else []
         self._against_walls(half, back)
         self._in_the_middle(half, back, height)
-        place.sky, place.sky_strength = str(rng.choice(ROOM_SKIES)), 1.6
+        if self.ahead and self.ahead.garden:
+            self._garden(self.ahead.window_x, back)
+        place.sky, place.sky_strength = str(rng.choice(ROOM_SKIES)), self.ahead.sky_strength if self.ahead else 1.6
         place.sky_turn = float(rng.uniform(0, 2 * np.pi))
         return place, self.build.mesh()
+
+    def _panes(self, ahead: WallAhead, origin: Array, half: float) -> list[tuple[float, float]]:
+        """Hangs the mirror and glazes the window of the wall ahead; the spans that the mirror takes of it."""
+        along = np.array([1.0, 0.0, 0.0])
+        if ahead.glazed:
+            at = origin + along * (half + ahead.window_x - ahead.window_width / 2) + [0, 0, WINDOW_LOW]
+            self.place.panes.append(Pane.of(GLASS, at, along * ahead.window_width, [0, 0, WINDOW_HIGH - WINDOW_LOW]))
+        if ahead.mirror_x is None:
+            return []
+        width, height = MIRROR_SIZE
+        start = half + ahead.mirror_x - width / 2
+        at = origin + along * start + [0, -0.025, MIRROR_LOW]
+        self.place.panes.append(Pane.of(MIRROR, at, along * width, [0, 0, height]))
+        board = origin + along * (start + width / 2) + [0, -0.011, MIRROR_LOW + height / 2]
+        self.build.box(board, [width + 0.08, 0.022, height + 0.08], self.material("planks", False))
+        return [(start, start + width)]
+
+    def _garden(self, x: float, back: float) -> None:
+        """What is seen through a window in the wall ahead: a lawn, a house, trees."""
+        self.build.rect([x - 12, back + 0.3, -0.01], [24, 0, 0], [0, 16, 0], self.material("grass"))
+        self._house(x + float(self.rng.uniform(-2.5, 2.5)), back + 7.5, 0.0)
+        for dx in (-2.6, 0.2, 2.8):
+            self._tree(x + dx + float(self.rng.uniform(-0.4, 0.4)), back + float(self.rng.uniform(3.0, 5.5)))
 
     def _against_walls(self, half: float, back: float) -> None:
         rng = self.rng

@@ -75,10 +75,13 @@ class RayScene:
 
     def sees(self, eye: NDArray, points: NDArray) -> NDArray[np.bool_]:
         """[P] whether nothing lies between `eye` [3] and `points` [P, 3]."""
-        away = points - eye
-        hits = self.cast(np.broadcast_to(eye, points.shape), away)
+        return self.clear(np.broadcast_to(eye, points.shape), points)
+
+    def clear(self, begin: NDArray, end: NDArray) -> NDArray[np.bool_]:
+        """[P] whether nothing lies between points [P, 3] and [P, 3], but for what the latter are on."""
+        away = end - begin
         length = np.linalg.norm(away, axis=1)
-        return hits.distance * length >= length - SLACK
+        return self.cast(begin, away).distance * length >= length - SLACK
 
     def escapes(self, eye: NDArray, directions: NDArray) -> NDArray[np.bool_]:
         """[R] whether rays from `eye` [3] along `directions` [R, 3] meet nothing."""

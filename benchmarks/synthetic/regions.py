@@ -5,10 +5,20 @@ point lies inside the clip's own frame t* and nothing stands before it there (sk
 and open). It *moves* if the projection of its surface point into this very view is, at any frame of the clip, farther
 than MOVING_PX from where it is at t*: a still wall before which somebody moves does not. Shadows, exposure and the
 rolling shutter are no motion in this sense; the views are those of the exact cameras, all rows at the frame's time.
+
+In a mirror what is reflected counts: it is seen at t* if the mirror shows it there, and moves as its image moves. On
+glass either layer may move; seen is what stands behind it. Depth is that of the mirror itself, and of what is behind
+glass.
+
+Hard scenes have masks of their things (`Regions.things`). `glass` and `mirror` are the pixels of panes in which nothing
+moves, `wall` those of the still wall that they are in, within `WALL_METRES` of one. `swinging`, `arm` and `hair` are
+the pixels whose centre shows the thing; hair is thinner than a pixel, so a pixel is hair if at least `HAIR_SHARE` of
+`HAIR_RAYS` squared rays through it meet a strand.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,10 +33,17 @@ from torch_backend.shot import atomic_path
 from .cameras import intrinsics
 from .generate import camera_of, frame_name, frame_number, frame_seconds
 from .noise import Array
+from .panes import MIRROR, Pane
 from .rays import Hits, RayScene
-from .sizes import MOVING_PX, Size
+from .sizes import MOVING_PX, THING, Size
 
 DEPTH_STEPS_PER_METRE = 1000.0
+HAIR_RAYS, HAIR_SHARE = 4, 0.15
+NUDGE = 1e-4
+"""Metres by which a ray that a pane reflects begins before it."""
+WALL_METRES, WALL_DEPTH = 0.6, 0.04
+"""How far around a pane the wall is beside it, and how far before or behind the pane's plane a point is on the wall:
+bare wall, and pictures on it, but no furniture."""
 
 
 @dataclass
@@ -39,6 +56,12 @@ class Geometry:
     """[T, M, 3] those that may; numbered after the static ones."""
     triangles: NDArray[np.int32]
     """[F, 3]."""
+    panes: list[Pane]
+    """Which are not among the triangles."""
+    thing: str
+    """Name of the thing that a hard scene is about; empty: it has none."""
+    thing_faces: NDArray[np.bool_]
+    """[F] which triangles are it."""
 
     @classmethod
     def load(cls, folder: Path) -> Geometry:
@@ -47,6 +70,8 @@ class Geometry:
         with np.load(folder / "geometry" / "static.npz", allow_pickle=False) as data:
             static, triangles = data["vertices"], [data["triangles"]]
         moving, at = [], len(static)
+        thing = plan.get("thing", {"name": "", "mover": ""})
+        its = [np.zeros(len(triangles[0]), bool)]
         for mover in plan["movers"]:
             if not mover["in_view"]:
                 continue
@@ -55,7 +80,13 @@ class Geometry:
                 triangles.append(data["triangles"] + at)
             moving.append(vertices)
             at += vertices.shape[1]
-        return cls(static, np.concatenate(moving, axis=1), np.concatenate(triangles))
+            its.append(np.zeros(len(triangles[-1]), bool))
+            if mover["name"] == thing["mover"]:
+                with np.load(folder / "geometry" / "thing.npz", allow_pickle=False) as data:
+                    its[-1] = data["faces"]
+        panes = [Pane.from_json(pane) for pane in plan.get("panes", [])]
+        every = np.concatenate(triangles)
+        return cls(static, np.concatenate(moving, axis=1), every, panes, thing["name"], np.concatenate(its))
 
     def at(self, index: int) -> RayScene:
         """The scene as it stands at a frame."""
@@ -75,9 +106,9 @@ class View:
     def eye(self) -> Array:
         return -self.matrix[:3, :3].T @ self.matrix[:3, 3]
 
-    def rays(self) -> Array:
-        """[H*W, 3] world directions through the pixel centres, of unit depth."""
-        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+    def rays(self, dx: float = 0.5, dy: float = 0.5) -> Array:
+        """[H*W, 3] world directions through the pixels, of unit depth: through their centres, or as far into them."""
+        x, y = np.meshgrid(np.arange(self.width) + dx, np.arange(self.height) + dy)
         local = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
         return local.reshape(-1, 3) @ self.matrix[:3, :3]
 
@@ -151,16 +182,94 @@ def region_maps(geometry: Geometry, scene: RayScene, index: int, view: View, own
     if sky.any():
         pixels, z = own.project(rays[sky], at_infinity=True)
         seen[sky] = own.shows(pixels, z) & scene.escapes(own.eye, rays[sky])
-    shape = view.height, view.width
-    return {
-        "depth_mm": depth.astype(np.uint16).reshape(shape),
-        "moving": _moving(geometry, hits, index, view).reshape(shape),
-        "seen": seen.reshape(shape),
-    }
+    moving = _moving(geometry, hits, index, view.project)
+    shown = [show_pane(geometry, scene, pane, hits, index, view, own) for pane in geometry.panes]
+    for pane, there in zip(geometry.panes, shown, strict=True):
+        moving[there.rays] |= there.moving
+        if pane.kind == MIRROR:
+            depth[there.rays] = np.round(there.distance * DEPTH_STEPS_PER_METRE)
+            moving[there.rays], seen[there.rays] = there.moving, there.seen
+    things = _things(geometry, scene, hits, view, moving, shown)
+    maps = {"depth_mm": depth.astype(np.uint16), "moving": moving, "seen": seen}
+    maps |= {THING + name: mask for name, mask in things.items()}
+    return {name: values.reshape(view.height, view.width) for name, values in maps.items()}
 
 
-def _moving(geometry: Geometry, hits: Hits, index: int, view: View) -> NDArray[np.bool_]:
-    """[R] whether the surface that each ray met is ever elsewhere in this view."""
+@dataclass
+class Shown:
+    """What R rays see in a pane by reflection."""
+
+    rays: NDArray[np.int64]
+    """[R] which of the picture's rays meet it."""
+    distance: Array
+    """[R] at which depth."""
+    moving: NDArray[np.bool_]
+    """[R] whether what is reflected is ever elsewhere in the pane."""
+    seen: NDArray[np.bool_]
+    """[R] whether the pane shows it in the clip's own frame, too."""
+
+
+def show_pane(geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index: int, view: View, own: View) -> Shown:
+    """What a pane reflects in a view of frame `index`, where nothing stands before it; `hits` are the view's own."""
+    rays = view.rays()
+    distance = pane.met(view.eye, rays)
+    which = np.flatnonzero(distance < hits.distance)
+    at = view.eye + rays[which] * distance[which, None]
+    back = pane.turned_back(rays[which])
+    reflected = scene.cast(at + NUDGE * pane.normal, back)
+    met = reflected.face >= 0
+
+    def image(points: Array) -> tuple[Array, Array]:
+        return view.project(pane.mirrored(points))
+
+    points = at + back * np.where(met, reflected.distance, 0.0)[:, None]
+    seen = np.zeros(len(which), bool)
+    if met.any():
+        # From the own eye: the image of the point, if the line to it passes the pane and nothing is in its way.
+        images = pane.mirrored(points[met])
+        away = images - own.eye
+        through = own.eye + away * pane.met(own.eye, away)[:, None].clip(max=1.0)
+        pixels, z = own.project(images)
+        open_way = own.shows(pixels, z) & (pane.met(own.eye, away) < 1.0)
+        open_way &= scene.sees(own.eye, through)
+        open_way &= scene.clear(through + NUDGE * pane.normal, points[met])
+        seen[met] = open_way
+    return Shown(which, distance[which], _moving(geometry, reflected, index, image), seen)
+
+
+def _things(
+    geometry: Geometry, scene: RayScene, hits: Hits, view: View, moving: NDArray[np.bool_], shown: list[Shown]
+) -> dict[str, NDArray[np.bool_]]:
+    """Masks [R] of what a hard scene is about, see the module."""
+    masks: dict[str, NDArray[np.bool_]] = {}
+    of_panes = np.zeros(len(hits.face), bool)
+    for pane, there in zip(geometry.panes, shown, strict=True):
+        masks.setdefault(pane.kind, np.zeros(len(hits.face), bool))[there.rays] = ~moving[there.rays]
+        of_panes[there.rays] = True
+    if geometry.panes:
+        still = (hits.face >= 0) & ~moving & ~of_panes
+        points = view.eye + view.rays() * np.where(still, hits.distance, 0.0)[:, None]
+        near = [p.within(points, WALL_METRES) & (np.abs(p.above(points)) < WALL_DEPTH) for p in geometry.panes]
+        masks["wall"] = still & np.any(near, axis=0)
+    if geometry.thing:
+        its = geometry.thing_faces
+        if geometry.thing == "hair":
+            share = np.zeros(len(hits.face))
+            at = (np.arange(HAIR_RAYS) + 0.5) / HAIR_RAYS
+            for dx, dy in itertools.product(at, at):
+                rays = view.rays(dx, dy)
+                face = scene.cast(np.broadcast_to(view.eye, rays.shape), rays).face
+                share += (face >= 0) & its[np.maximum(face, 0)]
+            masks["hair"] = share >= HAIR_SHARE * HAIR_RAYS**2
+        else:
+            masks[geometry.thing] = (hits.face >= 0) & its[np.maximum(hits.face, 0)]
+    return masks
+
+
+def _moving(
+    geometry: Geometry, hits: Hits, index: int, show: Callable[[Array], tuple[Array, Array]]
+) -> NDArray[np.bool_]:
+    """[R] whether the surface that each ray met is ever elsewhere in a view, which `show` projects into."""
     moving = np.zeros(len(hits.face), bool)
     corners = geometry.triangles[np.maximum(hits.face, 0)] - len(geometry.static)
     which = np.flatnonzero((hits.face >= 0) & (corners[:, 0] >= 0))
@@ -169,7 +278,7 @@ def _moving(geometry: Geometry, hits: Hits, index: int, view: View) -> NDArray[n
     corners, weights = corners[which], hits.barycentric[which].astype(np.float64)
 
     def project(time: int) -> Array:
-        return view.project(np.einsum("nk,nkd->nd", weights, geometry.moving[time][corners].astype(np.float64)))[0]
+        return show(np.einsum("nk,nkd->nd", weights, geometry.moving[time][corners].astype(np.float64)))[0]
 
     here = project(index)
     farthest = np.zeros(len(which))

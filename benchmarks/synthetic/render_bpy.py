@@ -58,9 +58,15 @@ class Stage:
 
     def __init__(self, folder: Path, plan: dict[str, Any]) -> None:
         self.folder, self.plan, self.oversize = folder, plan, plan["oversize"]
+        self.thing = self.without = None
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
         self._settings()
+        # A scene with panes has its things in a collection of their own, which is held out of the panes' layer.
+        self.collection = self.scene.collection
+        if plan.get("panes"):
+            self.collection = self._collection("things")
+            self._reflections()
         self._develop()
         self._world()
         for light in plan["lights"]:
@@ -73,6 +79,8 @@ class Stage:
             made.visible_camera = mover["in_view"]
             path = folder / "geometry" / f"{mover['name']}.npy"
             self.movers.append((made.data, np.load(path, mmap_mode="r", allow_pickle=False)))
+            if mover["name"] == plan.get("thing", {}).get("mover"):
+                self.thing, self.without = made, self._without(mover, made)
         self.time: float | None = None
         camera = bpy.data.cameras.new("camera")
         camera.sensor_fit, camera.sensor_width = "HORIZONTAL", 36.0
@@ -137,7 +145,88 @@ class Stage:
         tree.links.new(passes.outputs["Denoising Normal"], denoise.inputs["Normal"])
         lit = mixed("MULTIPLY", denoise.outputs[0], passes.outputs["Diffuse Color"])
         shining = mixed("ADD", passes.outputs["Emission"], passes.outputs["Environment"])
-        tree.links.new(mixed("ADD", lit, shining), output.inputs[0])
+        tree.links.new(self._with_panes(tree, mixed, mixed("ADD", lit, shining)), output.inputs[0])
+
+    def _collection(self, name: str) -> Any:
+        made = bpy.data.collections.new(name)
+        self.scene.collection.children.link(made)
+        return made
+
+    def _reflections(self) -> None:
+        """The panes, in a view layer that shows nothing but what they reflect; the other layer is without them.
+
+        Their one closure is the reflection, weighted by the share that is reflected: a surface that chose between
+        reflection and what is behind it by chance would be full of noise.
+        """
+        panes = self._collection("panes")
+        for number, pane in enumerate(self.plan["panes"]):
+            origin, along, up = (np.array(pane[name]) for name in ("origin", "along", "up"))
+            mesh = bpy.data.meshes.new(f"pane{number}")
+            corners = (origin, origin + along, origin + along + up, origin + up)
+            mesh.from_pydata([corner.tolist() for corner in corners], [], [range(4)])
+            mesh.materials.append(self._pane_material(pane["kind"]))
+            made = bpy.data.objects.new(mesh.name, mesh)
+            for ray in ("diffuse", "glossy", "transmission", "shadow", "volume_scatter"):
+                setattr(made, f"visible_{ray}", False)
+            panes.objects.link(made)
+        layer = self.scene.view_layers.new("reflections")
+        for name in ("glossy_direct", "glossy_indirect", "glossy_color"):
+            setattr(layer, f"use_pass_{name}", True)
+        layer.cycles.denoising_store_passes = True
+        layer.layer_collection.children["things"].holdout = True
+        self.scene.view_layers[0].layer_collection.children["panes"].exclude = True
+        self.scene.cycles.glossy_bounces = 1
+        self.scene.cycles.max_bounces = 4
+
+    def _pane_material(self, kind: str) -> Any:
+        material = bpy.data.materials.new(kind)
+        material.use_nodes = True
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        nodes.clear()
+        gloss, output = nodes.new("ShaderNodeBsdfAnisotropic"), nodes.new("ShaderNodeOutputMaterial")
+        gloss.inputs["Roughness"].default_value = 0.0
+        share = self.plan["reflects"][kind]
+        if kind == "glass":
+            fresnel = nodes.new("ShaderNodeFresnel")
+            fresnel.inputs["IOR"].default_value = share
+            links.new(fresnel.outputs[0], gloss.inputs["Color"])
+        else:
+            gloss.inputs["Color"].default_value = (share, share, share, 1.0)
+        links.new(gloss.outputs[0], output.inputs["Surface"])
+        return material
+
+    def _with_panes(self, tree: Any, mixed: Any, behind: Any) -> Any:
+        """Mixes in what panes reflect: behind * (1 - share reflected) + reflection; `behind` if there are none."""
+        if not self.plan.get("panes"):
+            return behind
+        passes, denoise = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("CompositorNodeDenoise")
+        passes.layer = "reflections"
+        light = mixed("ADD", passes.outputs["Glossy Direct"], passes.outputs["Glossy Indirect"])
+        share = passes.outputs["Glossy Color"]
+        # Through a clear mirror the renderer's guides are those of what is seen in it.
+        for guide in ("Normal", "Albedo"):
+            tree.links.new(passes.outputs[f"Denoising {guide}"], denoise.inputs[guide])
+        tree.links.new(mixed("MULTIPLY", light, share), denoise.inputs["Image"])
+        left = mixed("SUBTRACT", behind, mixed("MULTIPLY", behind, share))
+        return mixed("ADD", left, denoise.outputs[0])
+
+    def _without(self, mover: dict[str, Any], made: Any) -> Any:
+        """A mover less the triangles of the scene's thing, hidden until it is asked for; None if nothing is left."""
+        with np.load(self.folder / "geometry" / "thing.npz", allow_pickle=False) as data:
+            gone = data["gone"]
+        if gone.all() or not gone.any():
+            return None
+        twin = self._mesh(mover["name"], [self._material(mover["texture"], 0.0)], smooth=True, kept=~gone)
+        self.movers.append((twin.data, self.movers[-1][1]))
+        twin.hide_render = True
+        return twin
+
+    def _take_away(self, thing: bool) -> None:
+        """Hides the scene's thing, or shows it again."""
+        if self.thing:
+            self.thing.hide_render = thing
+        if self.without:
+            self.without.hide_render = not thing
 
     def _world(self) -> None:
         world = bpy.data.worlds.new("sky")
@@ -175,7 +264,9 @@ class Stage:
         made.location = wanted["location"]
         made.rotation_euler = Vector(wanted["direction"]).to_track_quat("-Z", "Y").to_euler()
         made.visible_camera = False
-        self.scene.collection.objects.link(made)
+        if self.plan.get("panes"):
+            made.visible_glossy = False
+        self.collection.objects.link(made)
 
     def _material(self, file: str, emission: float) -> Any:
         material = bpy.data.materials.new(file)
@@ -193,9 +284,11 @@ class Stage:
             material.cycles.emission_sampling = "NONE"
         return material
 
-    def _mesh(self, name: str, materials: list[Any], smooth: bool) -> Any:
+    def _mesh(self, name: str, materials: list[Any], smooth: bool, kept: np.ndarray | None = None) -> Any:
         with np.load(self.folder / "geometry" / f"{name}.npz", allow_pickle=False) as data:
             vertices, triangles, uv, material = (data[k] for k in ("vertices", "triangles", "uv", "material"))
+        if kept is not None:
+            triangles, uv, material = triangles[kept], uv[kept], material[kept]
         mesh = bpy.data.meshes.new(name)
         count = len(triangles)
         mesh.vertices.add(len(vertices))
@@ -211,7 +304,7 @@ class Stage:
             mesh.materials.append(each)
         mesh.update(calc_edges=True)
         made = bpy.data.objects.new(name, mesh)
-        self.scene.collection.objects.link(made)
+        self.collection.objects.link(made)
         return made
 
     def _go_to(self, moment: float) -> None:
@@ -239,7 +332,9 @@ class Stage:
         render = self.scene.render
         self.scene.cycles.seed = job["noise"]
         light = np.zeros((height, width, 3), np.float32)
-        for band in job["bands"]:
+        if "box" in job:
+            self._render_box(job, light)
+        for band in [] if "box" in job else job["bands"]:
             low, high = band["rows"]
             render.use_border = high - low < height
             # Blender counts rows from below.
@@ -249,6 +344,18 @@ class Stage:
         beside = out.with_name(f".{out.stem}.{os.getpid()}.tmp.png")
         beside.write_bytes(png(srgb(light * 2.0 ** (stops + job["stops"]))))
         os.replace(beside, out)
+
+    def _render_box(self, job: dict[str, Any], light: np.ndarray) -> None:
+        """The pixels of a box without the scene's thing; the rest stays black."""
+        (left, top, right, bottom), (height, width, _) = job["box"], light.shape
+        render = self.scene.render
+        render.use_border = True
+        render.border_min_x, render.border_max_x = left / width, right / width
+        render.border_min_y, render.border_max_y = 1.0 - bottom / height, 1.0 - top / height
+        self._take_away(True)
+        light[top:bottom, left:right] = self._light_of(job["bands"][0])[top:bottom, left:right]
+        self._take_away(False)
+        render.border_min_x, render.border_max_x = 0.0, 1.0
 
     def _light_of(self, band: dict[str, Any]) -> np.ndarray:
         """[h, w, 3] scene-linear, rows downwards: the rendered pixels averaged to those of the picture."""

@@ -183,7 +183,8 @@ class SolvedPixels:
     def regions(self, regions: Regions) -> Regions:
         """Maps of the nearest pixel."""
         at = self._row, self._column
-        return Regions(regions.depth[at], regions.moving[at], regions.seen[at])
+        things = {name: mask[at] for name, mask in regions.things.items()}
+        return Regions(regions.depth[at], regions.moving[at], regions.seen[at], things)
 
 
 def _triangulated(scene: SyntheticScene, shot: Shot, names: list[str]) -> dict[str, NDArray] | None:

@@ -11,7 +11,12 @@ LIMITS = ("moving-shadow", "exposure-ramp", "fast-mover", "rolling-shutter")
 """Kinds of scenes beside `plain`: each breaks one assumption of the method."""
 VERDICTS = ("walker", "still", "tripod")
 """Kinds of scenes that the verdict is tried on: somebody walks through, nothing moves, the camera only turns."""
-KINDS = ("plain", *LIMITS, *VERDICTS)
+HARD = ("glass", "swinging", "arm", "hair")
+"""Kinds of scenes each with a thing that a freeze loses: a window and a mirror, an apple on a thread, an arm that waves
+or points, fine hair before a bright window."""
+THING = "thing_"
+"""What the names of a hard scene's masks begin with in its .npz files."""
+KINDS = ("plain", *LIMITS, *VERDICTS, *HARD)
 CAMERA_MOVES = ("forward", "pan", "return", "orbit")
 MOVING_PX = 0.5
 """A pixel moves if its surface point is ever farther than this, in pixels of the view, from where it is at t*."""
@@ -68,9 +73,9 @@ SIZES = {
 }
 
 
-def place_of(seed: int) -> str:
-    """`room` or `ground`: where the scene of a seed plays."""
-    return "ground" if seed % 10 in (1, 4, 7) else "room"
+def place_of(seed: int, kind: str = "plain") -> str:
+    """`room` or `ground`: where the scene of a seed plays. What needs a wall or a ceiling always plays in a room."""
+    return "ground" if seed % 10 in (1, 4, 7) and kind not in ("glass", "swinging", "hair") else "room"
 
 
 def camera_move_of(seed: int, kind: str = "plain") -> str:

@@ -53,6 +53,7 @@ def test_figures_of_an_earlier_run_do_not_pass_for_this_one(tmp_path: Path):
 
 def test_a_benchmark_of_ones_own_scenes_needs_no_blender():
     assert splannequin._own_scenes(["--truth", "folder"]) and splannequin._own_scenes(["--shot=x", "--seeds", "2"])
+    assert not splannequin._own_scenes(["--shot", "x", "--hard"])
     assert not splannequin._own_scenes(["--quick"]) and not splannequin._own_scenes(["--shot", "x", "--size=tiny"])
 
 

@@ -18,7 +18,7 @@ from ..footage.images import write_png
 from ..footage.plates import Plates
 from ..freeze.detail import Detailer
 from ..freeze.developed import Instants
-from ..freeze.query import FrozenGaussians, OutputFrame, freeze_at, render_frozen, span_of
+from ..freeze.query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
 from ..scene import Scene, load_scene, read_image, split_frames
 from ..shot import Shot
 from ..solve.motion import find_motion
@@ -28,7 +28,8 @@ from ..train.model import render
 from .colorvideovdp import sequence_jod
 from .metrics import best_share_psnr, gradient_energy, missing_metrics, psnr_by_region, score
 from .records import DELIVERED, DEVELOPED, PICTURES, SPLATS, WITHHELD, Detailed, FrameScore, HeldOut, Picture
-from .truth import TruthScene
+from .things import matte_on_panes, opened_on, recall_of
+from .truth import PANES, TruthScene
 
 KEPT = 6
 """Pictures kept of every run, the same frames for all runs of a scene."""
@@ -51,21 +52,29 @@ class Frozen:
 
     def view(self, pose: int, shown: str = SPLATS) -> Tensor:
         """[H, W, 3] in [0, 1] from the pose of frame `pose`, exposed as that frame is, before grey."""
-        run, scene = self.run, self.scene
+        viewmat, K = self._camera(pose)
         gaussians = self.gaussians if shown == SPLATS or self.developed is None else self.developed
-        index = scene.frames.index(pose)
-        K = scene.camera_at(run.width, run.height)[index]
-        exposed_at = scene.time_of_frame(pose)
-        image = render_frozen(
-            gaussians, scene.viewmats[index], K, run.width, run.height, run.model.exposure, exposed_at
-        )
+        image = self._splats(pose, gaussians)
         color, alpha = image.color, image.alpha
         if shown in (WITHHELD, DELIVERED) and self.detailer is not None:
-            output = OutputFrame(pose, scene.viewmats[index], K, float(self.t_star), float(pose))
+            output = OutputFrame(pose, viewmat, K, float(self.t_star), float(pose))
             withheld = (pose,) if shown == WITHHELD else ()
-            made = self.detailer.frame(output, gaussians, image, run.width, run.height, withheld)
+            made = self.detailer.frame(output, gaussians, image, self.run.width, self.run.height, withheld)
             color, alpha = made.color, made.alpha
         return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0)
+
+    def motion(self, pose: int) -> Tensor:
+        """[H, W] in [0, 1] from the pose of frame `pose`: how much of what is seen the model moves in the clip."""
+        return self._splats(pose, self.gaussians).motion
+
+    def _camera(self, pose: int) -> tuple[Tensor, Tensor]:
+        index = self.scene.frames.index(pose)
+        return self.scene.viewmats[index], self.scene.camera_at(self.run.width, self.run.height)[index]
+
+    def _splats(self, pose: int, gaussians: FrozenGaussians) -> FrozenImage:
+        run, exposed_at = self.run, self.scene.time_of_frame(pose)
+        where = self._camera(pose)
+        return render_frozen(gaussians, *where, run.width, run.height, run.model.exposure, exposed_at)
 
 
 def plate_detail(shot: Shot, run: LoadedRun, scene: Scene, report: Reporter) -> Detailer:
@@ -100,6 +109,9 @@ def evaluate_run(
         kinds += [WITHHELD, DELIVERED]
     except JobError as error:
         missing["detail"] = f"Plate detail of {truth.name} was not judged: {error.message}"
+    matte = {}
+    if detailer is not None and truth.kind == "synthetic":
+        matte = matte_on_panes(truth, [scene.frames[i] for i in scene.solved], run.width, run.height)
     frozen = {
         t_star: freeze_run(
             run, scene, t_star, query, detailer, develop_run(truth.shot, run, scene, t_star, query, report)
@@ -125,6 +137,7 @@ def evaluate_run(
         **vars(shown.pop(SPLATS)),
         "detailed": shown,
         "plates": plates,
+        "matte": matte,
         "missing": missing,
     }
 
@@ -146,7 +159,7 @@ def _shown(
             report.progress(f"scoring {shown}", n + m / len(poses), len(frozen), f"t* {t_star}, pose {pose}")
             image, target = at.view(pose, shown), truth.truth(t_star, pose, at.run.width, at.run.height)
             if shown != DELIVERED or pose != t_star:
-                rows.append(_score(truth, t_star, pose, pose in held_out, image, target))
+                rows.append(_score(truth, at, pose, shown, pose in held_out, image, target))
             ours.append(image)
             theirs.append(target)
         steady = truth.fps > 0 and len(ours) > 1
@@ -207,8 +220,13 @@ def last_third_step_ms(path: Path, iterations: int) -> float | None:
     return 1000.0 * (seconds[late[-1]] - seconds[late[0]]) / (late[-1] - late[0])
 
 
-def _score(truth: TruthScene, t_star: int, pose: int, held_out: bool, image: Tensor, target: Tensor) -> FrameScore:
-    regions = truth.regions(t_star, pose, target.shape[1], target.shape[0])
+def _score(
+    truth: TruthScene, at: Frozen, pose: int, shown: str, held_out: bool, image: Tensor, target: Tensor
+) -> FrameScore:
+    height, width = target.shape[:2]
+    t_star = at.t_star
+    regions = truth.regions(t_star, pose, width, height)
+    paned = shown == SPLATS and not regions.keys().isdisjoint(PANES)
     judged = regions.get(truth.judged)
     energy = gradient_energy(target, judged)
     return FrameScore(
@@ -218,6 +236,8 @@ def _score(truth: TruthScene, t_star: int, pose: int, held_out: bool, image: Ten
         score(image, target, regions),
         best_share_psnr(image, target),
         gradient_energy(image, judged) / energy if energy > 0 else None,
+        recall_of(truth.behind(t_star, pose, width, height), image, target, regions),
+        opened_on(at.motion(pose), regions) if paned else {},
     )
 
 

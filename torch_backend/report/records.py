@@ -38,6 +38,10 @@ class FrameScore:
     """PSNR over the best 90 % of the pixels."""
     gradient_ratio: float | None = None
     """Gradient energy over the truth's: below 1 is softer."""
+    recalled: dict[str, Any] = field(default_factory=dict)
+    """{thing: [pixels that show it, pixels that should]} of a hard scene, see `things.recalled`."""
+    opened: dict[str, Any] = field(default_factory=dict)
+    """{pane: share of it that the freeze's motion matte calls moving} of a hard scene; of splats alone."""
 
     def value(self, metric: str, region: str = WHOLE) -> float | None:
         """A figure, or None if it is not there."""
@@ -153,6 +157,8 @@ class RunRecord:
     alone."""
     shown: str = SPLATS
     """What the frames of this record show; on disk always splats, see `as_shown`."""
+    matte: dict[str, Any] = field(default_factory=dict)
+    """{pane: {"moving", "unknown": share of it}} by the solve's motion matte, over all frames of a hard scene."""
     version: int = RECORD_VERSION
 
     @property

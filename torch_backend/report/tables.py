@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .hard_table import PANE_HEADER, PANE_NOTE, THING_HEADER, THING_NOTE, pane_rows, thing_rows
 from .metrics import METRICS, WHOLE, Key, Paired, Summary, paired, summarise
 from .records import DELIVERED, DEVELOPED, SPLATS, WITHHELD, FrameScore, RunRecord
 from .truth import REGIONS, RIGID
@@ -175,6 +176,10 @@ def all_tables(records: Sequence[RunRecord]) -> list[Table]:
             _regions(main),
             _every_metric(main, (WHOLE, "never_seen"), "Every metric, frame by frame"),
         ]
+    if rows := pane_rows(main):
+        tables.append(Table("Glass and mirrors", PANE_HEADER, rows, PANE_NOTE))
+    if rows := thing_rows(main):
+        tables.append(Table("Small movers, and hair", THING_HEADER, rows, THING_NOTE))
     ablations = [s for s in synthetic if s.variant not in ("default", "reference") and s.shown == SPLATS]
     if ablations:
         tables.append(_ablations(ablations, main))

@@ -27,6 +27,10 @@ from .real import ensure_motion, far_from, motion_shares
 TRUTH_VERSION = 1
 REGIONS = ("seen", "never_seen", "moving", "static")
 """By truth: visible in the clip's frame at t*; not; on something that moves in the clip; on nothing that does."""
+PANES = ("glass", "mirror")
+"""Of a hard scene: pixels of a window's pane and of a mirror in which nothing moves, by truth."""
+THINGS = (*PANES, "wall", "swinging", "arm", "hair")
+"""Besides: the still wall around panes; something that swings on a thread; an arm that gestures; loose hair."""
 RIGID = "rigid"
 """The region of a real clip in which the plate is the truth."""
 
@@ -59,11 +63,18 @@ class TruthScene(Protocol):
         ...
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """name -> bool [height, width]."""
+        """name -> bool [height, width]; in hard scenes some of `THINGS` too."""
+        ...
+
+    def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """thing -> [height, width, 3], the truth without it, right where the thing is; {} if that is not known."""
         ...
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """`moving` and `static`, bool [height, width], of the clip's own frame; {} if that is not known."""
+        """`moving`, `static` and what there is of `THINGS`, bool [height, width], of the clip's own frame.
+
+        {} if that is not known.
+        """
         ...
 
 
@@ -100,6 +111,10 @@ class TruthFolder:
         """The regions by truth; a pixel belongs to one if more than half of it does."""
         named = {name: self.folder / "regions" / f"{t_star:06d}_{pose:06d}_{name}.png" for name in self._regions}
         return {name: read_image(path, width, height).mean(2) > 0.5 for name, path in named.items()}
+
+    def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """Nothing: the folder holds none."""
+        return {}
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
         """Nothing: the folder holds none."""
@@ -140,6 +155,10 @@ class RealScene:
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
         """The rigid pixels of the plate; one counts if nearly all of it is."""
         return {RIGID: motion_shares(self.shot, pose, width, height)["rigid"] > 0.95}
+
+    def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
+        """Nothing: nobody has seen it."""
+        return {}
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
         """Static: nearly all of the pixel stands still; moving: nearly all of it moves. What is unknown is neither."""

@@ -60,6 +60,27 @@ class FlowConfig:
     """A point moves for certain if so much of what it is matched with says so."""
     sure: float = 4.0
     """With so many matches a point is known as well as it can be."""
+    spans: tuple[int, ...] = (4, 8, 16)
+    """Key frames this far before and after are laid over one by its depths, to see what is left of motion."""
+    least: float = 0.67
+    """What is left counts in units of this length,"""
+    unusual: float = 3.0
+    """or of so many times its median where that is more, up to `most_left`."""
+    most_left: float = 12.0
+    """Of the least: what moves may fill the picture."""
+    most: float = 1.2
+    """More of these units than that tell no more."""
+    visible: tuple[float, float] = (2.0, 3.5)
+    """A picture that changes by so much over what is left shows it: by the noise of the pair, from the one to the
+    other."""
+    bearing: float = 0.3
+    """By so much, of what it is at the match, the picture differs more where nothing moved, if it bears a match out."""
+    rim: float = 1.5
+    """At outlines these units count less by 1 + this."""
+    faint: float = 0.2
+    """So many of these units are nothing yet,"""
+    clear: float = 0.8
+    """and so many are motion for certain."""
     reach: int = 2
     """Over so many of the longest baselines a surface's scores are gathered along it."""
     radius: int = 4
@@ -68,7 +89,7 @@ class FlowConfig:
     """Smaller differences are no edges."""
     seed: float = 0.4
     """An area moves if a point in it has this score,"""
-    grow: float = 0.1
+    grow: float = 0.2
     """and reaches as far as points have this one."""
     blob: float = 10.0
     """Areas of less than this squared are noise, and holes of less are filled."""

@@ -17,6 +17,7 @@ from ..footage import load_frames
 from ..footage.images import read_frame
 from ..shot import Shot
 from .flow import FlowConfig, Map, Mask, Matches, neighbours, sample
+from .leftover import Leftover
 from .still import Look, StillTest, evidence
 from .stored import load_cameras, load_points
 
@@ -24,6 +25,8 @@ _FLOW_WIDTH = 640
 _LARGEST_SCALE = 2.0
 _KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
+_LEFT_EVERY = 2
+"""In every so manieth key frame what is left of motion is looked for: sways are slow."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 
@@ -116,10 +119,13 @@ def mattes(
     matches = Matches(clip.picture, config, clip.unit)
     own: dict[int, tuple[Map, Map]] = {}
     final: dict[int, tuple[Map, Map]] = {}
-    for turn in range(max(0, first - 1 - reach), last + reach + 1):
+    start = max(0, first - 1 - reach)
+    left: tuple[Map, Map] | None = None
+    for turn in range(start - start % _LEFT_EVERY, last + reach + 1):
         report.check_cancelled()
         if turn < len(keys):
-            own[turn] = _own_score(clip, matches, turn, config)
+            left = None if turn % _LEFT_EVERY == 0 else left
+            own[turn], left = _own_score(clip, matches, turn, config, left)
         key = turn - reach
         if key < max(0, first - 1) or not (wanted[key] or wanted[min(key + 1, last)]):
             continue
@@ -136,14 +142,25 @@ def mattes(
         clip.forget(key - config.baselines[-1])
 
 
-def _own_score(clip: Clip, matches: Matches, key: int, config: FlowConfig) -> tuple[Map, Map]:
-    """How much of what a key frame's points are matched with says that they move, 0 to 1, and how sure that is."""
+def _own_score(
+    clip: Clip, matches: Matches, key: int, config: FlowConfig, before: tuple[Map, Map] | None
+) -> tuple[tuple[Map, Map], tuple[Map, Map]]:
+    """((score, weight), what is left): how surely a key frame's points move, 0 to 1, and how much is known of them.
+
+    What is left of motion is looked for if there is none of the key `before`; else that is followed to here.
+    """
     seen = neighbours(matches, key, len(clip.keys), config)
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
-    on, off = evidence(test, key, seen, clip.depths[key], config)
+    on, off, inverse = evidence(test, key, seen, clip.depths[key], config)
     count = on + off
     score = np.clip(off / (count + config.doubt) / config.share, 0.0, 1.0)
-    return score, np.minimum(count / config.sure, 1.0) * (count >= 1.0)
+    if before is None:
+        left, known = Leftover(clip.picture, test, config).score(key, len(clip.keys), inverse, clip.depths[key])
+    else:
+        last = next(each for each in seen if each.key == key - 1)
+        left, known = (sample(values, last.at) * last.found for values in before)
+    sure = np.minimum(count / config.sure, 1.0) * (count >= 1.0)
+    return (np.maximum(score, left), np.maximum(sure, known * (left > score))), (left, known)
 
 
 def _followed(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .flow import FlowConfig, Map, Mask, Seen, sample
 
-_FEW = 50
+FEW = 50
 """Fewer points say nothing of a picture."""
 _OUTLINE = 0.25
 """Depths that differ by this share are two surfaces."""
@@ -79,7 +79,7 @@ class StillTest:
     """Flow pixels in one pixel of a picture 640 wide."""
 
 
-class _Texture:
+class Texture:
     """How a key frame's picture changes from place to place: where there is nothing to see, nothing can be told."""
 
     def __init__(self, picture: Map, unit: float, config: FlowConfig) -> None:
@@ -99,7 +99,7 @@ class _Texture:
 
 
 @dataclass
-class _Pair:
+class Pair:
     """A key frame and another one."""
 
     seen: Seen
@@ -108,33 +108,46 @@ class _Pair:
     """Matches farther than this from where the still point is seen may tell of motion; flow pixels."""
     there: Look
     """The other's picture, and how its brightness becomes this one's."""
-    gain: tuple[float, float]
-    matched: Map
+    gain: tuple[float, float] = (1.0, 0.0)
+    matched: Map = field(init=False)
     """Mean square difference of the pictures at the matches."""
     right: Mask = field(init=False)
     """Where they show the same."""
+    weight: Map = field(init=False)
+    """[h, w] how far each match is believed; 1 where it is found unless another is set."""
+
+    def __post_init__(self) -> None:
+        self.weight = self.seen.found.astype(np.float32)
+
+    @classmethod
+    def between(cls, test: StillTest, key: int, seen: Seen, config: FlowConfig) -> Pair:
+        """A key frame and one in which it is seen again; how alike they look there is not known yet."""
+        ray = Ray(test.grid, (test.viewmats[key], test.viewmats[seen.key]), (test.Ks[key], test.Ks[seen.key]))
+        limit = test.unit * (config.tolerance + config.per_link * (seen.links - 1))
+        return cls(seen, ray, limit, test.look(seen.key))
 
     def miss(self, inverse: Map) -> tuple[tuple[Map, Map], Map, Map, Map]:
         """Where still points are seen, and x, y and length of the matches' distance from there."""
         at, _ = self.ray.project(inverse)
-        x, y = (_smoothed(self.seen.at[i] - at[i], self.seen.found) for i in (0, 1))
+        x, y = (_smoothed(self.seen.at[i] - at[i], self.weight) for i in (0, 1))
         return at, x, y, np.hypot(x, y)
 
 
-def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: FlowConfig) -> tuple[Map, Map]:
-    """(on, off), [h, w] float32: how much of what a key frame's points are matched with says still, and moving.
+def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: FlowConfig) -> tuple[Map, Map, Map]:
+    """(on, off, inverse), [h, w] float32: how much of a key's matches says still, how much moving, and 1 / depth.
 
     `seen` are its matches, `depth` is the typical depth in its view, solve units.
     """
     look = test.look(key)
-    texture = _Texture(look.grid, test.unit, config)
+    texture = Texture(look.grid, test.unit, config)
     pairs = [_pair(test, key, s, texture, config) for s in seen]
-    inverse = still_points(pairs, look.grid.shape, depth, test.unit)
+    start = np.full(look.grid.shape, 1.0 / depth, np.float32)
+    inverse = still_points(pairs, start, depth, test.unit)
     agree = np.zeros_like(inverse)
     for pair in pairs:
         *_, length = pair.miss(inverse)
         told = pair.seen.found & texture.telling
-        if np.count_nonzero(told) >= _FEW:
+        if np.count_nonzero(told) >= FEW:
             guessed = test.guessed[key] or test.guessed[pair.seen.key]
             most = np.inf if guessed else config.most_noise * pair.limit
             pair.limit = max(pair.limit, min(config.noise * float(np.median(length[told])), most))
@@ -142,37 +155,40 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
     depths = _surroundings(inverse, agree >= 3)
     inverse = _best_depth(look, pairs, depths)
     on, off = _counted(key, look, texture, pairs, inverse, config)
+    doubt = config.doubt * (1.0 + config.outline * outlines(depths[0]))
+    return on, np.maximum(off - doubt, 0.0), inverse
+
+
+def outlines(inverse: Map) -> Map:
+    """[h, w] 0..1: how near points are to the outline of another surface, by inverse depths."""
     block = np.ones((7, 7), np.uint8)
-    jump = cv2.dilate(depths[0], block) / np.maximum(cv2.erode(depths[0], block), 1e-9) - 1.0
-    outline = np.clip(jump / _OUTLINE, 0.0, 1.0)
-    return on, np.maximum(off - config.doubt * (1.0 + config.outline * outline), 0.0)
+    jump = cv2.dilate(inverse, block) / np.maximum(cv2.erode(inverse, block), 1e-9) - 1.0
+    return np.clip(jump / _OUTLINE, 0.0, 1.0)
 
 
-def _pair(test: StillTest, key: int, seen: Seen, texture: _Texture, config: FlowConfig) -> _Pair:
+def _pair(test: StillTest, key: int, seen: Seen, texture: Texture, config: FlowConfig) -> Pair:
     """A key frame and one in which it is seen again."""
-    look, there = test.look(key), test.look(seen.key)
-    ray = Ray(test.grid, (test.viewmats[key], test.viewmats[seen.key]), (test.Ks[key], test.Ks[seen.key]))
-    limit = test.unit * (config.tolerance + config.per_link * (seen.links - 1))
-    gain = _gain(look.grid, sample(there.grid, seen.at), seen.found)
-    pair = _Pair(seen, ray, limit, there, gain, there.unlike(look.grid, seen.at, gain))
+    look, pair = test.look(key), Pair.between(test, key, seen, config)
+    pair.gain = brightness(look.grid, sample(pair.there.grid, seen.at), seen.found)
+    pair.matched = pair.there.unlike(look.grid, seen.at, pair.gain)
     pair.right = pair.matched - texture.nearly < _like(pair.matched, seen.found & texture.telling, config)
     return pair
 
 
-def still_points(pairs: list[_Pair], shape: tuple[int, ...], depth: float, unit: float, turns: int = 4) -> Map:
+def still_points(pairs: list[Pair], start: Map, depth: float, unit: float, turns: int = 4) -> Map:
     """Inverse depth of the still point that explains the matches best, those far off hardly counting.
 
-    [h, w], in 1 / solve units, at least 0; where the matches leave it open it is that of `depth`.
+    [h, w], in 1 / solve units, at least 0; where the matches leave it open it is `start`. `depth` is typical.
     """
-    inverse = np.full(shape, 1.0 / depth, np.float32)
+    inverse = start.copy()
     stiff = np.float32((0.3 * unit * depth) ** 2)
     for turn in range(turns):
-        top, bottom = stiff * (np.float32(1.0 / depth) - inverse), np.full_like(inverse, stiff)
+        top, bottom = stiff * (start - inverse), np.full_like(inverse, stiff)
         for pair in pairs:
             at, over = pair.ray.project(inverse)
             slope = pair.ray.slope(at, over)
             x, y = pair.seen.at[0] - at[0], pair.seen.at[1] - at[1]
-            weight = pair.seen.found * np.float32(1.0 / pair.limit**2)
+            weight = pair.weight * np.float32(1.0 / pair.limit**2)
             if turn:
                 weight /= np.square(1.0 + (x * x + y * y) * np.float32(1.0 / pair.limit**2))
             top += weight * (x * slope[0] + y * slope[1])
@@ -182,7 +198,7 @@ def still_points(pairs: list[_Pair], shape: tuple[int, ...], depth: float, unit:
 
 
 def _counted(
-    key: int, look: Look, texture: _Texture, pairs: list[_Pair], inverse: Map, config: FlowConfig
+    key: int, look: Look, texture: Texture, pairs: list[Pair], inverse: Map, config: FlowConfig
 ) -> tuple[Map, Map]:
     """What the pairs say of still points at inverse depths, as `evidence`."""
     on, off = np.zeros_like(inverse), np.zeros_like(inverse)
@@ -193,31 +209,30 @@ def _counted(
         unlike = pair.there.unlike(look.grid, at, pair.gain)
         away = found & (length > pair.limit)
         alike = unlike - texture.nearly < _like(unlike, found & ~away & texture.telling, config)
-        inside = _inside(at, look.grid.shape)
+        within = inside(at, look.grid.shape)
         better = pair.right & (unlike > config.better * pair.matched + config.contrast**2)
         off += away & better & (texture.change(x, y, length) > config.contrast**2)
         weight = min(1.0, abs(after) / config.baselines[-1]) ** config.haste
-        on += weight * ((found & ~away) + 0.5 * ((away & ~better) | (inside & alike & ~found)))
-        gone[after] = inside & ~found & ~alike
+        on += weight * ((found & ~away) + 0.5 * ((away & ~better) | (within & alike & ~found)))
+        gone[after] = within & ~found & ~alike
     for step in config.baselines[:2]:
         if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
             off += gone[step] & gone[-step]  # behind something is so on one side as a rule.
     return on, off
 
 
-def _smoothed(values: Map, found: Mask) -> Map:
+def _smoothed(values: Map, weight: Map) -> Map:
     """Mean of what is found around each point: a surface moves as one, flow errs here and there."""
-    weight = found.astype(np.float32)
     return cv2.blur(values * weight, (5, 5)) / np.maximum(cv2.blur(weight, (5, 5)), 1e-3)
 
 
 def _like(unlike: Map, still: Mask, config: FlowConfig) -> float:
     """Below how much pictures show the same: what is `still` tells how unlike a sharp and a blurred one are."""
-    usual = float(np.median(unlike[still])) if np.count_nonzero(still) >= _FEW else 0.0
+    usual = float(np.median(unlike[still])) if np.count_nonzero(still) >= FEW else 0.0
     return max(config.likeness**2, config.noise**2 * usual)
 
 
-def _best_depth(look: Look, pairs: list[_Pair], depths: list[Map]) -> Map:
+def _best_depth(look: Look, pairs: list[Pair], depths: list[Map]) -> Map:
     """Of the inverse depths, for each point the one at which it looks the same in the most neighbours."""
     best, least = depths[0], np.zeros_like(depths[0])
     for number, inverse in enumerate(depths):
@@ -225,23 +240,24 @@ def _best_depth(look: Look, pairs: list[_Pair], depths: list[Map]) -> Map:
         for pair in pairs:
             if pair.seen.links == 1:
                 at, _ = pair.ray.project(inverse)
-                inside = _inside(at, inverse.shape)
-                cost += inside * np.minimum(pair.there.unlike(look.grid, at, pair.gain), _MOST_UNLIKE)
-                count += inside
+                within = inside(at, inverse.shape)
+                cost += within * np.minimum(pair.there.unlike(look.grid, at, pair.gain), _MOST_UNLIKE)
+                count += within
         cost = cost / count + (_OTHER_DEPTH if number else 0.0)
         better = cost < least if number else np.ones(cost.shape, bool)
         best, least = np.where(better, inverse, best), np.where(better, cost, least)
     return best
 
 
-def _inside(at: tuple[Map, Map], shape: tuple[int, ...]) -> Mask:
+def inside(at: tuple[Map, Map], shape: tuple[int, ...]) -> Mask:
+    """Which positions lie in a picture whose grid has a shape."""
     return (at[0] >= 0) & (at[1] >= 0) & (at[0] < 2 * shape[1]) & (at[1] < 2 * shape[0])
 
 
-def _gain(values: Map, others: Map, found: Mask) -> tuple[float, float]:
+def brightness(values: Map, others: Map, found: Mask) -> tuple[float, float]:
     """Factor and offset that make `others` look like `values` where they are `found`: exposure drifts in a clip."""
     a, b = values[::4, ::4][found[::4, ::4]], others[::4, ::4][found[::4, ::4]]
-    if len(a) < _FEW:
+    if len(a) < FEW:
         return 1.0, 0.0
     spread = float(b.var())
     factor = (

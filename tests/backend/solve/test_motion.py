@@ -134,6 +134,17 @@ def test_motion_along_epipolar_lines_is_found(tmp_path, quiet):
     assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
 
 
+def test_a_slow_sway_of_half_a_pixel_is_found(tmp_path, quiet):
+    """Between neighbouring frames it is less than any flow can tell from its own noise."""
+    numbers = list(range(1, 31))
+    where = lambda share: (0.004 * np.sin(4 * share), 0.008 * np.sin(6 * share))  # noqa: E731
+    shot, board = build(tmp_path, where, numbers=numbers)
+    find_motion(shot, quiet())
+    labels = mattes(shot, numbers)
+    assert (labels[inner(board)] == MOVING).mean() > 0.8
+    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
+
+
 def test_a_still_world_is_still(tmp_path, quiet):
     shot, _ = build(tmp_path)
     result = find_motion(shot, quiet())

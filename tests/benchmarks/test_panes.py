@@ -1,0 +1,132 @@
+"""Glass and mirrors in a world of a few rectangles, where what each pixel shows is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic.cameras import _look, intrinsics
+from benchmarks.synthetic.geometry import Builder
+from benchmarks.synthetic.panes import GLASS, MIRROR, Pane
+from benchmarks.synthetic.regions import THING, Geometry, View, region_maps
+
+EYE = np.array([0.0, 0.0, 1.5])
+FRAMES = 3
+
+
+@pytest.fixture(scope="module")
+def world() -> Geometry:
+    """A wall at y = 3 with a mirror and a hole with a pane; a wall beyond at 6, one behind the camera at -3.
+
+    Before the latter hangs a board, 1.5 behind the camera, which moves 0.3 up from frame to frame.
+    """
+    still, board = Builder([1.0]), Builder([1.0])
+    for left, right in ((-4.0, 0.3), (1.3, 4.0)):
+        still.rect([left, 3.0, 0.0], [right - left, 0, 0], [0, 0, 3.0], 0)
+    still.rect([-8.0, 6.0, -2.0], [16.0, 0, 0], [0, 0, 8.0], 0)
+    still.rect([8.0, -3.0, -2.0], [-16.0, 0, 0], [0, 0, 8.0], 0)
+    board.rect([-0.9, -1.5, 1.3], [-0.4, 0, 0], [0, 0, 0.4], 0)
+    fixed, loose = still.mesh(), board.mesh()
+    vertices = np.stack([loose.vertices + np.array([0, 0, 0.3 * t]) for t in range(FRAMES)]).astype(np.float32)
+    triangles = np.concatenate([fixed.triangles, loose.triangles + len(fixed.vertices)])
+    panes = [
+        Pane.of(MIRROR, [-1.2, 2.98, 0.9], [1.0, 0, 0], [0, 0, 1.2]),
+        Pane.of(GLASS, [0.3, 3.0, 0.9], [1.0, 0, 0], [0, 0, 1.2]),
+    ]
+    return Geometry(fixed.vertices, vertices, triangles, panes, "", np.zeros(len(triangles), bool))
+
+
+def with_board(world: Geometry, moved: list[float]) -> Geometry:
+    """The same world with the board elsewhere."""
+    moving = world.moving + np.array(moved, np.float32)
+    return Geometry(world.static, moving, world.triangles, world.panes, world.thing, world.thing_faces)
+
+
+def view(yaw: float = 0.0, eye: np.ndarray = EYE) -> View:
+    """Looks along y, turned to the right by `yaw` radians."""
+    ahead = np.array([np.sin(yaw), np.cos(yaw), 0.0])
+    return View(_look(eye, eye + ahead, np.zeros(3)), intrinsics(160, 90), 160, 90)
+
+
+def box(of: View, low: list[float], high: list[float]) -> np.ndarray:
+    """[H, W] pixels between the projections of two corners, less a border of one."""
+    (x0, y1), (x1, y0) = (of.project(np.array(corner))[0] for corner in (low, high))
+    x, y = np.meshgrid(np.arange(of.width) + 0.5, np.arange(of.height) + 0.5)
+    return (x > x0 + 1) & (x < x1 - 1) & (y > y0 + 1) & (y < y1 - 1)
+
+
+def test_a_ray_is_turned_back_as_a_mirror_does():
+    pane = Pane.of(MIRROR, [-1, 2, -1], [2, 0, 0], [0, 0, 2])
+    assert pane.normal.tolist() == [0, -1, 0]
+    rays = np.array([[0.0, 1, 0], [0.4, 1, 0], [0.6, 1, 0], [0, -1, 0], [1, 0, 0]])
+    assert pane.met(np.zeros(3), rays).tolist() == [2, 2, np.inf, np.inf, np.inf]
+    assert pane.met(np.array([0.0, 5, 0]), -rays[:1]).tolist() == [np.inf], "its back reflects nothing"
+    assert pane.turned_back(rays[1]).tolist() == [0.4, -1, 0]
+    assert pane.mirrored(np.array([0.5, -3, 1])).tolist() == [0.5, 7, 1]
+
+
+def test_masks_are_of_panes_in_which_nothing_moves(world):
+    of = view()
+    maps = region_maps(world, world.at(1), 1, of, of)
+    mirror, glass, wall = (maps[THING + name] for name in ("mirror", "glass", "wall"))
+    whole = box(of, [-1.2, 2.98, 0.9], [-0.2, 2.98, 2.1])
+    image = box(of, [-1.3, 2 * 2.98 + 1.5, 1.6], [-0.9, 2 * 2.98 + 1.5, 2.0])  # the board's, at frame 1
+    assert image.any() and maps["moving"][image].all() and not mirror[image].any()
+    assert mirror[whole].mean() > 0.8 and (mirror | maps["moving"])[whole].all()
+    assert glass[box(of, [0.3, 3.0, 0.9], [1.3, 3.0, 2.1])].all(), "no mover is reflected there"
+    assert not (mirror & glass).any() and not (wall & (mirror | glass | maps["moving"])).any()
+    assert (maps["depth_mm"][mirror] == 2980).all() and (maps["depth_mm"][glass] == 6000).all()
+    assert (maps["depth_mm"][wall] == 3000).all()
+    rays = of.rays().reshape(90, 160, 3) * 3.0 + EYE
+    beside = (rays[..., 0] > -1.75) & (rays[..., 0] < 1.85) & (rays[..., 2] > 0.35) & (rays[..., 2] < 2.65)
+    inner = beside & (maps["depth_mm"] == 3000)
+    assert wall[inner].all() and not wall[(rays[..., 0] < -1.85) | (rays[..., 0] > 1.95)].any()
+    assert maps["seen"].all()
+
+
+def test_a_mirror_was_seen_where_the_other_view_saw_the_same_in_it(world):
+    of = view()
+    mirror = region_maps(world, world.at(1), 1, of, of)[THING + "mirror"]
+    away = region_maps(world, world.at(1), 1, of, view(1.2))
+    assert not away["seen"][mirror].any(), "the mirror is not in that frame"
+    # From half a metre to the left the left third of what it shows here lies beyond its edge: the image of the wall at
+    # -3 stands three times as far as the mirror.
+    beside = region_maps(world, world.at(1), 1, of, view(0.0, EYE - [0.5, 0, 0]))
+    share = beside["seen"][mirror].mean()
+    assert share == pytest.approx(2 / 3, abs=0.07)
+    columns = np.flatnonzero(mirror.any(axis=0))
+    seen = (beside["seen"] & mirror).sum(axis=0)[columns] / mirror.sum(axis=0)[columns]
+    assert seen[:3].mean() < 0.1 and seen[-3:].mean() > 0.9
+
+
+def test_what_hides_a_point_from_the_mirror_hides_it_from_the_eye(world):
+    """From 0.7 aside it shows a place of the wall behind that the board, now at 0.8, covers for the other eye."""
+    near = with_board(world, [0.0, 2.3, 0.0])
+    of, other = view(), view(0.0, EYE - np.array([0.7, 0, 0]))
+    maps = region_maps(near, near.at(1), 1, other, of)
+    shown = (other.rays() * 8.96 + other.eye).reshape(90, 160, 3)  # images of the wall at -3, 2.98 before the mirror
+    x, y = np.moveaxis(of.project(shown)[0], 2, 0)
+    board = box(of, [-1.3, 2 * 2.98 - 0.8, 1.6], [-0.9, 2 * 2.98 - 0.8, 2.0])
+    inside = (x > 0) & (x < 160) & (y > 0) & (y < 90)
+    covered = np.zeros_like(board)
+    covered[inside] = board[y[inside].astype(int), x[inside].astype(int)]
+    covered &= maps[THING + "mirror"]
+    assert covered.any() and not maps["seen"][covered].any()
+    assert maps["seen"][maps[THING + "mirror"] & ~covered].any()
+
+
+def test_what_moves_in_glass_moves_however_still_the_garden_is(world):
+    of = view(0.0, EYE + np.array([2.07, 0, 0]))
+    maps = region_maps(world, world.at(1), 1, of, of)
+    image = box(of, [-1.3, 7.5, 1.6], [-0.9, 7.5, 2.0])
+    assert image.any() and maps["moving"][image].all() and not maps[THING + "glass"][image].any()
+    assert maps[THING + "glass"].any() and (maps["depth_mm"][image] == 6000).all()
+
+
+def test_a_board_before_a_mirror_hides_it(world):
+    """Frame 2's board stands where the way from the other eye to the mirror is."""
+    of = view()
+    near = with_board(world, [0.3, 3.5, -0.3])
+    maps = region_maps(near, near.at(1), 1, of, of)
+    hidden = box(of, [-1.0, 2.0, 1.3], [-0.6, 2.0, 1.7])
+    assert hidden.any() and not maps[THING + "mirror"][hidden].any() and (maps["depth_mm"][hidden] == 2000).all()

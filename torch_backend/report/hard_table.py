@@ -1,0 +1,125 @@
+"""Rows of the report's tables of hard scenes: glass and mirrors, and whether small movers are there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .records import SPLATS, FrameScore, RunRecord
+from .things import RECALL_APART, RECALL_DISTANCE
+from .truth import PANES
+
+if TYPE_CHECKING:
+    from .tables import Setting
+
+LEAST_PIXELS = 6
+"""A pose in which fewer pixels should show the thing says nothing by itself: it counts in the sum only."""
+RECALLED = ("swinging", "arm")
+"""Things whose presence is asked for."""
+NONE = "–"
+
+
+def pane_rows(settings: Sequence[Setting]) -> list[list[str]]:
+    """Per setting that saw panes: dB on them and on the wall beside, the difference, what was taken for motion."""
+    rows = []
+    for s in settings:
+        if s.summary("psnr_db", "wall") is None:
+            continue
+        cells = [_decibels(s, region) for region in (*PANES, "wall")]
+        less = [_less_than_wall(s, pane) for pane in PANES]
+        opened = [_mean(s, lambda row, pane=pane: row.opened.get(pane)) for pane in PANES] if s.shown == SPLATS else []
+        matte = [_of_matte(s.runs, pane) for pane in PANES]
+        rows.append([s.label, *cells, *less, *_percent(opened or [None] * len(PANES)), *matte])
+    return rows
+
+
+PANE_HEADER = [
+    "method",
+    "glass, dB",
+    "mirror, dB",
+    "wall beside, dB",
+    "glass less wall",
+    "mirror less wall",
+    "glass opened",
+    "mirror opened",
+    "matte on glass",
+    "matte on mirror",
+]
+PANE_NOTE = (
+    "Mean PSNR in dB over pixels of a window's pane and of a mirror in which nothing moves, and of the still wall "
+    "within 0.6 m of them. Opened: share of the pane that the frozen frame's motion matte takes for something that "
+    "moves (above 0.5). Matte: share of the pane that the solve's motion matte calls moving, in brackets unknown."
+)
+THING_HEADER = ["method", "recall of the apple", "worst pose", "recall of the arm", "worst pose", "arm, dB", "hair, dB"]
+THING_NOTE = (
+    "Recall: of the pixels that show an apple of 2 % of the picture's width that swings on a thread, and a gesturing "
+    f"arm, at t* in the truth, the share that shows it in the frozen frame: colour within {RECALL_DISTANCE} (root mean "
+    "square over the channels) of the truth, and nearer to it than to what stands behind. Pixels whose background is "
+    f"within {RECALL_APART} of the thing do not count; the worst pose is one with at least {LEAST_PIXELS} that do. "
+    "Hair: loose strands before a bright window, mean PSNR in dB over pixels of which they cover at least 15 %."
+)
+
+
+def thing_rows(settings: Sequence[Setting]) -> list[list[str]]:
+    """Per setting that saw a small mover or hair: recall over all poses and of the worst, dB."""
+    rows = []
+    for s in settings:
+        counts = {name: _counts(s.runs, name) for name in RECALLED}
+        dB = [_decibels(s, region) for region in ("arm", "hair")]
+        if not any(counts.values()) and dB == [NONE, NONE]:
+            continue
+        recall = [cell for name in RECALLED for cell in _recall(counts[name])]
+        rows.append([s.label, *recall, *dB])
+    return rows
+
+
+def _counts(runs: Sequence[RunRecord], name: str) -> list[tuple[int, int]]:
+    """[(pixels that show it, pixels that should)] by frame."""
+    return [tuple(row.recalled[name]) for run in runs for row in run.rows if name in row.recalled]
+
+
+def _recall(counts: Sequence[tuple[int, int]]) -> list[str]:
+    """Over all frames, and of the worst frame of those with enough pixels."""
+    should = sum(of for _, of in counts)
+    if not should:
+        return [NONE, NONE]
+    each = [found / of for found, of in counts if of >= LEAST_PIXELS]
+    return [f"{sum(found for found, _ in counts) / should:.2f}", f"{min(each):.2f}" if each else NONE]
+
+
+def _decibels(setting: Setting, region: str) -> str:
+    found = setting.summary("psnr_db", region)
+    return NONE if found is None else f"{found.mean:.2f}"
+
+
+def _less_than_wall(setting: Setting, pane: str) -> str:
+    """Mean over frames that show both: dB of the pane less those of the wall."""
+    return _signed(_mean(setting, lambda row: _difference(row.value("psnr_db", "wall"), row.value("psnr_db", pane))))
+
+
+def _difference(wall: float | None, pane: float | None) -> float | None:
+    return None if wall is None or pane is None else pane - wall
+
+
+def _mean(setting: Setting, read: Callable[[FrameScore], float | None]) -> float | None:
+    values = [v for run in setting.runs for row in run.rows if (v := read(row)) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _of_matte(runs: Sequence[RunRecord], pane: str) -> str:
+    """Moving, and unknown in brackets."""
+    found = [run.matte[pane] for run in runs if pane in run.matte]
+    if not found:
+        return NONE
+    moving, unknown = (float(np.mean([of[name] for of in found])) for name in ("moving", "unknown"))
+    return f"{moving:.1%} ({unknown:.1%})"
+
+
+def _percent(values: Sequence[float | None]) -> list[str]:
+    return [NONE if v is None else f"{v:.1%}" for v in values]
+
+
+def _signed(value: float | None) -> str:
+    return NONE if value is None else f"{value:+.2f}"

@@ -1,0 +1,77 @@
+"""What hard scenes are judged by, beside the error of a region: whether a small mover is there at all, and whether
+glass and mirrors, which change with the view, were taken for what changes with time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from .real import motion_shares
+from .truth import PANES
+
+if TYPE_CHECKING:
+    from .truth import TruthScene
+
+RECALL_DISTANCE = 0.15
+"""A pixel shows the thing if its colour is at most this far from the truth: root mean square over the channels, of
+display-referred values in [0, 1]. PSNR of such a pixel is 16.5 dB: soft, displaced by a fraction of it, but there."""
+RECALL_APART = 0.1
+"""Thing and background less far apart than this, in the same measure, cannot be told from each other: such pixels do
+not count."""
+OPENED = 0.5
+"""A pixel of a frozen frame was taken for something that moves if its motion matte is above this."""
+
+
+def recalled(image: Tensor, truth: Tensor, behind: Tensor, mask: Tensor) -> tuple[int, int]:
+    """(pixels that show the thing, pixels that should) of a frozen frame.
+
+    A pixel shows it if its colour is within `RECALL_DISTANCE` of the truth, and nearer to that than to what is behind.
+
+    Args:
+        image, truth, behind: [H, W, 3] display-referred in [0, 1]; `behind` is the truth without the thing.
+        mask: bool [H, W], the thing's pixels in the truth.
+    """
+    error, mistaken, apart = (_distance(a, b) for a, b in ((image, truth), (image, behind), (truth, behind)))
+    told = mask & (apart > RECALL_APART)
+    return int((told & (error <= RECALL_DISTANCE) & (error < mistaken)).sum()), int(told.sum())
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    """[H, W] root mean square over channels."""
+    return (a.float().clamp(0.0, 1.0) - b.float().clamp(0.0, 1.0)).square().mean(2).sqrt()
+
+
+def recall_of(
+    behind: Mapping[str, Tensor], image: Tensor, truth: Tensor, regions: Mapping[str, Tensor]
+) -> dict[str, list[int]]:
+    """{thing: [pixels that show it, pixels that should]} of a frozen frame, for every thing that has a `behind`."""
+    return {name: list(recalled(image, truth, b, regions[name])) for name, b in behind.items() if name in regions}
+
+
+def opened_on(motion: Tensor, regions: Mapping[str, Tensor]) -> dict[str, float]:
+    """{pane: share of it that a freeze's motion matte [H, W] calls moving}, for panes that are in the picture."""
+    return {n: float((motion[regions[n]] > OPENED).float().mean()) for n in PANES if n in regions and regions[n].any()}
+
+
+def matte_on_panes(truth: TruthScene, frames: Sequence[int], width: int, height: int) -> dict[str, dict[str, float]]:
+    """{pane: {"moving", "unknown": share of its pixels}} by the shot's motion matte, over frames of the clip.
+
+    {} for scenes without panes. ValueError if a frame has no matte.
+    """
+    sums: dict[str, Tensor] = {}
+    for frame in frames:
+        regions = truth.frame_regions(frame, width, height)
+        panes = [name for name in PANES if name in regions and regions[name].any()]
+        if not panes:
+            continue
+        shares = motion_shares(truth.shot, frame, width, height)
+        unknown = 1.0 - shares["moving"] - shares["still"]
+        for name in panes:
+            of = regions[name]
+            found = [shares["moving"][of].sum(), unknown[of].sum(), of.sum()]
+            sums[name] = sums.get(name, torch.zeros(3, device=of.device)) + torch.stack([v.float() for v in found])
+    return {n: {"moving": float(s[0] / s[2]), "unknown": float(s[1] / s[2])} for n, s in sums.items()}

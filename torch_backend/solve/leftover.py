@@ -1,0 +1,143 @@
+"""What a camera's motion leaves over: sways too slow or too small to tell from the noise of a match.
+
+Another key frame is laid over a key frame by the depth that still points have there, so that still surfaces lie where
+they are and flow has next to nothing to find: what it still finds is known several times better than a match over the
+whole travel. Depths are fitted once more to these better matches, and what no depth explains then is own motion, if
+the pictures bear it out. Tried over a second and more, because sways grow with time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .flow import FlowConfig, Map, Mask, Seen, sample
+from .still import FEW, Look, Pair, StillTest, Texture, brightness, inside, outlines, still_points
+
+_FINEST, _STRIDE, _DESCENTS, _REFINEMENTS = 1, 4, 16, 2
+"""Of DIS: at half the size of the pictures and not finer, every fourth pixel."""
+_SPARSE, _TURNS = 4, 6
+"""Every so manieth point tells of the whole picture, and so often what moves in it is weighed less."""
+_FLOOR = 2.0
+"""Square difference of pictures that is less than any noise."""
+
+
+@dataclass
+class _Laid:
+    """A key frame and another one laid over it."""
+
+    pair: Pair
+    """Its weight says how alike the pictures are at the match."""
+    gained: Map
+    """[h, w] 0..1: how far the pictures bear the match out against the still point."""
+    visible: float
+    """Square difference of the pictures that shows more than noise."""
+
+
+class Leftover:
+    """Own motion that is left in key frames after the camera's is taken out."""
+
+    def __init__(self, picture: Callable[[int], NDArray[np.uint8]], test: StillTest, config: FlowConfig) -> None:
+        """`picture` gives key k as in `flow.Matches`."""
+        self._picture, self._test, self._config = picture, test, config
+        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._dis.setFinestScale(_FINEST)
+        self._dis.setPatchStride(_STRIDE)
+        self._dis.setGradientDescentIterations(_DESCENTS)
+        self._dis.setVariationalRefinementIterations(_REFINEMENTS)
+
+    def score(self, key: int, count: int, inverse: Map, depth: float) -> tuple[Map, Map]:
+        """(score, weight), [h, w] float32: how surely a key's points move, 0 to 1, and how much is known of them.
+
+        Of keys 0 to `count` - 1; `inverse` are the depths of still points, `depth` is the typical one, solve units.
+        """
+        config = self._config
+        look = self._test.look(key)
+        texture = Texture(look.grid, self._test.unit, config)
+        keys = [key + side * step for side in (-1, 1) for step in config.spans if 0 <= key + side * step < count]
+        laid = [self._laid(key, other, inverse, look, texture) for other in keys if not self._guessed(key, other)]
+        if len(laid) < 2:
+            return np.zeros_like(inverse), np.zeros_like(inverse)
+        pairs = [each.pair for each in laid]
+        inverse = still_points(pairs, inverse, depth, self._test.unit, turns=3)
+        told, known = [], np.zeros_like(inverse)
+        for each in laid:
+            _, x, y, length = each.pair.miss(inverse)
+            limit = self._limit(length, (each.pair.weight > 0.5) & texture.telling)
+            seen = np.minimum(texture.change(x, y, length) / each.visible, 1.0)
+            told.append(np.minimum(length / limit, config.most) * seen * each.gained * each.pair.weight)
+            known += each.pair.weight
+        second = np.partition(np.stack(told), -2, axis=0)[-2]  # one alone is what is hidden there
+        faint = config.faint
+        score = (second / (1.0 + config.rim * outlines(inverse)) - faint) / (config.clear - faint)
+        return np.clip(score, 0.0, 1.0), np.minimum(known, 1.0)
+
+    def _guessed(self, key: int, other: int) -> bool:
+        return self._test.guessed[key] or self._test.guessed[other]
+
+    def _limit(self, length: Map, told: Mask) -> float:
+        """The distance that may tell of motion, from how far matches are off as a rule."""
+        least = self._config.least * self._test.unit
+        noise = float(np.median(length[told])) if np.count_nonzero(told) >= FEW else 0.0
+        return float(np.clip(self._config.unusual * noise, least, self._config.most_left * least))
+
+    def _left(self, key: int, other: int, at: tuple[Map, Map], within: Mask) -> Map:
+        """[h, w, 2] flow of a key frame to another one that is laid over it: its points are seen `at` places there."""
+        one = self._picture(key)
+        x, y = (cv2.resize(p, one.shape[::-1], interpolation=cv2.INTER_LINEAR) - np.float32(0.5) for p in at)
+        brought = cv2.remap(self._picture(other), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        # Past the border there is nothing: the picture itself, that flow stays at rest there.
+        outside = cv2.resize((~within).astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        cv2.copyTo(one, outside, brought)
+        flow = np.nan_to_num(self._dis.calc(one, brought, None))  # type: ignore[call-overload]
+        return cv2.resize(flow, within.shape[::-1], interpolation=cv2.INTER_AREA)
+
+    def _laid(self, key: int, other: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
+        """The other key frame, laid over a key frame by inverse depths."""
+        test = self._test
+        pair = Pair.between(test, key, Seen(other, test.grid, np.zeros(inverse.shape, bool), 1), self._config)
+        at, _ = pair.ray.project(inverse)
+        within = inside(at, inverse.shape)
+        left = self._left(key, other, at, within)
+        moved = test.grid[0] + left[..., 0], test.grid[1] + left[..., 1]
+        match = sample(at[0], moved), sample(at[1], moved)
+        drift = _drift([match[i] - at[i] for i in (0, 1)], within & texture.telling, self._config.least * test.unit)
+        pair.gain = brightness(look.grid, sample(pair.there.grid, match), within)
+        still, found = (pair.there.unlike(look.grid, place, pair.gain) for place in (at, match))
+        sharp = within & texture.telling
+        usual = float(np.median(found[sharp])) if np.count_nonzero(sharp) >= FEW else 0.0
+        likeness = within / (1.0 + found / (4.0 * usual + 8.0 * _FLOOR))
+        gained = (still - found) / (found + usual + _FLOOR) / self._config.bearing
+        pair.seen = Seen(other, (match[0] - drift[0], match[1] - drift[1]), within, 1)
+        pair.weight = likeness.astype(np.float32)
+        noise = float(np.quantile(found[within], 0.3)) if np.count_nonzero(within) >= FEW else 0.0
+        least, most = self._config.visible
+        return _Laid(pair, np.clip(gained, 0.0, 1.0), min(max(noise, least**2), most**2))
+
+
+def _drift(left: list[Map], told: Mask, unit: float) -> list[Map]:
+    """By how much x and y of the whole picture are off, [h, w] each: a poor pose, a rolling shutter, a lens.
+
+    A second-order polynomial through what is `told` of what is `left`, those far from it hardly counting. What moves
+    by itself does so here and there and not evenly over the picture.
+    """
+    height, width = told.shape
+    y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j].astype(np.float32)
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    few = told[::_SPARSE, ::_SPARSE]
+    if np.count_nonzero(few) < FEW:
+        return [np.zeros_like(part) for part in left]
+    design = terms[::_SPARSE, ::_SPARSE][few].astype(np.float64)
+    wanted = np.stack([part[::_SPARSE, ::_SPARSE][few] for part in left], axis=-1).astype(np.float64)
+    found = np.zeros((6, 2))
+    found[0] = np.median(wanted, axis=0)
+    for _ in range(_TURNS):
+        gap = np.sum((wanted - design @ found) ** 2, axis=1)
+        weight = 1.0 / np.square(1.0 + gap / max(unit**2, float(np.median(gap))))
+        normal = design.T @ (design * weight[:, None]) + 1e-3 * len(design) * np.eye(6)
+        found = np.linalg.solve(normal, design.T @ (wanted * weight[:, None]))
+    return [(terms @ found[:, i].astype(np.float32)) for i in (0, 1)]
