@@ -45,6 +45,15 @@ class TrainConfig:
     """Seed of every random draw."""
     dssim: float = 0.2
     """Share of D-SSIM in the photometric loss (3DGS: 0.2)."""
+    moving_weight: float = 0.1
+    """Weight of pixels that the motion mattes call moving while the model is static: near nothing, so that what stands
+    behind a mover is not pulled to it, but not nothing, so that a mover has Gaussians when the gate opens."""
+    moving_weight_field: float = 1.0
+    """The same once there is a field."""
+    moving_margin: int = 2
+    """Training pixels around movers that have their weight."""
+    coarse: float = 0.5
+    """Share of the run that is trained at half the size; published hosts are not."""
     sh_degree: int = 2
     """Highest SH degree."""
     sh_every: float = 0.15
@@ -89,6 +98,12 @@ class TrainConfig:
     """When `auto` has enough: SH degree, Gaussians, time nodes, steps."""
     poses: PosesConfig = dataclasses.field(default_factory=PosesConfig)
     """Small corrections of the solve's cameras."""
+
+    @property
+    def decides(self) -> bool:
+        """Is the run ours: does it decide what it needs, heed the motion mattes, go from coarse to fine? Published
+        configurations and hosts that move everything are left as they are."""
+        return self.method in ("auto", "static") and self.host_config == "default"
 
 
 def _preview() -> TrainConfig:

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from ..contract import Cancelled, ExitCode, JobError, Reporter
 from ..deformation import (
@@ -20,16 +20,13 @@ from ..deformation import (
     Deltas,
     Rehearsal,
     Start,
-    change_of,
     field_box,
     host,
-    painted,
     split_deltas,
-    stays_open,
 )
 from ..gaussians import Densifier, Gaussians, initialise
 from ..raster import RasterOutput
-from ..scene import Scene
+from ..scene import Scene, resize_intrinsics
 from ..supervision import (
     Anchored,
     PaperView,
@@ -50,14 +47,15 @@ from .exposure import Exposure
 from .extend import Extension
 from .losses import photometric, psnr
 from .model import DynamicModel, render
+from .movers import harden, on_trial, weights_of
 from .needs import Needs
 from .poses import Poses, corrected
 from .repair import FieldMemory, drop_offenders, repair, unstable
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
-_MOMENTS = 16
-"""Times and cameras at which it is asked whether a Gaussian moves."""
+_LEAST_COARSE = 64
+"""Pixels of the shorter side below which pictures are not halved."""
 _LOOK_EVERY = 10
 """Steps between two looks at what a GPU counted, and between two reports of progress."""
 
@@ -75,6 +73,7 @@ class Trainer:
         config: every number of the run.
         identity: JSON-able facts that say which run a checkpoint belongs to; stored in it.
         device: where it trains.
+        movers: bool [I, H, W] what the motion mattes call moving in the training frames; None: there are no mattes.
     """
 
     def __init__(
@@ -86,12 +85,17 @@ class Trainer:
         report: Reporter,
         identity: dict[str, Any] | None = None,
         device: torch.device | str = "cpu",
+        movers: Tensor | None = None,
     ) -> None:
         self.identity, self.device = identity or {}, torch.device(device)
         self.scene, self.images, self.train_ids, self.config, self.report = scene, images, train, config, report
+        self.movers = movers if config.decides else None
         self.height, self.width = images.shape[1:3]
         self.viewmats = scene.viewmats.to(self.device)
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
+        ones = torch.ones(3, 3, device="cpu")
+        half = resize_intrinsics(ones, self.width, self.height, self.width // 2, self.height // 2)
+        self._halved = half.to(self.device)
         self.times = [float(scene.times[i]) for i in train]
         self._when = torch.tensor(self.times, device=self.device)
         self.seconds = float(scene.seconds[train[-1]] - scene.seconds[train[0]])
@@ -104,8 +108,7 @@ class Trainer:
         gaussians = gaussians.to(self.device)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
         self.initial = len(gaussians)
-        decides = config.method == "auto" and config.host_config == "default"
-        self.needs = Needs(config.needs, len(train) if decides else 0)
+        self.needs = Needs(config.needs, len(train) if config.decides else 0)
         self.extensions: list[Extension] = []
         self.iteration = 0
         self.trained_seconds = 0.0
@@ -124,6 +127,27 @@ class Trainer:
         self._saved_at = time.perf_counter()
 
     # ------------------------------------------------------------------ the run
+
+    @property
+    def working_size(self) -> tuple[int, int]:
+        """(height, width) that is trained at now: half of the images' in the first part of the run."""
+        height, width = self.height // 2, self.width // 2
+        coarse = self.config.decides and self.progress < self.config.coarse and min(height, width) >= _LEAST_COARSE
+        return (height, width) if coarse else (self.height, self.width)
+
+    @property
+    def pixel_area(self) -> float:
+        """Pixels of the images in one that is trained at now."""
+        height, width = self.working_size
+        return self.height * self.width / (height * width)
+
+    def working_camera(self, index: int) -> Tensor:
+        """[3, 3] of the scene's frame `index` in pixels of `working_size`."""
+        return self.Ks[index] if self.pixel_area == 1.0 else self.Ks[index] * self._halved
+
+    def bin_of_frame(self, frame: int) -> int:
+        """Time bin of the support bitmap for the trained frame at position `frame`."""
+        return self._bins[frame]
 
     @property
     def progress(self) -> float:
@@ -192,7 +216,7 @@ class Trainer:
         if paper and len(rows):
             state["means"].retain_grad()
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
-        loss = photometric(exposed, self._image(frame), self.config.dssim)
+        loss = photometric(exposed, self._working_image(frame), self.config.dssim, self._weights(frame))
         total = loss + self._regularisers(rows)
         if deltas is not None and self.config.supervision.preset == "support":
             price = stillness(deltas, len(self.model.gaussians), loss, self.progress, self.config.supervision)
@@ -213,7 +237,7 @@ class Trainer:
             self._left_out(frame)
             return loss.detach()
         self.bad_steps = 0
-        radii, weight = out.radii[0], out.weight_sum[0]
+        radii, weight = out.radii[0], out.weight_sum[0] * self.pixel_area
         if self.device.type != "cpu":
             left_out = ~applied
             self._bad = torch.stack([self._bad[0] + left_out, (self._bad[1] + 1) * left_out])
@@ -222,7 +246,7 @@ class Trainer:
         mark_seen(self.model.gaussians, self._bins[frame], weight)
         if look:
             index = self.train_ids[frame]
-            view = (self.viewmats[index], self.Ks[index], out.depth_median[0])
+            view = (self.viewmats[index], self.working_camera(index), out.depth_median[0])
             mark_hidden(self.model.gaussians, rows, self._bins[frame], state, *view)
         return loss.detach()
 
@@ -244,6 +268,22 @@ class Trainer:
 
     def _image(self, frame: int) -> Tensor:
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
+
+    def _working_image(self, frame: int) -> Tensor:
+        image, size = self._image(frame), self.working_size
+        if size == (self.height, self.width):
+            return image
+        return F.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0).contiguous()
+
+    def _weights(self, frame: int) -> Tensor | None:
+        """[H, W, 1] how much each pixel of a trained frame counts, at the working size; None: all in full."""
+        weight = self.config.moving_weight if self.model.field is None else self.config.moving_weight_field
+        if self.movers is None or weight >= 1.0:
+            return None
+        movers, size = self.movers[frame].to(self.device, non_blocking=True), self.working_size
+        if size != tuple(movers.shape):
+            movers = F.interpolate(movers[None, None].float(), size, mode="area")[0, 0] > 0.0
+        return weights_of(movers, weight, self.config.moving_margin)
 
     def _milestones(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
@@ -292,9 +332,9 @@ class Trainer:
     # ------------------------------------------------------------------ the gate
 
     def _open_gate(self) -> None:
-        """Opens all that is painted, on trial."""
+        """Opens, on trial, what is painted, or of it what the motion mattes call moving."""
         model = self.model.gaussians
-        model.open |= painted(model)
+        model.open |= on_trial(self)
         if bool(model.open.any()):
             self._create_field()
 
@@ -308,38 +348,14 @@ class Trainer:
             (self.iteration - first) % max(1, every) == 0 or self.iteration == last
         )
 
-    @torch.no_grad()
     def _harden_gate(self) -> None:
-        """Closes for good what did not move; its mean change stays. While nothing moves at all, the trial goes on."""
+        """Closes for good what did not move. While nothing moves at all, the trial goes on."""
         self._look()  # one NaN would spoil the neighbours' verdicts
-        rows, model = self.model.open_rows(), self.model.gaussians
-        if self.model.field is None or not len(rows):
+        if self.model.field is None or not len(self.model.open_rows()):
             return
-        picked = np.unique(np.linspace(0, len(self.centres) - 1, min(_MOMENTS, len(self.centres))).round().astype(int))
-        moments = [self.model.deltas(rows, self.centres[n : n + 1]) for n in picked]
-        asked = [moment for moment in moments if moment is not None]
-        change, mean = change_of(model, rows, asked, self._pixels(rows), self.config.gate)
-        stays = stays_open(model, rows, change, self.config.gate)
-        if not bool(stays.any()) and self.progress < self.config.gate.give_up:
-            return
-        self.needs.facts["hardened"] = self.iteration
-        closed, moved = rows[~stays], self.model.moved(rows, mean)
-        for name, param in model.params.items():
-            if name in moved:
-                param.data[closed] = moved[name][closed]
-        model.open[closed] = False
-        self._shift = self._shift[:0]
-
-    def _pixels(self, rows: Tensor) -> Tensor:
-        """[M] pixels of the training images per scene unit, where each of `rows` is nearest to a camera that saw it."""
-        means = self.model.gaussians.params["means"].detach()[rows]
-        nearest = torch.full((len(rows),), torch.inf, device=self.device)
-        for frame in range(0, len(self.train_ids), max(1, len(self.train_ids) // _MOMENTS)):
-            view = self.viewmats[self.train_ids[frame]]
-            depth = means @ view[2, :3] + view[2, 3]
-            seen = self.model.gaussians.support[rows, self._bins[frame]] & (depth > 1e-3)
-            nearest = torch.where(seen, torch.minimum(nearest, depth), nearest)
-        return torch.where(nearest.isfinite(), self.Ks[self.train_ids[0], 0, 0] / nearest, 0.0)
+        if harden(self):
+            self.needs.facts["hardened"] = self.iteration
+            self._shift = self._shift[:0]
 
     def _create_field(self) -> None:
         self._look()  # and every bound of the field
@@ -376,7 +392,7 @@ class Trainer:
         def loss(state: dict[str, Tensor], frame: int) -> Tensor:
             self.report.check_cancelled()
             out = self._render(state, frame, sh_degree=0, with_contributions=False)
-            return photometric(out.colors[0], self._image(frame), self.config.dssim)
+            return photometric(out.colors[0], self._working_image(frame), self.config.dssim)
 
         points, colors = (t.to(self.device) for t in (self.scene.points, self.scene.colors))
         field.rehearse(Rehearsal(points, colors, self.times, steps, loss, self.generator))
@@ -394,10 +410,8 @@ class Trainer:
         options.setdefault("background", self.background)
         options.setdefault("with_contributions", True)
         options.setdefault("with_depth", False)
-        degree = options.pop("sh_degree", self.model.sh_degree)
-        return render(
-            state, degree, self._viewmat(index, frame), self.Ks[index], self.width, self.height, **options
-        )  # fmt: skip
+        degree, (height, width) = options.pop("sh_degree", self.model.sh_degree), self.working_size
+        return render(state, degree, self._viewmat(index, frame), self.working_camera(index), width, height, **options)
 
     def _next_frame(self) -> int:
         if not self.order:
@@ -453,7 +467,8 @@ class Trainer:
         other_state["means"].retain_grad()
         other_out = self._render(other_state, other)
         exposed = self.model.exposure.apply(other_out.colors[0], self.times[other])
-        photometric(exposed, self._image(other), self.config.dssim).backward(retain_graph=True)
+        loss = photometric(exposed, self._working_image(other), self.config.dssim, self._weights(other))
+        loss.backward(retain_graph=True)
         other_acted = self._acted(other, rows, other_state, other_out)
         every = self.config.supervision.pulls == "all"
         if not every:
@@ -468,12 +483,12 @@ class Trainer:
 
     def _acted(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> Tensor:
         """bool [M]: on which of `rows` the frame acted; `out` and `state` after the frame's own backward pass."""
-        index, pull = self.train_ids[frame], state["means"].grad
+        (height, width), index, pull = self.working_size, self.train_ids[frame], state["means"].grad
         if pull is None or out.weight_sum is None:
             raise RuntimeError("the frame was rendered without gradients or contributions")
         return well_supervised(
             self.config.supervision, out.weight_sum[0][rows], out.means2d_grad[0][rows], pull[rows],
-            self.Ks[index], self.viewmats[index], state["means"].detach()[rows], (self.width, self.height),
+            self.working_camera(index), self.viewmats[index], state["means"].detach()[rows], (width, height),
         )  # fmt: skip
 
     def _paper_view(self, state: dict[str, Tensor], frame: int, rows: Tensor, acted: Tensor) -> PaperView:
