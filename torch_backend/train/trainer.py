@@ -129,11 +129,15 @@ class Trainer:
     # ------------------------------------------------------------------ the run
 
     @property
+    def fine_from(self) -> int:
+        """The iteration from which on the images' own size is trained at; before, it is half of that."""
+        large = min(self.height, self.width) // 2 >= _LEAST_COARSE
+        return math.ceil(self.config.coarse * self.config.iterations) if self.config.decides and large else 0
+
+    @property
     def working_size(self) -> tuple[int, int]:
-        """(height, width) that is trained at now: half of the images' in the first part of the run."""
-        height, width = self.height // 2, self.width // 2
-        coarse = self.config.decides and self.progress < self.config.coarse and min(height, width) >= _LEAST_COARSE
-        return (height, width) if coarse else (self.height, self.width)
+        """(height, width) that is trained at now."""
+        return (self.height, self.width) if self.iteration >= self.fine_from else (self.height // 2, self.width // 2)
 
     @property
     def pixel_area(self) -> float:
@@ -585,12 +589,15 @@ class Trainer:
 
     # ------------------------------------------------------------------ held-out frames
 
-    @torch.no_grad()
     def render_frame(self, index: int) -> Tensor:
         """Frame `index` of the scene at its own time, [H, W, 3], not clamped."""
+        return self._shown(index, self.Ks[index], self.width, self.height)
+
+    @torch.no_grad()
+    def _shown(self, index: int, K: Tensor, width: int, height: int) -> Tensor:
         state = self.model.state_at(float(self.scene.times[index]))
         out = render(
-            state, self.model.sh_degree, self._viewmat(index), self.Ks[index], self.width, self.height,
+            state, self.model.sh_degree, self._viewmat(index), K, width, height,
             background=self.background, with_depth=False, with_contributions=False,
         )  # fmt: skip
         return self.model.exposure.apply(out.colors[0], float(self.scene.times[index]))
@@ -602,6 +609,17 @@ class Trainer:
             self.report.check_cancelled()
             values.append(psnr(self.render_frame(i), images[n].to(self.device, torch.float32)))
         return values
+
+    def working_psnr(self, frames: list[int]) -> float | None:
+        """Mean PSNR in dB over trained frames at the size that is trained at now; None if there are none."""
+        height, width = self.working_size
+        values = []
+        for frame in frames:
+            self.report.check_cancelled()
+            index = self.train_ids[frame]
+            shown = self._shown(index, self.working_camera(index), width, height)
+            values.append(psnr(shown, self._working_image(frame)))
+        return sum(values) / len(values) if values else None
 
     def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
         """Mean PSNR in dB over held-out frames at their own times; None if there are none."""
