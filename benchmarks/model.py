@@ -40,7 +40,8 @@ from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot, write_json
 from torch_backend.solve.motion import load_motion
 from torch_backend.train import adam, config_from_params
-from torch_backend.train.config import TrainConfig, config_to_json
+from torch_backend.train.checkpoint import CHECKPOINT_FILE, read_meta
+from torch_backend.train.config import TrainConfig, config_from_json, config_to_json
 from torch_backend.train.movers import load_movers
 from torch_backend.train.run import training_size
 from torch_backend.train.trainer import Trainer
@@ -148,13 +149,20 @@ def strips(judge: Judge, folder: Path, t_stars: list[int]) -> None:
         write_png(folder / f"{t.scene.frames[index]:06d}.png", (strip * 255.0).round().byte().contiguous().numpy())
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
-    """Trains and judges once."""
-    shot = Shot.open(args.shot)
+def configured(args: argparse.Namespace, shot: Shot) -> TrainConfig:
+    """The configuration that is asked for, or that of the trained run that is."""
+    if args.run:
+        return config_from_json(read_meta(shot.run(args.run) / CHECKPOINT_FILE)["config"])
     params = TrainParams(method=args.method, seed=args.seed, iterations=args.iterations, width=args.width, holdout=8)
     config = changed(config_from_params(params), args.set)
     config.holdout_phase = args.phase
-    scene = load_scene(shot)
+    return config
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    """Trains and judges once."""
+    shot = Shot.open(args.shot)
+    config, scene = configured(args, shot), load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     images = load_images(scene, train + test, width, height)
@@ -164,7 +172,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         module.warm_up()
     since = time.process_time()
     trainer = Trainer(scene, images[: len(train)], train, config, _Silent(), movers=movers)  # type: ignore[arg-type]
-    trainer.run(args.results / f"{args.name}.safetensors", lambda _: None)
+    if args.run:
+        trainer.restore(shot.run(args.run) / CHECKPOINT_FILE)
+    else:
+        trainer.run(args.results / f"{args.name}.safetensors", lambda _: None)
     seconds = time.process_time() - since
     judge = Judge(shot, trainer, test, images[len(train) :])
     own = judge.at_own_time()
@@ -191,6 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
     parser.add_argument("--name", default="model", help="of the result's files")
     parser.add_argument("--method", default="auto")
+    parser.add_argument("--run", default="", metavar="NAME", help="train nothing: judge this run of the shot")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--phase", type=int, default=0, help="which of every 8 frames are held out; 0 only to report")
     parser.add_argument("--iterations", type=int, default=0, help="0: the preset's")
