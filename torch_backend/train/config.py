@@ -27,7 +27,7 @@ class TrainConfig:
 
     preset: str = "preview"
     """Preset these numbers come from."""
-    iterations: int = 3000
+    iterations: int = 2000
     """Training steps of one image each."""
     width: int = 320
     """Width in pixels of the training images (never above the working frames')."""
@@ -52,7 +52,7 @@ class TrainConfig:
     """The same once there is a field."""
     moving_margin: int = 2
     """Training pixels around movers that have their weight."""
-    coarse: float = 0.5
+    coarse: float = 1.0 / 3.0
     """Share of the run that is trained at half the size; published hosts are not."""
     sh_degree: int = 2
     """Highest SH degree."""
