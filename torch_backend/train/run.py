@@ -20,7 +20,7 @@ from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
-from ..solve.motion import load_motion, motion_key
+from ..solve.motion import PAINTED, load_motion, motion_key
 from . import adam
 from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
@@ -81,7 +81,11 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     motion = motion_of(shot, config)
-    key = content_key(config_to_json(config), solve_key(shot), train, test, *([motion] if motion else []))
+    key = content_key(config_to_json(config), solve_key(shot), train, test)
+    if motion and not trained_without(shot, run, key):
+        key = content_key(key, motion)
+    else:
+        motion = None
     done = finished(run, key)
     if done is not None and params.resume:
         forget(run, key)
@@ -231,6 +235,17 @@ def motion_of(shot: Shot, config: TrainConfig) -> str | None:
     frames = load_scene(shot).frames if config.decides else []
     has = any(load_motion(shot, frame) is not None for frame in frames)
     return motion_key(shot) if has else None
+
+
+def trained_without(shot: Shot, run: Path, key: str) -> bool:
+    """Was the run, of this key, trained before mattes were found? It stays, unless an artist has painted some since.
+
+    A freeze finds mattes where the solve did not: that alone is no reason to train anew what it froze.
+    """
+    checkpoint = run / CHECKPOINT_FILE
+    if any((shot.root / PAINTED).glob("*.png")) or not checkpoint.is_file():
+        return False
+    return read_meta(checkpoint).get("key") == key
 
 
 def _resume(trainer: Trainer, checkpoint: Path, wanted: bool, report: Reporter) -> bool:
