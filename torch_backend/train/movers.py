@@ -88,12 +88,14 @@ def moving_frames(trainer: Trainer, share: float) -> Tensor:
 
 
 def on_trial(trainer: Trainer) -> Tensor:
-    """bool [N]: who the gate opens on trial: all that is painted, or of it what moves in several frames."""
+    """bool [N]: who the gate opens on trial: all that is painted, or of it what moves in several frames and often."""
     gate: GateConfig = trainer.config.gate
     candidates = painted(trainer.model.gaussians)
     if trainer.movers is None:
         return candidates
-    return candidates & (moving_frames(trainer, gate.moving_share) >= gate.moving_frames)
+    moving = moving_frames(trainer, gate.moving_share)
+    often = moving >= gate.moving_often * trainer.model.gaussians.support.sum(1)
+    return candidates & often & (moving >= gate.moving_frames)
 
 
 @torch.no_grad()

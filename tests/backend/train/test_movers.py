@@ -86,6 +86,11 @@ def test_what_lies_in_movers_goes_on_trial_and_nothing_else(painted_world, quiet
     assert int(moving_frames(trainer, 0.5).max()) == len(trainer.train_ids)
     trainer.config.gate.moving_frames = FRAMES + 1
     assert not on_trial(trainer).any(), "a frame or two of motion are a fault of the flow"
+    trainer.config.gate.moving_frames = 3
+    trainer.movers[5:] = False
+    few = on_trial(trainer)
+    trainer.config.gate.moving_often = 0.5
+    assert few.any() and not on_trial(trainer).any(), "what something passes stands still most of the time"
     trainer.movers = None
     assert on_trial(trainer).float().mean() > 0.8, "without mattes all that is painted is tried"
 
