@@ -48,12 +48,8 @@ class TrainConfig:
     moving_weight: float = 0.1
     """Weight of pixels that the motion mattes call moving while the model is static: near nothing, so that what stands
     behind a mover is not pulled to it, but not nothing, so that a mover has Gaussians when the gate opens."""
-    moving_weight_field: float = 1.0
-    """The same once there is a field."""
     moving_margin: int = 2
     """Training pixels around movers that have their weight."""
-    coarse: float = 1.0 / 3.0
-    """Share of the run that is trained at half the size; published hosts are not."""
     sh_degree: int = 2
     """Highest SH degree."""
     sh_every: float = 0.15
@@ -101,8 +97,8 @@ class TrainConfig:
 
     @property
     def decides(self) -> bool:
-        """Is the run ours: does it decide what it needs, heed the motion mattes, go from coarse to fine? Published
-        configurations and hosts that move everything are left as they are."""
+        """Does the run decide what it needs and heed the motion mattes? Published configurations, and hosts that move
+        everything, are left as they are."""
         return self.method in ("auto", "static") and self.host_config == "default"
 
 

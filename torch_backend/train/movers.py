@@ -63,27 +63,26 @@ def moving_frames(trainer: Trainer, share: float) -> Tensor:
     """
     if trainer.movers is None:
         raise ValueError("the shot has no motion mattes")
-    model, (height, width) = trainer.model, trainer.working_size
+    model, height, width = trainer.model, trainer.height, trainer.width
     state = {name: p.detach() for name, p in model.gaussians.params.items()}
     counts = torch.zeros(len(model.gaussians), dtype=torch.long, device=model.device)
     background = torch.cat([trainer.background, trainer.background.new_zeros(1)])
-    least = SEEN_WEIGHT / trainer.pixel_area
     for n, index in enumerate(trainer.train_ids):
-        movers = trainer.movers[n].to(model.device)
+        movers = trainer.movers[n]
         if n in trainer.unusable | trainer.needs.held or not bool(movers.any()):
             continue
         trainer.report.check_cancelled()
-        where = F.interpolate(movers[None, None].float(), (height, width), mode="area")[0, 0]
+        where = movers.to(model.device, torch.float32)
         ink = torch.zeros(len(model.gaussians), 1, device=model.device, requires_grad=True)
         out = render(
-            state, model.sh_degree, trainer.viewmats[index], trainer.working_camera(index), width, height, colors=ink,
+            state, model.sh_degree, trainer.viewmats[index], trainer.Ks[index], width, height, colors=ink,
             background=background, with_depth=False, with_contributions=True,
         )  # fmt: skip
         if out.weight_sum is None:
             raise RuntimeError("the frame was rendered without contributions")
         (on_movers,) = torch.autograd.grad(out.colors[0, ..., 3], ink, where)
         painted_here = out.weight_sum[0]
-        counts += (painted_here > least) & (on_movers[:, 0] > share * painted_here)
+        counts += (painted_here > SEEN_WEIGHT) & (on_movers[:, 0] > share * painted_here)
     return counts
 
 

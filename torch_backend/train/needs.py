@@ -2,14 +2,13 @@
 
 A few trained frames are kept back as probes, and every decision reads the PSNR on them: the frames that are reported
 on (`TrainConfig.holdout`) decide nothing. Late in the run the probes are trained on like all others. Decisions depend
-on nothing but the run's numbers, and their state is in the checkpoint: a resumed run decides the same. Probes are
-looked at in the size that is trained at.
+on nothing but the run's numbers, and their state is in the checkpoint: a resumed run decides the same.
 
 - SH degree: a raise is kept if the model beats itself cut to the degree below. When that is asked, harmonics have
   learnt for a while only; what they gained is scaled by how far their learning rate still lets them go (`lasting`).
 - Growth: PSNR rises by optimisation alone too, and a run cannot be had twice. So growth ends on a bound: when all that
   the probes gained while the Gaussians grew, optimisation included, falls below a threshold per 10 % more of them,
-  what growth gained is below it as well. It errs on the side of growing; at half the size it is not asked.
+  what growth gained is below it as well. It errs on the side of growing.
 - End: when the probes gain nothing more. By then they are trained on, so what they gain is at least what a frame kept
   back would gain: this too errs on the side of going on.
 - Time nodes: from how long what the static model gets wrong stays the same (`correlation_frames`).
@@ -181,11 +180,8 @@ class Needs:
         value = self._psnr(trainer)
         if value is None:
             return
-        fine = trainer.iteration >= trainer.fine_from
-        if fine:  # what was measured at half the size is of another picture
-            self.measured = [m for m in self.measured if m[0] >= trainer.fine_from]
         self.measured.append((trainer.iteration, len(trainer.model.gaussians), value))
-        if fine and not self.joined and self.growing:
+        if not self.joined and self.growing:
             gain = growth_gain(self.measured)
             self.facts["growth_gain_db"] = gain
             if gain is not None and gain < self.config.growth_gain:
@@ -260,7 +256,7 @@ class Needs:
         degree = trainer.model.sh_degree
         try:
             trainer.model.sh_degree = degree if sh_degree is None else sh_degree
-            value = trainer.working_psnr(self.probes)
+            value = trainer.heldout_psnr([trainer.train_ids[n] for n in self.probes], trainer.images[self.probes])
         finally:
             trainer.model.sh_degree = degree
         return value if value is not None and math.isfinite(value) else None

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from ..contract import Cancelled, ExitCode, JobError, Reporter
 from ..deformation import (
@@ -26,7 +25,7 @@ from ..deformation import (
 )
 from ..gaussians import Densifier, Gaussians, initialise
 from ..raster import RasterOutput
-from ..scene import Scene, resize_intrinsics
+from ..scene import Scene
 from ..supervision import (
     Anchored,
     PaperView,
@@ -54,8 +53,6 @@ from .repair import FieldMemory, drop_offenders, repair, unstable
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
-_LEAST_COARSE = 64
-"""Pixels of the shorter side below which pictures are not halved."""
 _LOOK_EVERY = 10
 """Steps between two looks at what a GPU counted, and between two reports of progress."""
 
@@ -93,9 +90,6 @@ class Trainer:
         self.height, self.width = images.shape[1:3]
         self.viewmats = scene.viewmats.to(self.device)
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
-        ones = torch.ones(3, 3, device="cpu")
-        half = resize_intrinsics(ones, self.width, self.height, self.width // 2, self.height // 2)
-        self._halved = half.to(self.device)
         self.times = [float(scene.times[i]) for i in train]
         self._when = torch.tensor(self.times, device=self.device)
         self.seconds = float(scene.seconds[train[-1]] - scene.seconds[train[0]])
@@ -127,27 +121,6 @@ class Trainer:
         self._saved_at = time.perf_counter()
 
     # ------------------------------------------------------------------ the run
-
-    @property
-    def fine_from(self) -> int:
-        """The iteration from which on the images' own size is trained at; before, it is half of that."""
-        large = min(self.height, self.width) // 2 >= _LEAST_COARSE
-        return math.ceil(self.config.coarse * self.config.iterations) if self.config.decides and large else 0
-
-    @property
-    def working_size(self) -> tuple[int, int]:
-        """(height, width) that is trained at now."""
-        return (self.height, self.width) if self.iteration >= self.fine_from else (self.height // 2, self.width // 2)
-
-    @property
-    def pixel_area(self) -> float:
-        """Pixels of the images in one that is trained at now."""
-        height, width = self.working_size
-        return self.height * self.width / (height * width)
-
-    def working_camera(self, index: int) -> Tensor:
-        """[3, 3] of the scene's frame `index` in pixels of `working_size`."""
-        return self.Ks[index] if self.pixel_area == 1.0 else self.Ks[index] * self._halved
 
     def bin_of_frame(self, frame: int) -> int:
         """Time bin of the support bitmap for the trained frame at position `frame`."""
@@ -220,7 +193,7 @@ class Trainer:
         if paper and len(rows):
             state["means"].retain_grad()
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
-        loss = photometric(exposed, self._working_image(frame), self.config.dssim, self._weights(frame))
+        loss = photometric(exposed, self._image(frame), self.config.dssim, self._weights(frame))
         total = loss + self._regularisers(rows)
         if deltas is not None and self.config.supervision.preset == "support":
             price = stillness(deltas, len(self.model.gaussians), loss, self.progress, self.config.supervision)
@@ -241,7 +214,7 @@ class Trainer:
             self._left_out(frame)
             return loss.detach()
         self.bad_steps = 0
-        radii, weight = out.radii[0], out.weight_sum[0] * self.pixel_area
+        radii, weight = out.radii[0], out.weight_sum[0]
         if self.device.type != "cpu":
             left_out = ~applied
             self._bad = torch.stack([self._bad[0] + left_out, (self._bad[1] + 1) * left_out])
@@ -250,7 +223,7 @@ class Trainer:
         mark_seen(self.model.gaussians, self._bins[frame], weight)
         if look:
             index = self.train_ids[frame]
-            view = (self.viewmats[index], self.working_camera(index), out.depth_median[0])
+            view = (self.viewmats[index], self.Ks[index], out.depth_median[0])
             mark_hidden(self.model.gaussians, rows, self._bins[frame], state, *view)
         return loss.detach()
 
@@ -273,21 +246,12 @@ class Trainer:
     def _image(self, frame: int) -> Tensor:
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
 
-    def _working_image(self, frame: int) -> Tensor:
-        image, size = self._image(frame), self.working_size
-        if size == (self.height, self.width):
-            return image
-        return F.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0).contiguous()
-
     def _weights(self, frame: int) -> Tensor | None:
-        """[H, W, 1] how much each pixel of a trained frame counts, at the working size; None: all in full."""
-        weight = self.config.moving_weight if self.model.field is None else self.config.moving_weight_field
-        if self.movers is None or weight >= 1.0:
+        """[H, W, 1] how much each pixel of a trained frame counts; None: all in full, without mattes or with a field."""
+        if self.movers is None or self.model.field is not None:
             return None
-        movers, size = self.movers[frame].to(self.device, non_blocking=True), self.working_size
-        if size != tuple(movers.shape):
-            movers = F.interpolate(movers[None, None].float(), size, mode="area")[0, 0] > 0.0
-        return weights_of(movers, weight, self.config.moving_margin)
+        movers = self.movers[frame].to(self.device, non_blocking=True)
+        return weights_of(movers, self.config.moving_weight, self.config.moving_margin)
 
     def _milestones(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
@@ -396,7 +360,7 @@ class Trainer:
         def loss(state: dict[str, Tensor], frame: int) -> Tensor:
             self.report.check_cancelled()
             out = self._render(state, frame, sh_degree=0, with_contributions=False)
-            return photometric(out.colors[0], self._working_image(frame), self.config.dssim)
+            return photometric(out.colors[0], self._image(frame), self.config.dssim)
 
         points, colors = (t.to(self.device) for t in (self.scene.points, self.scene.colors))
         field.rehearse(Rehearsal(points, colors, self.times, steps, loss, self.generator))
@@ -414,8 +378,10 @@ class Trainer:
         options.setdefault("background", self.background)
         options.setdefault("with_contributions", True)
         options.setdefault("with_depth", False)
-        degree, (height, width) = options.pop("sh_degree", self.model.sh_degree), self.working_size
-        return render(state, degree, self._viewmat(index, frame), self.working_camera(index), width, height, **options)
+        degree = options.pop("sh_degree", self.model.sh_degree)
+        return render(
+            state, degree, self._viewmat(index, frame), self.Ks[index], self.width, self.height, **options
+        )  # fmt: skip
 
     def _next_frame(self) -> int:
         if not self.order:
@@ -471,7 +437,7 @@ class Trainer:
         other_state["means"].retain_grad()
         other_out = self._render(other_state, other)
         exposed = self.model.exposure.apply(other_out.colors[0], self.times[other])
-        loss = photometric(exposed, self._working_image(other), self.config.dssim, self._weights(other))
+        loss = photometric(exposed, self._image(other), self.config.dssim, self._weights(other))
         loss.backward(retain_graph=True)
         other_acted = self._acted(other, rows, other_state, other_out)
         every = self.config.supervision.pulls == "all"
@@ -487,12 +453,12 @@ class Trainer:
 
     def _acted(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> Tensor:
         """bool [M]: on which of `rows` the frame acted; `out` and `state` after the frame's own backward pass."""
-        (height, width), index, pull = self.working_size, self.train_ids[frame], state["means"].grad
+        index, pull = self.train_ids[frame], state["means"].grad
         if pull is None or out.weight_sum is None:
             raise RuntimeError("the frame was rendered without gradients or contributions")
         return well_supervised(
             self.config.supervision, out.weight_sum[0][rows], out.means2d_grad[0][rows], pull[rows],
-            self.working_camera(index), self.viewmats[index], state["means"].detach()[rows], (width, height),
+            self.Ks[index], self.viewmats[index], state["means"].detach()[rows], (self.width, self.height),
         )  # fmt: skip
 
     def _paper_view(self, state: dict[str, Tensor], frame: int, rows: Tensor, acted: Tensor) -> PaperView:
@@ -589,15 +555,12 @@ class Trainer:
 
     # ------------------------------------------------------------------ held-out frames
 
+    @torch.no_grad()
     def render_frame(self, index: int) -> Tensor:
         """Frame `index` of the scene at its own time, [H, W, 3], not clamped."""
-        return self._shown(index, self.Ks[index], self.width, self.height)
-
-    @torch.no_grad()
-    def _shown(self, index: int, K: Tensor, width: int, height: int) -> Tensor:
         state = self.model.state_at(float(self.scene.times[index]))
         out = render(
-            state, self.model.sh_degree, self._viewmat(index), K, width, height,
+            state, self.model.sh_degree, self._viewmat(index), self.Ks[index], self.width, self.height,
             background=self.background, with_depth=False, with_contributions=False,
         )  # fmt: skip
         return self.model.exposure.apply(out.colors[0], float(self.scene.times[index]))
@@ -609,17 +572,6 @@ class Trainer:
             self.report.check_cancelled()
             values.append(psnr(self.render_frame(i), images[n].to(self.device, torch.float32)))
         return values
-
-    def working_psnr(self, frames: list[int]) -> float | None:
-        """Mean PSNR in dB over trained frames at the size that is trained at now; None if there are none."""
-        height, width = self.working_size
-        values = []
-        for frame in frames:
-            self.report.check_cancelled()
-            index = self.train_ids[frame]
-            shown = self._shown(index, self.working_camera(index), width, height)
-            values.append(psnr(shown, self._working_image(frame)))
-        return sum(values) / len(values) if values else None
 
     def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
         """Mean PSNR in dB over held-out frames at their own times; None if there are none."""

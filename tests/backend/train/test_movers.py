@@ -1,7 +1,5 @@
 """What mattes call moving: it goes on trial and counts little before; nothing else opens; runs are known by mattes."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,6 @@ from torch_backend.contract import Cancelled, JobError, TrainParams
 from torch_backend.scene import load_images, load_scene
 from torch_backend.solve.motion import MOVING, PAINTED, STILL, UNKNOWN, load_motion, write_matte
 from torch_backend.train import config_from_params, load_run, train_shot
-from torch_backend.train import trainer as trainer_module
 from torch_backend.train.checkpoint import load_checkpoint
 from torch_backend.train.movers import load_movers, moving_frames, on_trial
 from torch_backend.train.trainer import Trainer
@@ -135,10 +132,9 @@ def test_a_run_is_known_by_its_mattes(tmp_path, quiet):
     assert summary["moving_share"] == 0.0
 
 
-def test_it_resumes_exactly_with_mattes_and_from_coarse_to_fine(painted_world, quiet, monkeypatch):
-    monkeypatch.setattr(trainer_module, "_LEAST_COARSE", 16)
+def test_it_resumes_exactly_with_mattes(painted_world, quiet):
     train_shot(painted_world.shot, short("whole"), quiet())
-    for share in (0.3, 0.7):  # at half the size; with a field
+    for share in (0.3, 0.7):  # static; with a field
         with pytest.raises(Cancelled):
             train_shot(painted_world.shot, short("broken"), quiet(cancel_at=("training", share)))
     train_shot(painted_world.shot, short("broken"), quiet())
@@ -149,16 +145,3 @@ def test_it_resumes_exactly_with_mattes_and_from_coarse_to_fine(painted_world, q
     assert any(name.startswith("field.") for name in whole)
     for name, value in whole.items():
         torch.testing.assert_close(value, broken[name], rtol=1e-4, atol=1e-5, msg=name)
-
-
-def test_the_first_part_is_trained_at_half_the_size(painted_world, quiet, monkeypatch):
-    trainer = trainer_of(painted_world, quiet, 0)
-    assert trainer.working_size == (HEIGHT, WIDTH), "too small a picture to halve"
-    monkeypatch.setattr(trainer_module, "_LEAST_COARSE", 16)
-    assert trainer.working_size == (HEIGHT // 2, WIDTH // 2)
-    assert trainer._working_image(3).shape == (HEIGHT // 2, WIDTH // 2, 3)
-    torch.testing.assert_close(trainer.working_camera(3)[:2], trainer.Ks[3][:2] / 2)
-    assert trainer.pixel_area == 4.0
-    assert trainer.render_frame(3).shape == (HEIGHT, WIDTH, 3), "what is measured has the images' size"
-    trainer.iteration = math.ceil(trainer.config.coarse * trainer.config.iterations)
-    assert trainer.working_size == (HEIGHT, WIDTH)
