@@ -247,7 +247,7 @@ class Trainer:
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
 
     def _weights(self, frame: int) -> Tensor | None:
-        """[H, W, 1] how much each pixel of a trained frame counts; None: all in full, without mattes or with a field."""
+        """[H, W, 1] how much each pixel of a trained frame counts; None: all in full (no mattes, or a field)."""
         if self.movers is None or self.model.field is not None:
             return None
         movers = self.movers[frame].to(self.device, non_blocking=True)
