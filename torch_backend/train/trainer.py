@@ -248,7 +248,7 @@ class Trainer:
 
     def _weights(self, frame: int) -> Tensor | None:
         """[H, W, 1] how much each pixel of a trained frame counts; None: all in full (no mattes, or a field)."""
-        if self.movers is None or self.model.field is not None:
+        if self.movers is None or self.model.field is not None or self.config.moving_weight >= 1.0:
             return None
         movers = self.movers[frame].to(self.device, non_blocking=True)
         return weights_of(movers, self.config.moving_weight, self.config.moving_margin)

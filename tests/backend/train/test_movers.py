@@ -95,7 +95,7 @@ def test_what_lies_in_movers_goes_on_trial_and_nothing_else(painted_world, quiet
 def test_movers_pull_what_is_static_little(painted_world, quiet):
     def strength(movers):
         trainer = trainer_of(painted_world, quiet, 0, movers=movers)
-        trainer.movers = torch.ones_like(trainer.movers) if movers else None
+        trainer.movers, trainer.config.moving_weight = torch.ones_like(trainer.movers) if movers else None, 0.1
         trainer.step()
         return float(trainer.model.gaussians.params["sh0"].grad.norm())
 
