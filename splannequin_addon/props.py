@@ -20,7 +20,7 @@ from . import compat, made
 from .translations import tr
 
 PRESETS = [
-    ("preview", "Preview", "320 pixels wide, 3000 steps: to see whether the shot holds, minutes on a laptop"),
+    ("preview", "Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
     ("standard", "Standard", "640 pixels wide, 9000 steps: for most shots"),
     ("final", "Final", "1280 pixels wide, 30000 steps, most Gaussians: takes longest"),
 ]

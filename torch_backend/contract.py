@@ -184,7 +184,7 @@ class TrainParams:
     """Steps to add to a finished run, whose own settings are kept; 0: none."""
 
 
-PRESET_STEPS = {"preview": 3000, "standard": 9000, "final": 30_000}
+PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
 PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
 """Width in pixels of each preset's training images, never above the working frames'."""

@@ -302,7 +302,7 @@ MESSAGES: dict[str, str] = {
     "Without a folder it goes to {}.": "Ohne Ordner kommt es nach {}.",
     "Scaled": "Skaliert",
     "Its scale was set from a known distance": "Sein Maßstab wurde nach einer bekannten Strecke gesetzt",
-    "320 pixels wide, 3000 steps: to see whether the shot holds, minutes on a laptop": "320 Pixel breit, 3000 Schritte: um zu sehen, ob der Shot hält, Minuten auf einem Laptop",
+    "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop": "320 Pixel breit, 2000 Schritte: um zu sehen, ob der Shot hält, Minuten auf einem Laptop",
     "640 pixels wide, 9000 steps: for most shots": "640 Pixel breit, 9000 Schritte: für die meisten Shots",
     "1280 pixels wide, 30000 steps, most Gaussians: takes longest": "1280 Pixel breit, 30000 Schritte, die meisten Gaussians: dauert am längsten",
     "processor": "Prozessor",
