@@ -45,11 +45,6 @@ class TrainConfig:
     """Seed of every random draw."""
     dssim: float = 0.2
     """Share of D-SSIM in the photometric loss (3DGS: 0.2)."""
-    moving_weight: float = 1.0
-    """Weight of pixels that the motion mattes call moving while the model is static. 0.1 gained still pixels nothing on
-    one real clip and lost two passing movers, which then had no Gaussians to open: -2.5 dB of moving pixels."""
-    moving_margin: int = 2
-    """Training pixels around movers that have their weight."""
     sh_degree: int = 2
     """Highest SH degree."""
     sh_every: float = 0.15

@@ -15,13 +15,8 @@ _C1, _C2 = 0.01**2, 0.03**2
 _WINDOW, _SIGMA = compiled_ssim.WINDOW, compiled_ssim.SIGMA
 
 
-def photometric(image: Tensor, target: Tensor, dssim: float, weights: Tensor | None = None) -> Tensor:
-    """(1 - dssim) * L1 + dssim * (1 - SSIM) of [H, W, 3] images (3DGS: dssim 0.2).
-
-    `weights` [H, W, 1] say how much each pixel of `image` is pulled: they multiply the gradient and leave the value.
-    """
-    if weights is not None:
-        image = _Pulled.apply(image, weights)
+def photometric(image: Tensor, target: Tensor, dssim: float) -> Tensor:
+    """(1 - dssim) * L1 + dssim * (1 - SSIM) of [H, W, 3] images (3DGS: dssim 0.2)."""
     loss = (image - target).abs().mean()
     if dssim > 0 and min(image.shape[:2]) >= _WINDOW:
         loss = (1.0 - dssim) * loss + dssim * (1.0 - ssim(image, target))
@@ -42,20 +37,6 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     if image.is_cuda and ssim_cuda.supports(image, target):
         return ssim_cuda.ssim(image, target)
     return _TorchSsim.apply(image, target)  # type: ignore[no-any-return]
-
-
-class _Pulled(torch.autograd.Function):
-    """The image itself; its gradient times weights."""
-
-    @staticmethod
-    def forward(ctx, image: Tensor, weights: Tensor) -> Tensor:  # type: ignore[override]
-        ctx.save_for_backward(weights)
-        return image.view_as(image)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        (weights,) = ctx.saved_tensors
-        return grad * weights, None
 
 
 def psnr(image: Tensor, target: Tensor) -> float:

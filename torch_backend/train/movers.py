@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional as F
 
 from ..deformation import GateConfig, change_of, painted, stays_open
 from ..scene import Scene
@@ -47,12 +46,6 @@ def load_movers(mattes: Mattes, scene: Scene, indices: list[int], width: int, he
             share = cv2.resize((matte == MOVING).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
             movers[n] = torch.from_numpy(share > _COVERED)
     return movers if found else None
-
-
-def weights_of(movers: Tensor, weight: float, margin: int) -> Tensor:
-    """float [H, W, 1] weights of the pixels of a frame: `weight` in and within `margin` pixels of its movers [H, W]."""
-    wide = F.max_pool2d(movers.float()[None, None], 2 * margin + 1, 1, margin)[0, 0]
-    return (1.0 - (1.0 - weight) * wide)[..., None]
 
 
 def moving_frames(trainer: Trainer, share: float) -> Tensor:

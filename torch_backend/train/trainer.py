@@ -46,7 +46,7 @@ from .exposure import Exposure
 from .extend import Extension
 from .losses import photometric, psnr
 from .model import DynamicModel, render
-from .movers import harden, on_trial, weights_of
+from .movers import harden, on_trial
 from .needs import Needs
 from .poses import Poses, corrected
 from .repair import FieldMemory, drop_offenders, repair, unstable
@@ -193,7 +193,7 @@ class Trainer:
         if paper and len(rows):
             state["means"].retain_grad()
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
-        loss = photometric(exposed, self._image(frame), self.config.dssim, self._weights(frame))
+        loss = photometric(exposed, self._image(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
         if deltas is not None and self.config.supervision.preset == "support":
             price = stillness(deltas, len(self.model.gaussians), loss, self.progress, self.config.supervision)
@@ -245,13 +245,6 @@ class Trainer:
 
     def _image(self, frame: int) -> Tensor:
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
-
-    def _weights(self, frame: int) -> Tensor | None:
-        """[H, W, 1] how much each pixel of a trained frame counts; None: all in full (no mattes, or a field)."""
-        if self.movers is None or self.model.field is not None or self.config.moving_weight >= 1.0:
-            return None
-        movers = self.movers[frame].to(self.device, non_blocking=True)
-        return weights_of(movers, self.config.moving_weight, self.config.moving_margin)
 
     def _milestones(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
@@ -437,7 +430,7 @@ class Trainer:
         other_state["means"].retain_grad()
         other_out = self._render(other_state, other)
         exposed = self.model.exposure.apply(other_out.colors[0], self.times[other])
-        loss = photometric(exposed, self._image(other), self.config.dssim, self._weights(other))
+        loss = photometric(exposed, self._image(other), self.config.dssim)
         loss.backward(retain_graph=True)
         other_acted = self._acted(other, rows, other_state, other_out)
         every = self.config.supervision.pulls == "all"

@@ -92,16 +92,6 @@ def test_what_lies_in_movers_goes_on_trial_and_nothing_else(painted_world, quiet
     assert on_trial(trainer).float().mean() > 0.8, "without mattes all that is painted is tried"
 
 
-def test_movers_pull_what_is_static_little(painted_world, quiet):
-    def strength(movers):
-        trainer = trainer_of(painted_world, quiet, 0, movers=movers)
-        trainer.movers, trainer.config.moving_weight = torch.ones_like(trainer.movers) if movers else None, 0.1
-        trainer.step()
-        return float(trainer.model.gaussians.params["sh0"].grad.norm())
-
-    assert strength(True) == pytest.approx(0.1 * strength(False), rel=1e-3)
-
-
 def test_where_the_mattes_say_that_nothing_moves_nothing_opens(tmp_path, quiet):
     world = build_world(tmp_path)
     paint_all(world, UNKNOWN)
