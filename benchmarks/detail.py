@@ -1,10 +1,11 @@
 """Frozen frames made of plates, against the plates of a real clip: `python -m benchmarks.detail SHOT --results DIR`.
 
 SHOT is a trained shot folder; nothing is written into it. For t* as suggested and one half a clip away, on frames held
-out of training: splats alone, plate detail with the plate of the same pose withheld, and what is delivered, each
-against that plate: PSNR whole, of the best 90 % of the pixels, of still pixels, and gradients over the plate's. Whole
-frames hold people who moved since, whom no freeze at another instant can match. Then what two instants differ by where
-nothing moves. DIR gets detail-NAME.json and strips (plate, splats, withheld, delivered) at 100 %.
+out of training: splats alone as the run has them (splats) and of the developed instant (developed), of that plate
+detail with the plate of the same pose withheld, and what is delivered, each against that plate: PSNR whole, of the best
+90 % of the pixels, of still pixels, and gradients over the plate's. Whole frames hold people who moved since, whom no
+freeze at another instant can match. Then what two instants differ by where nothing moves. DIR gets detail-NAME.json and
+strips (plate, splats, developed, withheld, delivered) at 100 %.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import torch
 from torch import Tensor
 
-from benchmarks.detail_clip import VARIANTS, DetailClip, open_clip
+from benchmarks.detail_clip import VARIANTS, DetailClip, open_clip, over
 from benchmarks.detail_figures import mean_difference, picture_figures
-from torch_backend.contract import JobError
+from torch_backend.contract import SWITCH, JobError
 from torch_backend.footage.images import write_png
 from torch_backend.native import default_threads
 from torch_backend.shot import write_json
@@ -42,7 +43,12 @@ def judge_frame(clip: DetailClip, frame: int, t_star: int) -> tuple[Row, dict[st
     plate, withheld = clip.plate(frame), clip.view(frame, t_star, {frame})
     delivered = clip.view(frame, t_star, image=withheld.image)
     still = clip.still(frame, t_star, delivered)
-    pictures = dict(zip(VARIANTS, (withheld.splats, withheld.picture, delivered.picture), strict=True))
+    pictures = {"withheld": withheld.picture, "delivered": delivered.picture}
+    if clip.develop:
+        image = clip.splats(frame, t_star, clip.field(t_star))
+        pictures = {"splats": over(image.color, image.alpha), "developed": withheld.splats, **pictures}
+    else:
+        pictures = {"splats": withheld.splats, **pictures}
     row: Row = {name: picture_figures(picture, plate, still) for name, picture in pictures.items()}
     row |= {"frame": frame, "still_share": float(still.float().mean())}
     row["plate_share"] = {
@@ -88,7 +94,7 @@ def judge(
 
 def means(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """{variant: {figure: mean over the frames that have it}}."""
-    return {v: {name: _mean(row[v][name] for row in rows) for name in FIGURES} for v in VARIANTS}
+    return {v: {name: _mean(row[v][name] for row in rows) for name in FIGURES} for v in VARIANTS if v in rows[0]}
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
@@ -97,7 +103,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def _told(row: Row) -> str:
-    return ", ".join(f"{v} {row[v]['best_90_db']:.1f}" for v in VARIANTS) + " dB best 90 %"
+    return ", ".join(f"{v} {row[v]['best_90_db']:.1f}" for v in VARIANTS if v in row) + " dB best 90 %"
 
 
 def table(name: str, result: dict[str, Any]) -> list[str]:
@@ -107,13 +113,13 @@ def table(name: str, result: dict[str, Any]) -> list[str]:
         "|---|" + "---:|" * len(FIGURES),
     ]
     for freeze in result["freezes"]:
-        for variant in VARIANTS:
-            values = [freeze["mean"][variant][figure] for figure in FIGURES]
+        for variant, of in freeze["mean"].items():
+            values = [of[figure] for figure in FIGURES]
             cells = ["–" if v is None else f"{v:.2f}" for v in values]
             lines.append(f"| t* {freeze['t_star']}, {variant} | " + " | ".join(cells) + " |")
     both = [[row for freeze in result["freezes"] for row in freeze["frames"]]]
-    for variant in VARIANTS if len(result["freezes"]) > 1 else ():
-        cells = ["–" if v is None else f"{v:.2f}" for v in means(both[0])[variant].values()]
+    for variant, of in means(both[0]).items() if len(result["freezes"]) > 1 else ():
+        cells = ["–" if v is None else f"{v:.2f}" for v in of.values()]
         lines.append(f"| both, {variant} | " + " | ".join(cells) + " |")
     share = _mean(row["still_share"] for row in both[0])
     lines += ["", f"Still: {100 * (share or 0):.0f} % of the pixels, by {result['motion_from']}."]
@@ -157,7 +163,14 @@ def common_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
     parser.add_argument("--worst", type=int, default=10, metavar="N", help="strips of so many frames (0: of all)")
+    develop_argument(parser)
     parser.add_argument("--no-strips", action="store_true", help="figures alone")
+
+
+def develop_argument(parser: argparse.ArgumentParser) -> None:
+    """Whether instants are developed."""
+    text = "off: instants stay as the run has them"
+    parser.add_argument("--develop", default="on", choices=SWITCH, help=text)
 
 
 def name_of(shot: Path) -> str:
@@ -173,7 +186,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(default_threads())
     try:
-        clip = open_clip(args.shot, args.run, args.width)
+        clip = open_clip(args.shot, args.run, args.width, args.develop == "on")
         frames = chosen_frames(clip, args)
         name, since = name_of(args.shot), time.perf_counter()
         strips = None if args.no_strips else args.results / f"strips-{name}"
@@ -181,7 +194,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (JobError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return 1
-    result |= {"version": 1, "shot": str(args.shot), "run": args.run, "seconds": time.perf_counter() - since}
+    result |= {"version": 1, "shot": str(args.shot), "run": args.run, "develop": args.develop}
+    result["seconds"] = time.perf_counter() - since
     write_json(args.results / f"detail-{name}.json", result)
     print("\n".join(["", *table(name, result)]))
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,9 @@ from benchmarks.sources import Log
 from torch_backend.contract import FreezeParams
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze.detail import DetailedFrame, Detailer
-from torch_backend.freeze.query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen
-from torch_backend.freeze.take import choose_t_star, span_of
+from torch_backend.freeze.developed import developed
+from torch_backend.freeze.query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
+from torch_backend.freeze.take import choose_t_star
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.shot import Shot
 from torch_backend.solve.motion import load_motion
@@ -24,8 +26,9 @@ from torch_backend.train import load_run
 
 BACKDROP = 0.5
 """Grey behind what no Gaussian covers, as in previews."""
-VARIANTS = ("splats", "withheld", "delivered")
-"""Splats alone; with plate detail, the plate of the same pose withheld; with all plates."""
+VARIANTS = ("splats", "developed", "withheld", "delivered")
+"""Splats alone as the run has them; those of the developed instant; of it with plate detail, the plate of the same pose
+withheld; with all plates. Nothing is developed with `--develop off`."""
 
 
 @dataclass
@@ -33,7 +36,7 @@ class View:
     """One frozen frame."""
 
     image: FrozenImage
-    """Splats alone."""
+    """Splats alone, of the instant as it is delivered."""
     detailed: DetailedFrame
     """With plate detail."""
     splats: Tensor
@@ -43,10 +46,14 @@ class View:
 
 
 class DetailClip:
-    """A run of a shot. Pictures are of `width` x `height`: the plates' own size unless another width is given."""
+    """A run of a shot. Pictures are of `width` x `height`: the plates' own size unless another width is given.
 
-    def __init__(self, shot: Shot, run: str = "main", width: int = 0) -> None:
+    Instants are developed as a take's are; nothing is written into the shot.
+    """
+
+    def __init__(self, shot: Shot, run: str = "main", width: int = 0, develop: bool = True) -> None:
         """JobError if the shot is not solved or the run not trained."""
+        self.develop = develop
         self.shot = shot
         self.run, self.scene = load_run(shot, run, torch.device("cpu")), load_scene(shot)
         own = Plates(shot)
@@ -86,19 +93,26 @@ class DetailClip:
         index = self.frames.index(frame)
         return self.scene.viewmats[index], self.Ks[index]
 
-    def frozen(self, t_star: int) -> FrozenGaussians:
-        """The run at an instant."""
+    def field(self, t_star: int) -> FrozenGaussians:
+        """The run at an instant, as it was trained."""
+        return freeze_at(self.run.model, self.scene.time_of_frame(t_star), span_of(self.scene, self.run))
+
+    def frozen(self, t_star: int, keep: bool = False) -> FrozenGaussians:
+        """The run at an instant as takes are rendered from it; `keep`: with the run, for others to load."""
         if t_star not in self._frozen:
-            self._frozen[t_star] = freeze_at(
-                self.run.model, self.scene.time_of_frame(t_star), span_of(self.scene, self.run)
-            )
+            made = self.field(t_star)
+            if self.develop and t_star in self.run.train_frames:
+                print(f"developing t* {t_star}", file=sys.stderr, flush=True)
+                made = developed(self.shot, self.run, self.scene, t_star, made, keep=keep)
+            self._frozen[t_star] = made
         return self._frozen[t_star]
 
-    def splats(self, frame: int, t_star: int) -> FrozenImage:
-        """The frozen frame by splats alone, with mattes and depth."""
+    def splats(self, frame: int, t_star: int, frozen: FrozenGaussians | None = None) -> FrozenImage:
+        """The frozen frame by splats alone, with mattes and depth; of `frozen`, or the instant as it is delivered."""
         viewmat, K = self.camera(frame)
         model, exposed_at = self.run.model, self.scene.time_of_frame(frame)
-        return render_frozen(self.frozen(t_star), viewmat, K, self.width, self.height, model.exposure, exposed_at)
+        frozen = frozen or self.frozen(t_star)
+        return render_frozen(frozen, viewmat, K, self.width, self.height, model.exposure, exposed_at)
 
     def view(self, frame: int, t_star: int, withheld: Collection[int] = (), image: FrozenImage | None = None) -> View:
         """The frozen frame with plate detail; `image` is that of `splats`, if it is at hand."""
@@ -145,6 +159,6 @@ def over(color: Tensor, alpha: Tensor) -> Tensor:
     return (color + (1.0 - alpha[..., None]) * BACKDROP).clamp(0.0, 1.0)
 
 
-def open_clip(path: str | Path, run: str = "main", width: int = 0) -> DetailClip:
+def open_clip(path: str | Path, run: str = "main", width: int = 0, develop: bool = True) -> DetailClip:
     """The clip of a shot folder."""
-    return DetailClip(Shot.open(path), run, width)
+    return DetailClip(Shot.open(path), run, width, develop)

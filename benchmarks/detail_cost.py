@@ -27,7 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 
-from benchmarks.detail import name_of
+from benchmarks.detail import develop_argument, name_of
 from benchmarks.detail_clip import DetailClip, open_clip
 from benchmarks.sources import child_environ
 from torch_backend.contract import JobError, frame_file, from_dict, read_json
@@ -101,12 +101,12 @@ def _enlarge(source: Path, target: Path, factor: int, rng: np.random.Generator) 
     write_png(target, large.clip(0, 255).astype(np.uint8))
 
 
-def measure(shot: Path, run: str, width: int, poses: Sequence[int]) -> dict[str, Any]:
+def measure(shot: Path, run: str, width: int, poses: Sequence[int], develop: bool) -> dict[str, Any]:
     """In a process of its own: seconds of each frame, and peak memory before and after."""
     import resource
 
     torch.set_num_threads(THREADS)
-    clip = open_clip(shot, run, width)
+    clip = open_clip(shot, run, width, develop)
     t_star = clip.instants()[0]
     clip.frozen(t_star)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -137,9 +137,9 @@ def _mb(rss: int) -> float:
     return rss / 1e6 if sys.platform == "darwin" else rss * 1024 / 1e6
 
 
-def in_child(shot: Shot, run: str, width: int, poses: Sequence[int]) -> dict[str, Any]:
+def in_child(shot: Shot, run: str, width: int, poses: Sequence[int], develop: bool = False) -> dict[str, Any]:
     """`measure` in a process of its own. RuntimeError with its last words if it fails."""
-    asked = json.dumps({"shot": str(shot.root), "run": run, "width": width, "poses": list(poses)})
+    asked = json.dumps({"shot": str(shot.root), "run": run, "width": width, "poses": list(poses), "develop": develop})
     threads = {f"{library}_NUM_THREADS": str(THREADS) for library in ("OMP", "MKL", "OPENBLAS")}
     command = [sys.executable, "-P", "-m", "benchmarks.detail_cost", "--work", asked]
     ran = subprocess.run(command, env=child_environ(**threads), capture_output=True, text=True)
@@ -206,6 +206,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--widths", type=int, nargs="+", default=list(WIDTHS), metavar="W", help="multiples of the clip's"
     )
     parser.add_argument("--frames", type=int, nargs="+", metavar="N", help="along the path (default: by width)")
+    develop_argument(parser)
     parser.add_argument("--work", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.work:
@@ -223,8 +224,11 @@ def main(argv: Sequence[str] | None = None) -> int:
                 counts = args.frames or PATHS.get(width, (12, 36))
                 poses = middle_poses(clip, max(counts))
                 shot = enlarged(Shot.open(args.shot), Path(folder), width // clip.scene.width, poses)
+                if args.develop == "on":  # here, whose memory is not told: that is done once for a take
+                    large = DetailClip(shot, args.run)
+                    large.frozen(large.instants()[0], keep=True)
                 for count in counts:
-                    found = in_child(shot, args.run, width, poses[:count])
+                    found = in_child(shot, args.run, width, poses[:count], args.develop == "on")
                     sizes.append(found | {"summary": summary(found)})
                     print(f"{width}, {count} frames: {sizes[-1]['summary']}", flush=True)
     except (JobError, OSError, RuntimeError, ValueError) as error:

@@ -264,7 +264,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(default_threads())
     try:
-        clip = open_clip(args.shot, args.run, FLOW_WIDTH)
+        clip = open_clip(args.shot, args.run, FLOW_WIDTH, args.develop == "on")
         pairs, since = pairs_of(clip, args), time.perf_counter()
         freezes = [judge_flow(clip, t_star, pairs) for t_star in args.t_star or clip.instants()]
         name = name_of(args.shot)
@@ -273,7 +273,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (JobError, ModuleNotFoundError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return 1
-    result = {"version": 1, "shot": str(args.shot), "run": args.run, "freezes": freezes}
+    result = {"version": 1, "shot": str(args.shot), "run": args.run, "develop": args.develop, "freezes": freezes}
     result["motion_from"] = clip.motion_from
     write_json(args.results / f"flow-{name}.json", result | {"seconds": time.perf_counter() - since})
     print("\n".join(["", *table(name, freezes), "", *verdicts(freezes), f"What moves: {clip.motion_from}."]))

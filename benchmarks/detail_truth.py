@@ -2,8 +2,8 @@
 
 SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot, with exact
 cameras, and an `auto` run are made in DIR if they are not there. Printed is the mean PSNR of all poses and instants
-that have a truth, splats -> plate of the pose withheld -> delivered, by region, and what got worse. The pose of t*
-itself does not count: plate t* is its truth. DIR gets truth-NAME.json.
+that have a truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and what got worse. The
+pose of t* itself does not count: plate t* is its truth. DIR gets truth-NAME.json.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ import torch
 
 from benchmarks.bench import RunSpec, hold_out_phase, train_spec
 from benchmarks.sources import Log, load_source
-from torch_backend.contract import JobError
+from torch_backend.contract import SWITCH, JobError
 from torch_backend.native import default_threads
-from torch_backend.report.evaluate import freeze_run, plate_detail
+from torch_backend.report.evaluate import develop_run, freeze_run, plate_detail
 from torch_backend.report.metrics import WHOLE, psnr_by_region
-from torch_backend.report.records import DELIVERED, SPLATS, WITHHELD
+from torch_backend.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
 from torch_backend.report.truth import REGIONS, TruthScene
 from torch_backend.scene import load_scene
 from torch_backend.shot import write_json
 from torch_backend.train import load_run
 
-VARIANTS = (SPLATS, WITHHELD, DELIVERED)
+VARIANTS = (SPLATS, DEVELOPED, WITHHELD, DELIVERED)
 WANTED = {WHOLE: 4.0, "never_seen": 3.0, "moving": 1.5}
 """Region -> dB that delivered frames should gain over splats."""
 WITHHELD_WANTED = 2.0
@@ -51,15 +51,18 @@ def trained(truth: TruthScene, source: str, args: argparse.Namespace) -> str:
     return spec.run_name
 
 
-def judge(truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1) -> list[dict[str, Any]]:
-    """PSNR in dB of every pose: [{t_star, pose, variant: {region: dB or None}}].
+def judge(
+    truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1, develop: bool = True
+) -> list[dict[str, Any]]:
+    """PSNR in dB of every pose: [{t_star, pose, variant: {region: dB or None}}]; not developed, that is as splats are.
 
     But for that of t* itself: what is delivered there is plate t*, which is the truth to the byte.
     """
     run, scene = load_run(truth.shot, run_name, torch.device("cpu")), load_scene(truth.shot)
     detailer, size, rows = plate_detail(truth.shot, run, scene, Log()), (run.width, run.height), []
     for t_star in t_stars:
-        frozen = freeze_run(run, scene, t_star, "nearest", detailer)
+        made = develop_run(truth.shot, run, scene, t_star, "nearest", Log()) if develop else None
+        frozen = freeze_run(run, scene, t_star, "nearest", detailer, made)
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
             row: dict[str, Any] = {"t_star": t_star, "pose": pose}
@@ -79,19 +82,19 @@ def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def told(of: dict[str, float]) -> str:
-    """Splats, withheld and delivered."""
+    """Each of `VARIANTS`."""
     return " -> ".join(f"{of[v]:.2f}" for v in VARIANTS)
 
 
 def table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     """Means by scene and region in Markdown."""
     lines = [
-        "| scene | region | splats -> withheld -> delivered, dB | withheld | delivered |",
-        "|---|---|---|---:|---:|",
+        "| scene | region | splats -> developed -> withheld -> delivered, dB | developed | withheld | delivered |",
+        "|---|---|---|---:|---:|---:|",
     ]
     for scene, regions in found.items():
         for region, of in regions.items():
-            gains = [f"{of[v] - of[SPLATS]:+.2f}" for v in (WITHHELD, DELIVERED)]
+            gains = [f"{of[v] - of[SPLATS]:+.2f}" for v in VARIANTS[1:]]
             lines.append(f"| {scene} | {region} | {told(of)} | {' | '.join(gains)} |")
     return lines
 
@@ -101,9 +104,10 @@ def shortfalls(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     said = []
     for scene, regions in found.items():
         for region, of in regions.items():
-            for v in (WITHHELD, DELIVERED):
+            for v in VARIANTS[1:]:
                 gain = of[v] - of[SPLATS]
-                wanted = WANTED.get(region) if v == DELIVERED else WITHHELD_WANTED if region == WHOLE else None
+                wanted = WANTED.get(region) if v == DELIVERED else None
+                wanted = WITHHELD_WANTED if (v, region) == (WITHHELD, WHOLE) else wanted
                 if gain < 0:
                     said.append(f"WORSE: {scene}, {region}, {v}: {gain:+.2f} dB.")
                 elif wanted is not None and gain < wanted:
@@ -122,6 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--iterations", type=int, default=1500)
     parser.add_argument("--gaussians", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0, help="of the training")
+    parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
     parser.add_argument("--train-only", action="store_true")
     args = parser.parse_args(argv)
     torch.set_num_threads(default_threads())
@@ -134,7 +139,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"{truth.name}: {truth.shot.run(run)}", flush=True)
             if args.train_only:
                 continue
-            rows = judge(truth, run, args.t_star or truth.t_stars, args.every)
+            rows = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on")
             found[truth.name] = means(rows)
             name = truth.name.replace(" ", "-")
             facts = {"version": 1, "scene": truth.name, "run": str(truth.shot.run(run))}

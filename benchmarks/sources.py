@@ -27,6 +27,7 @@ from benchmarks.synthetic.sizes import HARD, LIMITS, REPORT_SEEDS, SIZES, TUNING
 from torch_backend.contract import read_json
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key
+from torch_backend.solve.motion import find_motion
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -60,6 +61,7 @@ class SyntheticTruth:
         self.name = f"{self._scene.size} {self._scene.name}"
         place = shots / f"{self._scene.size}-{self._scene.name}-{cameras}{SHOT_SUFFIX}"
         self.shot = (exact_shot if cameras == "exact" else solved_shot)(self._scene, place, Log())
+        find_motion(self.shot, Log())  # exact cameras come without; the motion mattes drive the training
         self._pixels = SolvedPixels(self.shot)
         self.t_stars, self._poses = list(self._scene.t_stars), list(self._scene.poses)
         steps = np.diff(self._poses)

@@ -365,6 +365,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         overscan=args.overscan,
         grain=not args.no_grain,
         detail=args.detail,
+        develop=args.develop,
         only_missing=True,
         device=_device(args),
     )
@@ -443,7 +444,9 @@ def parser() -> argparse.ArgumentParser:
     text = "width of the frozen frames in pixels (0: the source's own)"
     whole.add_argument("--freeze-width", type=int, default=0, help=text)
     text = "on: frozen frames are made of the plates, where they can be believed; off: of the splats alone"
-    whole.add_argument("--detail", default="on", choices=contract.DETAILS, help=text)
+    whole.add_argument("--detail", default="on", choices=contract.SWITCH, help=text)
+    text = "on: the instant is trained on as the still scene that it is; off: it stays as the run has it"
+    whole.add_argument("--develop", default="on", choices=contract.SWITCH, help=text)
     whole.add_argument(
         "--overscan", type=contract.overscan, default=0.0, metavar="PERCENT", help="beyond the frame, or: lens"
     )

@@ -587,6 +587,7 @@ class SPLANNEQUIN_PT_freeze(_StepPanel, bpy.types.Panel):
         """The take's name, what it is made of, its size, and where it is seen from."""
         layout.prop(context.scene.splannequin, "take_name")
         layout.prop(context.scene.splannequin, "detail")
+        layout.prop(context.scene.splannequin, "develop")
         layout.prop(context.scene.splannequin, "freeze_width")
         layout.prop(context.scene.splannequin, "overscan")
         layout.prop(context.scene.splannequin, "path_camera")

@@ -20,7 +20,7 @@ from . import compat, made
 from .translations import tr
 
 PRESETS = [
-    ("preview", "Preview", "320 pixels wide, 3000 steps: to see whether the shot holds, minutes on a laptop"),
+    ("preview", "Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
     ("standard", "Standard", "640 pixels wide, 9000 steps: for most shots"),
     ("final", "Final", "1280 pixels wide, 30000 steps, most Gaussians: takes longest"),
 ]
@@ -180,6 +180,14 @@ class ShotSettings:
         name="Detail",
         description="Make frozen frames of the plates, where they can be believed: as sharp as the plate. "
         "Off: of the splats alone, soft throughout",
+        default=True,
+        options=set(),
+    )
+    develop: BoolProperty(
+        name="Develop",
+        description="Train the frozen instant on as the still scene that it is, before it is rendered: what moves is "
+        "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each "
+        "t*. Off: the instant as the training left it",
         default=True,
         options=set(),
     )

@@ -109,6 +109,7 @@ def params_of(scene: Any, step: str) -> Any:
         width=props.freeze_width,
         overscan=-1.0 if props.overscan == "LENS" else 0.0,
         detail="on" if props.detail else "off",
+        develop="on" if props.develop else "off",
         only_missing=True,
         device=backend.device(),
     )
@@ -192,6 +193,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         only_missing=True,
         grain=bool(facts.get("grain")),
         detail="on" if facts.get("detail") else "off",
+        develop="on" if facts.get("developed") is not None else "off",
     )
 
 

@@ -161,7 +161,7 @@ def _tick() -> float | None:
         _session.drawn,
         (
             bool(_session.facts),
-            *((instant(s), s.splannequin.live_show, s.splannequin.detail, s.frame_current) for s in scenes),
+            *((instant(s), p.live_show, p.detail, p.develop, s.frame_current) for s in scenes for p in [s.splannequin]),
         ),
     )
     now = time.monotonic()
@@ -207,7 +207,8 @@ def view_of(
 
 def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
     """True if both show the same, at whatever size, made of plates or not."""
-    if (one.t_star, one.show, one.exposed_like) != (other.t_star, other.show, other.exposed_like):
+    told = [(v.t_star, v.show, v.exposed_like, v.develop) for v in (one, other)]
+    if told[0] != told[1]:
         return False
     ks = [np.array(v.K) / (v.width, v.height, v.width, v.height) for v in (one, other)]
     return bool(np.allclose(ks[0], ks[1], atol=2e-3) and np.allclose(one.viewmat, other.viewmat, atol=1e-6))
@@ -232,6 +233,7 @@ def _draw() -> None:
         quick.exposed_like = sharp.exposed_like = float(scene.frame_current)
     quick.view = sharp.view = key
     sharp.detail = scene.splannequin.detail and sharp.show == "color"
+    quick.develop = sharp.develop = scene.splannequin.develop
     _ask(key, quick, sharp)
     frame = _session.frames.get(key)
     if frame is not None:

@@ -276,6 +276,7 @@ def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
         overscan=args.overscan,
         grain=not args.no_grain,
         detail=args.detail,
+        develop=args.develop,
         only_missing=True,
         device=args.device,
     )
@@ -423,7 +424,9 @@ def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
     text = "width of the frozen frames in pixels (0: the source's own)"
     to.add_argument("--freeze-width", type=int, default=0, help=text)
     text = "on: frozen frames are made of the plates, where they can be believed; off: of the splats alone"
-    to.add_argument("--detail", default="on", choices=contract.DETAILS, help=text)
+    to.add_argument("--detail", default="on", choices=contract.SWITCH, help=text)
+    text = "on: the instant is trained on as the still scene that it is; off: it stays as the run has it"
+    to.add_argument("--develop", default="on", choices=contract.SWITCH, help=text)
     to.add_argument(
         "--overscan", type=_overscan, default=0.0, metavar="PERCENT",
         help="picture beyond the frame on every side, or `lens`: what the way back through the lens needs",

@@ -184,7 +184,7 @@ class TrainParams:
     """Steps to add to a finished run, whose own settings are kept; 0: none."""
 
 
-PRESET_STEPS = {"preview": 3000, "standard": 9000, "final": 30_000}
+PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
 PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
 """Width in pixels of each preset's training images, never above the working frames'."""
@@ -226,6 +226,9 @@ class FreezeParams:
     """Width in pixels of the frozen frames; 0: the source's own."""
     detail: str = "on"
     """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
+    develop: str = "on"
+    """on: the instant is trained on as the still scene that it is, and kept with the run; off: it stays as the run has
+    it. Of keyed instants, six at most."""
     overscan: float = 0.0
     """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
     lens needs. `width` is that of the frame without it."""
@@ -248,8 +251,8 @@ def overscan(text: str) -> float:
     return value
 
 
-DETAILS = ("on", "off")
-"""What `FreezeParams.detail` may be."""
+SWITCH = ("on", "off")
+"""What `FreezeParams.detail` and `FreezeParams.develop` may be."""
 DEVICES = ("auto", "cpu", "cuda")
 """Where a run may train and freeze."""
 
@@ -567,6 +570,8 @@ class LiveView:
     """color; guesses: colour, tinted where nobody saw it near t*; support or motion: that matte as a grey picture."""
     detail: bool = False
     """Make it of the plates, as a take is: it takes longer, and waits for all views that are not. Of `color` alone."""
+    develop: bool = True
+    """Show the instant developed, if it has been: see `FreezeParams.develop`."""
 
     def __post_init__(self) -> None:
         if len(self.viewmat) != 16 or len(self.K) != 4:

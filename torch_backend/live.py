@@ -31,6 +31,7 @@ from torch import Tensor
 from .contract import NO_DEPTH, JobError, LiveView, from_dict, read_message, write_message
 from .footage.plates import Plates
 from .freeze.detail import DetailConfig, DetailedFrame, Detailer
+from .freeze.developed import developed_path, load_developed
 from .freeze.query import (
     FrozenGaussians,
     FrozenImage,
@@ -39,9 +40,9 @@ from .freeze.query import (
     freeze_at,
     rank_instants,
     render_frozen,
+    span_of,
 )
 from .freeze.sightings import SightingConfig, motion_mattes
-from .freeze.take import span_of
 from .scene import Scene, frame_table, load_scene
 from .shot import Shot
 from .train import LoadedRun, choose_device, load_run
@@ -124,10 +125,10 @@ class LiveSession:
     """A loaded run. JobError if the shot has no such run."""
 
     def __init__(self, shot: Shot, run: str, device: str = "auto") -> None:
-        self.run = load_run(shot, run, choose_device(device))
+        self._shot, self.run = shot, load_run(shot, run, choose_device(device))
         self.scene = load_scene(shot)
         self._span = span_of(self.scene, self.run)
-        self._frozen: OrderedDict[float, FrozenGaussians] = OrderedDict()
+        self._frozen: OrderedDict[tuple[int, tuple[int, int] | None], FrozenGaussians] = OrderedDict()
         self._sharpness = {frame: row["sharpness"] for frame, row in frame_table(shot).items()}
         self._details = _Details(shot, self.run, self.scene)
 
@@ -161,7 +162,7 @@ class LiveSession:
         since = time.perf_counter()
         at = min(self.run.train_frames, key=lambda frame: abs(frame - view.t_star))
         output = self._output(view, at)
-        frozen, exposed_at = self._at(float(at)), self.scene.time_of_frame(output.exposed_like)
+        frozen, exposed_at = self._at(at, view.develop), self.scene.time_of_frame(output.exposed_like)
         exposure = self.run.model.exposure
         image = render_frozen(frozen, output.viewmat, output.K, view.width, view.height, exposure, exposed_at)
         if view.detail and view.show == "color":
@@ -184,6 +185,7 @@ class LiveSession:
             "height": view.height,
             "t_star": at,
             "show": view.show,
+            "developed": frozen.descent is not None,
             "seconds": round(time.perf_counter() - since, 5),
         }
         return header, body
@@ -202,14 +204,30 @@ class LiveSession:
                 viewmat = self.scene.viewmats[i]
         return OutputFrame(frame, viewmat, K, float(at), float(like))
 
-    def _at(self, frame: float) -> FrozenGaussians:
-        if frame not in self._frozen:
-            time_at = self.scene.time_of_frame(frame)
-            self._frozen[frame] = freeze_at(self.run.model, time_at, self._span)
-            if len(self._frozen) > _INSTANTS_KEPT:
+    def _at(self, frame: int, develop: bool) -> FrozenGaussians:
+        """The scene at a trained frame, developed if it has been by now, and is wanted so."""
+        file = _file_of(developed_path(self.run, frame)) if develop else None
+        key = frame, file
+        if key not in self._frozen:
+            field = self._field(frame)
+            made = None if file is None else load_developed(self._shot, self.run, frame, field)
+            self._frozen[key] = field if made is None else made
+            while len(self._frozen) > _INSTANTS_KEPT:
                 self._frozen.popitem(last=False)
-        self._frozen.move_to_end(frame)
-        return self._frozen[frame]
+        self._frozen.move_to_end(key)
+        return self._frozen[key]
+
+    def _field(self, frame: int) -> FrozenGaussians:
+        return freeze_at(self.run.model, self.scene.time_of_frame(frame), self._span)
+
+
+def _file_of(path: Path) -> tuple[int, int] | None:
+    """Bytes and time (ns) of a file, None if there is none: what is read of it is known by them."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns
 
 
 class _Waiting:

@@ -93,6 +93,12 @@ def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, cont
     assert look(t_star=8.0) is None and session.open, "not asked for over and over"
 
 
+def test_switching_developing_is_asked_for_like_another_view(addon, contract):
+    views = [contract.LiveView(1, 0, VIEWMAT, [9.0, 9.0, 8.0, 6.0], 16, 12, 6.0, develop=on) for on in (True, False)]
+    same = addon("viewport")._same
+    assert same(views[0], views[0]) and not same(*views)
+
+
 def test_a_view_that_came_to_rest_is_drawn_once_more_however_late_the_timer_is(addon, shot, scene, monkeypatch):
     viewport, drawn = addon("viewport"), []
     scene.splannequin.shot_path, scene.splannequin.run_name = str(shot), "main"

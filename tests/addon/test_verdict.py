@@ -90,3 +90,25 @@ def test_the_command_line_takes_detail(addon, tmp_path):
     for words, expected in (([], "on"), (["--detail", "off"], "off")):
         args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
         assert headless._freeze_params(args).detail == expected
+
+
+def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
+    steps, props, take = addon("steps"), with_shot.splannequin, shot / "takes" / "freeze" / "take.json"
+    asked = []
+    for wanted in (True, False):
+        props.develop = wanted
+        asked.append(steps.params_of(with_shot, "freeze").develop)
+    assert asked == ["on", "off"]
+    props.develop = True
+    assert steps.params_of(with_shot, "bake").develop == "off", "its frames are of before instants were developed"
+    props.develop = False
+    for frames in ([6], []):  # of a ramp with many instants none is
+        add(take, developed=frames)
+        assert steps.params_of(with_shot, "bake").develop == "on"
+
+
+def test_the_command_line_takes_develop(addon, tmp_path):
+    headless = addon("headless")
+    for words, expected in (([], "on"), (["--develop", "off"], "off")):
+        args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
+        assert headless._freeze_params(args).develop == expected

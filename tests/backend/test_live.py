@@ -88,7 +88,8 @@ def test_ready_tells_what_there_is_to_freeze(session, trained):
 
 def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
     world, _ = trained
-    freeze_shot(world.shot, FreezeParams(take="live", t_star=112, first=105, last=105, detail="off"), quiet())
+    part = dict(t_star=112, first=105, last=105, detail="off", develop="off")
+    freeze_shot(world.shot, FreezeParams(take="live", **part), quiet())
     want = read_frozen_exr(world.shot.take("live") / "000105.exr")
     rgba, depth = picture(ask(session[0], view_of(world, 105, 112.2, exposed_like=105.0)))
     seen = want.rgba[..., 3] > 0.99
@@ -205,7 +206,7 @@ def test_without_its_footage_a_view_of_plates_says_so_and_splats_go_on(trained, 
 def test_guesses_are_tinted_by_how_ill_they_were_seen(trained):
     world, _ = trained
     session = LiveSession(world.shot, "main", "cpu")
-    session._at(112.0).support[:] = 0.25
+    session._at(112, True).support[:] = 0.25
     asked = {k: v for k, v in view_of(world, 105, 112).items() if k != "kind"}
     plain, tinted = (picture(session.draw(LiveView(**asked, show=show)))[0] for show in ("color", "guesses"))
     guess = 0.75 * _TINTED

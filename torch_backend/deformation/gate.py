@@ -1,8 +1,9 @@
 """The gate: which Gaussians move at all.
 
-All start closed, and the first part of the run is static. Then every one that is painted is opened on trial, under a
-price on motion (`supervision.stillness`), and when the Gaussians have stopped multiplying those that did not use it are
-closed for good, their mean change kept. Closed Gaussians never touch the field: no cost, no drift, nothing to anchor.
+All start closed, and the first part of the run is static. Then those that lie in what the motion mattes call moving are
+opened on trial, or every one that is painted where a shot has no mattes, under a price on motion
+(`supervision.stillness`); those that did not use it are closed for good, their mean change kept. Closed Gaussians never
+touch the field: no cost, no drift, nothing to anchor.
 
 The error of the static model was tried as the judge, and is a poor one: where a surface is hard to fit it is as large
 as where something moves (figures in docs/architecture.md), while motion that is worth its price to several frames in a
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -28,6 +30,9 @@ from .protocol import Deltas
 class GateConfig:
     """When the gate opens, and what keeps it open."""
 
+    WIDTH: ClassVar[int] = 320
+    """Width of the pictures that `pixels` counts in, whatever is trained on: a motion is as large as it looks."""
+
     start: float = 1.0 / 3.0
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""
     harden: float = 0.45
@@ -35,18 +40,24 @@ class GateConfig:
     give_up: float = 0.75
     """Share of the run until which that is put off while nothing moves yet: some fields take their time."""
     pixels: float = 0.2
-    """A Gaussian stays open if it moves by this many pixels of the training images, seen from the nearest camera..."""
+    """A Gaussian stays open if it moves by so many pixels of pictures `WIDTH` wide, seen from the nearest camera..."""
     color: float = 0.02
     """...or changes its colour by this (display-referred, 0 to 1)..."""
     opacity: float = 0.05
     """...or its opacity by this."""
     noise: float = 4.0
     """Nor does it stay open with less than this many times the change of the quarter that changes least: where cameras
-    are solved, everything seems to move a little, and what holds still tells how much."""
+    are solved, everything seems to move a little, and what holds still tells how much. Without motion mattes only."""
     max_share: float = 0.5
     """Most Gaussians that stay open; what moves most goes first."""
     neighbours: int = 8
     """The median over this many nearest open ones stands for a Gaussian: things move in pieces, noise does not."""
+    moving_share: float = 0.5
+    """With motion mattes, a Gaussian is put on trial if this share of what it paints of a frame falls on movers..."""
+    moving_frames: int = 3
+    """...in at least so many frames,"""
+    moving_often: float = 0.1
+    """and in this share of the time bins in which it was seen: a wall that a hand passes is a wall."""
 
 
 @torch.no_grad()
@@ -57,7 +68,12 @@ def painted(model: Gaussians) -> Tensor:
 
 @torch.no_grad()
 def change_of(
-    model: Gaussians, rows: Tensor, moments: Iterable[Deltas], pixels: Tensor, config: GateConfig
+    model: Gaussians,
+    rows: Tensor,
+    moments: Iterable[Deltas],
+    pixels: Tensor,
+    config: GateConfig,
+    seen: Tensor | None = None,
 ) -> tuple[Tensor, Deltas]:
     """How much Gaussians change over time, in units of what keeps them open; and their mean deltas.
 
@@ -65,34 +81,51 @@ def change_of(
         rows: [M] who.
         moments: their deltas [M] at times spread over the clip.
         pixels: [M] pixels per scene unit where each is seen from nearest.
+        seen: bool [T, M] at which of the moments somebody saw each: where nobody did, a field says anything. Who was
+            seen at none of them is asked at all. None: all were.
 
     Returns:
-        (change [M], mean deltas [M]): the largest departure from the mean over the moments.
+        (change [M], mean deltas [M]): the largest departure from the mean over the moments at which each was seen.
     """
     moments = list(moments)
-    mean = Deltas(*(None if parts[0] is None else torch.stack(parts).mean(0) for parts in zip(*moments, strict=True)))  # type: ignore[arg-type]
+    counts = torch.ones(len(moments), len(rows), device=rows.device) if seen is None else seen.float()
+    counts = torch.where(counts.sum(0) > 0, counts, 1.0)
+    shares = counts / counts.sum(0)
+    mean = Deltas(*(None if parts[0] is None else _weighted(shares, parts) for parts in zip(*moments, strict=True)))  # type: ignore[arg-type]
     opacity = model.params["opacity_logits"][rows]
     change = torch.zeros(len(rows), device=rows.device)
-    for at in moments:
-        change = torch.maximum(change, (at.means - mean.means).norm(dim=1) * pixels / config.pixels)
+    for at, counted in zip(moments, counts, strict=True):
+        here = (at.means - mean.means).norm(dim=1) * pixels / config.pixels
         if at.sh0 is not None and mean.sh0 is not None:
-            change = torch.maximum(change, SH_C0 * (at.sh0 - mean.sh0).abs().amax((1, 2)) / config.color)
+            here = torch.maximum(here, SH_C0 * (at.sh0 - mean.sh0).abs().amax((1, 2)) / config.color)
         if at.opacity_logits is not None and mean.opacity_logits is not None:
-            here, usual = torch.sigmoid(opacity + at.opacity_logits), torch.sigmoid(opacity + mean.opacity_logits)
-            change = torch.maximum(change, (here - usual).abs() / config.opacity)
+            now, usual = torch.sigmoid(opacity + at.opacity_logits), torch.sigmoid(opacity + mean.opacity_logits)
+            here = torch.maximum(here, (now - usual).abs() / config.opacity)
+        change = torch.maximum(change, torch.where(counted > 0, here, 0.0))
     return change, mean
 
 
+def _weighted(shares: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
+    """Sum of parts [T] of [M, ...] by shares [T, M]."""
+    return torch.einsum("tm,tm...->m...", shares, torch.stack(parts))
+
+
 @torch.no_grad()
-def stays_open(model: Gaussians, rows: Tensor, change: Tensor, config: GateConfig) -> Tensor:
-    """bool [M]: which of the open `rows` stay so, by their `change` [M] and that of their neighbours."""
+def stays_open(
+    model: Gaussians, rows: Tensor, change: Tensor, config: GateConfig, noise: float | None = None
+) -> Tensor:
+    """bool [M]: which of the open `rows` stay so, by their `change` [M] and that of their neighbours.
+
+    `noise` stands for the configuration's.
+    """
+    noise = config.noise if noise is None else noise
     if len(rows) <= config.neighbours:
         return change > 1.0
     means = model.params["means"].detach()[rows].cpu().numpy()
     nearest = KDTree(means).query(means, k=config.neighbours + 1)[1].reshape(len(rows), -1)
     nearest = torch.from_numpy(np.ascontiguousarray(nearest)).to(rows.device)
     smooth = change[nearest].median(1).values
-    stays = smooth > max(1.0, config.noise * float(change.quantile(0.25)))
+    stays = smooth > max(1.0, noise * float(change.quantile(0.25)))
     room = int(config.max_share * len(model))
     if int(stays.sum()) > room:
         kept = torch.where(stays, smooth, -torch.inf).topk(room).indices

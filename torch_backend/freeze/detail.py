@@ -189,7 +189,9 @@ class Detailer:
         """`moving`: see `Sightings`."""
         self.run, self.scene, self.plates = run, scene, plates
         self.config = config or DetailConfig()
+        self._moving = moving
         self.seen = Sightings(run, scene, plates, moving, self.config.sightings)
+        """The plates as the scene at hand has them: the run's, or that of a developed instant."""
         self._layers: OrderedDict[tuple[int, float], InstantLayer | None] = OrderedDict()
 
     @torch.no_grad()
@@ -212,6 +214,7 @@ class Detailer:
             withheld: frames whose plates are not to be used.
         """
         splat = image
+        self._turn_to(frozen)
         frozen, image = self._joined(output, frozen, image, width, height)
         shot = self._shot(output, frozen, image, width, height)
         usable = [frame for frame in self.seen.frames if frame not in withheld]
@@ -222,11 +225,18 @@ class Detailer:
 
     # ------------------------------------------------------------------------------------------------- the frame
 
+    def _turn_to(self, frozen: FrozenGaussians) -> None:
+        """Looks at the plates as a scene has them; frames of one instant come one after another."""
+        developed = frozen if frozen.descent is not None else None
+        if developed is not self.seen.stage.developed:
+            config = self.config.sightings
+            self.seen = Sightings(self.run, self.scene, self.plates, self._moving, config, developed)
+
     def _joined(
         self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, width: int, height: int
     ) -> tuple[FrozenGaussians, FrozenImage]:
         """The frozen scene with what plate t* shows and the model lacks, and its render."""
-        layer = self._layer(output.t_star, frozen)
+        layer = self._layer(output.t_star, frozen) if frozen.descent is None else None  # developed ones have theirs
         if layer is None:
             return frozen, image
         frozen = join(frozen, layer)
@@ -459,14 +469,14 @@ class Detailer:
         """([h, w, 3] scene units from t* to each plate of what is seen, [h, w] share whose way nobody knows)."""
         h, w = shot.depth.shape
         rows, state = self.seen.rows, shot.frozen.state
-        count, known = len(state["means"]), len(self.run.model.gaussians)
-        extra = torch.zeros(count, 3 * len(chosen) + 1, device=state["means"].device)
-        extra[known:, -1] = 1.0
+        strangers = self.seen.stage.strangers(shot.frozen)
+        extra = torch.zeros(len(strangers), 3 * len(chosen) + 1, device=state["means"].device)
+        extra[strangers, -1] = 1.0
         if len(rows):
             now = state["means"][rows].cpu()
             for n, frame in enumerate(chosen):
                 extra[rows, 3 * n : 3 * n + 3] = (self.seen.view(frame).offsets - now).to(extra.device)
-        if not len(rows) and known == count:
+        if not len(rows) and not bool(strangers.any()):
             return [torch.zeros(h, w, 3, device="cpu") for _ in chosen], torch.zeros(h, w, device="cpu")
         rows_full, columns = shot.image.alpha.shape
         K = resize_intrinsics(shot.K[None], columns, rows_full, w, h)[0]

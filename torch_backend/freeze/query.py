@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..scene import Scene
 from ..supervision import nearest_bin, support_confidence
+from ..train import LoadedRun
 from ..train.exposure import Exposure
 from ..train.model import DynamicModel, render
 from .bands import bands
@@ -29,6 +31,18 @@ class FrozenGaussians:
     """[N] in 0..1: how well each Gaussian is known at the instant."""
     motion: Tensor
     """[N] in 0..1: 1 for Gaussians that move in the clip."""
+    descent: Descent | None = None
+    """Where its Gaussians come from, if they are not the run's own rows any more: developed instants."""
+
+
+@dataclass
+class Descent:
+    """How Gaussians that descend from a run's own move as those do."""
+
+    frozen: FrozenGaussians
+    """What they descend from: the run's Gaussians at t*, and behind them those that the run does not have."""
+    origin: Tensor
+    """[N] int64: the row of `frozen` from which each descends."""
 
 
 @dataclass
@@ -65,6 +79,12 @@ class OutputFrame:
     """Frame number at which time stands still."""
     exposed_like: float
     """Frame number whose exposure the camera has: its own on the clip's poses, t* on a path of its own."""
+
+
+def span_of(scene: Scene, run: LoadedRun) -> float:
+    """Seconds between the first and the last trained frame."""
+    at = {frame: second for frame, second in zip(scene.frames, scene.seconds, strict=True)}
+    return max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
 
 
 @torch.no_grad()

@@ -17,8 +17,9 @@ from ..scene import Scene, read_image, resize_intrinsics
 from ..shot import Shot
 from ..solve.motion import MOVING, UNKNOWN, load_motion
 from ..train import LoadedRun
-from .query import FrozenGaussians, FrozenImage, freeze_at, render_frozen
+from .query import FrozenGaussians, FrozenImage, render_frozen
 from .reproject import blurred, inside, look_up, pixel_centres, project, resized, same_surface, widened
+from .travel import Stage
 
 MovingOf = Callable[[int], "Tensor | None"]
 """Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
@@ -122,8 +123,12 @@ class Sightings:
         plates: PlateReader,
         moving: MovingOf | None = None,
         config: SightingConfig | None = None,
+        frozen: FrozenGaussians | None = None,
     ) -> None:
-        """`moving` None: the shot's motion mattes, and where it has none the model's own matte."""
+        """`moving` None: the shot's motion mattes, and where it has none the model's own matte.
+
+        `frozen`: an instant that was developed, which then is the model; None: the run.
+        """
         self.run, self.scene, self.plates = run, scene, plates
         self.moving = moving or motion_mattes(Shot(scene.folder.parent))
         self.config = config or SightingConfig()
@@ -135,7 +140,9 @@ class Sightings:
         self.size = width, max(8, round(plates.height * width / plates.width))
         self.unit = width / _LENGTHS_OF
         """Pixels of decisions to a pixel in which lengths are configured."""
-        self.rows = run.model.open_rows().cpu()
+        self.stage = Stage(run, scene, frozen)
+        """The model in every frame."""
+        self.rows = self.stage.rows.cpu()
         views = scene.viewmats
         self.centres = -torch.einsum("nji,nj->ni", views[:, :3, :3], views[:, :3, 3])
         """[F, 3] camera centres of the clip's frames, scene units."""
@@ -206,7 +213,7 @@ class Sightings:
 
     def _own_render(self, frame: int, width: int, height: int) -> tuple[FrozenGaussians, FrozenImage]:
         time = self.scene.time_of_frame(frame)
-        frozen = freeze_at(self.run.model, time, 1.0)
+        frozen = self.stage.at(frame)
         viewmat, K = self.camera(frame, width, height)
         return frozen, render_frozen(frozen, viewmat, K, width, height, self.run.model.exposure, time)
 

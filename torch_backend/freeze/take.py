@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,9 +38,10 @@ from ..train.anew import SUMMARY_FILE
 from .bands import bands
 from .contact_sheet import write_contact_sheet
 from .detail import DetailedFrame, Detailer
+from .developed import Instants
 from .exr import DetailLayers, FrameMetadata, Made, read_frozen_exr, read_key, write_frozen_exr
 from .grain import Brush, Grain, measure_plate
-from .query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, suggest_t_star
+from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen, suggest_t_star
 from .reproject import resized
 from .transfer import to_display
 from .verdict import judge_take, unsure
@@ -73,10 +74,13 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     grain = plate_grain(shot, scene) if params.grain else None
     # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
     plate = (shot.info().width, round(shot.info().width * height / width))
+    if params.detail == "on" or params.develop == "on":
+        find_motion(shot, report)  # of shots solved before the solve looked for it
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
-    look = Look(run, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail))
+    instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
+    look = Look(run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail))
     keys = {f.frame: look.key(f) for f in whole}
-    key = take_key(run, params, t_star, width, height, beyond)
+    key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))
     done = _prepare(folder, keys, key, params, detail is not None)
     left = sum(f.frame not in done for f in frames)
     each = look.whole[0] * look.whole[1] * (20.0 + (6.0 if grain else 0.0) + (24.0 if detail else 0.0))
@@ -102,6 +106,8 @@ class Look:
 
     run: LoadedRun
     """The run that is frozen."""
+    instants: Instants
+    """Its scenes at the take's instants."""
     query: str
     """As in `FreezeParams`."""
     size: tuple[int, int]
@@ -142,6 +148,7 @@ class Look:
             output.K.flatten().tolist(),
             *([self.beyond] if any(self.beyond) else []),
             *([self.detail_key] if self.detail_key else []),
+            *([self.instants.keys[output.t_star]] if output.t_star in self.instants.keys else []),
         )
 
 
@@ -150,12 +157,12 @@ def plate_detail(
     report: Reporter,
 ) -> Detailer | None:  # fmt: skip
     """What makes a take's frames of plates; None where `params` wants splats alone. `first` is any frame of the take.
+    The shot's motion mattes must have been found.
 
     Plates are read at the scale of the frames, so that one pixel answers one: at their own size by default.
     """
     if params.detail == "off":
         return None
-    find_motion(shot, report)  # of shots solved before the solve looked for it
     plates = Plates(shot)
     scale = float(first.K[0, 0]) / float(scene.Ks[0, 0, 0] * plates.width / scene.width)
     if not params.camera_path and size != (plates.width, plates.height):
@@ -257,10 +264,11 @@ def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tu
 
 
 def take_key(
-    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, beyond: tuple[int, int] = (0, 0)
-) -> str:
+    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, beyond: tuple[int, int] = (0, 0),
+    developed: Sequence[str] = (),
+) -> str:  # fmt: skip
     """Identifies what a take shows. The frame range is not part of it. Frames have keys of their own, see `Look.key`;
-    this one tells about frames that were rendered before they had."""
+    this one tells about frames that were rendered before they had. `developed`: keys of the instants that are."""
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
         TAKE_VERSION,
@@ -272,6 +280,7 @@ def take_key(
         height,
         path,
         *([beyond] if any(beyond) else []),
+        *([list(developed)] if developed else []),
     )
 
 
@@ -320,18 +329,13 @@ def _render_all(
     """Renders and writes what is not done. Returns frame number -> [h, w] share of plate, small, of those rendered."""
     run = look.run
     shares: dict[int, Tensor] = {}
-    frozen: FrozenGaussians | None = None
-    at = float("nan")
+    look.instants.prepare((f.t_star for f in frames if f.frame not in done), report)
     for n, output in enumerate(frames):
         report.check_cancelled()
         report.progress("freezing", n, len(frames), f"frame {output.frame}")
         if output.frame in done:
             continue
-        if frozen is None or output.t_star != at:
-            frozen, at = (
-                freeze_at(run.model, scene.time_of_frame(output.t_star), span_of(scene, run), look.query),
-                output.t_star,
-            )
+        frozen = look.instants.at(output.t_star, report)
         exposed_at = scene.time_of_frame(output.exposed_like)
         K = output.K.clone()
         K[:2, 2] += torch.tensor(look.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
@@ -346,12 +350,6 @@ def _render_all(
         del made, image  # at 4K the next frame needs their gigabyte
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
     return shares
-
-
-def span_of(scene: Scene, run: LoadedRun) -> float:
-    """Seconds between the first and the last trained frame."""
-    at = {frame: second for frame, second in zip(scene.frames, scene.seconds, strict=True)}
-    return max(1e-6, float(at[run.train_frames[-1]] - at[run.train_frames[0]]))
 
 
 def _write_frame(
@@ -495,8 +493,7 @@ def _finish(
     if note:
         report.warning(note)
     report.progress("finishing the take", 2, 3, "PLY")
-    frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), params.query)
-    _write_ply(folder / "frozen.ply", frozen, scene)
+    _write_ply(folder / "frozen.ply", look.instants.at(float(t_star), report), scene)
     redistort = _redistort(shot, folder, size, look.beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
@@ -507,6 +504,7 @@ def _finish(
         "t_star_per_frame": params.t_star_per_frame,
         "camera_path": params.camera_path,
         "query": params.query,
+        **({"developed": look.instants.frames} if params.develop == "on" else {}),
         "width": size[0],
         "height": size[1],
         "overscan": params.overscan,

@@ -24,8 +24,8 @@ _SHRINK = 1.6
 class DensifyConfig:
     """Schedule and thresholds; iterations are shares of the run's length."""
 
-    budget: int = 25_000
-    """Most Gaussians the run may have."""
+    budget: int = 58_000
+    """Most Gaussians the run may have: of a preview, about one per pixel of its training images."""
     start: float = 0.06
     """Share of the run at which growth begins."""
     stop: float = 0.5

@@ -17,8 +17,8 @@ from ..contract import JobError, Reporter, frame_file, read_json
 from ..footage.images import write_png
 from ..footage.plates import Plates
 from ..freeze.detail import Detailer
-from ..freeze.query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen
-from ..freeze.take import span_of
+from ..freeze.developed import Instants
+from ..freeze.query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
 from ..scene import Scene, load_scene, read_image, split_frames
 from ..shot import Shot
 from ..solve.motion import find_motion
@@ -27,7 +27,7 @@ from ..train.checkpoint import load_checkpoint
 from ..train.model import render
 from .colorvideovdp import sequence_jod
 from .metrics import best_share_psnr, gradient_energy, missing_metrics, psnr_by_region, score
-from .records import DELIVERED, PICTURES, SPLATS, WITHHELD, Detailed, FrameScore, HeldOut, Picture
+from .records import DELIVERED, DEVELOPED, PICTURES, SPLATS, WITHHELD, Detailed, FrameScore, HeldOut, Picture
 from .things import matte_on_panes, opened_on, recall_of
 from .truth import PANES, TruthScene
 
@@ -47,30 +47,34 @@ class Frozen:
     gaussians: FrozenGaussians
     detailer: Detailer | None = None
     """What makes plate detail; None: splats are all there is."""
+    developed: FrozenGaussians | None = None
+    """The instant developed; None: what is made of plates is made on `gaussians`, as splats alone are."""
 
     def view(self, pose: int, shown: str = SPLATS) -> Tensor:
         """[H, W, 3] in [0, 1] from the pose of frame `pose`, exposed as that frame is, before grey."""
         viewmat, K = self._camera(pose)
-        image = self._splats(pose)
+        gaussians = self.gaussians if shown == SPLATS or self.developed is None else self.developed
+        image = self._splats(pose, gaussians)
         color, alpha = image.color, image.alpha
-        if shown != SPLATS and self.detailer is not None:
+        if shown in (WITHHELD, DELIVERED) and self.detailer is not None:
             output = OutputFrame(pose, viewmat, K, float(self.t_star), float(pose))
             withheld = (pose,) if shown == WITHHELD else ()
-            made = self.detailer.frame(output, self.gaussians, image, self.run.width, self.run.height, withheld)
+            made = self.detailer.frame(output, gaussians, image, self.run.width, self.run.height, withheld)
             color, alpha = made.color, made.alpha
         return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0)
 
     def motion(self, pose: int) -> Tensor:
         """[H, W] in [0, 1] from the pose of frame `pose`: how much of what is seen the model moves in the clip."""
-        return self._splats(pose).motion
+        return self._splats(pose, self.gaussians).motion
 
     def _camera(self, pose: int) -> tuple[Tensor, Tensor]:
         index = self.scene.frames.index(pose)
         return self.scene.viewmats[index], self.scene.camera_at(self.run.width, self.run.height)[index]
 
-    def _splats(self, pose: int) -> FrozenImage:
+    def _splats(self, pose: int, gaussians: FrozenGaussians) -> FrozenImage:
         run, exposed_at = self.run, self.scene.time_of_frame(pose)
-        return render_frozen(self.gaussians, *self._camera(pose), run.width, run.height, run.model.exposure, exposed_at)
+        where = self._camera(pose)
+        return render_frozen(gaussians, *where, run.width, run.height, run.model.exposure, exposed_at)
 
 
 def plate_detail(shot: Shot, run: LoadedRun, scene: Scene, report: Reporter) -> Detailer:
@@ -99,7 +103,7 @@ def evaluate_run(
     """
     run, scene = load_run(truth.shot, run_name, device), load_scene(truth.shot)
     held_out = held_out_frames(run, scene)
-    missing, detailer, kinds = missing_metrics(), None, [SPLATS]
+    missing, detailer, kinds = missing_metrics(), None, [SPLATS, DEVELOPED]
     try:
         detailer = plate_detail(truth.shot, run, scene, report)
         kinds += [WITHHELD, DELIVERED]
@@ -108,7 +112,12 @@ def evaluate_run(
     matte = {}
     if detailer is not None and truth.kind == "synthetic":
         matte = matte_on_panes(truth, [scene.frames[i] for i in scene.solved], run.width, run.height)
-    frozen = {t_star: freeze_run(run, scene, t_star, query, detailer) for t_star in truth.t_stars}
+    frozen = {
+        t_star: freeze_run(
+            run, scene, t_star, query, detailer, develop_run(truth.shot, run, scene, t_star, query, report)
+        )
+        for t_star in truth.t_stars
+    }
     shown = {name: _shown(truth, frozen, held_out, name, report) for name in kinds}
     for name, of in shown.items():
         if name != WITHHELD:  # as fast as what is delivered, and not to be looked at
@@ -164,10 +173,22 @@ def held_out_frames(run: LoadedRun, scene: Scene) -> list[int]:
     return [scene.frames[i] for i in test]
 
 
-def freeze_run(run: LoadedRun, scene: Scene, t_star: int, query: str, detailer: Detailer | None = None) -> Frozen:
-    """The run frozen at frame `t_star`; `detailer` as `plate_detail` gives it, None for splats alone."""
+def freeze_run(
+    run: LoadedRun, scene: Scene, t_star: int, query: str, detailer: Detailer | None = None,
+    developed: FrozenGaussians | None = None,
+) -> Frozen:  # fmt: skip
+    """The run frozen at frame `t_star`; `detailer` as `plate_detail` gives it, None for splats alone; `developed` as
+    `develop_run` does, None: as the run has it."""
     frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), query)
-    return Frozen(run, scene, t_star, frozen, detailer)
+    return Frozen(run, scene, t_star, frozen, detailer, developed)
+
+
+def develop_run(shot: Shot, run: LoadedRun, scene: Scene, t_star: int, query: str, report: Reporter) -> FrozenGaussians:
+    """The scene that a take of frame `t_star` is rendered from, kept with the run: developed, if it was trained on.
+
+    Motion mattes must have been found, as `plate_detail` does.
+    """
+    return Instants(shot, run, scene, query, [float(t_star)]).at(float(t_star), report)
 
 
 @torch.no_grad()

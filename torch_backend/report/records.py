@@ -13,12 +13,13 @@ from ..contract import check_version, from_dict, read_json
 from ..shot import write_json
 from .metrics import WHOLE, Key
 
-RECORD_VERSION = 3
+RECORD_VERSION = 4
 """Rises when figures measured before must not stand beside new ones."""
 PICTURES = "pictures"
 """Folder of pictures beside the records."""
-SPLATS, WITHHELD, DELIVERED = "splats", "withheld", "delivered"
-"""What a frozen frame shows: splats alone; plate detail without the plate of its own pose; what a take delivers."""
+SPLATS, DEVELOPED, WITHHELD, DELIVERED = "splats", "developed", "withheld", "delivered"
+"""What a frozen frame shows: splats alone, as the run has them; those of the developed instant; of that, plate detail
+without the plate of its own pose; what a take delivers."""
 
 
 @dataclass
@@ -71,13 +72,13 @@ class Picture:
 
 @dataclass
 class Detailed:
-    """The freezes of a run with plate detail, at the same instants and poses."""
+    """The freezes of a run made in another way, at the same instants and poses."""
 
     rows: list[FrameScore]
     jod: dict[str, float | None] = field(default_factory=dict)
     """t* -> ColorVideoVDP of its poses as a sequence."""
     frozen_fps: float | None = None
-    """Frozen frames per second, splats and detail; None where it says nothing."""
+    """Frozen frames per second, all that they are made of; None where it says nothing."""
     pictures: list[Picture] = field(default_factory=list)
     two_instants: list[Picture] = field(default_factory=list)
     """One pose at two instants."""
@@ -152,7 +153,8 @@ class RunRecord:
     finished: str = ""
     """Date and time, UTC."""
     detailed: dict[str, Detailed] = field(default_factory=dict)
-    """`WITHHELD` and `DELIVERED` -> the same freezes made so; `rows` and what else is here are of splats alone."""
+    """`DEVELOPED`, `WITHHELD`, `DELIVERED` -> the same freezes made so; `rows` and what else is here are of splats
+    alone."""
     shown: str = SPLATS
     """What the frames of this record show; on disk always splats, see `as_shown`."""
     matte: dict[str, Any] = field(default_factory=dict)

@@ -10,7 +10,7 @@ import numpy as np
 
 from .hard_table import PANE_HEADER, PANE_NOTE, THING_HEADER, THING_NOTE, pane_rows, thing_rows
 from .metrics import METRICS, WHOLE, Key, Paired, Summary, paired, summarise
-from .records import DELIVERED, SPLATS, WITHHELD, FrameScore, RunRecord
+from .records import DELIVERED, DEVELOPED, SPLATS, WITHHELD, FrameScore, RunRecord
 from .truth import REGIONS, RIGID
 
 HOST_NAMES = {
@@ -30,7 +30,7 @@ REGION_NAMES = {
     "static": "static",
     RIGID: "what never moves",
 }
-SHOWN_NAMES = {WITHHELD: "plate detail, plate withheld", DELIVERED: "plate detail"}
+SHOWN_NAMES = {DEVELOPED: "developed", WITHHELD: "plate detail, plate withheld", DELIVERED: "plate detail"}
 """What frames show, besides splats -> what is added to a method's name."""
 QUERIES = {"plain": "at t*", "nearest": "nearest seen"}
 """How Gaussians are asked -> in a table."""
@@ -39,9 +39,11 @@ QUERY_NOTE = (
     "asked at the time nearest to t* at which it was seen."
 )
 DETAIL_NOTE = (
-    "A method alone is splats alone; with *plate detail* the frames are what a take delivers: the plates' own pixels, "
-    "carried to t*, where they can be believed. *Plate withheld*: without the plate of the pose that is judged, which "
-    "on what never moves is the answer itself. What is delivered at t*'s own pose is the truth itself, and not counted."
+    "A method alone is splats alone, as the training left them; *developed*: the instant's splats, trained on as the "
+    "still scene that it is. With *plate detail* the frames are what a take delivers: of the developed instant, and of "
+    "the plates' own pixels, carried to t*, where they can be believed. *Plate withheld*: without the plate of the "
+    "pose that is judged, which on what never moves is the answer itself. What is delivered at t*'s own pose is the "
+    "truth itself, and not counted."
 )
 _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
 NONE = "–"
@@ -124,7 +126,7 @@ class Setting:
 def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
     """The records of synthetic or real scenes by setting, hosts in the order of `HOST_NAMES`.
 
-    What was judged with plate detail too is a setting of its own, after that of splats alone.
+    What was judged developed and with plate detail too is a setting of its own, after that of splats alone.
     """
     alone = [r for r in records if r.kind == kind]
     chosen = [shown for r in alone for shown in (r, *(r.as_shown(name) for name in r.detailed))]
@@ -268,7 +270,7 @@ def _costs(settings: Sequence[Setting]) -> Table:
         "Means over runs. Held-out: frames of the clip kept out of training, each at its own time: whole, on what "
         "moves, on what does not. Seconds, milliseconds and frames per second are wall time with that many threads per "
         "run and that many runs at once; a step's are those of the last third of the run, with the measurements in it. "
-        "With plate detail a run is the same one, frozen otherwise."
+        "Developed and with plate detail a run is the same one, frozen otherwise."
     )
     if there:
         note += f" Load of the machine after the runs: {min(there):.1f} to {max(there):.1f}; wall times include it."
@@ -277,8 +279,8 @@ def _costs(settings: Sequence[Setting]) -> Table:
 
 
 def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
-    """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static, plate
-    detail against splats alone."""
+    """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static,
+    developed instants and plate detail against splats alone."""
     pairs = []
     for group in _places(settings):
         at = {(s.variant, s.host, s.supervision): s for s in group if s.shown == SPLATS}

@@ -27,7 +27,7 @@ class TrainConfig:
 
     preset: str = "preview"
     """Preset these numbers come from."""
-    iterations: int = 3000
+    iterations: int = 2000
     """Training steps of one image each."""
     width: int = 320
     """Width in pixels of the training images (never above the working frames')."""
@@ -89,6 +89,12 @@ class TrainConfig:
     """When `auto` has enough: SH degree, Gaussians, time nodes, steps."""
     poses: PosesConfig = dataclasses.field(default_factory=PosesConfig)
     """Small corrections of the solve's cameras."""
+
+    @property
+    def decides(self) -> bool:
+        """Does the run decide what it needs and heed the motion mattes? Published configurations, and hosts that move
+        everything, are left as they are."""
+        return self.method in ("auto", "static") and self.host_config == "default"
 
 
 def _preview() -> TrainConfig:

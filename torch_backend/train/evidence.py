@@ -7,7 +7,6 @@ at which somebody saw them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +17,7 @@ from torch.nn import functional as F
 
 from .losses import psnr
 from .model import DynamicModel, render
+from .movers import Mattes
 from .trainer import Trainer
 
 GRID = 4
@@ -34,9 +34,6 @@ MOVING_SHARE = 0.3
 """Share of a pixel that has to be of what moves before it is taken to travel."""
 STILL_SHARE = 1 / 640
 """Travel below this share of the width is none."""
-
-Mattes = Callable[[int], NDArray[np.uint8] | None]
-"""Frame number -> what moves in it, [h, w] uint8: 0 still, 128 unknown, 255 moving; None where there is none."""
 
 
 @dataclass(frozen=True)

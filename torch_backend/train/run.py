@@ -20,15 +20,16 @@ from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
-from ..solve.motion import load_motion
+from ..solve.motion import PAINTED, load_motion, motion_key
 from . import adam
 from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .device import choose_device, unused_card
-from .evidence import Mattes, gather
+from .evidence import gather
 from .extend import EXTENSION_FILE, pending
 from .model import DynamicModel
+from .movers import Mattes, load_movers
 from .needs import modelled
 from .trainer import Trainer, restore_model
 from .verdict import figures_of, told, warn
@@ -79,7 +80,12 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
+    motion = motion_of(shot, config)
     key = content_key(config_to_json(config), solve_key(shot), train, test)
+    if motion and not trained_without(shot, run, key):
+        key = content_key(key, motion)
+    else:
+        motion = None
     done = finished(run, key)
     if done is not None and params.resume:
         forget(run, key)
@@ -90,12 +96,13 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     if folder != run and params.resume:
         report.warning(
-            "The run's settings or cameras changed: it is trained anew.",
+            "The run's settings, cameras or motion mattes changed: it is trained anew.",
             "The run that is there stays until the new one is done.",
         )
     images = place_images(load_images(scene, train + test, width, height, report), device)
-    identity = {"key": key, "solve": solve_key(shot)}
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
+    identity = {"key": key, "solve": solve_key(shot), "motion": motion}
+    movers = load_movers(functools.partial(load_motion, shot), scene, train, width, height) if motion else None
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers)
     checkpoint = folder / CHECKPOINT_FILE
     resumed = _resume(trainer, checkpoint, params.resume, report)
     for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
@@ -138,13 +145,19 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if facts["solve"] != solve_key(shot):
         message = f"The run {params.run!r} was trained on other cameras than the shot has now: it cannot be extended."
         raise JobError(message, "Remove the run or name another one, then train.", ExitCode.TRAIN)
+    motion = facts.get("motion")  # None too if it was trained before mattes counted
+    if motion and motion != motion_key(shot):
+        message = f"The run {params.run!r} was trained with other motion mattes than the shot has now."
+        raise JobError(message, "Train it again: it cannot be extended.", ExitCode.TRAIN)
     config, device, scene = config_from_json(facts["config"]), _prepared_device(params, report), load_scene(shot)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
-    images = place_images(load_images(scene, train + test, *training_size(scene, config.width), report), device)
+    size = training_size(scene, config.width)
+    images = place_images(load_images(scene, train + test, *size, report), device)
     held_out = images[len(train) :]
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
-    identity = {"key": facts["key"], "solve": facts["solve"]}
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device)
+    identity = {"key": facts["key"], "solve": facts["solve"], "motion": motion}
+    movers = load_movers(functools.partial(load_motion, shot), scene, train, *size) if motion else None
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers)
     begun = pending(folder, facts) if params.resume else None
     if before["iterations"] != facts["iteration"]:  # it was killed between its last two files: only figures are missing
         trainer.restore(checkpoint)
@@ -215,6 +228,24 @@ def finished(folder: Path, key: str) -> dict[str, Any] | None:
 def solve_key(shot: Shot) -> str:
     """Identifies the solved cameras, by content: a copied shot is still the same shot."""
     return content_key(read_json(shot.solve / "cameras.json"))
+
+
+def motion_of(shot: Shot, config: TrainConfig) -> str | None:
+    """Identifies the motion mattes that a run of these settings is trained with; None if it is trained without."""
+    frames = load_scene(shot).frames if config.decides else []
+    has = any(load_motion(shot, frame) is not None for frame in frames)
+    return motion_key(shot) if has else None
+
+
+def trained_without(shot: Shot, run: Path, key: str) -> bool:
+    """Was the run, of this key, trained before mattes were found? It stays, unless an artist has painted some since.
+
+    A freeze finds mattes where the solve did not: that alone is no reason to train anew what it froze.
+    """
+    checkpoint = run / CHECKPOINT_FILE
+    if any((shot.root / PAINTED).glob("*.png")) or not checkpoint.is_file():
+        return False
+    return read_meta(checkpoint).get("key") == key
 
 
 def _resume(trainer: Trainer, checkpoint: Path, wanted: bool, report: Reporter) -> bool:

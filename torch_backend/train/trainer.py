@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,12 +19,9 @@ from ..deformation import (
     Deltas,
     Rehearsal,
     Start,
-    change_of,
     field_box,
     host,
-    painted,
     split_deltas,
-    stays_open,
 )
 from ..gaussians import Densifier, Gaussians, initialise
 from ..raster import RasterOutput
@@ -50,14 +46,13 @@ from .exposure import Exposure
 from .extend import Extension
 from .losses import photometric, psnr
 from .model import DynamicModel, render
+from .movers import harden, on_trial
 from .needs import Needs
 from .poses import Poses, corrected
 from .repair import FieldMemory, drop_offenders, repair, unstable
 
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
-_MOMENTS = 16
-"""Times and cameras at which it is asked whether a Gaussian moves."""
 _LOOK_EVERY = 10
 """Steps between two looks at what a GPU counted, and between two reports of progress."""
 
@@ -75,6 +70,7 @@ class Trainer:
         config: every number of the run.
         identity: JSON-able facts that say which run a checkpoint belongs to; stored in it.
         device: where it trains.
+        movers: bool [I, H, W] what the motion mattes call moving in the training frames; None: there are no mattes.
     """
 
     def __init__(
@@ -86,9 +82,11 @@ class Trainer:
         report: Reporter,
         identity: dict[str, Any] | None = None,
         device: torch.device | str = "cpu",
+        movers: Tensor | None = None,
     ) -> None:
         self.identity, self.device = identity or {}, torch.device(device)
         self.scene, self.images, self.train_ids, self.config, self.report = scene, images, train, config, report
+        self.movers = movers if config.decides else None
         self.height, self.width = images.shape[1:3]
         self.viewmats = scene.viewmats.to(self.device)
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
@@ -104,8 +102,7 @@ class Trainer:
         gaussians = gaussians.to(self.device)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
         self.initial = len(gaussians)
-        decides = config.method == "auto" and config.host_config == "default"
-        self.needs = Needs(config.needs, len(train) if decides else 0)
+        self.needs = Needs(config.needs, len(train) if config.decides else 0)
         self.extensions: list[Extension] = []
         self.iteration = 0
         self.trained_seconds = 0.0
@@ -124,6 +121,10 @@ class Trainer:
         self._saved_at = time.perf_counter()
 
     # ------------------------------------------------------------------ the run
+
+    def bin_of_frame(self, frame: int) -> int:
+        """Time bin of the support bitmap for the trained frame at position `frame`."""
+        return self._bins[frame]
 
     @property
     def progress(self) -> float:
@@ -292,9 +293,9 @@ class Trainer:
     # ------------------------------------------------------------------ the gate
 
     def _open_gate(self) -> None:
-        """Opens all that is painted, on trial."""
+        """Opens, on trial, what is painted, or of it what the motion mattes call moving."""
         model = self.model.gaussians
-        model.open |= painted(model)
+        model.open |= on_trial(self)
         if bool(model.open.any()):
             self._create_field()
 
@@ -308,38 +309,14 @@ class Trainer:
             (self.iteration - first) % max(1, every) == 0 or self.iteration == last
         )
 
-    @torch.no_grad()
     def _harden_gate(self) -> None:
-        """Closes for good what did not move; its mean change stays. While nothing moves at all, the trial goes on."""
+        """Closes for good what did not move. While nothing moves at all, the trial goes on."""
         self._look()  # one NaN would spoil the neighbours' verdicts
-        rows, model = self.model.open_rows(), self.model.gaussians
-        if self.model.field is None or not len(rows):
+        if self.model.field is None or not len(self.model.open_rows()):
             return
-        picked = np.unique(np.linspace(0, len(self.centres) - 1, min(_MOMENTS, len(self.centres))).round().astype(int))
-        moments = [self.model.deltas(rows, self.centres[n : n + 1]) for n in picked]
-        asked = [moment for moment in moments if moment is not None]
-        change, mean = change_of(model, rows, asked, self._pixels(rows), self.config.gate)
-        stays = stays_open(model, rows, change, self.config.gate)
-        if not bool(stays.any()) and self.progress < self.config.gate.give_up:
-            return
-        self.needs.facts["hardened"] = self.iteration
-        closed, moved = rows[~stays], self.model.moved(rows, mean)
-        for name, param in model.params.items():
-            if name in moved:
-                param.data[closed] = moved[name][closed]
-        model.open[closed] = False
-        self._shift = self._shift[:0]
-
-    def _pixels(self, rows: Tensor) -> Tensor:
-        """[M] pixels of the training images per scene unit, where each of `rows` is nearest to a camera that saw it."""
-        means = self.model.gaussians.params["means"].detach()[rows]
-        nearest = torch.full((len(rows),), torch.inf, device=self.device)
-        for frame in range(0, len(self.train_ids), max(1, len(self.train_ids) // _MOMENTS)):
-            view = self.viewmats[self.train_ids[frame]]
-            depth = means @ view[2, :3] + view[2, 3]
-            seen = self.model.gaussians.support[rows, self._bins[frame]] & (depth > 1e-3)
-            nearest = torch.where(seen, torch.minimum(nearest, depth), nearest)
-        return torch.where(nearest.isfinite(), self.Ks[self.train_ids[0], 0, 0] / nearest, 0.0)
+        if harden(self):
+            self.needs.facts["hardened"] = self.iteration
+            self._shift = self._shift[:0]
 
     def _create_field(self) -> None:
         self._look()  # and every bound of the field
@@ -453,7 +430,8 @@ class Trainer:
         other_state["means"].retain_grad()
         other_out = self._render(other_state, other)
         exposed = self.model.exposure.apply(other_out.colors[0], self.times[other])
-        photometric(exposed, self._image(other), self.config.dssim).backward(retain_graph=True)
+        loss = photometric(exposed, self._image(other), self.config.dssim)
+        loss.backward(retain_graph=True)
         other_acted = self._acted(other, rows, other_state, other_out)
         every = self.config.supervision.pulls == "all"
         if not every:

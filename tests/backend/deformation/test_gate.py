@@ -54,6 +54,20 @@ def test_what_is_only_displaced_does_not_move():
     assert mean.sh0 is None
 
 
+def test_times_at_which_nobody_saw_it_say_nothing():
+    m, rows = model(10), torch.arange(10)
+    places = torch.tensor([0.1, 0.1, 0.7])
+    asked = [Deltas(place.expand(10, 3).clone(), torch.zeros(10, 4)) for place in places]
+    seen = torch.tensor([True, True, False])[:, None].repeat(1, 10)
+    seen[:, 4], seen[:, 7] = True, False
+    change, mean = change_of(m, rows, asked, torch.full((10,), 100.0), GateConfig(), seen)
+    assert float(change[0]) < 1e-3
+    torch.testing.assert_close(mean.means[0], torch.full((3,), 0.1))
+    for row in (4, 7):  # seen always; seen never: nothing is known better than all
+        torch.testing.assert_close(mean.means[row], torch.full((3,), 0.3))
+        assert float(change[row]) > 100.0
+
+
 def test_the_piece_that_moves_stays_open_and_little_else():
     m, rows = model(), torch.arange(400)
     moves = m.params["means"].detach()[:, 0] > 0.85

@@ -14,7 +14,7 @@ from torch_backend.shot import write_json
 from torch_backend.solve.lens import load_lens
 from torch_backend.solve.stmap import needed_margin, redistort_map
 
-RANGE = {"t_star": 105, "first": 104, "last": 105}
+RANGE = {"t_star": 105, "first": 104, "last": 105, "develop": "off"}
 
 
 @pytest.fixture(scope="module")

@@ -145,7 +145,7 @@ def test_a_frame_whose_warp_is_gone_is_made_again(trained, take, quiet):
 
 def test_a_painted_matte_makes_frames_stale(trained, quiet):
     world, _ = trained
-    ask = FreezeParams(take="painted", t_star=105, first=110, last=110, only_missing=True)
+    ask = FreezeParams(take="painted", develop="off", t_star=105, first=110, last=110, only_missing=True)
     path = world.shot.root / PAINTED / "000110.png"
     before = path.read_bytes()
     try:
@@ -164,7 +164,8 @@ def test_a_ramp_that_runs_is_the_clip(trained, quiet):
     """Each frame at its own instant: plates, bit for bit but for half floats; then time stands still."""
     world, _ = trained
     ramp = {str(n): float(min(n, 105)) for n in range(101, 117)}
-    freeze_shot(world.shot, FreezeParams(take="runs", t_star_per_frame=ramp, first=104, last=106), quiet())
+    part = dict(t_star_per_frame=ramp, first=104, last=106, develop="off")
+    freeze_shot(world.shot, FreezeParams(take="runs", **part), quiet())
     plates = Plates(world.shot)
     for n in (104, 105):
         frame = read_frozen_exr(world.shot.take("runs") / f"{n:06d}.exr")
@@ -206,7 +207,7 @@ def bright(tmp_path_factory, world, quiet):
 
 
 def test_light_beyond_white_and_below_black_is_the_plates(bright, quiet):
-    facts = freeze_shot(bright, FreezeParams(t_star=108, first=103, last=104), quiet())
+    facts = freeze_shot(bright, FreezeParams(t_star=108, first=103, last=104, develop="off"), quiet())
     assert (facts["width"], facts["height"]) == (128, 96)
     for n in (103, 104):
         source = oiio.ImageBuf(str(bright.root.parent / "source" / f"a.{n}.exr")).get_pixels(oiio.FLOAT)

@@ -19,7 +19,7 @@ def times(folder):
 def test_a_range_with_a_step_then_the_rest_of_it(trained, quiet):
     world, _ = trained
     folder = world.shot.take("part")
-    ask = dict(take="part", t_star=104, only_missing=True)
+    ask = dict(take="part", t_star=104, develop="off", only_missing=True)
     facts = freeze_shot(world.shot, FreezeParams(**ask, first=102, last=108, step=3), quiet())
     some = times(folder)
     assert sorted(some) == [102, 105, 108]
@@ -39,10 +39,11 @@ def test_only_frames_whose_instant_changed_are_stale(trained, quiet):
     world, _ = trained
     folder = world.shot.take("held")
     ramp = {str(101 + n): 104.0 for n in range(16)}
-    freeze_shot(world.shot, FreezeParams(take="held", t_star_per_frame=ramp, only_missing=True), quiet())
+    ask = dict(take="held", develop="off", only_missing=True)
+    freeze_shot(world.shot, FreezeParams(**ask, t_star_per_frame=ramp), quiet())
     before = times(folder)
     released = ramp | {"115": 105.0, "116": 106.0}
-    freeze_shot(world.shot, FreezeParams(take="held", t_star_per_frame=released, only_missing=True), quiet())
+    freeze_shot(world.shot, FreezeParams(**ask, t_star_per_frame=released), quiet())
     after = times(folder)
     assert {n for n in after if after[n] != before[n]} == {115, 116}
     assert json.loads((folder / "take.json").read_text())["t_star_per_frame"] == released
@@ -61,7 +62,7 @@ def test_only_frames_whose_camera_changed_are_stale(trained, quiet, tmp_path):
         return str(tmp_path / "path.json")
 
     folder = world.shot.take("move")
-    ask = dict(take="move", t_star=108, only_missing=True)
+    ask = dict(take="move", develop="off", t_star=108, only_missing=True)
     freeze_shot(world.shot, FreezeParams(**ask, camera_path=path(0.0)), quiet())
     before = times(folder)
     freeze_shot(world.shot, FreezeParams(**ask, camera_path=path(0.1)), quiet())
@@ -72,7 +73,7 @@ def test_only_frames_whose_camera_changed_are_stale(trained, quiet, tmp_path):
 def test_a_newer_run_makes_every_frame_stale(trained, quiet):
     world, _ = trained
     folder = world.shot.take("run")
-    ask = FreezeParams(take="run", t_star=104, first=101, last=103, only_missing=True)
+    ask = FreezeParams(take="run", t_star=104, develop="off", first=101, last=103, only_missing=True)
     freeze_shot(world.shot, ask, quiet())
     before = times(folder)
     (world.shot.run("main") / "checkpoint.safetensors").touch()
@@ -83,7 +84,7 @@ def test_a_newer_run_makes_every_frame_stale(trained, quiet):
 def test_a_take_of_before_frames_had_keys_stays_until_grain_or_plates_are_wanted(trained, quiet):
     world, _ = trained
     folder = world.shot.take("old")
-    ask = dict(take="old", t_star=104, first=101, last=103, only_missing=True)
+    ask = dict(take="old", t_star=104, develop="off", first=101, last=103, only_missing=True)
     old = FreezeParams(**ask, grain=False, detail="off")
     for wanted in (FreezeParams(**ask, detail="off"), FreezeParams(**ask, grain=False)):
         freeze_shot(world.shot, old, quiet())
@@ -107,7 +108,7 @@ def _forget_keys(folder):
 def test_a_damaged_frame_is_rendered_again(trained, quiet):
     world, _ = trained
     folder = world.shot.take("broken")
-    ask = FreezeParams(take="broken", t_star=104, first=101, last=102, only_missing=True)
+    ask = FreezeParams(take="broken", t_star=104, develop="off", first=101, last=102, only_missing=True)
     freeze_shot(world.shot, ask, quiet())
     (folder / "000102.exr").write_bytes(b"torn")
     freeze_shot(world.shot, ask, quiet())
@@ -118,7 +119,7 @@ def test_a_damaged_frame_is_rendered_again(trained, quiet):
 def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quiet, grain):
     world, _ = trained
     folder = world.shot.take(f"grain{grain}")
-    part = dict(t_star=104, first=101, last=102, detail="off")
+    part = dict(t_star=104, develop="off", first=101, last=102, detail="off")
     ask = FreezeParams(take=folder.name, grain=grain, **part)
     facts = freeze_shot(world.shot, ask, quiet())
     one, other = (read_frozen_exr(folder / f"{n:06d}.exr") for n in (101, 102))
@@ -138,7 +139,7 @@ def test_grain_is_a_layer_beside_a_picture_that_it_does_not_change(trained, quie
 
 def test_plates_bring_their_own_grain(trained, quiet):
     world, _ = trained
-    ask = dict(t_star=104, first=112, last=112)
+    ask = dict(t_star=104, develop="off", first=112, last=112)
     facts = freeze_shot(world.shot, FreezeParams(take="plates", **ask), quiet())
     plates = read_frozen_exr(world.shot.take("plates") / "000112.exr")
     assert np.max(facts["grain"]["deviation_8bit"]) > 0

@@ -75,7 +75,8 @@ def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(tra
             if "was not trained on" in message:  # said between the loading of the model and the first frame
                 save_checkpoint(run / "checkpoint.safetensors", tensors, meta)
 
-    asked = dict(run=run.name, take="meanwhile", t_star=109, first=105, last=105, only_missing=True, detail="off")
+    asked = dict(run=run.name, take="meanwhile", t_star=109, first=105, last=105, only_missing=True)
+    asked |= dict(detail="off", develop="off")
     frame, report = world.shot.take("meanwhile") / "000105.exr", TrainsMeanwhile()
     freeze_shot(world.shot, FreezeParams(**asked), report)
     old, again = read_frozen_exr(frame), quiet()
@@ -110,7 +111,8 @@ def test_what_a_take_leaves(trained, takes):
     assert (folder / "video.mp4").stat().st_size > 500
     assert read_png(folder / "preview" / "000101.png").shape == (48, 64, 3)
     ply = read_ply(folder / "frozen.ply")
-    assert len(ply.means) == len(load_run(world.shot, "main").model.gaussians)
+    kept = load_checkpoint(world.shot.run("main") / "developed" / "000105.safetensors")[0]
+    assert facts["developed"] == [105] and len(ply.means) == len(kept["origin"]), "the developed instant"
     assert np.median(ply.means[:, 2]) == pytest.approx(4.0, rel=0.1)
 
 
@@ -128,26 +130,26 @@ def test_query_nearest_is_the_plain_one_where_everything_is_supported(trained):
 
 def test_only_missing_frames_are_rendered_again(trained, quiet):
     world, _ = trained
-    freeze_shot(world.shot, FreezeParams(take="again", t_star=104), quiet())
+    freeze_shot(world.shot, FreezeParams(take="again", develop="off", t_star=104), quiet())
     folder = world.shot.take("again")
     (folder / "000103.exr").unlink()
     before = {p.name: p.stat().st_mtime_ns for p in folder.glob("*.exr")}
-    freeze_shot(world.shot, FreezeParams(take="again", t_star=104, only_missing=True), quiet())
+    freeze_shot(world.shot, FreezeParams(take="again", develop="off", t_star=104, only_missing=True), quiet())
     after = {p.name: p.stat().st_mtime_ns for p in folder.glob("*.exr")}
     assert {n for n in after if after[n] != before.get(n)} == {"000103.exr"}
-    freeze_shot(world.shot, FreezeParams(take="again", t_star=110, only_missing=True), quiet())
+    freeze_shot(world.shot, FreezeParams(take="again", develop="off", t_star=110, only_missing=True), quiet())
     assert all(p.stat().st_mtime_ns != after[p.name] for p in folder.glob("*.exr"))
 
 
 def test_cancelled_take_goes_on(trained, quiet):
     world, _ = trained
     with pytest.raises(Cancelled):
-        freeze_shot(world.shot, FreezeParams(take="cut", t_star=104), quiet(cancel_at=("freezing", 0.5)))
+        freeze_shot(world.shot, FreezeParams(take="cut", develop="off", t_star=104), quiet(cancel_at=("freezing", 0.5)))
     folder = world.shot.take("cut")
     done = {p.name: p.stat().st_mtime_ns for p in folder.glob("*.exr")}
     assert 0 < len(done) < 16
     assert not list(folder.glob(".*"))
-    freeze_shot(world.shot, FreezeParams(take="cut", t_star=104, only_missing=True), quiet())
+    freeze_shot(world.shot, FreezeParams(take="cut", develop="off", t_star=104, only_missing=True), quiet())
     assert len(list(folder.glob("*.exr"))) == 16
     assert all((folder / n).stat().st_mtime_ns == t for n, t in done.items())
 
@@ -168,7 +170,7 @@ def test_camera_path_of_its_own_size(trained, quiet, tmp_path):
     viewmat[2, 3] = 0.3
     path = CameraPath(128, 96, [CameraFrame(1, viewmat.flatten().tolist(), [120.0, 120.0, 64.0, 48.0], "blender")])
     write_json(tmp_path / "path.json", path.to_json())
-    params = FreezeParams(take="path", t_star=108, camera_path=str(tmp_path / "path.json"), width=128)
+    params = FreezeParams(take="path", t_star=108, camera_path=str(tmp_path / "path.json"), width=128, develop="off")
     assert freeze_shot(world.shot, params, quiet())["frames"] == 1
     image = read_frozen_exr(world.shot.take("path") / "000001.exr")
     assert image.rgba.shape == (96, 128, 4)
@@ -188,7 +190,8 @@ def test_wrong_requests_are_sentences(trained, quiet, params, word):
 def test_t_star_snaps_to_a_trained_frame_and_says_so(trained, quiet):
     world, _ = trained
     report = quiet()
-    assert freeze_shot(world.shot, FreezeParams(take="snap", t_star=109), report)["t_star_frame"] in (108, 110)
+    facts = freeze_shot(world.shot, FreezeParams(take="snap", t_star=109, develop="off"), report)
+    assert facts["t_star_frame"] in (108, 110)
     assert any(e[0] == "warning" and "109" in e[1] for e in report.events)
 
 

@@ -15,7 +15,7 @@ from benchmarks.sources import ROOT
 from torch_backend.contract import read_json
 from torch_backend.deformation import host_config, hosts
 from torch_backend.report.evaluate import last_third_step_ms
-from torch_backend.report.records import DELIVERED, WITHHELD, finished, load_record
+from torch_backend.report.records import DELIVERED, DEVELOPED, WITHHELD, finished, load_record
 from torch_backend.report.truth import RealScene, TruthFolder
 from torch_backend.report.write import write_report
 from torch_backend.scene import load_scene, split_frames
@@ -109,11 +109,15 @@ def test_a_record_holds_every_frame_and_its_regions(done, scene):
         assert [p.psnr_db for p in record.pictures] == sorted(p.psnr_db for p in record.pictures)
         # The same with plate detail; what is delivered at t*'s own pose is the truth itself, and does not count.
         poses = [(r.t_star, r.pose) for r in record.rows]
-        assert [(r.t_star, r.pose) for r in record.detailed[WITHHELD].rows] == poses
+        for shown in (DEVELOPED, WITHHELD):
+            assert [(r.t_star, r.pose) for r in record.detailed[shown].rows] == poses
         assert [(r.t_star, r.pose) for r in record.detailed[DELIVERED].rows] == [p for p in poses if p[0] != p[1]]
         static = {shown: record.as_shown(shown).values("psnr_db", "static") for shown in record.detailed}
         gains = [value - static[WITHHELD][key] for key, value in static[DELIVERED].items()]
         assert sum(gains) > 0 and "detail" not in record.missing
+        alone = record.values("psnr_db", "static")
+        gains = [value - alone[key] for key, value in static[DEVELOPED].items()]
+        assert sum(gains) > len(gains), "a run of 60 steps has a lot to gain"
         made = record.detailed[DELIVERED]
         assert made.frozen_fps > 0 and made.pictures and all((results / p.ours).is_file() for p in made.pictures)
         assert not {p.ours for p in made.pictures} & {p.ours for p in record.pictures}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import detail, detail_cost, detail_flow, detail_truth
-from benchmarks.detail_clip import open_clip
+from benchmarks.detail_clip import VARIANTS, open_clip
 from torch_backend.footage.images import read_png
 from torch_backend.footage.plates import Plates
 from torch_backend.shot import Shot, write_json
@@ -28,19 +28,23 @@ def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tm
     assert [f["t_star"] for f in found["freezes"]] == [suggested, other]
     for freeze in found["freezes"]:
         mean = freeze["mean"]
-        still = [mean[variant]["still_db"] for variant in ("splats", "withheld", "delivered")]
-        assert still == sorted(still) and still[2] > max(45, still[1] + 3)
+        still = [mean[variant]["still_db"] for variant in VARIANTS]
+        assert still == sorted(still) and still[3] > max(45, still[2] + 3)
         assert mean["delivered"]["best_90_db"] > mean["splats"]["best_90_db"]
         assert all(0.1 < row["still_share"] < 0.95 for row in freeze["frames"])
     assert found["instants_differ_255"] < 1.0 and found["motion_from"] == clip.motion_from
     strips = list((tmp_path / "strips").glob("*.png"))
-    assert len(strips) == 2 and read_png(strips[0]).shape == (48, 4 * 64, 3)
-    assert len(detail.table("tiny", found)) == 2 + 9 + 2
+    assert len(strips) == 2 and read_png(strips[0]).shape == (48, 5 * 64, 3)
+    assert len(detail.table("tiny", found)) == 2 + 12 + 2
+    alone = detail.judge(open_clip(shot.root, develop=False), [suggested], frames[:1])["freezes"][0]["mean"]
+    first = found["freezes"][0]["frames"][0]
+    assert list(alone) == ["splats", "withheld", "delivered"]
+    assert alone["splats"]["still_db"] == pytest.approx(first["splats"]["still_db"], abs=0.01)
 
 
 def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
     """The patch goes up to 7 pixels a frame, of frames that are 320 wide; frozen it does not."""
-    clip = open_clip(shot.root, width=320)
+    clip = open_clip(shot.root, width=320, develop=False)
     t_star = clip.frames[8]
     found = detail_flow.judge_flow(clip, t_star, [(109, 110), (110, 111)])
     restless = {what: of["moving"]["unsteady_255"] for what, of in found["clip"].items()}
@@ -113,18 +117,20 @@ def test_the_line_through_costs_and_how_far_off_it_is():
 
 def test_regions_that_got_worse_are_named():
     def pose(splats: float, withheld: float, delivered: float, moving: float | None) -> dict:
+        values = splats, splats + 1, withheld, delivered
         regions = {
             name: {"whole": value, "moving": moving if name == "splats" or moving is None else moving - 1}
-            for name, value in (("splats", splats), ("withheld", withheld), ("delivered", delivered))
+            for name, value in zip(detail_truth.VARIANTS, values, strict=True)
         }
         return {"t_star": 9, "pose": 1, **regions}
 
     mean = detail_truth.means([pose(20, 23, 25, 22.0), pose(22, 23, 27, None)])
     assert mean == {
-        "whole": {"splats": 21, "withheld": 23, "delivered": 26},
-        "moving": {"splats": 22, "withheld": 21, "delivered": 21},
+        "whole": {"splats": 21, "developed": 22, "withheld": 23, "delivered": 26},
+        "moving": {"splats": 22, "developed": 21, "withheld": 21, "delivered": 21},
     }
     said = detail_truth.shortfalls({"room": mean})
-    assert len(said) == 2 and all(s.startswith("WORSE: room, moving") for s in said)
-    assert "| room | whole | 21.00 -> 23.00 -> 26.00 | +2.00 | +5.00 |" in detail_truth.table({"room": mean})
+    assert len(said) == 3 and all(s.startswith("WORSE: room, moving") for s in said)
+    row = "| room | whole | 21.00 -> 22.00 -> 23.00 -> 26.00 | +1.00 | +2.00 | +5.00 |"
+    assert row in detail_truth.table({"room": mean})
     json.dumps(mean)

@@ -16,6 +16,7 @@ from torch_backend.footage.images import write_png
 from torch_backend.report.metrics import score
 from torch_backend.report.records import (
     DELIVERED,
+    DEVELOPED,
     WITHHELD,
     Detailed,
     FrameScore,
@@ -76,7 +77,7 @@ def example(results: Path, frame: torch.Tensor, scene: str, seed: int, host: str
         [p for p in pictures if p.pose == 40], plates, {}, machine_facts(), "bench", "2026-11-21 12:00",
     )  # fmt: skip
     if host == "auto":
-        gains = {WITHHELD: 2.0, DELIVERED: 4.0}
+        gains = {DEVELOPED: 1.0, WITHHELD: 2.0, DELIVERED: 4.0}
         for shown, gain in gains.items():
             shots = [] if shown == WITHHELD else pictures
             better = [sharper(row, gain) for row in rows]
@@ -123,7 +124,7 @@ def test_a_record_comes_back_as_it_went(results):
 
 
 def test_a_damaged_record_is_named(tmp_path):
-    (tmp_path / "x.json").write_text('{"version": 3, "rows": []}')
+    (tmp_path / "x.json").write_text('{"version": 4, "rows": []}')
     with pytest.raises(ValueError, match="x.json"):
         load_record(tmp_path / "x.json")
     (tmp_path / "y.json").write_text('{"version": 99}')
@@ -151,18 +152,19 @@ def test_what_is_compared_with_what(results):
     assert ("auto (ours)", "static 3DGS") in names and ("auto (ours)", "4DGaussians + support") in names
     assert ("auto (ours), plate detail", "auto (ours)") in names
     assert ("auto (ours), plate detail, plate withheld", "auto (ours)") in names
-    assert len(names) == 8
+    assert ("auto (ours), developed", "auto (ours)") in names
+    assert len(names) == 9
 
 
 def test_every_table_has_a_row_of_what_is_delivered(results):
     """And figures of it: in the table of who wins by region, beside splats alone in the others."""
     tables = {table.title: table for table in all_tables(load_records(results))}
-    kinds = ("plate detail, plate withheld", "plate detail")
+    kinds = ("developed", "plate detail, plate withheld", "plate detail")
     for title, table in tables.items():
         for kind in kinds:
             assert any(row[0].split(" against ")[0] == f"auto (ours), {kind}" for row in table.rows), (title, kind)
     regions = {row[0]: row[1:] for row in tables["By region"].rows}
-    for kind, gain in zip(kinds, (2.0, 4.0), strict=True):
+    for kind, gain in zip(kinds, (1.0, 2.0, 4.0), strict=True):
         for alone, made in zip(regions["auto (ours)"], regions[f"auto (ours), {kind}"], strict=True):
             assert float(made) - float(alone) == pytest.approx(gain, abs=0.011)
     won = [row for row in tables["Who wins"].rows if row[0] == "auto (ours), plate detail against auto (ours)"]

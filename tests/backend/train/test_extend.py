@@ -93,7 +93,8 @@ def test_the_finished_run_stays_until_the_last_added_step(world, quiet, finished
     report = quiet()
     assert train_shot(world.shot, short("ext-kept"), report)["iterations"] == 60
     assert ("progress", "training", 1, 1, "already trained") in report.events
-    take = freeze_shot(world.shot, FreezeParams(run="ext-kept", take="ext-kept", first=104, last=104), quiet())
+    params = FreezeParams(run="ext-kept", take="ext-kept", first=104, last=104, develop="off")
+    take = freeze_shot(world.shot, params, quiet())
     assert take["run"] == "ext-kept"
     assert {name: (folder / name).read_bytes() for name in kept} == kept
 

@@ -222,11 +222,12 @@ def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
 
 def test_published_hosts_are_left_alone(long_world, quiet):
     scene, images = long_world
-    for params in (TrainParams(method="hexplane"), TrainParams(method="static"), TrainParams(host_config="reference")):
+    for params in (TrainParams(method="hexplane"), TrainParams(host_config="reference")):
         trainer = Trainer(scene, images, scene.solved, config_from_params(params), quiet())
         assert trainer.needs.probes == []
         assert trainer.needs.held == set()
-    assert trainer_of(long_world, quiet).needs.held == set(probe_frames(len(scene.solved), 12))
+    for method in ("auto", "static"):  # the one is compared with the other: both decide
+        assert trainer_of(long_world, quiet, method=method).needs.held == set(probe_frames(len(scene.solved), 12))
 
 
 def test_time_nodes_follow_the_motion(long_world, quiet, tmp_path):

@@ -1,0 +1,137 @@
+"""What mattes call moving: it goes on trial and counts little before; nothing else opens; runs are known by mattes."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world, paint_motion
+from torch_backend.contract import Cancelled, JobError, TrainParams
+from torch_backend.scene import load_images, load_scene
+from torch_backend.solve.motion import MOVING, PAINTED, STILL, UNKNOWN, load_motion, write_matte
+from torch_backend.train import config_from_params, load_run, train_shot
+from torch_backend.train.checkpoint import load_checkpoint
+from torch_backend.train.movers import load_movers, moving_frames, on_trial
+from torch_backend.train.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def painted_world(tmp_path_factory):
+    """A tiny shot whose mattes show the patch; tests leave its mattes alone."""
+    world = build_world(tmp_path_factory.mktemp("painted"))
+    paint_motion(world)
+    return world
+
+
+def short(name, **changes):
+    return TrainParams(run=name, iterations=60, max_gaussians=1500, **changes)
+
+
+def paint_all(world, value):
+    for n in range(FRAMES):
+        path = world.shot.root / PAINTED / f"{FIRST + n:06d}.png"
+        path.parent.mkdir(exist_ok=True)
+        write_matte(path, np.full((HEIGHT, WIDTH), value, np.uint8))
+
+
+def trainer_of(world, quiet, steps, movers=True, **changes):
+    scene = load_scene(world.shot)
+    config = config_from_params(TrainParams(iterations=300, max_gaussians=1500, holdout=0, **changes))
+    images = load_images(scene, scene.solved, WIDTH, HEIGHT)
+    found = load_movers(lambda frame: load_motion(world.shot, frame), scene, scene.solved, WIDTH, HEIGHT)
+    trainer = Trainer(scene, images, scene.solved, config, quiet(), movers=found if movers else None)
+    for _ in range(steps):
+        trainer._milestones()
+        trainer.step()
+        trainer.iteration += 1
+    return trainer
+
+
+def centred_on_movers(trainer, margin):
+    """int [N]: in how many frames the centre of each Gaussian projects into what moves, widened by `margin` pixels."""
+    means, counts = trainer.model.gaussians.params["means"].detach(), 0
+    for n, index in enumerate(trainer.train_ids):
+        wide = torch.nn.functional.max_pool2d(trainer.movers[n][None].float(), 2 * margin + 1, 1, margin)[0] > 0
+        camera = means @ trainer.viewmats[index][:3, :3].T + trainer.viewmats[index][:3, 3]
+        pixels = (camera @ trainer.Ks[index].T)[:, :2] / camera[:, 2:].clamp_min(1e-3)
+        x, y = pixels.long().clamp(min=0).unbind(1)
+        inside = (pixels >= 0).all(1) & (x < WIDTH) & (y < HEIGHT)
+        counts = counts + (inside & wide[y.clamp(max=HEIGHT - 1), x.clamp(max=WIDTH - 1)])
+    return counts
+
+
+def test_mattes_of_another_size_are_brought_to_the_training_images():
+    class Frames:
+        frames = (7, 8)
+
+    matte = np.full((40, 80), STILL, np.uint8)
+    matte[:20, :40], matte[20:] = MOVING, UNKNOWN
+    movers = load_movers({7: matte, 8: None}.get, Frames(), [0, 1], 16, 8)
+    assert movers.shape == (2, 8, 16)
+    assert movers[0, :4, :8].all()
+    assert int(movers.sum()) == 32, "unknown counts as still, and so does a frame without a matte"
+    assert load_movers(lambda frame: None, Frames(), [0, 1], 16, 8) is None
+
+
+def test_what_lies_in_movers_goes_on_trial_and_nothing_else(painted_world, quiet):
+    trainer = trainer_of(painted_world, quiet, 90)
+    trial = on_trial(trainer)
+    rows = torch.nonzero(trial).flatten()
+    assert 10 < len(rows) < 0.5 * len(trial)
+    assert float((centred_on_movers(trainer, 1) >= 3)[rows].float().mean()) > 0.95
+    always = centred_on_movers(trainer, 0) == len(trainer.train_ids)
+    assert float(trial[always].float().mean()) > 0.8
+    assert int(moving_frames(trainer, 0.5).max()) == len(trainer.train_ids)
+    trainer.config.gate.moving_frames = FRAMES + 1
+    assert not on_trial(trainer).any(), "a frame or two of motion are a fault of the flow"
+    trainer.config.gate.moving_frames = 3
+    trainer.movers[5:] = False
+    few = on_trial(trainer)
+    trainer.config.gate.moving_often = 0.5
+    assert few.any() and not on_trial(trainer).any(), "what something passes stands still most of the time"
+    trainer.movers = None
+    assert on_trial(trainer).float().mean() > 0.8, "without mattes all that is painted is tried"
+
+
+def test_where_the_mattes_say_that_nothing_moves_nothing_opens(tmp_path, quiet):
+    world = build_world(tmp_path)
+    paint_all(world, UNKNOWN)
+    summary = train_shot(world.shot, short("still"), quiet())
+    assert summary["moving_share"] == 0.0
+    assert load_run(world.shot, "still").model.field is None
+
+
+def test_published_hosts_do_not_heed_them(painted_world, quiet):
+    for changes in ({"method": "hexplane"}, {"host_config": "reference"}):
+        assert trainer_of(painted_world, quiet, 0, **changes).movers is None
+    assert trainer_of(painted_world, quiet, 0, method="static").movers is not None
+
+
+def test_a_run_is_known_by_its_mattes(tmp_path, quiet):
+    world = build_world(tmp_path)
+    paint_motion(world)
+    train_shot(world.shot, short("main"), quiet())
+    again = quiet()
+    train_shot(world.shot, short("main"), again)
+    assert ("progress", "training", 1, 1, "already trained") in again.events
+    paint_all(world, UNKNOWN)
+    with pytest.raises(JobError, match="other motion mattes"):
+        train_shot(world.shot, TrainParams(run="main", extend=10), quiet())
+    later = quiet()
+    summary = train_shot(world.shot, short("main"), later)
+    assert any("motion mattes changed" in event[1] for event in later.events if event[0] == "warning")
+    assert summary["moving_share"] == 0.0
+
+
+def test_it_resumes_exactly_with_mattes(painted_world, quiet):
+    train_shot(painted_world.shot, short("whole"), quiet())
+    for share in (0.3, 0.7):  # static; with a field
+        with pytest.raises(Cancelled):
+            train_shot(painted_world.shot, short("broken"), quiet(cancel_at=("training", share)))
+    train_shot(painted_world.shot, short("broken"), quiet())
+    whole, facts = load_checkpoint(painted_world.shot.run("whole") / "checkpoint.safetensors")
+    broken, _ = load_checkpoint(painted_world.shot.run("broken") / "checkpoint.safetensors")
+    assert facts["motion"]
+    assert whole.keys() == broken.keys()
+    assert any(name.startswith("field.") for name in whole)
+    for name, value in whole.items():
+        torch.testing.assert_close(value, broken[name], rtol=1e-4, atol=1e-5, msg=name)

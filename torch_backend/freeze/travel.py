@@ -1,0 +1,84 @@
+"""How the Gaussians of a frozen scene stand in the clip's other frames, as the run moves them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..gaussians.model import PARAM_NAMES
+from ..scene import Scene
+from ..train import LoadedRun
+from .query import FrozenGaussians, freeze_at
+
+_KEPT = 64
+"""Frames whose changes are kept: of 25,000 open Gaussians about 3 MB each."""
+
+
+class Travel:
+    """From a scene frozen at t* to the clip's frames.
+
+    The run's own Gaussians come first in the scene; what stands behind them (an instant's layer) is not moved.
+    """
+
+    def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians) -> None:
+        self.run, self.scene = run, scene
+        self.rows = run.model.open_rows()
+        """[M] int64, rows of the run's Gaussians that move."""
+        self.known = len(run.model.gaussians)
+        """How many Gaussians the run has."""
+        self._now = {name: frozen.state[name][self.rows] for name in PARAM_NAMES}
+        device = frozen.support.device
+        self._place = torch.full((len(frozen.support),), -1, dtype=torch.long, device=device)
+        self._place[self.rows] = torch.arange(len(self.rows), device=device)
+        self._changes: dict[int, dict[str, Tensor]] = {}
+
+    def movable(self, origin: Tensor) -> Tensor:
+        """[K] int64: which of Gaussians that descend from `origin` [N] the run moves."""
+        return torch.nonzero(self._place[origin] >= 0).flatten()
+
+    def moved(self, state: dict[str, Tensor], origin: Tensor, frame: int) -> dict[str, Tensor]:
+        """Gaussians that descend from the frozen scene by `origin` [N], as they are in a frame; with gradients."""
+        rows = self.movable(origin)
+        if not len(rows):
+            return dict(state)
+        place, change = self._place[origin[rows]], self._change(frame)
+        return {name: value.index_add(0, rows, change[name][place]) for name, value in state.items()}
+
+    @torch.no_grad()
+    def _change(self, frame: int) -> dict[str, Tensor]:
+        if frame not in self._changes:
+            then = freeze_at(self.run.model, self.scene.time_of_frame(frame), 1.0).state
+            self._changes[frame] = {name: then[name][self.rows] - now for name, now in self._now.items()}
+            while len(self._changes) > _KEPT:
+                del self._changes[next(iter(self._changes))]
+        return self._changes[frame]
+
+
+class Stage:
+    """The scene as it stood in every frame of the clip: the run's own, or that which an instant was developed to."""
+
+    def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians | None = None) -> None:
+        """`frozen` None or not developed: the run's own."""
+        self.run, self.scene, self.developed = run, scene, None
+        self.rows = run.model.open_rows()
+        """[M] int64, rows of the scene's Gaussians that move."""
+        self._travel = None
+        if frozen is not None and frozen.descent is not None:
+            self.developed, self._travel = frozen, Travel(run, scene, frozen.descent.frozen)
+            self.rows = self._travel.movable(frozen.descent.origin)
+
+    def at(self, frame: int) -> FrozenGaussians:
+        """The scene in a frame."""
+        if self.developed is None or self._travel is None or self.developed.descent is None:
+            return freeze_at(self.run.model, self.scene.time_of_frame(frame), 1.0)
+        state = self._travel.moved(self.developed.state, self.developed.descent.origin, frame)
+        return replace(self.developed, state=state)
+
+    def strangers(self, frozen: FrozenGaussians) -> Tensor:
+        """bool [N]: which Gaussians of a frozen scene the run does not have: nobody knows how they moved."""
+        known = len(self.run.model.gaussians)
+        if frozen.descent is not None:
+            return frozen.descent.origin >= known
+        return torch.arange(len(frozen.support), device=frozen.support.device) >= known

@@ -1,0 +1,132 @@
+"""What moves by the shot's motion mattes, and the gate's decisions from it.
+
+Flow finds movers that a photometric trial does not: on real clips the trial alone opened window reflections, and left
+waving hands closed. Unknown counts as still. A shot without mattes is trained by the trial alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..deformation import GateConfig, change_of, painted, stays_open
+from ..scene import Scene
+from ..solve.motion import MOVING
+from ..supervision.support import SEEN_WEIGHT
+from .model import render
+
+if TYPE_CHECKING:
+    from .trainer import Trainer
+
+MOMENTS = 16
+"""Times and cameras at which it is asked whether a Gaussian moves."""
+_COVERED = 0.25
+"""Share of a training pixel that has to move before the pixel does: at rims the matte is a pixel off."""
+
+Mattes = Callable[[int], NDArray[np.uint8] | None]
+"""Frame number -> what moves in it, [h, w] uint8: 0 still, 128 unknown, 255 moving; None where there is none."""
+
+
+def load_movers(mattes: Mattes, scene: Scene, indices: list[int], width: int, height: int) -> Tensor | None:
+    """bool [I, height, width]: what moves in frames `indices` of the scene; None if no frame has a matte.
+
+    A frame without one stands still. JobError if a matte is damaged.
+    """
+    movers, found = torch.zeros(len(indices), height, width, dtype=torch.bool, device="cpu"), False
+    for n, index in enumerate(indices):
+        matte = mattes(scene.frames[index])
+        if matte is not None:
+            found = True
+            share = cv2.resize((matte == MOVING).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+            movers[n] = torch.from_numpy(share > _COVERED)
+    return movers if found else None
+
+
+def moving_frames(trainer: Trainer, share: float) -> Tensor:
+    """int [N]: in how many trained frames each Gaussian lies in what moves, by what it paints there.
+
+    It counts where it is really seen, in front of what it stands before: at least `share` of its alpha * T over the
+    frame's pixels falls on movers. The static model is asked; frames that are kept back or unusable are not.
+    """
+    if trainer.movers is None:
+        raise ValueError("the shot has no motion mattes")
+    model, height, width = trainer.model, trainer.height, trainer.width
+    state = {name: p.detach() for name, p in model.gaussians.params.items()}
+    counts = torch.zeros(len(model.gaussians), dtype=torch.long, device=model.device)
+    background = torch.cat([trainer.background, trainer.background.new_zeros(1)])
+    for n, index in enumerate(trainer.train_ids):
+        movers = trainer.movers[n]
+        if n in trainer.unusable | trainer.needs.held or not bool(movers.any()):
+            continue
+        trainer.report.check_cancelled()
+        where = movers.to(model.device, torch.float32)
+        ink = torch.zeros(len(model.gaussians), 1, device=model.device, requires_grad=True)
+        out = render(
+            state, model.sh_degree, trainer.viewmats[index], trainer.Ks[index], width, height, colors=ink,
+            background=background, with_depth=False, with_contributions=True,
+        )  # fmt: skip
+        if out.weight_sum is None:
+            raise RuntimeError("the frame was rendered without contributions")
+        (on_movers,) = torch.autograd.grad(out.colors[0, ..., 3], ink, where)
+        painted_here = out.weight_sum[0]
+        counts += (painted_here > SEEN_WEIGHT) & (on_movers[:, 0] > share * painted_here)
+    return counts
+
+
+def on_trial(trainer: Trainer) -> Tensor:
+    """bool [N]: who the gate opens on trial: all that is painted, or of it what moves in several frames and often."""
+    gate: GateConfig = trainer.config.gate
+    candidates = painted(trainer.model.gaussians)
+    if trainer.movers is None:
+        return candidates
+    moving = moving_frames(trainer, gate.moving_share)
+    often = moving >= gate.moving_often * trainer.model.gaussians.support.sum(1)
+    return candidates & often & (moving >= gate.moving_frames)
+
+
+@torch.no_grad()
+def harden(trainer: Trainer) -> bool:
+    """Closes for good what did not move; its mean change stays. False while nothing moves at all: the trial goes on."""
+    model, config = trainer.model, trainer.config.gate
+    rows = model.open_rows()
+    count = len(trainer.centres)
+    picked = np.unique(np.linspace(0, count - 1, min(MOMENTS, count)).round().astype(int)).tolist()
+    moments = [model.deltas(rows, trainer.centres[n : n + 1]) for n in picked]
+    asked = [moment for moment in moments if moment is not None]
+    seen = model.gaussians.support[rows][:, picked].T
+    pixels = pixels_per_unit(trainer, rows)
+    change, mean = change_of(model.gaussians, rows, asked, pixels, config, seen)
+    # What is on trial by its matte has no still quarter among it that could say how large noise is.
+    noise = config.noise if trainer.movers is None else 0.0
+    stays = stays_open(model.gaussians, rows, change, config, noise)
+    if not bool(stays.any()) and trainer.progress < config.give_up:
+        return False
+    closed, moved = rows[~stays], model.moved(rows, mean)
+    for name, param in model.gaussians.params.items():
+        if name in moved:
+            param.data[closed] = moved[name][closed]
+    model.gaussians.open[closed] = False
+    return True
+
+
+def pixels_per_unit(trainer: Trainer, rows: Tensor) -> Tensor:
+    """[M] pixels of pictures `GateConfig.WIDTH` wide per scene unit, where a camera that saw each of `rows` is nearest.
+
+    0 for what no asked camera saw.
+    """
+    means = trainer.model.gaussians.params["means"].detach()[rows]
+    nearest = torch.full((len(rows),), torch.inf, device=trainer.device)
+    frames = range(0, len(trainer.train_ids), max(1, len(trainer.train_ids) // MOMENTS))
+    for frame in frames:
+        view = trainer.viewmats[trainer.train_ids[frame]]
+        depth = means @ view[2, :3] + view[2, 3]
+        seen = trainer.model.gaussians.support[rows, trainer.bin_of_frame(frame)] & (depth > 1e-3)
+        nearest = torch.where(seen, torch.minimum(nearest, depth), nearest)
+    focal = trainer.Ks[trainer.train_ids[0], 0, 0] * (GateConfig.WIDTH / trainer.width)
+    return torch.where(nearest.isfinite(), focal / nearest, 0.0)
