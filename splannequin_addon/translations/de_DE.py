@@ -636,7 +636,7 @@ BACKEND: dict[str, str] = {
     "Use footage in which the camera travels.": "Material nehmen, in dem die Kamera fährt.",
     "Their cameras are placed from their neighbours.": "Ihre Kameras sind aus den Nachbarn ergänzt.",
     # ------------------------------------------------------------------------------------------ training and freeze
-    "The run's settings or cameras changed: it is trained anew.": "Einstellungen oder Kameras des Laufs haben sich geändert: er wird neu trainiert.",
+    "The run's settings, cameras or motion mattes changed: it is trained anew.": "Einstellungen, Kameras oder Bewegungsmatten des Laufs haben sich geändert: er wird neu trainiert.",
     "The run that is there stays until the new one is done.": "Der vorhandene Lauf bleibt, bis der neue fertig ist.",
     # Verdicts
     "Good.": "Gut.",

@@ -22,6 +22,8 @@ _FINEST, _STRIDE, _DESCENTS, _REFINEMENTS = 1, 4, 16, 2
 """Of DIS: at half the size of the pictures and not finer, every fourth pixel."""
 _SPARSE, _TURNS = 4, 6
 """Every so manieth point tells of the whole picture, and so often what moves in it is weighed less."""
+_NEAREST = 5.0
+"""What is nearer than the typical depth by more than this counts as this near."""
 _FLOOR = 2.0
 """Square difference of pictures that is less than any noise."""
 
@@ -105,7 +107,8 @@ class Leftover:
         left = self._left(key, other, at, within)
         moved = test.grid[0] + left[..., 0], test.grid[1] + left[..., 1]
         match = sample(at[0], moved), sample(at[1], moved)
-        drift = _drift([match[i] - at[i] for i in (0, 1)], within & texture.telling, self._config.least * test.unit)
+        off = [match[i] - at[i] for i in (0, 1)]
+        drift = _drift(off, within & texture.telling, inverse, self._config.least * test.unit)
         pair.gain = brightness(look.grid, sample(pair.there.grid, match), within)
         still, found = (pair.there.unlike(look.grid, place, pair.gain) for place in (at, match))
         sharp = within & texture.telling
@@ -119,25 +122,28 @@ class Leftover:
         return _Laid(pair, np.clip(gained, 0.0, 1.0), min(max(noise, least**2), most**2))
 
 
-def _drift(left: list[Map], told: Mask, unit: float) -> list[Map]:
+def _drift(left: list[Map], told: Mask, inverse: Map, unit: float) -> list[Map]:
     """By how much x and y of the whole picture are off, [h, w] each: a poor pose, a rolling shutter, a lens.
 
-    A second-order polynomial through what is `told` of what is `left`, those far from it hardly counting. What moves
-    by itself does so here and there and not evenly over the picture.
+    A second-order polynomial, and what is nearer more so, as a camera that stands elsewhere sees it, through what is
+    `told` of what is `left`, those far from it hardly counting. What moves by itself does so here and there and not
+    evenly over the picture.
     """
     height, width = told.shape
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j].astype(np.float32)
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     few = told[::_SPARSE, ::_SPARSE]
     if np.count_nonzero(few) < FEW:
         return [np.zeros_like(part) for part in left]
+    near = np.minimum(inverse / max(float(np.median(inverse[told])), 1e-9), _NEAREST).astype(np.float32)
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, near], axis=-1)
     design = terms[::_SPARSE, ::_SPARSE][few].astype(np.float64)
     wanted = np.stack([part[::_SPARSE, ::_SPARSE][few] for part in left], axis=-1).astype(np.float64)
-    found = np.zeros((6, 2))
+    count = design.shape[1]
+    found = np.zeros((count, 2))
     found[0] = np.median(wanted, axis=0)
     for _ in range(_TURNS):
         gap = np.sum((wanted - design @ found) ** 2, axis=1)
         weight = 1.0 / np.square(1.0 + gap / max(unit**2, float(np.median(gap))))
-        normal = design.T @ (design * weight[:, None]) + 1e-3 * len(design) * np.eye(6)
+        normal = design.T @ (design * weight[:, None]) + 1e-3 * len(design) * np.eye(count)
         found = np.linalg.solve(normal, design.T @ (wanted * weight[:, None]))
     return [(terms @ found[:, i].astype(np.float32)) for i in (0, 1)]

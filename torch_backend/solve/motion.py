@@ -119,9 +119,9 @@ def is_found(shot: Shot, config: FlowConfig | None = None) -> bool:
     return _record(shot.solve / FOLDER / _RECORD).get("key") == _solve_key(shot, config or FlowConfig())
 
 
-def motion_key(shot: Shot) -> str:
-    """Changes when any matte does, found or painted."""
-    found = _record(shot.solve / FOLDER / _RECORD).get("key") if is_found(shot) else None
+def motion_key(shot: Shot, with_found: bool = True) -> str:
+    """Changes when any matte does, found or painted; without those that were found, only when a painted one does."""
+    found = _record(shot.solve / FOLDER / _RECORD).get("key") if with_found and is_found(shot) else None
     return content_key(found, *sorted(p for p in (shot.root / PAINTED).glob("*.png") if p.is_file()))
 
 

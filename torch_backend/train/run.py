@@ -146,7 +146,8 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         message = f"The run {params.run!r} was trained on other cameras than the shot has now: it cannot be extended."
         raise JobError(message, "Remove the run or name another one, then train.", ExitCode.TRAIN)
     motion = facts.get("motion")  # None too if it was trained before mattes counted
-    if motion and motion != motion_key(shot):
+    # A freeze finds mattes where the solve did not: what was trained with painted ones alone can still be extended.
+    if motion and motion not in (motion_key(shot), motion_key(shot, with_found=False)):
         message = f"The run {params.run!r} was trained with other motion mattes than the shot has now."
         raise JobError(message, "Train it again: it cannot be extended.", ExitCode.TRAIN)
     config, device, scene = config_from_json(facts["config"]), _prepared_device(params, report), load_scene(shot)
