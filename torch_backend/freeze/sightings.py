@@ -75,6 +75,8 @@ class PlateView:
     """[h, w] float16 in 0..1: low-passed difference between plate and the model's own render of it."""
     offsets: Tensor
     """[M, 3] means of the open Gaussians in that frame, scene units."""
+    shown: Tensor | None
+    """[h, w, 3] float16, the model's own render of it, where plates are no larger than decisions; else None."""
 
 
 @dataclass
@@ -199,7 +201,9 @@ class Sightings:
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height
         fine = min(1.0, _FINEST / width)
-        shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
+        shown = self.view(frame).shown
+        if shown is None:
+            shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
         plate = self.plates.display(frame)
         out = torch.empty(height, width, 3, dtype=torch.float16, device="cpu")
         if fine == 1.0:
@@ -236,6 +240,7 @@ class Sightings:
             plate.half(),
             missed.half(),
             frozen.state["means"].cpu()[self.rows],
+            image.color.half() if self.size == (self.plates.width, self.plates.height) else None,
         )
 
 
