@@ -97,12 +97,12 @@ def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
     assert np.abs(rgba[..., :3] - linear_to_srgb(want.rgba[..., :3]))[seen].max() < 4e-3
     assert np.abs(depth[seen] / want.depth[seen] - 1).max() < 1e-3
     assert bool((depth[rgba[..., 3] == 0] == np.float32(NO_DEPTH)).all())
-    tinted, _ = picture(ask(session[0], view_of(world, 105, 112, show="guesses", exposed_like=105.0)))
+    tinted, _ = picture(ask(session[0], view_of(world, 105, 112, show="guesses", exposed_like=105.0, develop=False)))
     guess = _TINTED * (1.0 - want.support)[..., None]
     expected = rgba[..., :3] * (1.0 - guess) + guess * rgba[..., 3:] * np.array(_TINT)
     assert np.abs(tinted[..., :3] - expected)[seen].max() < 4e-3
     for show in ("support", "motion"):
-        matte, _ = picture(ask(session[0], view_of(world, 105, 112, show=show)))
+        matte, _ = picture(ask(session[0], view_of(world, 105, 112, show=show, develop=False)))
         assert np.abs(matte[..., 0] - getattr(want, show) * want.rgba[..., 3]).max() < 4e-3
 
 

@@ -15,6 +15,9 @@ from ..train.exposure import Exposure
 from ..train.model import DynamicModel, render
 from .bands import bands
 
+_ENDS = 0.08
+"""An instant this near to an end of the clip, as a share of the trained frames, has plates on one side only to tell how
+far away things are: hands and heads came out worse there."""
 SUPPORT_SECONDS = 2.0
 """The support matte of a moving Gaussian falls to 1/e at this distance from the nearest time it was seen."""
 
@@ -206,7 +209,8 @@ def best_instants(instants: list[Instant], count: int = 5, apart: float = 0.08) 
 def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> list[Instant]:
     """Every trained frame as an instant to freeze: one that saw most of what moves and whose plate is sharp is good.
 
-    Gaussians count by how far they travel, so that people weigh more than a flickering lamp.
+    Gaussians count by how far they travel, so that people weigh more than a flickering lamp. Between two that are as
+    good the one that is not at an end of the clip wins.
 
     Args:
         times: [S] normalised times of the trained frames.
@@ -224,6 +228,8 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     seen = (travel[:, None] * support).sum(0) / travel.sum().clamp_min(1e-9)
     bins = [int((model.centres - float(t)).abs().argmin()) for t in times]
     share = seen.cpu().numpy()[bins]
-    scores = share / max(float(share.max()), 1e-6) + 0.5 * rank
+    end = np.minimum(np.arange(len(times)), np.arange(len(times))[::-1])
+    inner = np.minimum(end / max(1.0, _ENDS * len(times)), 1.0)
+    scores = share / max(float(share.max()), 1e-6) + 0.5 * rank + 0.1 * inner
     told = zip(scores.tolist(), share.tolist(), rank.tolist(), strict=True)
     return [Instant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(told)]
