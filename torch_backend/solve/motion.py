@@ -120,9 +120,13 @@ def is_found(shot: Shot, config: FlowConfig | None = None) -> bool:
 
 
 def motion_key(shot: Shot, with_found: bool = True) -> str:
-    """Changes when any matte does, found or painted; without those that were found, only when a painted one does."""
+    """Changes when any matte does, found or painted; without those that were found, only when a painted one does.
+
+    Painted ones count by content: a shot that was copied is still the same shot, and a run of it goes on.
+    """
     found = _record(shot.solve / FOLDER / _RECORD).get("key") if with_found and is_found(shot) else None
-    return content_key(found, *sorted(p for p in (shot.root / PAINTED).glob("*.png") if p.is_file()))
+    painted = sorted(p for p in (shot.root / PAINTED).glob("*.png") if p.is_file())
+    return content_key(found, [[p.name, hashlib.sha256(p.read_bytes()).hexdigest()] for p in painted])
 
 
 def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
