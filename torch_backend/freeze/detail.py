@@ -59,8 +59,9 @@ class DetailConfig:
     """Pixels around what moves in which the leading plate is not believed: hair, motion blur, the flow's own error."""
     feather: float = 1.5
     """Sigma of the leading plate's matte along its border, pixels."""
-    enough: float = 0.3
-    """Sum of weights at which a pixel is all plate; below, splats are mixed in."""
+    doubt: float = 0.05
+    """Sum of weights at which a pixel is half plate, half splats: what plates say is believed in part, as it is wrong
+    in part. On truth the best share of a single plate's residual in what moves is 0.4 to 0.65."""
     travel: float = 1.0
     """Pixels that the model moves a point by, from t* to the frame's own plate, from which on that plate is not
     believed there if it bears the motion out: sways too small for the flow."""
@@ -68,10 +69,12 @@ class DetailConfig:
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
     thin: int = 3
     """Half the width in pixels below which such a spot is an outline, which a wrong depth explains."""
-    sway: float = 6.0
+    sway: float = 3.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
-    sway_trust: float = 0.3
-    """How far a plate of another time is believed in what moves, and only where plate t* does not show it."""
+    sway_trust: float = 0.15
+    """How far a plate of another time is believed in what moves, where the model explains it. Depths that are off by a
+    pixel carry plate t* to a wrong place far away in pose; the own plate's residual is at its place, at another time:
+    either alone is worse than both."""
     instant: bool = True
     """Give what plate t* shows and the model lacks a surface of its own (`instant.py`)."""
     sightings: SightingConfig = field(default_factory=SightingConfig)
@@ -400,10 +403,10 @@ class Detailer:
         larger = torch.tensor(
             [self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]], device="cpu"
         )
-        told = shot.t in fillers.chosen
-        untold = 1.0 - self.seen.seen(shot.t, points).visible if told else torch.ones(count, device="cpu")
-        untold = untold * (1.0 - unknown)
         weights, places = [], []
+        untold = 1.0 - unknown
+        if shot.t in fillers.chosen:  # the better plate t* shows it, the less another time is needed
+            untold = untold * (1.0 - self._near(shot, shot.t, self.seen.seen(shot.t, points)))
         for n, frame in enumerate(fillers.chosen):
             there = points if frame == shot.t else points + look_up(fillers.moved[n], small)
             sighting = self.seen.seen(frame, there)
@@ -412,8 +415,8 @@ class Detailer:
             places.append(sighting.pixels * larger)
         believed = torch.stack(weights)
         rest.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]
-        rest.share = (believed.sum(dim=0) / self.config.enough).clamp(max=1.0)
         total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
+        rest.share = total / (total + self.config.doubt)
         for n, residual in enumerate(fillers.residuals):
             carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
         rest.color += carried * rest.share[:, None]
@@ -423,15 +426,20 @@ class Detailer:
         """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
         view = self.seen.view(frame)
         travel = (project(points, view.viewmat, view.K)[0] - sighting.pixels).norm(dim=-1)
-        trust = torch.exp(-(travel / (self.config.sway * self.seen.unit)).square())
+        trust = torch.exp(-travel / (self.config.sway * self.seen.unit))
         return self.config.sway_trust * sighting.explained * trust
+
+    def _near(self, shot: _Shot, frame: int, sighting: Sighting) -> Tensor:
+        """[...] in 0..1: how surely a plate shows points where the depth says."""
+        return sighting.visible / (1.0 + self._parallax(shot, frame, sighting.depth))
 
     def _weight(self, shot: _Shot, frame: int, sighting: Sighting, motion: Tensor, sway: Tensor) -> Tensor:
         """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*."""
-        near = sighting.visible / (1.0 + self._parallax(shot, frame, sighting.depth))
+        near = self._near(shot, frame, sighting)
         if frame == shot.t:
             return near
-        return near * ((1.0 - motion) * (1.0 - sighting.moving) + motion * sway)
+        still = (1.0 - motion) * (1.0 - sighting.moving)
+        return near * (still + (1.0 - still) * sway)
 
     def _chosen(self, shot: _Shot, matte: Tensor, leading: int, usable: list[int]) -> list[int]:
         """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
