@@ -75,6 +75,9 @@ class DetailConfig:
     """How far a plate of another time is believed in what moves, where the model explains it. Depths that are off by a
     pixel carry plate t* to a wrong place far away in pose; the own plate's residual is at its place, at another time:
     either alone is worse than both."""
+    agreement: float = 0.03
+    """Low-passed difference, display-referred, between a plate of another time and plate t* at which the first is
+    believed 1/e in what moves: it may show another state."""
     instant: bool = True
     """Give what plate t* shows and the model lacks a surface of its own (`instant.py`)."""
     sightings: SightingConfig = field(default_factory=SightingConfig)
@@ -158,6 +161,8 @@ class _Fillers:
     """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
     unknown: Tensor
     """[h, w] in 0..1: share of it whose way nobody knows."""
+    agreed: list[Tensor]
+    """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
     residuals: list[Tensor]
     """[H, W, 3] float16 each, as `Sightings.residual`."""
 
@@ -386,7 +391,24 @@ class Detailer:
         if not bool((matte < _ALL).any()):
             return None
         chosen = self._chosen(shot, matte, leading, usable)
-        return _Fillers(chosen, *self._displacements(shot, chosen), [self.seen.residual(frame) for frame in chosen])
+        moved, unknown = self._displacements(shot, chosen)
+        agreed = self._agreed(shot, chosen, moved)
+        return _Fillers(chosen, moved, unknown, agreed, [self.seen.residual(frame) for frame in chosen])
+
+    def _agreed(self, shot: _Shot, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
+        """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
+        if shot.t not in chosen:
+            return [torch.ones_like(shot.depth) for _ in chosen]
+        truth = self.seen.seen(shot.t, shot.points)
+        told = look_up(self.seen.view(shot.t).picture.float(), truth.pixels)
+        out = []
+        for frame, way in zip(chosen, moved, strict=True):
+            there = self.seen.seen(frame, shot.points + way)
+            says = look_up(self.seen.view(frame).picture.float(), there.pixels)
+            both = (truth.visible * there.visible)[..., None]
+            off = self.seen.difference(says * both, told * both, 1.0)
+            out.append(torch.exp(-(off / self.config.agreement).square()))
+        return out
 
     def _rest(self, shot: _Shot, fillers: _Fillers, matte: Tensor, rows: slice) -> _Rest:
         """What the leading plate does not give of some rows: the splats, with what they missed from other plates."""
@@ -410,7 +432,7 @@ class Detailer:
         for n, frame in enumerate(fillers.chosen):
             there = points if frame == shot.t else points + look_up(fillers.moved[n], small)
             sighting = self.seen.seen(frame, there)
-            sway = self._sway(frame, points, sighting) * untold
+            sway = self._sway(frame, points, sighting) * untold * look_up(fillers.agreed[n], small)
             weights.append(self._weight(shot, frame, sighting, motion, sway))
             places.append(sighting.pixels * larger)
         believed = torch.stack(weights)
