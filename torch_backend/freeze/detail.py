@@ -33,7 +33,8 @@ from ..train.model import render
 from .bands import bands, hand_back, look_up_near
 from .instant import InstantLayer, instant_layer, join
 from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
-from .reproject import blurred, look_up, narrowed, pixel_centres, project, resized, unproject, widened
+from .regions import opened
+from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import MovingOf, PlateReader, Sighting, SightingConfig, Sightings
 from .transfer import to_display, to_linear
 from .warp import sample, snap
@@ -316,7 +317,8 @@ class Detailer:
             return within, st, own
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
         if own:
-            wrong = wrong | self._swayed(shot, leading, size)
+            off = self._off(shot, leading)
+            wrong = self.seen.whole(wrong | self._swayed(shot, leading, off), off)
         wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
         matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
         if not own:
@@ -324,24 +326,28 @@ class Detailer:
             matte = matte * lead.visible * torch.exp(-error.square())
         return resized(matte, columns, rows) * within, st, own
 
-    def _swayed(self, shot: _Shot, frame: int, size: tuple[int, int]) -> Tensor:
-        """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
-
-        That is, the render of t* differs from the plate by more than the render of the plate's own time does. A
-        textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways that are.
-        """
+    def _off(self, shot: _Shot, frame: int) -> Tensor:
+        """[h, w] low-passed difference of the frozen render and its own plate, 0 beyond that."""
         h, w = shot.depth.shape
         view = self.seen.view(frame)
-        inner_h, inner_w = view.missed.shape
-        top, left = (h - inner_h) // 2, (w - inner_w) // 2
-        shown = resized(shot.image.color, w, h)[top : top + inner_h, left : left + inner_w]
-        gained = self.seen.difference(view.picture.float(), shown) - view.missed.float()
-        out = torch.zeros(h, w, dtype=torch.bool, device="cpu")
-        out[top : top + inner_h, left : left + inner_w] = gained > self.config.borne_out
-        out = (out & (self._travel(shot, frame) > self.config.travel)).float()
+        inside = _middle(view.missed, shot.depth)
+        out = torch.zeros(h, w, device="cpu")
+        out[inside] = self.seen.difference(view.picture.float(), resized(shot.image.color, w, h)[inside])
+        return out
+
+    def _swayed(self, shot: _Shot, frame: int, off: Tensor) -> Tensor:
+        """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
+
+        That is, the render of t* differs from the plate (`off`, as `_off`) by more than the render of the plate's own
+        time does. A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
+        that are.
+        """
+        missed = self.seen.view(frame).missed.float()
+        inside, out = _middle(missed, shot.depth), torch.zeros_like(off, dtype=torch.bool)
+        out[inside] = off[inside] - missed > self.config.borne_out
+        out = out & (self._travel(shot, frame) > self.config.travel)
         # Outlines are errors of depth; what moves is a region.
-        thin = round(self.config.thin * self.seen.unit)
-        return widened(narrowed(out, thin), thin) > 0.5
+        return opened(out, round(self.config.thin * self.seen.unit))
 
     def _travel(self, shot: _Shot, frame: int) -> Tensor:
         """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
@@ -557,6 +563,13 @@ class Detailer:
         source[share <= 0.0] = 0.0
         made.plate[rows], made.source[rows] = share, source
         made.linear[rows] = fill if lead is None else torch.addcmul(fill, matte[..., None], lead)
+
+
+def _middle(inner: Tensor, outer: Tensor) -> tuple[slice, slice]:
+    """(rows, columns) of a picture [h, w, ...] that lies in the middle of a larger one."""
+    (rows, columns), (h, w) = outer.shape[:2], inner.shape[:2]
+    top, left = (rows - h) // 2, (columns - w) // 2
+    return slice(top, top + h), slice(left, left + w)
 
 
 def _with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Tensor:
