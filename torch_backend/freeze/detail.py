@@ -33,7 +33,7 @@ from ..train.model import render
 from .bands import bands, hand_back, look_up_near
 from .instant import InstantLayer, instant_layer, join
 from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
-from .regions import opened
+from .regions import closed, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import MovingOf, PlateReader, Sighting, SightingConfig, Sightings
 from .transfer import to_display, to_linear
@@ -67,8 +67,14 @@ class DetailConfig:
     believed there if it bears the motion out: sways too small for the flow."""
     borne_out: float = 0.03
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
+    denied: float = 0.15
+    """Low-passed difference of the frozen render and its own plate, display-referred, from which on that plate is not
+    believed where plate t* agrees with the render: something held still that was elsewhere."""
     thin: int = 3
-    """Half the width in pixels below which such a spot is an outline, which a wrong depth explains."""
+    """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
+    gap: int = 4
+    """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
+    sees flickers from pixel to pixel."""
     sway: float = 6.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.3
@@ -140,6 +146,13 @@ class _Shot:
     """[h, w] in 0..1: what moves in the clip, at t*."""
     per_pixel: float
     """Pixels of decisions per pixel of the picture."""
+    denied: Tensor
+    """[h, w] in 0..1: where its own plate shows something else than plate t* and the render do."""
+
+    @property
+    def doubted(self) -> Tensor:
+        """[h, w] in 0..1: where plates of other times are not believed for standing still."""
+        return torch.maximum(self.motion, self.denied)
 
     @property
     def centre(self) -> Tensor:
@@ -269,7 +282,7 @@ class Detailer:
         t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
         motion = resized(image.motion, w, h)
         own = self._is_own(output, width, height)
-        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns)
+        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, torch.zeros_like(motion))
 
     def _is_own(self, output: OutputFrame, width: int, height: int) -> bool:
         """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
@@ -299,7 +312,8 @@ class Detailer:
     ) -> tuple[Tensor, Tensor, bool]:
         """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
 
-        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's.
+        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's; and
+        `shot.denied`.
         """
         rows, columns = shot.image.alpha.shape
         lead = self.seen.seen(leading, shot.points)
@@ -310,6 +324,8 @@ class Detailer:
             shot.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
         else:
             shot.motion = torch.maximum(shot.motion, lead.moving) if own else shot.motion
+        gap = round(self.config.gap * self.seen.unit)
+        shot.motion = torch.maximum(shot.motion, closed(shot.motion > 0.5, gap).float())
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns, device="cpu"), st, own
@@ -318,7 +334,12 @@ class Detailer:
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
         if own:
             off = self._off(shot, leading)
-            wrong = self.seen.whole(wrong | self._swayed(shot, leading, off), off)
+            wrong = wrong | self._swayed(shot, leading, off)
+            if truth is not None:
+                denied = self._denied(truth, off)
+                wrong = wrong | denied
+                shot.denied = denied.float()
+            wrong = closed(self.seen.whole(wrong, off), gap)
         wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
         matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
         if not own:
@@ -334,6 +355,14 @@ class Detailer:
         out = torch.zeros(h, w, device="cpu")
         out[inside] = self.seen.difference(view.picture.float(), resized(shot.image.color, w, h)[inside])
         return out
+
+    def _denied(self, truth: Sighting, off: Tensor) -> Tensor:
+        """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate shows something else (`off`).
+
+        A hand that is held still where it was not at t* is still to the flow; a wrong depth explains edges only.
+        """
+        denied = (off > self.config.denied) & (truth.visible * truth.explained > 0.5)
+        return self.seen.whole(opened(denied, round(self.config.thin * self.seen.unit)), off)
 
     def _swayed(self, shot: _Shot, frame: int, off: Tensor) -> Tensor:
         """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
@@ -402,7 +431,7 @@ class Detailer:
         pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
         small = pixels * shot.per_pixel
         points = unproject(pixels, shot.image.depth[rows][y, x], shot.viewmat, shot.K)
-        motion, unknown = look_up(shot.motion, small), look_up(fillers.unknown, small)
+        motion, unknown = look_up(shot.doubted, small), look_up(fillers.unknown, small)
         larger = torch.tensor(
             [self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]], device="cpu"
         )
@@ -443,7 +472,7 @@ class Detailer:
         """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
         h, w = shot.depth.shape
         need = 1.0 - resized(matte, w, h)[::4, ::4]
-        points, motion = shot.points[::4, ::4], shot.motion[::4, ::4]
+        points, motion = shot.points[::4, ::4], shot.doubted[::4, ::4]
         k = self.seen.frames.index(leading)
         around = {k + side * step for step in self.config.reach for side in (-1, 1)} | {k}
         reach = {self.seen.frames[i] for i in around if 0 <= i < len(self.seen.frames)} | {shot.t}
