@@ -333,6 +333,7 @@ class Detailer:
             return within, st, own
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
         if own:
+            wrong = wrong | self._beside(shot, leading, usable)
             off = self._off(shot, leading)
             wrong = wrong | self._swayed(shot, leading, off)
             if truth is not None:
@@ -355,6 +356,14 @@ class Detailer:
         out = torch.zeros(h, w, device="cpu")
         out[inside] = self.seen.difference(view.picture.float(), resized(shot.image.color, w, h)[inside])
         return out
+
+    def _beside(self, shot: _Shot, frame: int, usable: list[int]) -> Tensor:
+        """[h, w] bool: what the plates before and after call moving. What only one of three finds flickers."""
+        at, moving = usable.index(frame), torch.zeros_like(shot.depth)
+        for neighbour in usable[max(0, at - 1) : at] + usable[at + 1 : at + 2]:
+            sighting = self.seen.seen(neighbour, shot.points)
+            moving = torch.maximum(moving, sighting.visible * sighting.moving)
+        return moving > 0.5
 
     def _denied(self, truth: Sighting, off: Tensor) -> Tensor:
         """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate shows something else (`off`).
