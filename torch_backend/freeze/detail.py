@@ -282,7 +282,8 @@ class Detailer:
         t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
         motion = resized(image.motion, w, h)
         own = self._is_own(output, width, height)
-        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, torch.zeros_like(motion))
+        nothing = torch.zeros_like(motion)
+        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing)
 
     def _is_own(self, output: OutputFrame, width: int, height: int) -> bool:
         """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
@@ -358,12 +359,18 @@ class Detailer:
         return out
 
     def _beside(self, shot: _Shot, frame: int, usable: list[int]) -> Tensor:
-        """[h, w] bool: what the plates before and after call moving. What only one of three finds flickers."""
-        at, moving = usable.index(frame), torch.zeros_like(shot.depth)
-        for neighbour in usable[max(0, at - 1) : at] + usable[at + 1 : at + 2]:
-            sighting = self.seen.seen(neighbour, shot.points)
-            moving = torch.maximum(moving, sighting.visible * sighting.moving)
-        return moving > 0.5
+        """[h, w] bool: what the plate before or after sees and calls moving, or both call moving that is before it.
+
+        What only one of three finds would come and go.
+        """
+        at = usable.index(frame)
+        around = usable[max(0, at - 1) : at] + usable[at + 1 : at + 2]
+        sightings = [self.seen.seen(neighbour, shot.points) for neighbour in around]
+        told = [sighting.moving > 0.5 for sighting in sightings]
+        itself = [moving & (sighting.visible > 0.5) for moving, sighting in zip(told, sightings, strict=True)]
+        nothing = torch.zeros_like(shot.depth, dtype=torch.bool)
+        both = told[0] & told[1] if len(told) == 2 else nothing
+        return torch.stack([both, *itself]).any(dim=0)
 
     def _denied(self, truth: Sighting, off: Tensor) -> Tensor:
         """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate shows something else (`off`).
