@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -146,13 +146,8 @@ class _Shot:
     """[h, w] in 0..1: what moves in the clip, at t*."""
     per_pixel: float
     """Pixels of decisions per pixel of the picture."""
-    denied: Tensor
-    """[h, w] in 0..1: where its own plate shows something else than plate t* and the render do."""
-
-    @property
-    def doubted(self) -> Tensor:
-        """[h, w] in 0..1: where plates of other times are not believed for standing still."""
-        return torch.maximum(self.motion, self.denied)
+    doubt: Tensor
+    """[h, w] in 0..1: where plates of other times are believed only if they agree with the model."""
 
     @property
     def centre(self) -> Tensor:
@@ -314,7 +309,7 @@ class Detailer:
         """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
 
         Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's; and
-        `shot.denied`.
+        `shot.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so.
         """
         rows, columns = shot.image.alpha.shape
         lead = self.seen.seen(leading, shot.points)
@@ -338,12 +333,10 @@ class Detailer:
             off = self._off(shot, leading)
             wrong = wrong | self._swayed(shot, leading, off)
             if truth is not None:
-                denied = self._denied(truth, off)
-                wrong = wrong | denied
-                shot.denied = denied.float()
+                wrong = wrong | self._denied(truth, off)
             wrong = closed(self.seen.whole(wrong, off), gap)
-        wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
-        matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
+        shot.doubt = widened(wrong.float(), round(self.config.margin * self.seen.unit))
+        matte = 1.0 - blurred(shot.doubt, self.config.feather * self.seen.unit)
         if not own:
             error = self._parallax(shot, leading, shot.depth)
             matte = matte * lead.visible * torch.exp(-error.square())
@@ -378,7 +371,7 @@ class Detailer:
         A hand that is held still where it was not at t* is still to the flow; a wrong depth explains edges only.
         """
         denied = (off > self.config.denied) & (truth.visible * truth.explained > 0.5)
-        return self.seen.whole(opened(denied, round(self.config.thin * self.seen.unit)), off)
+        return opened(denied, round(self.config.thin * self.seen.unit))
 
     def _swayed(self, shot: _Shot, frame: int, off: Tensor) -> Tensor:
         """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
@@ -447,17 +440,17 @@ class Detailer:
         pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
         small = pixels * shot.per_pixel
         points = unproject(pixels, shot.image.depth[rows][y, x], shot.viewmat, shot.K)
-        motion, unknown = look_up(shot.doubted, small), look_up(fillers.unknown, small)
+        motion, unknown = look_up(shot.motion, small), look_up(fillers.unknown, small)
         larger = torch.tensor(
             [self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]], device="cpu"
         )
-        told = shot.t in fillers.chosen
+        doubt, told = look_up(shot.doubt, small), shot.t in fillers.chosen
         untold = 1.0 - self.seen.seen(shot.t, points).visible if told else torch.ones(count, device="cpu")
         untold = untold * (1.0 - unknown)
         weights, places = [], []
         for n, frame in enumerate(fillers.chosen):
             there = points if frame == shot.t else points + look_up(fillers.moved[n], small)
-            sighting = self.seen.seen(frame, there)
+            sighting = self._doubted(self.seen.seen(frame, there), doubt)
             sway = self._sway(frame, points, sighting) * untold
             weights.append(self._weight(shot, frame, sighting, motion, sway))
             places.append(sighting.pixels * larger)
@@ -469,6 +462,10 @@ class Detailer:
             carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
         rest.color += carried * rest.share[:, None]
         return rest
+
+    def _doubted(self, sighting: Sighting, doubt: Tensor) -> Sighting:
+        """The sighting, with what it shows of points in doubt [...] taken for moving where the model says otherwise."""
+        return replace(sighting, moving=torch.maximum(sighting.moving, doubt * (1.0 - sighting.explained)))
 
     def _sway(self, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
         """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
@@ -488,13 +485,13 @@ class Detailer:
         """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
         h, w = shot.depth.shape
         need = 1.0 - resized(matte, w, h)[::4, ::4]
-        points, motion = shot.points[::4, ::4], shot.doubted[::4, ::4]
+        points, motion, doubt = (of[::4, ::4] for of in (shot.points, shot.motion, shot.doubt))
         k = self.seen.frames.index(leading)
         around = {k + side * step for step in self.config.reach for side in (-1, 1)} | {k}
         reach = {self.seen.frames[i] for i in around if 0 <= i < len(self.seen.frames)} | {shot.t}
         zero = torch.zeros_like(motion)
         gains = {
-            frame: need * self._weight(shot, frame, self.seen.seen(frame, points), motion, zero)
+            frame: need * self._weight(shot, frame, self._doubted(self.seen.seen(frame, points), doubt), motion, zero)
             for frame in sorted(reach)
             if frame in usable
         }
