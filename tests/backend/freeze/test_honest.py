@@ -1,11 +1,14 @@
 """What moved is let go of whole, though mattes miss parts of it: nothing of it stays, no speck and no outline."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy import ndimage
 
-from tests.backend.freeze.test_detail import H, W, build, off, widened
+from tests.backend.freeze.test_detail import H, W, board_at, build, off, widened
+from torch_backend.deformation import Deformation, Deltas
 from torch_backend.freeze.detail import DetailConfig, Detailer
 from torch_backend.freeze.regions import closed, grown, opened
 from torch_backend.freeze.sightings import SightingConfig
@@ -19,6 +22,13 @@ BLIND = {"denied": 9.0, "travel": 1e9}
 @pytest.fixture(scope="module")
 def world(tmp_path_factory, quiet):
     return build(tmp_path_factory.mktemp("honest"), quiet())
+
+
+class Stays(Deformation):
+    """No motion: the board stands where it is at T_STAR."""
+
+    def forward(self, means, times, own=None):
+        return Deltas(torch.tensor([board_at(T_STAR), 0.0, 0.0]).expand(len(means), 3))
 
 
 def narrowed(mask, by):
@@ -94,6 +104,20 @@ def test_what_the_plates_before_and_after_call_moving_is_moving(world):
     assert made.matte.numpy()[narrowed(both, 6)].max() < 0.01
     alone = {frame: np.zeros((H, W), bool) for frame in (FRAME - 1, FRAME, FRAME + 1)}
     assert make(world, alone, blind, **BLIND).matte.numpy()[narrowed(both, 6)].min() > 0.99, "else nothing is told"
+
+
+def test_plates_that_fill_show_nothing_of_it_either(world):
+    """Flow found the board in the frame's own plate alone, and the model leaves it where it was at t*."""
+    before = world.run.model
+    world.run.model = replace(before, field=Stays())
+    try:
+        mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14) if frame not in (FRAME, T_STAR)}
+        made = make(world, mattes, SightingConfig(contradicted=9.0))
+        believed = make(world, mattes, SightingConfig(contradicted=9.0, unexplained=1e6))
+    finally:
+        world.run.model = before
+    assert shows_its_own_board(world, made) < 0.01
+    assert shows_its_own_board(world, believed) > 0.1, "else there is nothing to mend"
 
 
 def test_gaps_within_what_moves_belong_to_it(world):
