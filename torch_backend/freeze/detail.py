@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -33,7 +33,8 @@ from ..train.model import render
 from .bands import bands, hand_back, look_up_near
 from .instant import InstantLayer, instant_layer, join
 from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
-from .reproject import blurred, look_up, narrowed, pixel_centres, project, resized, unproject, widened
+from .regions import closed, opened
+from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import MovingOf, PlateReader, Sighting, SightingConfig, Sightings
 from .transfer import to_display, to_linear
 from .warp import sample, snap
@@ -67,8 +68,14 @@ class DetailConfig:
     believed there if it bears the motion out: sways too small for the flow."""
     borne_out: float = 0.03
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
+    denied: float = 0.15
+    """Low-passed difference of the frozen render and its own plate, display-referred, from which on that plate is not
+    believed where plate t* agrees with the render: something held still that was elsewhere."""
     thin: int = 3
-    """Half the width in pixels below which such a spot is an outline, which a wrong depth explains."""
+    """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
+    gap: int = 4
+    """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
+    sees flickers from pixel to pixel."""
     sway: float = 3.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.15
@@ -145,6 +152,8 @@ class _Shot:
     """[h, w] in 0..1: what moves in the clip, at t*."""
     per_pixel: float
     """Pixels of decisions per pixel of the picture."""
+    doubt: Tensor
+    """[h, w] in 0..1: where plates of other times are believed only if they agree with the model."""
 
     @property
     def centre(self) -> Tensor:
@@ -276,7 +285,8 @@ class Detailer:
         t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
         motion = resized(image.motion, w, h)
         own = self._is_own(output, width, height)
-        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns)
+        nothing = torch.zeros_like(motion)
+        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing)
 
     def _is_own(self, output: OutputFrame, width: int, height: int) -> bool:
         """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
@@ -306,7 +316,8 @@ class Detailer:
     ) -> tuple[Tensor, Tensor, bool]:
         """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
 
-        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's.
+        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's; and
+        `shot.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so.
         """
         rows, columns = shot.image.alpha.shape
         lead = self.seen.seen(leading, shot.points)
@@ -317,6 +328,8 @@ class Detailer:
             shot.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
         else:
             shot.motion = torch.maximum(shot.motion, lead.moving) if own else shot.motion
+        gap = round(self.config.gap * self.seen.unit)
+        shot.motion = torch.maximum(shot.motion, closed(shot.motion > 0.5, gap).float())
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns, device="cpu"), st, own
@@ -324,32 +337,63 @@ class Detailer:
             return within, st, own
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
         if own:
-            wrong = wrong | self._swayed(shot, leading, size)
-        wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
-        matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
+            wrong = wrong | self._beside(shot, leading, usable)
+            off = self._off(shot, leading)
+            wrong = wrong | self._swayed(shot, leading, off)
+            if truth is not None:
+                wrong = wrong | self._denied(truth, off)
+            wrong = closed(self.seen.whole(wrong, off), gap)
+        shot.doubt = widened(wrong.float(), round(self.config.margin * self.seen.unit))
+        matte = 1.0 - blurred(shot.doubt, self.config.feather * self.seen.unit)
         if not own:
             error = self._parallax(shot, leading, shot.depth)
             matte = matte * lead.visible * torch.exp(-error.square())
         return resized(matte, columns, rows) * within, st, own
 
-    def _swayed(self, shot: _Shot, frame: int, size: tuple[int, int]) -> Tensor:
-        """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
-
-        That is, the render of t* differs from the plate by more than the render of the plate's own time does. A
-        textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways that are.
-        """
+    def _off(self, shot: _Shot, frame: int) -> Tensor:
+        """[h, w] low-passed difference of the frozen render and its own plate, 0 beyond that."""
         h, w = shot.depth.shape
         view = self.seen.view(frame)
-        inner_h, inner_w = view.missed.shape
-        top, left = (h - inner_h) // 2, (w - inner_w) // 2
-        shown = resized(shot.image.color, w, h)[top : top + inner_h, left : left + inner_w]
-        gained = self.seen.difference(view.picture.float(), shown) - view.missed.float()
-        out = torch.zeros(h, w, dtype=torch.bool, device="cpu")
-        out[top : top + inner_h, left : left + inner_w] = gained > self.config.borne_out
-        out = (out & (self._travel(shot, frame) > self.config.travel)).float()
+        inside = _middle(view.missed, shot.depth)
+        out = torch.zeros(h, w, device="cpu")
+        out[inside] = self.seen.difference(view.picture.float(), resized(shot.image.color, w, h)[inside])
+        return out
+
+    def _beside(self, shot: _Shot, frame: int, usable: list[int]) -> Tensor:
+        """[h, w] bool: what the plate before or after sees and calls moving, or both call moving that is before it.
+
+        What only one of three finds would come and go.
+        """
+        at = usable.index(frame)
+        around = usable[max(0, at - 1) : at] + usable[at + 1 : at + 2]
+        sightings = [self.seen.seen(neighbour, shot.points) for neighbour in around]
+        told = [sighting.moving > 0.5 for sighting in sightings]
+        itself = [moving & (sighting.visible > 0.5) for moving, sighting in zip(told, sightings, strict=True)]
+        nothing = torch.zeros_like(shot.depth, dtype=torch.bool)
+        both = told[0] & told[1] if len(told) == 2 else nothing
+        return torch.stack([both, *itself]).any(dim=0)
+
+    def _denied(self, truth: Sighting, off: Tensor) -> Tensor:
+        """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate shows something else (`off`).
+
+        A hand that is held still where it was not at t* is still to the flow; a wrong depth explains edges only.
+        """
+        denied = (off > self.config.denied) & (truth.visible * truth.explained > 0.5)
+        return opened(denied, round(self.config.thin * self.seen.unit))
+
+    def _swayed(self, shot: _Shot, frame: int, off: Tensor) -> Tensor:
+        """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
+
+        That is, the render of t* differs from the plate (`off`, as `_off`) by more than the render of the plate's own
+        time does. A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
+        that are.
+        """
+        missed = self.seen.view(frame).missed.float()
+        inside, out = _middle(missed, shot.depth), torch.zeros_like(off, dtype=torch.bool)
+        out[inside] = off[inside] - missed > self.config.borne_out
+        out = out & (self._travel(shot, frame) > self.config.travel)
         # Outlines are errors of depth; what moves is a region.
-        thin = round(self.config.thin * self.seen.unit)
-        return widened(narrowed(out, thin), thin) > 0.5
+        return opened(out, round(self.config.thin * self.seen.unit))
 
     def _travel(self, shot: _Shot, frame: int) -> Tensor:
         """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
@@ -425,13 +469,14 @@ class Detailer:
         larger = torch.tensor(
             [self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]], device="cpu"
         )
+        doubt = look_up(shot.doubt, small)
         weights, places = [], []
         untold = 1.0 - unknown
         if shot.t in fillers.chosen:  # the better plate t* shows it, the less another time is needed
             untold = untold * (1.0 - self._near(shot, shot.t, self.seen.seen(shot.t, points)))
         for n, frame in enumerate(fillers.chosen):
             there = points if frame == shot.t else points + look_up(fillers.moved[n], small)
-            sighting = self.seen.seen(frame, there)
+            sighting = self._doubted(self.seen.seen(frame, there), doubt)
             sway = self._sway(frame, points, sighting) * untold * look_up(fillers.agreed[n], small)
             weights.append(self._weight(shot, frame, sighting, motion, sway))
             places.append(sighting.pixels * larger)
@@ -443,6 +488,10 @@ class Detailer:
             carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
         rest.color += carried * rest.share[:, None]
         return rest
+
+    def _doubted(self, sighting: Sighting, doubt: Tensor) -> Sighting:
+        """The sighting, with what it shows of points in doubt [...] taken for moving where the model says otherwise."""
+        return replace(sighting, moving=torch.maximum(sighting.moving, doubt * (1.0 - sighting.explained)))
 
     def _sway(self, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
         """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
@@ -467,13 +516,13 @@ class Detailer:
         """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
         h, w = shot.depth.shape
         need = 1.0 - resized(matte, w, h)[::4, ::4]
-        points, motion = shot.points[::4, ::4], shot.motion[::4, ::4]
+        points, motion, doubt = (of[::4, ::4] for of in (shot.points, shot.motion, shot.doubt))
         k = self.seen.frames.index(leading)
         around = {k + side * step for step in self.config.reach for side in (-1, 1)} | {k}
         reach = {self.seen.frames[i] for i in around if 0 <= i < len(self.seen.frames)} | {shot.t}
         zero = torch.zeros_like(motion)
         gains = {
-            frame: need * self._weight(shot, frame, self.seen.seen(frame, points), motion, zero)
+            frame: need * self._weight(shot, frame, self._doubted(self.seen.seen(frame, points), doubt), motion, zero)
             for frame in sorted(reach)
             if frame in usable
         }
@@ -587,6 +636,13 @@ class Detailer:
         source[share <= 0.0] = 0.0
         made.plate[rows], made.source[rows] = share, source
         made.linear[rows] = fill if lead is None else torch.addcmul(fill, matte[..., None], lead)
+
+
+def _middle(inner: Tensor, outer: Tensor) -> tuple[slice, slice]:
+    """(rows, columns) of a picture [h, w, ...] that lies in the middle of a larger one."""
+    (rows, columns), (h, w) = outer.shape[:2], inner.shape[:2]
+    top, left = (rows - h) // 2, (columns - w) // 2
+    return slice(top, top + h), slice(left, left + w)
 
 
 def _with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Tensor:

@@ -18,6 +18,7 @@ from ..shot import Shot
 from ..solve.motion import MOVING, UNKNOWN, load_motion
 from ..train import LoadedRun
 from .query import FrozenGaussians, FrozenImage, render_frozen
+from .regions import grown, opened
 from .reproject import blurred, inside, look_up, pixel_centres, project, resized, same_surface, widened
 from .travel import Stage
 
@@ -113,6 +114,12 @@ class SightingConfig:
     """Low-passed difference, display-referred, at which a plate is believed 1/e."""
     region: int = 4
     """A difference speaks for so many pixels around it: half-rejected movers leave their outlines."""
+    contradicted: float = 0.1
+    """Low-passed difference, display-referred, from which on a pixel beside what moves belongs to it."""
+    reach: int = 24
+    """How far from what the matte calls moving such a region may go: a model that is wrong all over has no end."""
+    thin: int = 2
+    """Half the width below which such a difference is an edge, not a region."""
 
 
 class Sightings:
@@ -198,6 +205,15 @@ class Sightings:
         looks = look_up(torch.stack([view.moving, view.explained], dim=-1), pixels)
         return Sighting(pixels, depth, visible, within, looks[..., 0], looks[..., 1])
 
+    def whole(self, moving: Tensor, off: Tensor) -> Tensor:
+        """[h, w] bool: `moving`, bool, and the regions that touch it in which plate and model differ, by `off` [h, w].
+
+        Flow ends some pixels before what moves does, or says nothing within it. What was missed would stand where it
+        is as specks and outlines.
+        """
+        differs = opened(off > self.config.contradicted, round(self.config.thin * self.unit))
+        return grown(moving, differs, round(self.config.reach * self.unit))
+
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height
         fine = min(1.0, _FINEST / width)
@@ -229,6 +245,7 @@ class Sightings:
         # The working frame will do, and need not be decoded from 4K footage.
         plate = read_image(self.scene.image_path(self.index[frame]), width, height)
         missed = self.difference(plate, image.color)
+        moving = torch.maximum(moving, self.whole(moving > 0.5, missed).float())
         off = self.difference(plate, image.color, 1.0)
         region = round(self.config.region * self.unit)
         off = blurred(widened(off, region), 0.5 * region)
