@@ -68,9 +68,13 @@ class DetailConfig:
     believed there if it bears the motion out: sways too small for the flow."""
     borne_out: float = 0.03
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
+    agreed: float = 0.15
+    """Low-passed difference of the frozen render and its own plate, display-referred, up to which they agree."""
     denied: float = 0.15
     """Low-passed difference of the frozen render and its own plate, display-referred, from which on that plate is not
     believed where plate t* agrees with the render: something held still that was elsewhere."""
+    denied_too: float = 0.1
+    """The same, for what hangs together with such a spot."""
     thin: int = 3
     """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
     gap: int = 4
@@ -337,9 +341,8 @@ class Detailer:
             return within, st, own
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
         if own:
-            wrong = wrong | self._beside(shot, leading, usable)
             off = self._off(shot, leading)
-            wrong = wrong | self._swayed(shot, leading, off)
+            wrong = wrong | self._swayed(shot, leading, off) | self._beside(shot, leading, usable, off)
             if truth is not None:
                 wrong = wrong | self._denied(truth, off)
             wrong = closed(self.seen.whole(wrong, off), gap)
@@ -359,19 +362,23 @@ class Detailer:
         out[inside] = self.seen.difference(view.picture.float(), resized(shot.image.color, w, h)[inside])
         return out
 
-    def _beside(self, shot: _Shot, frame: int, usable: list[int]) -> Tensor:
+    def _beside(self, shot: _Shot, frame: int, usable: list[int], off: Tensor) -> Tensor:
         """[h, w] bool: what the plate before or after sees and calls moving, or both call moving that is before it.
 
-        What only one of three finds would come and go.
+        What only one of three finds would come and go. Where its own plate shows what the frozen render does (`off`)
+        nothing would, and the plate stays.
         """
-        at = usable.index(frame)
+        h, w = shot.depth.shape
+        at, points = usable.index(frame), shot.points[::2, ::2]  # a quarter of the work
         around = usable[max(0, at - 1) : at] + usable[at + 1 : at + 2]
-        sightings = [self.seen.seen(neighbour, shot.points) for neighbour in around]
-        told = [sighting.moving > 0.5 for sighting in sightings]
-        itself = [moving & (sighting.visible > 0.5) for moving, sighting in zip(told, sightings, strict=True)]
-        nothing = torch.zeros_like(shot.depth, dtype=torch.bool)
-        both = told[0] & told[1] if len(told) == 2 else nothing
-        return torch.stack([both, *itself]).any(dim=0)
+        found, both = torch.zeros(points.shape[:2], device="cpu"), torch.ones(points.shape[:2], device="cpu")
+        for neighbour in around:
+            sighting = self.seen.seen(neighbour, points)
+            found, both = torch.maximum(found, sighting.visible * sighting.moving), both * sighting.moving
+        if len(around) == 2:
+            found = torch.maximum(found, both)
+        near = widened((off > self.config.agreed).float(), round(self.config.margin * self.seen.unit))
+        return (resized(found, w, h) > 0.5) & (near > 0.5)
 
     def _denied(self, truth: Sighting, off: Tensor) -> Tensor:
         """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate shows something else (`off`).
@@ -379,7 +386,8 @@ class Detailer:
         A hand that is held still where it was not at t* is still to the flow; a wrong depth explains edges only.
         """
         denied = (off > self.config.denied) & (truth.visible * truth.explained > 0.5)
-        return opened(denied, round(self.config.thin * self.seen.unit))
+        spots = opened(denied, round(self.config.thin * self.seen.unit))
+        return self.seen.whole(spots, off, self.config.denied_too)
 
     def _swayed(self, shot: _Shot, frame: int, off: Tensor) -> Tensor:
         """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.

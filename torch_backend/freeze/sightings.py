@@ -114,9 +114,9 @@ class SightingConfig:
     """Low-passed difference, display-referred, at which a plate is believed 1/e."""
     region: int = 4
     """A difference speaks for so many pixels around it: half-rejected movers leave their outlines."""
-    contradicted: float = 0.1
+    contradicted: float = 0.2
     """Low-passed difference, display-referred, from which on a pixel beside what moves belongs to it."""
-    reach: int = 24
+    reach: int = 16
     """How far from what the matte calls moving such a region may go: a model that is wrong all over has no end."""
     thin: int = 2
     """Half the width below which such a difference is an edge, not a region."""
@@ -205,13 +205,15 @@ class Sightings:
         looks = look_up(torch.stack([view.moving, view.explained], dim=-1), pixels)
         return Sighting(pixels, depth, visible, within, looks[..., 0], looks[..., 1])
 
-    def whole(self, moving: Tensor, off: Tensor) -> Tensor:
+    def whole(self, moving: Tensor, off: Tensor, least: float = 0.0) -> Tensor:
         """[h, w] bool: `moving`, bool, and the regions that touch it in which plate and model differ, by `off` [h, w].
+
+        `least` is the difference that counts; 0: `contradicted`.
 
         Flow ends some pixels before what moves does, or says nothing within it. What was missed would stand where it
         is as specks and outlines.
         """
-        differs = opened(off > self.config.contradicted, round(self.config.thin * self.unit))
+        differs = opened(off > (least or self.config.contradicted), round(self.config.thin * self.unit))
         return grown(moving, differs, round(self.config.reach * self.unit))
 
     def _missed(self, frame: int) -> Tensor:
