@@ -46,7 +46,7 @@ class DevelopConfig:
     harm: float = 0.02
     """Loss on the still pixels of those, in dB, from which on the instant stays as it was."""
     instant_share: float = 0.1
-    """Share of the steps that are taken on plate t* itself."""
+    """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training."""
     margin: int = 2
     """Pixels of pictures 640 wide around what moves that are left out with it."""
     dssim: float = 0.2
@@ -87,7 +87,8 @@ def develop(
 
     Args:
         frozen: the run's scene at t*, and behind its Gaussians those of an instant's layer, if it has one.
-        t_star: frame number; one of the trained frames.
+        t_star: frame number. If it is none of the run's trained frames its plate is not looked at: what moves is learnt
+            from the nearest trained frame on either side, in which it stands where the field has it.
         moving: what moves in the clip's frames.
         check: reports progress, and cancels.
     """
@@ -106,9 +107,10 @@ class _Darkroom:
         self.width = min(scene.width, config.width)
         self.height = max(16, round(scene.height * self.width / scene.width))
         self.index = {frame: i for i, frame in enumerate(scene.frames)}
-        frames = [frame for frame in _spread(run.train_frames, config.frames) if frame != t_star]
+        self.instants = _instants(run.train_frames, t_star)
+        frames = [frame for frame in _spread(run.train_frames, config.frames) if frame not in self.instants]
         self.probes = _spread(frames[1:-1], min(config.probes, len(frames) // 4))
-        self.frames = sorted({*frames, t_star} - {*self.probes})
+        self.frames = sorted({*frames, *self.instants} - {*self.probes})
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
         self.viewmats = scene.viewmats.to(self.device)
         self.moving, self.travel = moving, Travel(run, scene, frozen)
@@ -129,7 +131,7 @@ class _Darkroom:
             for group in self.optimizer.param_groups:
                 group["lr"] = group["first"] * 0.1 ** (n / steps) * min(1.0, (n + 1) / (self.config.warm * steps + 1))
             if float(torch.rand(1, generator=self.generator, device="cpu")) < self.config.instant_share:
-                frame = self.t_star
+                frame = self.instants[n % len(self.instants)]
             else:
                 order = order or torch.randperm(len(self.frames), generator=self.generator, device="cpu").tolist()
                 frame = self.frames[order.pop()]
@@ -144,14 +146,14 @@ class _Darkroom:
 
     @torch.no_grad()
     def _judged(self) -> tuple[float, float]:
-        """(PSNR in dB of the still pixels of the probes, of plate t*)."""
-        still = torch.zeros(2, dtype=torch.float64, device=self.device)
-        for frame in self.probes:
-            shown, learnt = self._shown(frame)
-            error = (shown.clamp(0.0, 1.0) - self._picture(frame)).square().mean(-1)[learnt]
-            still += torch.stack([error.double().sum(), torch.tensor(float(error.numel()), device=self.device)])
-        at = (self._shown(self.t_star)[0].clamp(0.0, 1.0) - self._picture(self.t_star)).square().mean().double()
-        errors = torch.stack([still[0] / still[1].clamp_min(1.0), at]).clamp_min(1e-12)
+        """(PSNR in dB of the still pixels of the probes, of plate t* or its neighbours)."""
+        sums = torch.zeros(2, 2, dtype=torch.float64, device=self.device)
+        for n, frames in enumerate((self.probes, self.instants)):
+            for frame in frames:
+                shown, learnt = self._shown(frame)
+                error = (shown.clamp(0.0, 1.0) - self._picture(frame)).square().mean(-1)[learnt]
+                sums[n] += torch.stack([error.double().sum(), torch.tensor(float(error.numel()), device=self.device)])
+        errors = (sums[:, 0] / sums[:, 1].clamp_min(1.0)).clamp_min(1e-12)
         return tuple((-10.0 * errors.log10()).tolist())
 
     def _step(self, frame: int) -> None:
@@ -182,7 +184,7 @@ class _Darkroom:
     def _learnt(self, frame: int, mover: Tensor) -> Tensor:
         """bool [H, W]: which pixels of a frame say what the frozen scene should show there."""
         matte = self._matte(frame)
-        if frame == self.t_star:
+        if frame in self.instants:
             return torch.ones_like(matte, dtype=torch.bool)
         return (matte < 0.5) & (mover < 0.1)
 
@@ -230,6 +232,14 @@ class _Darkroom:
         }  # fmt: skip
         groups = [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()]
         return FusedAdam(groups, eps=1e-15)
+
+
+def _instants(trained: list[int], t_star: int) -> list[int]:
+    """The trained frames that show an instant: its own, else the nearest on either side of it."""
+    if t_star in trained:
+        return [t_star]
+    before, after = [f for f in trained if f < t_star], [f for f in trained if f > t_star]
+    return [*before[-1:], *after[:1]]
 
 
 def _spread(frames: list[int], most: int) -> list[int]:
