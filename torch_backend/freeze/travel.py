@@ -19,12 +19,14 @@ _KEPT = 64
 class Travel:
     """From a scene frozen at t* to the clip's frames.
 
-    The run's own Gaussians come first in the scene; what stands behind them (an instant's layer) is not moved.
+    The run's own Gaussians come first in the scene; what stands behind them (an instant's layer) is not moved, nor is
+    what was closed at t* (`twin.py`).
     """
 
     def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians) -> None:
         self.run, self.scene = run, scene
-        self.rows = run.model.open_rows()
+        rows = run.model.open_rows()
+        self.rows = rows[frozen.motion[rows] > 0.5]
         """[M] int64, rows of the run's Gaussians that move."""
         self.known = len(run.model.gaussians)
         """How many Gaussians the run has."""

@@ -25,6 +25,7 @@ from torch_backend.freeze.instant import instant_layer, join
 from torch_backend.freeze.query import render_frozen, span_of
 from torch_backend.freeze.sightings import motion_mattes
 from torch_backend.freeze.travel import Stage, Travel
+from torch_backend.freeze.twin import closed, settled
 from torch_backend.live import LiveSession
 from torch_backend.scene import load_scene
 from torch_backend.solve.motion import load_motion
@@ -105,8 +106,31 @@ def test_developed_gaussians_travel_with_those_they_descend_from(made):
     then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state["means"] - frozen.state["means"]
     moved, origin = stage.at(112).state["means"] - now.state["means"], now.descent.origin
     known = origin < len(run.model.gaussians)
-    torch.testing.assert_close(moved[known], then[origin[known]], atol=1e-5, rtol=1e-4)
-    assert not bool(moved[~known].any()) and torch.equal(stage.strangers(now), ~known)
+    moves = now.descent.frozen.motion[origin] > 0.5
+    assert int((known & moves).sum()) > 30, "or the test says nothing"
+    torch.testing.assert_close(moved[known & moves], then[origin[known & moves]], atol=1e-5, rtol=1e-4)
+    assert not bool(moved[~known | ~moves].any()) and torch.equal(stage.strangers(now), ~known)
+
+
+def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(trained):
+    """Part of the wall was opened by mistake, and at t* the field has it in tatters."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen, patch = field(run, scene), run.model.open_rows()
+    wall = torch.arange(len(frozen.support))[frozen.motion < 0.5]
+    wall = wall[frozen.state["means"][wall, 0] > frozen.state["means"][wall, 0].median()]
+    run.model.gaussians.open[wall] = True
+    torn = dataclasses.replace(frozen, motion=frozen.motion.index_fill(0, wall, 1.0), state=dict(frozen.state))
+    torn.state["opacity_logits"] = frozen.state["opacity_logits"].clone()
+    torn.state["opacity_logits"][wall] -= 1.5
+    mended = settled(run, scene, torn, T_STAR, motion_mattes(world.shot))
+    shut = (torn.motion > 0.5) & (mended.motion < 0.5)
+    assert float(shut[wall].float().mean()) > 0.8, "what is seen of it"
+    stays = mended.motion[patch] > 0.5
+    ours, twins = (scores(world, run, scene, f) for f in (mended, closed(run, torn, run.model.open_rows())))
+    was_moving, was_still = scores(world, run, scene, torn)
+    assert ours[1] > was_still + 2.0 and ours[1] > twins[1] - 0.05, "no worse than static where nothing moves"
+    assert ours[0] > was_moving - 0.1 and ours[0] > twins[0] + 1.0 and bool(stays.any())
 
 
 def test_a_developed_instant_is_nearer_to_the_truth(trained, made):
