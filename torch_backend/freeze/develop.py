@@ -21,7 +21,7 @@ from ..train import LoadedRun
 from ..train.adam import FusedAdam
 from ..train.losses import photometric
 from ..train.model import render
-from .query import Descent, FrozenGaussians
+from .query import FrozenGaussians
 from .travel import Travel
 from .working import MovingOf, WorkingPlates, showing, spread
 
@@ -110,7 +110,6 @@ class _Darkroom:
         self.travel = Travel(run, scene, frozen)
         self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
         self.params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in frozen.state.items()}
-        self.origin = torch.arange(len(frozen.support), device=self.device)
         self.optimizer = self._optimizer()
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
         self.mover[len(run.model.gaussians) :] = 1.0
@@ -135,7 +134,7 @@ class _Darkroom:
         else:
             state = {name: p.detach() for name, p in self.params.items()}
         was = self.frozen
-        return FrozenGaussians(state, was.sh_degree, was.support, was.motion, Descent(was, self.origin))
+        return FrozenGaussians(state, was.sh_degree, was.support, was.motion, was)
 
     @torch.no_grad()
     def _judged(self) -> tuple[float, float]:
@@ -164,7 +163,7 @@ class _Darkroom:
         What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         """
         background = torch.full((3,), 0.5, device=self.device) if background is None else background
-        state = self.travel.moved(dict(self.params), self.origin, frame)
+        state = self.travel.moved(dict(self.params), frame)
         out = render(
             state, self.frozen.sh_degree, *self.plates.camera(frame),
             background=torch.cat([background, background.new_zeros(1)]), colors=self.mover[:, None],

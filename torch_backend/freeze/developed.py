@@ -21,7 +21,7 @@ from ..train import LoadedRun
 from ..train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from .develop import DevelopConfig, develop
 from .instant import instant_layer, join
-from .query import Descent, FrozenGaussians, freeze_at, span_of
+from .query import FrozenGaussians, freeze_at, span_of
 from .sightings import motion_mattes
 from .twin import settled
 
@@ -151,31 +151,22 @@ def load_developed(
     support, motion = (_grown(v, len(base["means"])) for v in (support, motion))
     before = FrozenGaussians(base, frozen.sh_degree, support, motion)
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
-    origin = tensors["origin"].to(device)
-    return FrozenGaussians(
-        state, frozen.sh_degree, before.support[origin], before.motion[origin], Descent(before, origin)
-    )
+    return FrozenGaussians(state, frozen.sh_degree, support, motion, before)
 
 
 def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
     """True if tensors of a file fit each other and the run: it may come from anywhere."""
     names = [f"{part}.{name}" for part in ("base", "state") for name in PARAM_NAMES]
-    origin = tensors.get("origin")
-    if origin is None or origin.dtype != torch.long or origin.dim() != 1 or not all(n in tensors for n in names):
+    closed = tensors.get("closed")
+    if closed is None or closed.dtype != torch.long or closed.dim() != 1 or not all(n in tensors for n in names):
         return False
-    before = len(tensors["base.means"]) if tensors["base.means"].dim() else 0
+    count, known = len(tensors["base.means"]) if tensors["base.means"].dim() else 0, len(frozen.support)
     for name in names:
         like, value = frozen.state[name.partition(".")[2]], tensors[name]
-        count = before if name.startswith("base.") else len(origin)
         if value.dtype != like.dtype or value.shape != (count, *like.shape[1:]) or not bool(value.isfinite().all()):
             return False
-    closed = tensors.get("closed")
-    if closed is None or closed.dtype != torch.long or closed.dim() != 1:
-        return False
-    if len(closed) and (int(closed.min()) < 0 or int(closed.max()) >= len(frozen.support)):
-        return False
-    rooted = not len(origin) or (int(origin.min()) >= 0 and int(origin.max()) < before)
-    return rooted and before >= len(frozen.support)
+    rooted = not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
+    return rooted and count >= known
 
 
 def developed(
@@ -221,11 +212,11 @@ def _save(
     assert made.descent is not None
     path = developed_path(run, t_star)
     folder = shot.own(path.parent)
-    before = made.descent.frozen.motion[: len(field.motion)]
-    tensors = {"origin": made.descent.origin, "closed": torch.nonzero(before < field.motion).flatten()}
+    before = made.descent.motion[: len(field.motion)]
+    tensors = {"closed": torch.nonzero(before < field.motion).flatten()}
     # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
-    tensors |= {f"base.{name}": made.descent.frozen.state[name] for name in PARAM_NAMES}
+    tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)
     for other in folder.glob("*.safetensors"):
