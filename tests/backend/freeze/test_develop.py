@@ -220,6 +220,17 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
     assert again is not None and same(again, first)
 
 
+def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(apart):
+    shot, run, scene, _ = apart
+    held, config = 109, DevelopConfig(steps=20, harm=99.0)
+    assert held not in run.train_frames
+    frozen, mattes = field(run, scene, held), motion_mattes(shot)
+    made = [develop(run, scene, settled(run, scene, frozen, held, mattes), held, mattes, config)]
+    scene.image_path(scene.frames.index(held)).write_bytes(b"nobody reads it")
+    made.append(develop(run, scene, settled(run, scene, frozen, held, mattes), held, mattes, config))
+    assert same(*made) and not torch.equal(made[0].state["sh0"], made[0].descent.state["sh0"])
+
+
 def test_instants_of_another_training_go_when_one_is_kept(apart):
     shot, run, scene, frozen = apart
     path = developed_path(run, T_STAR)
