@@ -222,7 +222,7 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
 
 def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(apart):
     shot, run, scene, _ = apart
-    held, config = 109, DevelopConfig(steps=20, harm=99.0)
+    held, config = 109, DevelopConfig(steps=100, harm=99.0)
     assert held not in run.train_frames
     frozen, mattes = field(run, scene, held), motion_mattes(shot)
     made = [develop(run, scene, settled(run, scene, frozen, held, mattes), held, mattes, config)]
