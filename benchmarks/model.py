@@ -41,6 +41,7 @@ from torch_backend.freeze.develop import develop
 from torch_backend.freeze.developed import config_for, developed
 from torch_backend.freeze.query import FrozenGaussians, FrozenImage, freeze_at, render_frozen
 from torch_backend.freeze.sightings import motion_mattes
+from torch_backend.freeze.twin import settled
 from torch_backend.raster import cpu as raster_cpu
 from torch_backend.raster import ssim
 from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
@@ -226,7 +227,9 @@ class Freezer:
         if frame in self.run.train_frames:
             made = developed(self.shot, self.run, scene, frame, frozen, self.config, keep=False)
         else:
-            made = develop(self.run, scene, frozen, frame, motion_mattes(self.shot), self.config)
+            mattes = motion_mattes(self.shot)
+            still = settled(self.run, scene, frozen, frame, mattes)
+            made = develop(self.run, scene, still, frame, mattes, self.config)
         self.seconds += time.process_time() - since
         return made
 
