@@ -22,8 +22,9 @@ from ..train.adam import FusedAdam
 from ..train.losses import photometric
 from ..train.model import render
 from .query import FrozenGaussians
+from .sightings import MovingOf
 from .travel import Travel
-from .working import MovingOf, WorkingPlates, showing, spread
+from .working import WorkingPlates, showing, spread
 
 Check = Callable[[int, int], None]
 """Called with (steps done, steps in all); raises to cancel."""

@@ -22,7 +22,8 @@ from ..train import LoadedRun
 from ..train.model import gathered, render
 from ..train.movers import mean_of
 from .query import FrozenGaussians
-from .working import MovingOf, WorkingPlates, showing, spread
+from .sightings import MovingOf
+from .working import WorkingPlates, showing, spread
 
 _SEEN = 0.05
 """Pixels that a plate has to see of a Gaussian before it counts."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -11,9 +9,8 @@ from ..scene import Scene, read_image
 from ..train.model import gathered
 from .query import FrozenGaussians
 from .reproject import resized, widened
+from .sightings import MovingOf
 
-MovingOf = Callable[[int], "Tensor | None"]
-"""Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
 _SEEN = 0.05
 """Pixels that a camera has to see of a Gaussian before it can say whether that moves."""
 
