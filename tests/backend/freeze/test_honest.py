@@ -177,4 +177,4 @@ def test_opening_and_closing_are_those_of_their_masks():
     assert (opened(torn, 4).numpy()[inner] == ndimage.binary_opening(mask, side)[inner]).all()
     found, want = closed(torn, 4).numpy()[inner], ndimage.binary_closing(mask, side)[inner]
     assert (found == want).mean() > 0.95 and want.mean() > mask[inner].mean() + 0.1, "at half size, so nearly"
-    assert (found >= mask[inner]).all() and (closed(torn, 0).numpy() == mask).mean() > 0.97
+    assert (found >= mask[inner]).all() and (closed(torn, 0).numpy() == mask).all()
