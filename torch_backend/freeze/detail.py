@@ -332,8 +332,6 @@ class Detailer:
             shot.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
         else:
             shot.motion = torch.maximum(shot.motion, lead.moving) if own else shot.motion
-        gap = round(self.config.gap * self.seen.unit)
-        shot.motion = torch.maximum(shot.motion, closed(shot.motion > 0.5, gap).float())
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns, device="cpu"), st, own
@@ -345,7 +343,7 @@ class Detailer:
             wrong = wrong | self._swayed(shot, leading, off) | self._beside(shot, leading, usable, off)
             if truth is not None:
                 wrong = wrong | self._denied(truth, off)
-            wrong = closed(self.seen.whole(wrong, off), gap)
+            wrong = closed(self.seen.whole(wrong, off), round(self.config.gap * self.seen.unit))
         shot.doubt = widened(wrong.float(), round(self.config.margin * self.seen.unit))
         matte = 1.0 - blurred(shot.doubt, self.config.feather * self.seen.unit)
         if not own:

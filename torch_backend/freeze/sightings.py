@@ -18,7 +18,7 @@ from ..shot import Shot
 from ..solve.motion import MOVING, UNKNOWN, load_motion
 from ..train import LoadedRun
 from .query import FrozenGaussians, FrozenImage, render_frozen
-from .regions import grown, opened
+from .regions import grown
 from .reproject import blurred, inside, look_up, pixel_centres, project, resized, same_surface, widened
 from .travel import Stage
 
@@ -213,8 +213,10 @@ class Sightings:
         Flow ends some pixels before what moves does, or says nothing within it. What was missed would stand where it
         is as specks and outlines.
         """
-        differs = opened(off > (least or self.config.contradicted), round(self.config.thin * self.unit))
-        return grown(moving, differs, round(self.config.reach * self.unit))
+        if not bool(moving.any()):
+            return moving
+        reach, thin = (round(length * self.unit) for length in (self.config.reach, self.config.thin))
+        return grown(moving, off > (least or self.config.contradicted), reach, thin)
 
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height
@@ -247,7 +249,6 @@ class Sightings:
         # The working frame will do, and need not be decoded from 4K footage.
         plate = read_image(self.scene.image_path(self.index[frame]), width, height)
         missed = self.difference(plate, image.color)
-        moving = torch.maximum(moving, self.whole(moving > 0.5, missed).float())
         off = self.difference(plate, image.color, 1.0)
         region = round(self.config.region * self.unit)
         off = blurred(widened(off, region), 0.5 * region)
