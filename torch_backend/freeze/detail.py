@@ -73,6 +73,8 @@ class DetailConfig:
     denied: float = 0.15
     """Low-passed difference of the frozen render and its own plate, display-referred, from which on that plate is not
     believed where plate t* agrees with the render: something held still that was elsewhere."""
+    own_time: float = 0.3
+    """Share of such a difference that must be gone in the render of the plate's own time."""
     denied_too: float = 0.1
     """The same, for what hangs together with such a spot."""
     thin: int = 3
@@ -339,8 +341,10 @@ class Detailer:
             return within, st, own
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
         if own:
-            off = self._off(shot, leading)
-            wrong = wrong | self._swayed(shot, leading, off) | self._beside(shot, leading, usable, off)
+            off, gained = self._off(shot, leading)
+            wrong = wrong | self._swayed(shot, leading, gained) | self._beside(shot, leading, usable, off)
+            # What the model lacks at the plate's own time, too, is its fault and no motion.
+            off = torch.where(gained > self.config.own_time * off, off, 0.0)
             if truth is not None:
                 wrong = wrong | self._denied(truth, off)
             wrong = closed(self.seen.whole(wrong, off), round(self.config.gap * self.seen.unit))
@@ -351,14 +355,16 @@ class Detailer:
             matte = matte * lead.visible * torch.exp(-error.square())
         return resized(matte, columns, rows) * within, st, own
 
-    def _off(self, shot: _Shot, frame: int) -> Tensor:
-        """[h, w] low-passed difference of the frozen render and its own plate, 0 beyond that."""
+    def _off(self, shot: _Shot, frame: int) -> tuple[Tensor, Tensor]:
+        """([h, w] low-passed difference of the frozen render and its own plate, [h, w] by how much that is more than
+        the difference of the model at the plate's own time); 0 beyond the plate."""
         h, w = shot.depth.shape
         view = self.seen.view(frame)
         inside = _middle(view.missed, shot.depth)
-        out = torch.zeros(h, w, device="cpu")
-        out[inside] = self.seen.difference(view.picture.float(), resized(shot.image.color, w, h)[inside])
-        return out
+        off, gained = torch.zeros(h, w, device="cpu"), torch.zeros(h, w, device="cpu")
+        off[inside] = self.seen.difference(view.picture.float(), resized(shot.image.color, w, h)[inside])
+        gained[inside] = off[inside] - view.missed.float()
+        return off, gained
 
     def _beside(self, shot: _Shot, frame: int, usable: list[int], off: Tensor) -> Tensor:
         """[h, w] bool: what the plate before or after sees and calls moving, or both call moving that is before it.
@@ -387,17 +393,14 @@ class Detailer:
         spots = opened(denied, round(self.config.thin * self.seen.unit))
         return self.seen.whole(spots, off, self.config.denied_too)
 
-    def _swayed(self, shot: _Shot, frame: int, off: Tensor) -> Tensor:
+    def _swayed(self, shot: _Shot, frame: int, gained: Tensor) -> Tensor:
         """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
 
-        That is, the render of t* differs from the plate (`off`, as `_off`) by more than the render of the plate's own
-        time does. A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
+        That is, the render of t* differs from the plate by more than the render of the plate's own time does (`gained`,
+        as `_off`). A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
         that are.
         """
-        missed = self.seen.view(frame).missed.float()
-        inside, out = _middle(missed, shot.depth), torch.zeros_like(off, dtype=torch.bool)
-        out[inside] = off[inside] - missed > self.config.borne_out
-        out = out & (self._travel(shot, frame) > self.config.travel)
+        out = (gained > self.config.borne_out) & (self._travel(shot, frame) > self.config.travel)
         # Outlines are errors of depth; what moves is a region.
         return opened(out, round(self.config.thin * self.seen.unit))
 
