@@ -60,13 +60,12 @@ class Shades:
         return np.maximum(np.maximum(red, green), blue)
 
 
-def _sampled(picture: NDArray, x: Map, y: Map) -> NDArray[np.float32]:
+def _sampled(picture: NDArray, x: Map, y: Map) -> NDArray:
     """[..., 3] colours of a picture at positions [a, b], bilinear, in rows that are short enough for OpenCV."""
     count = -(-x.size // _ROW)
-    places = (np.resize(p, (count, _ROW)) for p in (x, y))  # the last row is filled up with whatever
-    found = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    found = found.reshape(count * _ROW, -1)[: x.size].reshape(*x.shape, -1)
-    return np.asarray(found)
+    x_rows, y_rows = (np.resize(p, (count, _ROW)) for p in (x, y))  # the last row is filled up with whatever
+    found = cv2.remap(picture, x_rows, y_rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found).reshape(count * _ROW, -1)[: x.size].reshape(*x.shape, -1)
 
 
 @dataclass
@@ -101,7 +100,6 @@ class Fleeting:
     def __init__(self, grid: tuple[Map, Map], unit: float, config: FlowConfig) -> None:
         """`grid` and `unit` as in `still.StillTest`."""
         self._grid, self._config = grid, config
-        self._faint = np.float32(0.0)
         self._least = max(2, round((config.speck * unit / 2.0) ** 2))
 
     def mask(self, frame: Sight, others: Sequence[Other], inverse: Map, depth: float) -> Mask:
@@ -184,7 +182,7 @@ class Fleeting:
         x, y = (np.clip(0.5 * p - 0.5, -1e4, 1e4).astype(np.float32) for p in at)
         height, width = self._grid[0].shape
         within = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        return x, y, within & (_sampled(other.inverse, x, y)[..., 0] <= _HIDDEN * inverse * over + self._faint)
+        return x, y, within & (_sampled(other.inverse, x, y)[..., 0] <= _HIDDEN * inverse * over)
 
     def _compared(
         self, frame: Sight, other: Other, points: tuple[Map, Map], inverse: Map, values: NDArray[np.uint8]
@@ -227,7 +225,7 @@ class Fleeting:
         for good, of in sides.values():
             explained |= (of >= 2) & (good == of)
         result = np.zeros(mask.shape, bool)
-        result[every] = explained.any(0)[whole]
+        result[every] = np.any(explained, axis=0)[whole]
         return result
 
 

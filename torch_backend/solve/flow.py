@@ -88,6 +88,7 @@ class FlowConfig:
     explained: float = 0.5
     """A depth at which so many of them show the same explains it by a thing that stands still."""
     need: int = 3
+    """In fewer of them a point says nothing."""
     depths: int = 64
     """So many depths are tried."""
     speck: float = 4.0
