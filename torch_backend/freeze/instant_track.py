@@ -19,6 +19,8 @@ from .instant_depth import View
 
 _TURNS = 6
 """So often sightings that do not fit are weighed less."""
+_AROUND = 8
+"""So many sightings around one tell where it should be."""
 
 
 @dataclass
@@ -192,7 +194,7 @@ def _follow(
 
 def swing(track: Track, index: int, cameras: Callable[[int], View], config: TrackConfig, unit: float) -> Swing | None:
     """Where a thing is at t* that swings, or None if its track is not that of one, or does not tell how deep it is."""
-    places = track.at
+    places = _smooth(track.at, unit)
     if len(places) < config.least:
         return None
     views = {i: cameras(i) for i in places}
@@ -210,8 +212,30 @@ def swing(track: Track, index: int, cameras: Callable[[int], View], config: Trac
         return None
     axis = view.viewmat[2, :3]
     focal = float(view.K[0, 0])
-    deviation = float(np.sqrt(axis @ spread @ axis)) * max(residual, 0.1 * unit) / focal / depth
+    told, free = 2 * len(places), 2 * len(places) - 3 * len(_terms(0.0, speed))
+    noise = max(residual * np.sqrt(told / max(free, 1)), 0.1 * unit)
+    deviation = float(np.sqrt(axis @ spread @ axis)) * noise / focal / depth
     return Swing(place, depth, deviation, residual) if deviation <= config.unsure else None
+
+
+def _smooth(places: dict[int, NDArray[np.float64]], unit: float) -> dict[int, NDArray[np.float64]]:
+    """The sightings that lie about where those around them lead: a wrong match leaps."""
+    order = sorted(places)
+    if len(order) < _AROUND + 1:
+        return places
+    times, points = np.array(order, np.float64), np.stack([places[i] for i in order])
+    off = np.zeros(len(order))
+    for n in range(len(order)):
+        near = [k for k in np.argsort(np.abs(times - times[n]), kind="stable")[: _AROUND + 1] if k != n]
+        ways = np.stack([np.ones(len(near)), times[near] - times[n], np.square(times[near] - times[n])], axis=-1)
+        # The least sum of distances, nearly: one wrong match among those around must not lead astray.
+        weight = np.ones(len(near))
+        for _ in range(_TURNS):
+            curve = np.linalg.lstsq(ways * weight[:, None], points[near] * weight[:, None], rcond=None)[0]
+            weight = 1.0 / np.sqrt(np.linalg.norm(points[near] - ways @ curve, axis=-1) + 0.1 * unit)
+        off[n] = float(np.linalg.norm(points[n] - curve[0]))
+    limit = 6.0 * float(np.median(off)) + 2.0 * unit
+    return {i: places[i] for i, far in zip(order, off, strict=True) if far <= limit}
 
 
 def _terms(time: NDArray[np.float64] | float, speed: float) -> NDArray[np.float64]:
