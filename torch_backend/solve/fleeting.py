@@ -121,7 +121,7 @@ class Fleeting:
         if not unlike.any():
             return nothing
         rows, columns = np.nonzero(unlike)
-        share = self._share(frame, [each for each in others if each.step > 1], rows, columns, inverse)
+        share = self._share(frame, others, rows, columns, inverse)
         weak, strong = nothing.copy(), nothing.copy()
         weak[rows, columns], strong[rows, columns] = share >= c.fleeting[0], share >= c.fleeting[1]
         # Outlines are lines of one point: depths and pictures are off there.
@@ -136,7 +136,8 @@ class Fleeting:
         """[N] share of the others that show the still points at rows and columns, and show something else there.
 
         They have to agree with each other, else it is they that are changing, as behind a head that passes. 0 if a
-        point is seen by too few.
+        point is seen by too few, and if there is none before or none after: what has just come out from behind
+        something is like that. The nearest do not count: what moves slowly is still there in them.
         """
         points, inverse = self._points(rows, columns), inverse[rows, columns][None]
         places = [self._places(frame, other, points, inverse) for other in others]
@@ -151,12 +152,15 @@ class Fleeting:
         usual = np.nan_to_num(np.take_along_axis(np.sort(shown, axis=0), middle, axis=0)[0])
         values, limit = frame.shades.colors[rows, columns][None].astype(np.float32), self._config.unlike
         count, of = np.zeros(len(rows)), np.zeros(len(rows))
+        sides = {side: np.zeros(len(rows), bool) for side in (-1, 1)}
         for other, (x, y, within) in zip(others, places, strict=True):
             shades, gain = other.sight.shades, other.gain
             agree = shades.unlike(usual, x, y, gain) <= limit
-            count += (within & agree & (shades.unlike(values, x, y, gain) > limit))[0]
-            of += within[0]
-        return np.where(of >= self._config.need, count / np.maximum(of, 1), 0.0)
+            unlike = (within & agree & (shades.unlike(values, x, y, gain) > limit))[0]
+            sides[other.side] |= unlike
+            if other.step > 1:
+                count, of = count + unlike, of + within[0]
+        return np.where((of >= self._config.need) & sides[-1] & sides[1], count / np.maximum(of, 1), 0.0)
 
     def _first(self, others: Sequence[Other]) -> list[Other]:
         """The two that tell the most at once: half a second before and after, or what there is."""
