@@ -4,13 +4,18 @@ Trains `--method` on a solved shot, of which nothing is written, and judges at t
 held-out frames: S (still pixels: the motion matte says still, and no mover is within 8 px of 640), moving pixels and
 the whole, each frame at its own time; and frozen still pixels, F: time stands still at each `--t-star`, seen from the
 held-out frames at least a quarter of the clip away, where neither the matte of that frame nor that of t* has a mover.
-Tune with `--phase` other than 0. Seconds are of the processor, training alone; one thread. `--set` changes any number
-of the configuration: `--set gate.start=0.4 densify.budget=50000`.
+With `--develop` both instants are developed as a freeze does it, whatever the method; F, the best 90 % and the gradient
+energy of those frames are judged before and after, at the training size and at `LARGE` pixels. `--held N`: moving
+pixels of N held-out frames as time standing still at that very frame shows them, whose plate neither training nor
+developing has seen. Tune with `--phase` other than 0. Seconds are of the processor; one thread. `--set` changes any
+number of the configuration, `--set gate.start=0.4 densify.budget=50000`, `--develop-set` any of `DevelopConfig`.
+`--again` judges the training that an earlier call of the same `--name` left in DIR.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 import json
 import os
@@ -32,14 +37,18 @@ from benchmarks.training_step import _Silent
 from torch_backend.contract import JobError, TrainParams
 from torch_backend.deformation import planes
 from torch_backend.footage.images import write_png
-from torch_backend.freeze.query import freeze_at, render_frozen
+from torch_backend.freeze.develop import develop
+from torch_backend.freeze.developed import config_for, developed
+from torch_backend.freeze.query import FrozenGaussians, FrozenImage, freeze_at, render_frozen
+from torch_backend.freeze.sightings import motion_mattes
+from torch_backend.freeze.twin import settled
 from torch_backend.raster import cpu as raster_cpu
 from torch_backend.raster import ssim
-from torch_backend.report.metrics import gradient_magnitude, psnr_of
+from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot, write_json
 from torch_backend.solve.motion import load_motion
-from torch_backend.train import adam, config_from_params
+from torch_backend.train import LoadedRun, adam, config_from_params
 from torch_backend.train.checkpoint import CHECKPOINT_FILE, read_meta
 from torch_backend.train.config import TrainConfig, config_from_json, config_to_json
 from torch_backend.train.movers import load_movers
@@ -48,6 +57,10 @@ from torch_backend.train.trainer import Trainer
 
 FIGURES = ("still", "moving", "whole", "frozen", "gradient")
 """S, M, whole and F in dB; gradient energy of the render at its own time over the plate's."""
+LARGE = 640
+"""Width at which frozen frames are judged too, at most: that of the working frames."""
+OF_FROZEN = ("frozen", "best_90", "gradient")
+"""Of a frozen frame at another pose: F and the best 90 % of its pixels in dB; gradient energy over the plate's."""
 _MARGIN = 8 / 640
 
 
@@ -66,31 +79,34 @@ def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
 
 
 class Judge:
-    """Held-out frames of a shot at the training size, and what of them moves."""
+    """Held-out frames of a shot at a size, and what of them moves."""
 
-    def __init__(self, shot: Shot, trainer: Trainer, test: list[int], images: Tensor) -> None:
-        self.shot, self.trainer, self.test = shot, trainer, test
+    def __init__(self, shot: Shot, trainer: Trainer, test: list[int], width: int) -> None:
+        self.shot, self.trainer, self.scene, self.test = shot, trainer, trainer.scene, test
+        self.width, self.height = training_size(self.scene, width)
+        images = load_images(self.scene, test, self.width, self.height)
         self.images = dict(zip(test, images.float(), strict=True))
-        self.size = (trainer.height, trainer.width)
+        self.Ks = self.scene.camera_at(self.width, self.height)
 
     def matte(self, index: int) -> Tensor:
         """[H, W] in 0..1. ValueError without one."""
-        found = load_motion(self.shot, self.trainer.scene.frames[index])
+        found = load_motion(self.shot, self.scene.frames[index])
         if found is None:
             raise ValueError("the shot has no motion mattes: solve it anew")
-        return F.interpolate(torch.from_numpy(found / 255.0).float()[None, None], self.size, mode="nearest-exact")[0, 0]
+        matte = torch.from_numpy(found / 255.0).float()[None, None]
+        return F.interpolate(matte, (self.height, self.width), mode="nearest-exact")[0, 0]
 
     def still(self, matte: Tensor, mover: Tensor | None = None) -> Tensor:
         """Pixels that stand still, bool [H, W]."""
-        return still_pixels(matte, mover, max(1, round(_MARGIN * self.size[1])))
+        return still_pixels(matte, mover, max(1, round(_MARGIN * self.width)))
 
-    def at_own_time(self) -> list[dict[str, float | None]]:
-        """S, moving, whole and gradient energy, a row per held-out frame."""
+    def at_own_time(self) -> list[dict[str, Any]]:
+        """S, moving, whole and gradient energy, a row per held-out frame; at the training size."""
         rows = []
         for index, plate in self.images.items():
             shown, matte = self.trainer.render_frame(index), self.matte(index)
             rows.append({
-                "frame": self.trainer.scene.frames[index],
+                "frame": self.scene.frames[index],
                 "still": _psnr(shown, plate, self.still(matte)),
                 "moving": _psnr(shown, plate, matte > 0.75),
                 "whole": _psnr(shown, plate, torch.ones_like(matte) > 0),
@@ -98,23 +114,40 @@ class Judge:
             })  # fmt: skip
         return rows
 
-    def frozen(self, t_star: int) -> list[dict[str, float | None]]:
-        """F with time at the delivered frame of index `t_star`, a row per held-out frame far enough away."""
-        t, scene = self.trainer, self.trainer.scene
-        frozen = freeze_at(t.model, float(scene.times[t_star]), t.seconds)
-        Ks, there, rows = scene.camera_at(t.width, t.height), self.matte(t_star), []
+    def seen(self, frozen: FrozenGaussians, index: int) -> FrozenImage:
+        """A frozen scene from the camera of a frame."""
+        t, at = self.trainer, float(self.scene.times[index])
+        view = t.viewmats[index], self.Ks[index]
+        return render_frozen(frozen, *view, self.width, self.height, t.model.exposure, at)
+
+    def frozen(self, frozen: FrozenGaussians, t_star: int) -> list[dict[str, Any]]:
+        """`OF_FROZEN` with time at the delivered frame of index `t_star`, a row per held-out frame far enough away."""
+        views, there, rows = self.trainer.viewmats, self.matte(t_star), []
         for index, plate in self.images.items():
-            if abs(index - t_star) < len(scene.frames) / 4:
+            if abs(index - t_star) < len(self.scene.frames) / 4:
                 continue
-            view = t.viewmats[index], Ks[index]
-            image = render_frozen(frozen, *view, t.width, t.height, t.model.exposure, float(scene.times[index]))
-            places, depth = induced_places(image.depth, *view, t.viewmats[t_star], Ks[t_star])
-            known = inside(places, t.width, t.height, 0.0) & (depth > 0)
+            image = self.seen(frozen, index)
+            cameras = views[index], self.Ks[index], views[t_star], self.Ks[t_star]
+            places, depth = induced_places(image.depth, *cameras)
+            known = inside(places, self.width, self.height, 0.0) & (depth > 0)
             mover = torch.where(known, sampled(there, places, nearest=True), 0.0) > 0.75
-            shown = image.color + 0.5 * (1.0 - image.alpha[..., None])
-            value = _psnr(shown, plate, self.still(self.matte(index), mover))
-            rows.append({"frame": scene.frames[index], "frozen": value})
+            shown = over_grey(image)
+            rows.append({
+                "frame": self.scene.frames[index],
+                "frozen": _psnr(shown, plate, self.still(self.matte(index), mover)),
+                "best_90": best_share_psnr(shown, plate),
+                "gradient": gradient_magnitude(shown) / max(1e-9, gradient_magnitude(plate)),
+            })  # fmt: skip
         return rows
+
+    def moving_at(self, frozen: FrozenGaussians, index: int) -> float | None:
+        """PSNR of what moves in a held-out frame, of the scene frozen at it, from its own pose."""
+        return _psnr(over_grey(self.seen(frozen, index)), self.images[index], self.matte(index) > 0.75)
+
+
+def over_grey(image: FrozenImage) -> Tensor:
+    """[H, W, 3] as previews show it."""
+    return image.color + 0.5 * (1.0 - image.alpha[..., None])
 
 
 def _psnr(image: Tensor, plate: Tensor, where: Tensor) -> float | None:
@@ -133,20 +166,14 @@ def nearest_trained(trainer: Trainer, frame: int) -> int:
     return min(trainer.train_ids, key=lambda i: abs(trainer.scene.frames[i] - frame))
 
 
-def strips(judge: Judge, folder: Path, t_stars: list[int]) -> None:
-    """Plate, render at its own time, frozen at each t*: a picture per held-out frame, at 100 %."""
-    t = judge.trainer
-    frozen = [freeze_at(t.model, float(t.scene.times[i]), t.seconds) for i in t_stars]
-    Ks = t.scene.camera_at(t.width, t.height)
+def strips(judge: Judge, folder: Path, scenes: Sequence[FrozenGaussians]) -> None:
+    """Plate, and each frozen scene: a picture per held-out frame, at 100 %."""
     folder.mkdir(parents=True, exist_ok=True)
     for index, plate in judge.images.items():
-        shown = [plate, t.render_frame(index)]
-        for state in frozen:
-            at = float(t.scene.times[index])
-            image = render_frozen(state, t.viewmats[index], Ks[index], t.width, t.height, t.model.exposure, at)
-            shown.append(image.color + 0.5 * (1.0 - image.alpha[..., None]))
+        shown = [plate, *(over_grey(judge.seen(frozen, index)) for frozen in scenes)]
         strip = torch.cat(shown, dim=1).clamp(0.0, 1.0)
-        write_png(folder / f"{t.scene.frames[index]:06d}.png", (strip * 255.0).round().byte().contiguous().numpy())
+        name = f"{judge.scene.frames[index]:06d}.png"
+        write_png(folder / name, (strip * 255.0).round().byte().contiguous().numpy())
 
 
 def configured(args: argparse.Namespace, shot: Shot) -> TrainConfig:
@@ -159,39 +186,112 @@ def configured(args: argparse.Namespace, shot: Shot) -> TrainConfig:
     return config
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
-    """Trains and judges once."""
-    shot = Shot.open(args.shot)
-    config, scene = configured(args, shot), load_scene(shot)
+def trained(args: argparse.Namespace, shot: Shot, config: TrainConfig) -> tuple[Trainer, list[int], float]:
+    """(trainer at its end, indices of the frames held out, CPU seconds of the training)."""
+    scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
-    images = load_images(scene, train + test, width, height)
-    mattes = functools.partial(load_motion, shot)
+    images, mattes = load_images(scene, train, width, height), functools.partial(load_motion, shot)
     movers = None if args.no_mattes else load_movers(mattes, scene, train, width, height)
     for module in (raster_cpu, ssim, adam, planes):
         module.warm_up()
-    since = time.process_time()
-    trainer = Trainer(scene, images[: len(train)], train, config, _Silent(), movers=movers)  # type: ignore[arg-type]
-    if args.run:
-        trainer.restore(shot.run(args.run) / CHECKPOINT_FILE)
+    since, left = time.process_time(), args.results / f"{args.name}.safetensors"
+    trainer = Trainer(scene, images, train, config, _Silent(), movers=movers)  # type: ignore[arg-type]
+    if args.run or args.again:
+        trainer.restore(shot.run(args.run) / CHECKPOINT_FILE if args.run else left)
     else:
-        trainer.run(args.results / f"{args.name}.safetensors", lambda _: None)
-    seconds = time.process_time() - since
-    judge = Judge(shot, trainer, test, images[len(train) :])
-    own = judge.at_own_time()
-    half = len(scene.frames) // 2
-    first = nearest_trained(trainer, args.t_star)
-    t_stars = [first, nearest_trained(trainer, scene.frames[(first + half) % len(scene.frames)])]
-    frozen = [judge.frozen(i) for i in t_stars]
+        trainer.run(left, lambda _: None)
+    return trainer, test, time.process_time() - since
+
+
+class Freezer:
+    """Instants of a training, as the field has them and as a freeze develops them."""
+
+    def __init__(self, args: argparse.Namespace, shot: Shot, trainer: Trainer) -> None:
+        t, self.shot, self.trainer = trainer, shot, trainer
+        frames = [t.scene.frames[i] for i in t.train_ids]
+        self.run = LoadedRun(args.results / args.name, t.config, t.model, t.width, t.height, frames, [args.name])
+        changes = dict(change.split("=", 1) for change in args.develop_set)
+        changes = {name: json.loads(value) for name, value in changes.items()}
+        self.config = dataclasses.replace(config_for(self.run), **changes)
+        self.seconds = 0.0
+
+    def field(self, index: int) -> FrozenGaussians:
+        """The instant of a frame as it was trained."""
+        return freeze_at(self.trainer.model, float(self.trainer.scene.times[index]), self.trainer.seconds)
+
+    def developed(self, index: int) -> FrozenGaussians:
+        """The instant of a frame, developed: with what its plate alone shows, if that was trained on."""
+        scene, since = self.trainer.scene, time.process_time()
+        frame, frozen = scene.frames[index], self.field(index)
+        if frame in self.run.train_frames:
+            made = developed(self.shot, self.run, scene, frame, frozen, self.config, keep=False)
+        else:
+            mattes = motion_mattes(self.shot)
+            still = settled(self.run, scene, frozen, frame, mattes)
+            made = develop(self.run, scene, still, frame, mattes, self.config)
+        self.seconds += time.process_time() - since
+        return made
+
+
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most so many of them, evenly."""
+    step = max(1.0, len(indices) / max(1, count))
+    return [indices[int((n + 0.5) * step)] for n in range(min(count, len(indices)))]
+
+
+def judged(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge], t_stars: list[int]) -> dict[str, Any]:
+    """Rows of the frozen frames by size, before and after developing: {"field": {"small": [...], ...}, ...}."""
+    rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    scenes = []
+    for kind in ("field", "developed") if args.develop else ("field",):
+        rows[kind] = {size: [] for size in judges}
+        for index in t_stars:
+            frozen = getattr(freezer, kind)(index)
+            scenes.append(frozen)
+            for size, judge in judges.items():
+                rows[kind][size] += [{"t_star": index, **row} for row in judge.frozen(frozen, index)]
     if args.strips:
-        strips(judge, args.results / f"strips-{args.name}", t_stars)
+        strips(judges["large"], args.results / f"strips-{args.name}", scenes)
+    return rows
+
+
+def held(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge], test: list[int]) -> list[dict[str, Any]]:
+    """What moves at instants that nobody has seen, dB: a row per held-out frame in which enough does."""
+    rows = []
+    for index in spread([i for i in test if bool((judges["small"].matte(i) > 0.75).any())], args.held):
+        row: dict[str, Any] = {"frame": freezer.trainer.scene.frames[index]}
+        for kind in ("field", "developed") if args.develop else ("field",):
+            frozen = getattr(freezer, kind)(index)
+            row[kind] = {size: judge.moving_at(frozen, index) for size, judge in judges.items()}
+        rows.append(row)
+    return rows
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    """Trains and judges once."""
+    shot = Shot.open(args.shot)
+    config = configured(args, shot)
+    trainer, test, seconds = trained(args, shot, config)
+    scene, model = trainer.scene, trainer.model
+    judges = {"small": Judge(shot, trainer, test, config.width), "large": Judge(shot, trainer, test, LARGE)}
+    half, first = len(scene.frames) // 2, nearest_trained(trainer, args.t_star)
+    t_stars = [first, nearest_trained(trainer, scene.frames[(first + half) % len(scene.frames)])]
+    freezer = Freezer(args, shot, trainer)
+    own, frozen = judges["small"].at_own_time(), judged(args, freezer, judges, t_stars)
+    instants = held(args, freezer, judges, test)
     figures = {name: mean(own, name) for name in FIGURES if name != "frozen"}
-    figures["frozen"] = mean([row for rows in frozen for row in rows], "frozen")
-    model = trainer.model
+    figures["frozen"] = mean(frozen["field"]["small"], "frozen")
+    for kind, sizes in frozen.items():
+        figures |= {f"{kind}_{s}_{name}": mean(rows, name) for s, rows in sizes.items() for name in OF_FROZEN}
+        for size in judges if instants else ():
+            figures[f"{kind}_{size}_held"] = mean([row[kind] for row in instants], size)
     return {
-        "figures": figures, "cpu_seconds": seconds, "gaussians": len(model.gaussians), "open": len(model.open_rows()),
+        "figures": figures, "cpu_seconds": seconds, "develop_cpu_seconds": freezer.seconds,
+        "gaussians": len(model.gaussians), "open": len(model.open_rows()),
         "iterations": trainer.iteration, "sh_degree": model.sh_degree, "t_stars": t_stars, "own": own,
-        "frozen": frozen, "needs": trainer.needs.state(), "config": config_to_json(config),
+        "frozen": frozen, "held": instants, "needs": trainer.needs.state(), "config": config_to_json(config),
+        "develop_config": dataclasses.asdict(freezer.config),
     }  # fmt: skip
 
 
@@ -211,6 +311,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--no-mattes", action="store_true", help="train without the motion mattes (they still judge)")
     parser.add_argument("--strips", action="store_true", help="write pictures")
     parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE")
+    parser.add_argument("--again", action="store_true", help="judge what an earlier call trained")
+    parser.add_argument("--develop", action="store_true", help="develop the instants too")
+    parser.add_argument("--develop-set", nargs="*", default=[], metavar="FIELD=VALUE")
+    parser.add_argument("--held", type=int, default=0, metavar="N", help="instants that nobody has seen")
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     args.results.mkdir(parents=True, exist_ok=True)

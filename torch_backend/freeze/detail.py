@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -33,7 +33,8 @@ from ..train.model import render
 from .bands import bands, hand_back, look_up_near
 from .instant import InstantLayer, instant_layer, join
 from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
-from .reproject import blurred, look_up, narrowed, pixel_centres, project, resized, unproject, widened
+from .regions import closed, opened
+from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import MovingOf, PlateReader, Sighting, SightingConfig, Sightings
 from .transfer import to_display, to_linear
 from .warp import sample, snap
@@ -59,19 +60,37 @@ class DetailConfig:
     """Pixels around what moves in which the leading plate is not believed: hair, motion blur, the flow's own error."""
     feather: float = 1.5
     """Sigma of the leading plate's matte along its border, pixels."""
-    enough: float = 0.3
-    """Sum of weights at which a pixel is all plate; below, splats are mixed in."""
+    doubt: float = 0.05
+    """Sum of weights at which a pixel is half plate, half splats: what plates say is believed in part, as it is wrong
+    in part. On truth the best share of a single plate's residual in what moves is 0.4 to 0.65."""
     travel: float = 1.0
     """Pixels that the model moves a point by, from t* to the frame's own plate, from which on that plate is not
     believed there if it bears the motion out: sways too small for the flow."""
     borne_out: float = 0.03
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
+    agreed: float = 0.15
+    """Low-passed difference of the frozen render and its own plate, display-referred, up to which they agree."""
+    denied: float = 0.15
+    """Low-passed difference of the frozen render and its own plate, display-referred, from which on that plate is not
+    believed where plate t* agrees with the render: something held still that was elsewhere."""
+    own_time: float = 0.3
+    """Share of such a difference that must be gone in the render of the plate's own time."""
+    denied_too: float = 0.1
+    """The same, for what hangs together with such a spot."""
     thin: int = 3
-    """Half the width in pixels below which such a spot is an outline, which a wrong depth explains."""
-    sway: float = 6.0
+    """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
+    gap: int = 4
+    """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
+    sees flickers from pixel to pixel."""
+    sway: float = 3.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
-    sway_trust: float = 0.3
-    """How far a plate of another time is believed in what moves, and only where plate t* does not show it."""
+    sway_trust: float = 0.15
+    """How far a plate of another time is believed in what moves, where the model explains it. Depths that are off by a
+    pixel carry plate t* to a wrong place far away in pose; the own plate's residual is at its place, at another time:
+    either alone is worse than both."""
+    agreement: float = 0.03
+    """Low-passed difference, display-referred, between a plate of another time and plate t* at which the first is
+    believed 1/e in what moves: it may show another state."""
     instant: bool = True
     """Give what plate t* shows and the model lacks a surface of its own (`instant.py`)."""
     sightings: SightingConfig = field(default_factory=SightingConfig)
@@ -139,6 +158,8 @@ class _Shot:
     """[h, w] in 0..1: what moves in the clip, at t*."""
     per_pixel: float
     """Pixels of decisions per pixel of the picture."""
+    doubt: Tensor
+    """[h, w] in 0..1: where plates of other times are believed only if they agree with the model."""
 
     @property
     def centre(self) -> Tensor:
@@ -155,6 +176,8 @@ class _Fillers:
     """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
     unknown: Tensor
     """[h, w] in 0..1: share of it whose way nobody knows."""
+    agreed: list[Tensor]
+    """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
     residuals: list[Tensor]
     """[H, W, 3] float16 each, as `Sightings.residual`."""
 
@@ -268,7 +291,8 @@ class Detailer:
         t = min(self.seen.frames, key=lambda frame: abs(frame - output.t_star))
         motion = resized(image.motion, w, h)
         own = self._is_own(output, width, height)
-        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns)
+        nothing = torch.zeros_like(motion)
+        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing)
 
     def _is_own(self, output: OutputFrame, width: int, height: int) -> bool:
         """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
@@ -298,7 +322,8 @@ class Detailer:
     ) -> tuple[Tensor, Tensor, bool]:
         """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
 
-        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's.
+        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's; and
+        `shot.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so.
         """
         rows, columns = shot.image.alpha.shape
         lead = self.seen.seen(leading, shot.points)
@@ -316,32 +341,68 @@ class Detailer:
             return within, st, own
         wrong = torch.maximum(shot.motion, lead.moving) > 0.5
         if own:
-            wrong = wrong | self._swayed(shot, leading, size)
-        wrong = widened(wrong.float(), round(self.config.margin * self.seen.unit))
-        matte = 1.0 - blurred(wrong, self.config.feather * self.seen.unit)
+            off, gained = self._off(shot, leading)
+            wrong = wrong | self._swayed(shot, leading, gained) | self._beside(shot, leading, usable, off)
+            # What the model lacks at the plate's own time, too, is its fault and no motion.
+            off = torch.where(gained > self.config.own_time * off, off, 0.0)
+            if truth is not None:
+                wrong = wrong | self._denied(truth, off)
+            wrong = closed(self.seen.whole(wrong, off), round(self.config.gap * self.seen.unit))
+        shot.doubt = widened(wrong.float(), round(self.config.margin * self.seen.unit))
+        matte = 1.0 - blurred(shot.doubt, self.config.feather * self.seen.unit)
         if not own:
             error = self._parallax(shot, leading, shot.depth)
             matte = matte * lead.visible * torch.exp(-error.square())
         return resized(matte, columns, rows) * within, st, own
 
-    def _swayed(self, shot: _Shot, frame: int, size: tuple[int, int]) -> Tensor:
-        """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
-
-        That is, the render of t* differs from the plate by more than the render of the plate's own time does. A
-        textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways that are.
-        """
+    def _off(self, shot: _Shot, frame: int) -> tuple[Tensor, Tensor]:
+        """([h, w] low-passed difference of the frozen render and its own plate, [h, w] by how much that is more than
+        the difference of the model at the plate's own time); 0 beyond the plate."""
         h, w = shot.depth.shape
         view = self.seen.view(frame)
-        inner_h, inner_w = view.missed.shape
-        top, left = (h - inner_h) // 2, (w - inner_w) // 2
-        shown = resized(shot.image.color, w, h)[top : top + inner_h, left : left + inner_w]
-        gained = self.seen.difference(view.picture.float(), shown) - view.missed.float()
-        out = torch.zeros(h, w, dtype=torch.bool, device="cpu")
-        out[top : top + inner_h, left : left + inner_w] = gained > self.config.borne_out
-        out = (out & (self._travel(shot, frame) > self.config.travel)).float()
+        inside = _middle(view.missed, shot.depth)
+        off, gained = torch.zeros(h, w, device="cpu"), torch.zeros(h, w, device="cpu")
+        off[inside] = self.seen.difference(view.picture.float(), resized(shot.image.color, w, h)[inside])
+        gained[inside] = off[inside] - view.missed.float()
+        return off, gained
+
+    def _beside(self, shot: _Shot, frame: int, usable: list[int], off: Tensor) -> Tensor:
+        """[h, w] bool: what the plate before or after sees and calls moving, or both call moving that is before it.
+
+        What only one of three finds would come and go. Where its own plate shows what the frozen render does (`off`)
+        nothing would, and the plate stays.
+        """
+        h, w = shot.depth.shape
+        at, points = usable.index(frame), shot.points[::2, ::2]  # a quarter of the work
+        around = usable[max(0, at - 1) : at] + usable[at + 1 : at + 2]
+        found, both = torch.zeros(points.shape[:2], device="cpu"), torch.ones(points.shape[:2], device="cpu")
+        for neighbour in around:
+            sighting = self.seen.seen(neighbour, points)
+            found, both = torch.maximum(found, sighting.visible * sighting.moving), both * sighting.moving
+        if len(around) == 2:
+            found = torch.maximum(found, both)
+        near = widened((off > self.config.agreed).float(), round(self.config.margin * self.seen.unit))
+        return (resized(found, w, h) > 0.5) & (near > 0.5)
+
+    def _denied(self, truth: Sighting, off: Tensor) -> Tensor:
+        """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate shows something else (`off`).
+
+        A hand that is held still where it was not at t* is still to the flow; a wrong depth explains edges only.
+        """
+        denied = (off > self.config.denied) & (truth.visible * truth.explained > 0.5)
+        spots = opened(denied, round(self.config.thin * self.seen.unit))
+        return self.seen.whole(spots, off, self.config.denied_too)
+
+    def _swayed(self, shot: _Shot, frame: int, gained: Tensor) -> Tensor:
+        """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
+
+        That is, the render of t* differs from the plate by more than the render of the plate's own time does (`gained`,
+        as `_off`). A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
+        that are.
+        """
+        out = (gained > self.config.borne_out) & (self._travel(shot, frame) > self.config.travel)
         # Outlines are errors of depth; what moves is a region.
-        thin = round(self.config.thin * self.seen.unit)
-        return widened(narrowed(out, thin), thin) > 0.5
+        return opened(out, round(self.config.thin * self.seen.unit))
 
     def _travel(self, shot: _Shot, frame: int) -> Tensor:
         """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
@@ -383,7 +444,24 @@ class Detailer:
         if not bool((matte < _ALL).any()):
             return None
         chosen = self._chosen(shot, matte, leading, usable)
-        return _Fillers(chosen, *self._displacements(shot, chosen), [self.seen.residual(frame) for frame in chosen])
+        moved, unknown = self._displacements(shot, chosen)
+        agreed = self._agreed(shot, chosen, moved)
+        return _Fillers(chosen, moved, unknown, agreed, [self.seen.residual(frame) for frame in chosen])
+
+    def _agreed(self, shot: _Shot, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
+        """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
+        if shot.t not in chosen:
+            return [torch.ones_like(shot.depth) for _ in chosen]
+        truth = self.seen.seen(shot.t, shot.points)
+        told = look_up(self.seen.view(shot.t).picture.float(), truth.pixels)
+        out = []
+        for frame, way in zip(chosen, moved, strict=True):
+            there = self.seen.seen(frame, shot.points + way)
+            says = look_up(self.seen.view(frame).picture.float(), there.pixels)
+            both = (truth.visible * there.visible)[..., None]
+            off = self.seen.difference(says * both, told * both, 1.0)
+            out.append(torch.exp(-(off / self.config.agreement).square()))
+        return out
 
     def _rest(self, shot: _Shot, fillers: _Fillers, matte: Tensor, rows: slice) -> _Rest:
         """What the leading plate does not give of some rows: the splats, with what they missed from other plates."""
@@ -400,50 +478,60 @@ class Detailer:
         larger = torch.tensor(
             [self.plates.width / self.seen.size[0], self.plates.height / self.seen.size[1]], device="cpu"
         )
-        told = shot.t in fillers.chosen
-        untold = 1.0 - self.seen.seen(shot.t, points).visible if told else torch.ones(count, device="cpu")
-        untold = untold * (1.0 - unknown)
+        doubt = look_up(shot.doubt, small)
         weights, places = [], []
+        untold = 1.0 - unknown
+        if shot.t in fillers.chosen:  # the better plate t* shows it, the less another time is needed
+            untold = untold * (1.0 - self._near(shot, shot.t, self.seen.seen(shot.t, points)))
         for n, frame in enumerate(fillers.chosen):
             there = points if frame == shot.t else points + look_up(fillers.moved[n], small)
-            sighting = self.seen.seen(frame, there)
-            sway = self._sway(frame, points, sighting) * untold
+            sighting = self._doubted(self.seen.seen(frame, there), doubt)
+            sway = self._sway(frame, points, sighting) * untold * look_up(fillers.agreed[n], small)
             weights.append(self._weight(shot, frame, sighting, motion, sway))
             places.append(sighting.pixels * larger)
         believed = torch.stack(weights)
         rest.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]
-        rest.share = (believed.sum(dim=0) / self.config.enough).clamp(max=1.0)
         total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
+        rest.share = total / (total + self.config.doubt)
         for n, residual in enumerate(fillers.residuals):
             carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
         rest.color += carried * rest.share[:, None]
         return rest
 
+    def _doubted(self, sighting: Sighting, doubt: Tensor) -> Sighting:
+        """The sighting, with what it shows of points in doubt [...] taken for moving where the model says otherwise."""
+        return replace(sighting, moving=torch.maximum(sighting.moving, doubt * (1.0 - sighting.explained)))
+
     def _sway(self, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
         """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
         view = self.seen.view(frame)
         travel = (project(points, view.viewmat, view.K)[0] - sighting.pixels).norm(dim=-1)
-        trust = torch.exp(-(travel / (self.config.sway * self.seen.unit)).square())
+        trust = torch.exp(-travel / (self.config.sway * self.seen.unit))
         return self.config.sway_trust * sighting.explained * trust
+
+    def _near(self, shot: _Shot, frame: int, sighting: Sighting) -> Tensor:
+        """[...] in 0..1: how surely a plate shows points where the depth says."""
+        return sighting.visible / (1.0 + self._parallax(shot, frame, sighting.depth))
 
     def _weight(self, shot: _Shot, frame: int, sighting: Sighting, motion: Tensor, sway: Tensor) -> Tensor:
         """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*."""
-        near = sighting.visible / (1.0 + self._parallax(shot, frame, sighting.depth))
+        near = self._near(shot, frame, sighting)
         if frame == shot.t:
             return near
-        return near * ((1.0 - motion) * (1.0 - sighting.moving) + motion * sway)
+        still = (1.0 - motion) * (1.0 - sighting.moving)
+        return near * (still + (1.0 - still) * sway)
 
     def _chosen(self, shot: _Shot, matte: Tensor, leading: int, usable: list[int]) -> list[int]:
         """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
         h, w = shot.depth.shape
         need = 1.0 - resized(matte, w, h)[::4, ::4]
-        points, motion = shot.points[::4, ::4], shot.motion[::4, ::4]
+        points, motion, doubt = (of[::4, ::4] for of in (shot.points, shot.motion, shot.doubt))
         k = self.seen.frames.index(leading)
         around = {k + side * step for step in self.config.reach for side in (-1, 1)} | {k}
         reach = {self.seen.frames[i] for i in around if 0 <= i < len(self.seen.frames)} | {shot.t}
         zero = torch.zeros_like(motion)
         gains = {
-            frame: need * self._weight(shot, frame, self.seen.seen(frame, points), motion, zero)
+            frame: need * self._weight(shot, frame, self._doubted(self.seen.seen(frame, points), doubt), motion, zero)
             for frame in sorted(reach)
             if frame in usable
         }
@@ -557,6 +645,13 @@ class Detailer:
         source[share <= 0.0] = 0.0
         made.plate[rows], made.source[rows] = share, source
         made.linear[rows] = fill if lead is None else torch.addcmul(fill, matte[..., None], lead)
+
+
+def _middle(inner: Tensor, outer: Tensor) -> tuple[slice, slice]:
+    """(rows, columns) of a picture [h, w, ...] that lies in the middle of a larger one."""
+    (rows, columns), (h, w) = outer.shape[:2], inner.shape[:2]
+    top, left = (rows - h) // 2, (columns - w) // 2
+    return slice(top, top + h), slice(left, left + w)
 
 
 def _with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Tensor:

@@ -21,12 +21,13 @@ from ..train import LoadedRun
 from ..train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from .develop import DevelopConfig, develop
 from .instant import instant_layer, join
-from .query import Descent, FrozenGaussians, freeze_at, span_of
+from .query import FrozenGaussians, freeze_at, span_of
 from .sightings import motion_mattes
+from .twin import settled
 
 FOLDER = "developed"
 """Of developed instants, in a run's folder."""
-VERSION = 1
+VERSION = 2
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -97,7 +98,7 @@ class Instants:
             self._held[t_star] = made
             return made
         try:
-            _save(self.shot, self.run, int(t_star), made, self.keys[t_star])
+            _save(self.shot, self.run, int(t_star), frozen, made, self.keys[t_star])
         except (OSError, JobError) as error:
             self._held[t_star] = made
             said = error if isinstance(error, JobError) else path_error(error)
@@ -144,30 +145,28 @@ def load_developed(
     if not _whole(tensors, frozen):
         return None
     device = frozen.support.device
+    closed = tensors["closed"].to(device)
     base = {name: tensors[f"base.{name}"].to(device) for name in PARAM_NAMES}
-    support, motion = (_grown(v, len(base["means"])) for v in (frozen.support, frozen.motion))
+    support, motion = frozen.support.index_fill(0, closed, 1.0), frozen.motion.index_fill(0, closed, 0.0)
+    support, motion = (_grown(v, len(base["means"])) for v in (support, motion))
     before = FrozenGaussians(base, frozen.sh_degree, support, motion)
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
-    origin = tensors["origin"].to(device)
-    return FrozenGaussians(
-        state, frozen.sh_degree, before.support[origin], before.motion[origin], Descent(before, origin)
-    )
+    return FrozenGaussians(state, frozen.sh_degree, support, motion, before)
 
 
 def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
     """True if tensors of a file fit each other and the run: it may come from anywhere."""
     names = [f"{part}.{name}" for part in ("base", "state") for name in PARAM_NAMES]
-    origin = tensors.get("origin")
-    if origin is None or origin.dtype != torch.long or origin.dim() != 1 or not all(n in tensors for n in names):
+    closed = tensors.get("closed")
+    if closed is None or closed.dtype != torch.long or closed.dim() != 1 or not all(n in tensors for n in names):
         return False
-    before = len(tensors["base.means"]) if tensors["base.means"].dim() else 0
+    count, known = len(tensors["base.means"]) if tensors["base.means"].dim() else 0, len(frozen.support)
     for name in names:
         like, value = frozen.state[name.partition(".")[2]], tensors[name]
-        count = before if name.startswith("base.") else len(origin)
         if value.dtype != like.dtype or value.shape != (count, *like.shape[1:]) or not bool(value.isfinite().all()):
             return False
-    rooted = not len(origin) or (int(origin.min()) >= 0 and int(origin.max()) < before)
-    return rooted and before >= len(frozen.support)
+    rooted = not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
+    return rooted and count >= known
 
 
 def developed(
@@ -188,7 +187,7 @@ def developed(
         return made
     made = _make(shot, run, scene, t_star, frozen, config, check)
     if keep and not run.stale:
-        _save(shot, run, t_star, made, developed_key(shot, run, t_star, config, query))
+        _save(shot, run, t_star, frozen, made, developed_key(shot, run, t_star, config, query))
     return made
 
 
@@ -196,20 +195,28 @@ def _make(
     shot: Shot, run: LoadedRun, scene: Scene, t_star: int, frozen: FrozenGaussians, config: DevelopConfig,
     check: Callable[[int, int], None] | None,
 ) -> FrozenGaussians:  # fmt: skip
+    moving = motion_mattes(shot)
+    frozen = settled(run, scene, frozen, t_star, moving)
     layer = instant_layer(run, scene, None, frozen, float(t_star), motion=lambda frame: load_motion(shot, frame))
     joined = frozen if layer is None else join(frozen, layer)
-    return develop(run, scene, joined, t_star, motion_mattes(shot), config, check)
+    return develop(run, scene, joined, t_star, moving, config, check)
 
 
-def _save(shot: Shot, run: LoadedRun, t_star: int, made: FrozenGaussians, key: str) -> None:
-    """Writes an instant; those of other trainings of the run go. OSError, or JobError where a link leads elsewhere."""
+def _save(
+    shot: Shot, run: LoadedRun, t_star: int, field: FrozenGaussians, made: FrozenGaussians, key: str
+) -> None:  # fmt: skip
+    """Writes an instant of the run's `field`; those of other trainings of the run go.
+
+    OSError, or JobError where a link leads elsewhere.
+    """
     assert made.descent is not None
     path = developed_path(run, t_star)
     folder = shot.own(path.parent)
-    tensors: dict[str, Tensor] = {"origin": made.descent.origin}
+    before = made.descent.motion[: len(field.motion)]
+    tensors = {"closed": torch.nonzero(before < field.motion).flatten()}
     # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
-    tensors |= {f"base.{name}": made.descent.frozen.state[name] for name in PARAM_NAMES}
+    tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)
     for other in folder.glob("*.safetensors"):

@@ -23,6 +23,7 @@ from ..scene import Scene, read_image, resize_intrinsics
 from ..train import LoadedRun
 from ..train.exposure import Exposure
 from .instant_depth import DepthConfig, Region, View, inverse_depth, own_motion
+from .instant_track import Track, TrackConfig, swing, tracks
 from .query import FrozenGaussians, FrozenImage, render_frozen
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
@@ -77,6 +78,8 @@ class InstantConfig:
     """Detail that correlates this well with that at the same pixels of other frames is on the picture (a logo)."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How depth is told."""
+    track: TrackConfig = field(default_factory=TrackConfig)
+    """How small things are followed."""
 
 
 @dataclass
@@ -121,14 +124,14 @@ def instant_layer(
     index = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
     bench = _Bench(run, scene, plates, index, config, motion)
     image = bench.render(frozen)
-    if not (bench.difference(image) >= config.seed).any():
+    things = _small_things(bench, image)
+    if not things and not (bench.difference(image) >= config.seed).any():
         return None
     kept, ghost = _ghosts(bench, frozen, image)
     if ghost.any():
         frozen = fade(frozen, kept)
         image = bench.render(frozen)
-    regions = _regions(bench, image)
-    state, mask, regions = _shell(bench, frozen, image, regions)
+    state, mask, regions = _shell(bench, frozen, image, _regions(bench, image), things)
     layer = InstantLayer(state, scene.frames[index], torch.from_numpy(mask), torch.from_numpy(ghost), kept, regions)
     if len(state["means"]) and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, mask > 0):
         empty = {name: value[:0] for name, value in state.items()}
@@ -172,17 +175,28 @@ class _Bench:
         self.view = self.at(index)
 
     def at(self, index: int) -> View:
-        """Delivered frame `index`: its plate and camera."""
-        if index in self._views:
-            return self._views[index]
+        """Delivered frame `index`: its plate and camera. Kept."""
+        if index not in self._views:
+            self._views[index] = self._read(index)
+        return self._views[index]
+
+    def _read(self, index: int) -> View:
         scene, size = self._scene, (self.width, self.height)
         if self._plates is None:
             picture = read_image(scene.image_path(index), *size).numpy()
         else:
             picture = _resized(self._plates.display(scene.frames[index]).numpy().clip(0.0, 1.0), *size)
-        viewmat, K = scene.viewmats[index].double().numpy(), self._Ks[index].double().numpy()
-        self._views[index] = View(index, np.ascontiguousarray(picture, np.float32), viewmat, K)
-        return self._views[index]
+        return self.camera(index, np.ascontiguousarray(picture, np.float32))
+
+    def camera(self, index: int, picture: NDArray[np.float32] | None = None) -> View:
+        """Its camera, with a picture or none."""
+        viewmat, K = self._scene.viewmats[index].double().numpy(), self._Ks[index].double().numpy()
+        return View(index, np.zeros((0, 0, 3), np.float32) if picture is None else picture, viewmat, K)
+
+    def frame(self, index: int) -> tuple[View, NDArray[np.bool_]] | None:
+        """A plate with its camera, and what moves there [h, w]; None if that is not known. Not kept."""
+        matte = self.matte(index) if 0 <= index < len(self._scene.frames) else None
+        return None if matte is None else (self._views.get(index) or self._read(index), matte > 0.5)
 
     def neighbours(self) -> list[View]:
         """Frames around t*, on both sides where there are any."""
@@ -195,9 +209,10 @@ class _Bench:
         chosen = np.unique(np.linspace(0, len(self._scene.frames) - 1, count).round().astype(int)).tolist()
         return [self.at(i) for i in chosen if i != self.index]
 
-    def matte(self) -> NDArray[np.float32] | None:
-        """Motion matte of t* [h, w] in 0..1, if there is one."""
-        found = self._motion(self._scene.frames[self.index]) if self._motion else None
+    def matte(self, index: int | None = None) -> NDArray[np.float32] | None:
+        """Motion matte of a frame, or of t*, [h, w] in 0..1, if there is one."""
+        index = self.index if index is None else index
+        found = self._motion(self._scene.frames[index]) if self._motion else None
         if found is None:
             return None
         return _resized(np.float32(1.0 / MOVING) * found.astype(np.float32), self.width, self.height)
@@ -267,23 +282,30 @@ def _stuck(bench: _Bench, region: NDArray[np.bool_], image: FrozenImage) -> bool
 
 
 def _shell(
-    bench: _Bench, frozen: FrozenGaussians, image: FrozenImage, regions: list[NDArray[np.bool_]]
+    bench: _Bench, frozen: FrozenGaussians, image: FrozenImage, regions: list[NDArray[np.bool_]], things: list[Track]
 ) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
     """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
     view, cover = bench.view, np.zeros((bench.height, bench.width), np.float32)
     inverse, told = np.zeros_like(cover), []
-    others = bench.neighbours() if regions else []
+    others = bench.neighbours() if regions or things else []
     explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9)
     matte = bench.matte()
     mover = image.motion.numpy() if matte is None else np.maximum(matte, image.motion.numpy())
-    for region in regions:
-        soft = _cover(bench, image, region)
+    alone = np.zeros_like(explained) if not things else np.any([t.pixels for t in things], axis=0)
+    covers: list[tuple[NDArray[np.float32], Track | None]]
+    covers = [(_cover(bench, image, r), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
+    covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
+    for soft, thing in covers:
         if soft.max() < 0.5:
             continue
         depths, facts = inverse_depth(
             view, others, soft >= 0.5, explained & (soft < 0.1), image.depth.numpy(), mover, bench.config.depth,
             bench.unit,
         )  # fmt: skip
+        swings = None if thing is None else swing(thing, bench.index, bench.camera, bench.config.track, bench.unit)
+        if swings is not None:
+            depths = np.full_like(depths, 1.0 / swings.depth)
+            facts = replace(facts, depth=swings.depth, deviation=swings.deviation)
         stronger = soft > cover
         inverse[stronger], cover[stronger] = depths[stronger], soft[stronger]
         told.append(facts)
@@ -291,6 +313,26 @@ def _shell(
     rows, columns = np.nonzero(cover > 0.1)
     means = view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
     return _gaussians(bench, frozen, means, rows, columns, inverse, cover, colors), cover, told
+
+
+def _small_things(bench: _Bench, image: FrozenImage) -> list[Track]:
+    """Small things that move at t* and that the render does not show, however little a low-pass leaves of them."""
+    c = bench.config
+    return tracks(bench.frame, bench.index, image.color.numpy(), c.track, bench.unit)
+
+
+def _thing_cover(bench: _Bench, image: FrozenImage, thing: Track) -> NDArray[np.float32]:
+    """How much of each pixel [h, w] a small thing covers: how far it is on the way from what is behind to its colour.
+
+    Its colours differ, so what is farther from what is behind than a third of that way is wholly its own inside.
+    """
+    import cv2
+
+    plate, behind = bench.view.picture, image.color.numpy()
+    way = thing.color - behind
+    share = ((plate - behind) * way).sum(-1) / np.maximum(np.square(way).sum(-1), 1e-4)
+    near = cv2.dilate(thing.pixels.astype(np.uint8), _disc(1.0)) > 0
+    return np.where(near, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)
 
 
 def _gaussians(

@@ -67,6 +67,8 @@ class Region:
     """0..1: how sure it is what the region hangs on."""
     own_motion: float | None
     """Distance of matches from epipolar lines in pixels per frame: the region's own motion; None: no match."""
+    deviation: float | None = None
+    """Standard deviation of the depth as a share of it where it was triangulated (`instant_track`); None: a guess."""
 
 
 @dataclass

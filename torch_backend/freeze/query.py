@@ -34,18 +34,9 @@ class FrozenGaussians:
     """[N] in 0..1: how well each Gaussian is known at the instant."""
     motion: Tensor
     """[N] in 0..1: 1 for Gaussians that move in the clip."""
-    descent: Descent | None = None
-    """Where its Gaussians come from, if they are not the run's own rows any more: developed instants."""
-
-
-@dataclass
-class Descent:
-    """How Gaussians that descend from a run's own move as those do."""
-
-    frozen: FrozenGaussians
-    """What they descend from: the run's Gaussians at t*, and behind them those that the run does not have."""
-    origin: Tensor
-    """[N] int64: the row of `frozen` from which each descends."""
+    descent: FrozenGaussians | None = None
+    """What a developed instant was before, row by row: the run's Gaussians at t*, and behind them those that the run
+    does not have. They still move as those do. None if it was not developed."""
 
 
 @dataclass

@@ -18,6 +18,7 @@ from ..shot import Shot
 from ..solve.motion import MOVING, UNKNOWN, load_motion
 from ..train import LoadedRun
 from .query import FrozenGaussians, FrozenImage, render_frozen
+from .regions import grown
 from .reproject import blurred, inside, look_up, pixel_centres, project, resized, same_surface, widened
 from .travel import Stage
 
@@ -113,6 +114,12 @@ class SightingConfig:
     """Low-passed difference, display-referred, at which a plate is believed 1/e."""
     region: int = 4
     """A difference speaks for so many pixels around it: half-rejected movers leave their outlines."""
+    contradicted: float = 0.2
+    """Low-passed difference, display-referred, from which on a pixel beside what moves belongs to it."""
+    reach: int = 16
+    """How far from what the matte calls moving such a region may go: a model that is wrong all over has no end."""
+    thin: int = 2
+    """Half the width below which such a difference is an edge, not a region."""
 
 
 class Sightings:
@@ -197,6 +204,19 @@ class Sightings:
         visible = same_surface(depth, look_up(view.depth, pixels), self.config.depth_tolerance) * within
         looks = look_up(torch.stack([view.moving, view.explained], dim=-1), pixels)
         return Sighting(pixels, depth, visible, within, looks[..., 0], looks[..., 1])
+
+    def whole(self, moving: Tensor, off: Tensor, least: float = 0.0) -> Tensor:
+        """[h, w] bool: `moving`, bool, and the regions that touch it in which plate and model differ, by `off` [h, w].
+
+        `least` is the difference that counts; 0: `contradicted`.
+
+        Flow ends some pixels before what moves does, or says nothing within it. What was missed would stand where it
+        is as specks and outlines.
+        """
+        if not bool(moving.any()):
+            return moving
+        reach, thin = (round(length * self.unit) for length in (self.config.reach, self.config.thin))
+        return grown(moving, off > (least or self.config.contradicted), reach, thin)
 
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height

@@ -19,32 +19,26 @@ _KEPT = 64
 class Travel:
     """From a scene frozen at t* to the clip's frames.
 
-    The run's own Gaussians come first in the scene; what stands behind them (an instant's layer) is not moved.
+    The run's own Gaussians come first in the scene; what stands behind them (an instant's layer) is not moved, nor is
+    what was closed at t* (`twin.py`).
     """
 
     def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians) -> None:
         self.run, self.scene = run, scene
-        self.rows = run.model.open_rows()
+        rows = run.model.open_rows()
+        self.rows = rows[frozen.motion[rows] > 0.5]
         """[M] int64, rows of the run's Gaussians that move."""
         self.known = len(run.model.gaussians)
         """How many Gaussians the run has."""
         self._now = {name: frozen.state[name][self.rows] for name in PARAM_NAMES}
-        device = frozen.support.device
-        self._place = torch.full((len(frozen.support),), -1, dtype=torch.long, device=device)
-        self._place[self.rows] = torch.arange(len(self.rows), device=device)
         self._changes: dict[int, dict[str, Tensor]] = {}
 
-    def movable(self, origin: Tensor) -> Tensor:
-        """[K] int64: which of Gaussians that descend from `origin` [N] the run moves."""
-        return torch.nonzero(self._place[origin] >= 0).flatten()
-
-    def moved(self, state: dict[str, Tensor], origin: Tensor, frame: int) -> dict[str, Tensor]:
-        """Gaussians that descend from the frozen scene by `origin` [N], as they are in a frame; with gradients."""
-        rows = self.movable(origin)
-        if not len(rows):
+    def moved(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
+        """The scene, or what it was developed to, as it is in a frame; with gradients."""
+        if not len(self.rows):
             return dict(state)
-        place, change = self._place[origin[rows]], self._change(frame)
-        return {name: value.index_add(0, rows, change[name][place]) for name, value in state.items()}
+        change = self._change(frame)
+        return {name: value.index_add(0, self.rows, change[name]) for name, value in state.items()}
 
     @torch.no_grad()
     def _change(self, frame: int) -> dict[str, Tensor]:
@@ -66,19 +60,16 @@ class Stage:
         """[M] int64, rows of the scene's Gaussians that move."""
         self._travel = None
         if frozen is not None and frozen.descent is not None:
-            self.developed, self._travel = frozen, Travel(run, scene, frozen.descent.frozen)
-            self.rows = self._travel.movable(frozen.descent.origin)
+            self.developed, self._travel = frozen, Travel(run, scene, frozen.descent)
+            self.rows = self._travel.rows
 
     def at(self, frame: int) -> FrozenGaussians:
         """The scene in a frame."""
-        if self.developed is None or self._travel is None or self.developed.descent is None:
+        if self.developed is None or self._travel is None:
             return freeze_at(self.run.model, self.scene.time_of_frame(frame), 1.0)
-        state = self._travel.moved(self.developed.state, self.developed.descent.origin, frame)
-        return replace(self.developed, state=state)
+        return replace(self.developed, state=self._travel.moved(self.developed.state, frame))
 
     def strangers(self, frozen: FrozenGaussians) -> Tensor:
         """bool [N]: which Gaussians of a frozen scene the run does not have: nobody knows how they moved."""
         known = len(self.run.model.gaussians)
-        if frozen.descent is not None:
-            return frozen.descent.origin >= known
         return torch.arange(len(frozen.support), device=frozen.support.device) >= known

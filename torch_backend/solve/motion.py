@@ -26,7 +26,7 @@ from .stored import load_cameras
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
-MOTION_VERSION = 2
+MOTION_VERSION = 3
 FOLDER, PAINTED = "motion", "motion_paint"
 """Of the found mattes, in the solve's folder, and of the painted ones, in the shot's."""
 _RECORD, _UNFINISHED = "motion.json", "unfinished.json"

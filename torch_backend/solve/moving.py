@@ -16,6 +16,7 @@ from ..contract import Reporter, frame_file
 from ..footage import load_frames
 from ..footage.images import read_frame
 from ..shot import Shot
+from .fleeting import Fleeting, Other, Shades, Sight, seeded
 from .flow import FlowConfig, Map, Mask, Matches, neighbours, sample
 from .leftover import Leftover
 from .still import Look, StillTest, evidence
@@ -27,6 +28,8 @@ _KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
 _LEFT_EVERY = 2
 """In every so manieth key frame what is left of motion is looked for: sways are slow."""
+_PART = 0.25
+"""A pixel is fleeting if so much of what is around it is."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 
@@ -54,18 +57,27 @@ class Clip:
         Ks *= np.array([width / path.width, height / path.height, 1.0])[None, :, None]
         self.viewmats, self.Ks = viewmats[self.keys], Ks[self.keys]
         """Of the keys: [K, 4, 4] world-to-camera, solve units, and [K, 3, 3] in flow pixels."""
-        self.guessed = [path.frames[i].source == "interpolated" for i in self.keys]
+        self._cameras = viewmats, Ks
+        self._guessed = [camera.source == "interpolated" for camera in path.frames]
+        self.guessed = [self._guessed[i] for i in self.keys]
         """Keys whose pose was not solved."""
         points = load_points(shot)["xyz"].astype(np.float64)
         self.depths = [_typical_depth(points, viewmat) for viewmat in self.viewmats]
         """Of the keys: median depth of the sparse points before the camera."""
-        self._pictures: dict[int, NDArray[np.uint8]] = {}
+        self._pictures: dict[int, tuple[NDArray[np.uint8], Sight]] = {}
         self._looks: dict[int, Look] = {}
 
     def picture(self, key: int) -> NDArray[np.uint8]:
         """Grey picture of a key in the flow's size. JobError if the frame is damaged."""
+        return self._key(key)[0]
+
+    def sight(self, key: int) -> Sight | None:
+        """A key in colour, with its camera; None if its pose was not solved."""
+        return None if self.guessed[key] else self._key(key)[1]
+
+    def _key(self, key: int) -> tuple[NDArray[np.uint8], Sight]:
         if key not in self._pictures:
-            self._pictures[key] = self.grey(self.keys[key])
+            self._pictures[key] = self.frame(self.keys[key])
         return self._pictures[key]
 
     def look(self, key: int) -> Look:
@@ -74,21 +86,31 @@ class Clip:
             self._looks[key] = Look(self.picture(key))
         return self._looks[key]
 
-    def grey(self, index: int) -> NDArray[np.uint8]:
-        """Grey picture of any frame, as `picture`."""
+    def frame(self, index: int) -> tuple[NDArray[np.uint8], Sight]:
+        """Any frame: grey in the flow's size, as `picture`, and in colour on the grid, with its camera."""
         pixels = read_frame(self._shot.frames / frame_file(self.frames[index], ".png"))
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
-        grey = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
-        if grey.shape == self.flow_size[::-1]:
-            return grey
-        how = cv2.INTER_AREA if self.flow_size[0] < grey.shape[1] else cv2.INTER_CUBIC
-        return np.asarray(cv2.resize(grey, self.flow_size, interpolation=how), np.uint8)
+        grey = _sized(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8), self.flow_size)
+        colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))
+        return grey, Sight(Shades(colors), self._cameras[0][index], self._cameras[1][index])
+
+    def is_guessed(self, index: int) -> bool:
+        """True if the pose of a frame was not solved."""
+        return self._guessed[index]
 
     def forget(self, before: int) -> None:
         """Drops the pictures of keys below `before`."""
         for store in (self._pictures, self._looks):
             for key in [key for key in store if key < before]:
                 del store[key]
+
+
+def _sized(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """A picture at another size: averaged where it shrinks."""
+    if pixels.shape[1::-1] == size:
+        return pixels
+    how = cv2.INTER_AREA if size[0] < pixels.shape[1] else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(pixels, size, interpolation=how), np.uint8)
 
 
 def _keys(seconds: list[float]) -> list[int]:
@@ -117,7 +139,8 @@ def mattes(
         return
     first, last = wanted.index(True), len(wanted) - 1 - wanted[::-1].index(True)
     matches = Matches(clip.picture, config, clip.unit)
-    own: dict[int, tuple[Map, Map]] = {}
+    fleeting = Fleeting(matches.grid, clip.unit, config)
+    own: dict[int, tuple[Map, Map, Map]] = {}
     final: dict[int, tuple[Map, Map]] = {}
     start = max(0, first - 1 - reach)
     left: tuple[Map, Map] | None = None
@@ -132,9 +155,13 @@ def mattes(
         final[key] = _followed(matches, key, own, len(keys), reach, config)
         for n in groups[key] if wanted[key] else ():
             if n not in written:
-                picture = clip.picture(key) if n == keys[key] else clip.grey(n)
-                score = final[key] if n == keys[key] else _between(clip, matches, picture, key, final)
-                yield n, _labels(clip, picture, *score, config)
+                picture, sight = (clip.picture(key), clip.sight(key)) if n == keys[key] else clip.frame(n)
+                if n == keys[key]:
+                    score, inverse = final[key], own[key][2]
+                else:
+                    score, inverse = _between(clip, matches, picture, key, final, own)
+                gone = _fleeting(clip, fleeting, n, key, sight, inverse, own, config)
+                yield n, _labels(clip, picture, *score, gone, config)
         for store in (own, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
@@ -144,8 +171,9 @@ def mattes(
 
 def _own_score(
     clip: Clip, matches: Matches, key: int, config: FlowConfig, before: tuple[Map, Map] | None
-) -> tuple[tuple[Map, Map], tuple[Map, Map]]:
-    """((score, weight), what is left): how surely a key frame's points move, 0 to 1, and how much is known of them.
+) -> tuple[tuple[Map, Map, Map], tuple[Map, Map]]:
+    """((score, weight, inverse), what is left): how surely a key frame's points move, 0 to 1, how much is known of
+    them, and the inverse depths of still points.
 
     What is left of motion is looked for if there is none of the key `before`; else that is followed to here.
     """
@@ -160,18 +188,18 @@ def _own_score(
         last = next(each for each in seen if each.key == key - 1)
         left, known = (sample(values, last.at) * last.found for values in before)
     sure = np.minimum(count / config.sure, 1.0) * (count >= 1.0)
-    return (np.maximum(score, left), np.maximum(sure, known * (left > score))), (left, known)
+    return (np.maximum(score, left), np.maximum(sure, known * (left > score)), inverse), (left, known)
 
 
 def _followed(
-    matches: Matches, key: int, own: dict[int, tuple[Map, Map]], count: int, reach: int, config: FlowConfig
+    matches: Matches, key: int, own: dict[int, tuple[Map, Map, Map]], count: int, reach: int, config: FlowConfig
 ) -> tuple[Map, Map]:
     """Score and weight of a key frame with those of its neighbours followed to it: a surface has one label."""
-    score, sure = own[key]
+    score, sure, _ = own[key]
     total, weight = 2.0 * score * sure, 2.0 * sure
     for seen in neighbours(matches, key, count, config):
         if abs(seen.key - key) <= reach:
-            score, sure = own[seen.key]
+            score, sure, _ = own[seen.key]
             share = sample(sure, seen.at) * seen.found
             total = total + share * sample(score, seen.at)
             weight = weight + share
@@ -179,21 +207,44 @@ def _followed(
 
 
 def _between(
-    clip: Clip, matches: Matches, picture: NDArray[np.uint8], key: int, final: dict[int, tuple[Map, Map]]
-) -> tuple[Map, Map]:
-    """Score and weight of a frame between key - 1 and key, by flow to both."""
+    clip: Clip, matches: Matches, picture: NDArray[np.uint8], key: int, final: dict[int, tuple[Map, Map]],
+    own: dict[int, tuple[Map, Map, Map]],
+) -> tuple[tuple[Map, Map], Map]:  # fmt: skip
+    """(score, weight) and inverse depths of still points of a frame between key - 1 and key, by flow to both."""
     total = np.zeros(picture.shape, np.float32)[::2, ::2]
-    weight = np.zeros_like(total)
+    weight, inverse, count = (np.zeros_like(total) for _ in range(3))
     for other in (key - 1, key):
         at, found = matches.loose(picture, clip.picture(other))
         score, sure = final[other]
         share = sample(sure, at) * found
         total, weight = total + share * sample(score, at), weight + share
-    return total / np.maximum(weight, 1e-6), weight
+        near = found + np.float32(1e-3)
+        inverse, count = inverse + near * sample(own[other][2], at), count + near
+    return (total / np.maximum(weight, 1e-6), weight), inverse / count
 
 
-def _labels(clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, config: FlowConfig) -> NDArray[np.uint8]:
-    """The labels [H, W] of a frame's score and weight on the grid."""
+def _fleeting(
+    clip: Clip, fleeting: Fleeting, n: int, key: int, sight: Sight | None, inverse: Map,
+    own: dict[int, tuple[Map, Map, Map]], config: FlowConfig,
+) -> Mask:  # fmt: skip
+    """What is elsewhere in the keys around frame `n`, which is key `key` or lies between it and the one before."""
+    if sight is None or clip.is_guessed(n):
+        return np.zeros(inverse.shape, bool)
+    nearest = {-1: key - 1, 1: key + (n == clip.keys[key])}
+    around: list[Other] = []
+    for side, first in nearest.items():
+        for step in config.baselines:
+            other = first + side * (step - 1)
+            found = clip.sight(other) if 0 <= other < len(clip.keys) else None
+            if found is not None:
+                around.append(Other(side, step, found, own[other][2]))
+    return fleeting.mask(sight, around, inverse, clip.depths[key])
+
+
+def _labels(
+    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, fleeting: Mask, config: FlowConfig
+) -> NDArray[np.uint8]:
+    """The labels [H, W] of a frame's score and weight on the grid, and of what is fleeting there."""
     grey = cv2.resize(picture, score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
     spread = _Spread(grey, config.radius, config.edge)
     weight = np.minimum(weight, _ENOUGH)
@@ -202,21 +253,12 @@ def _labels(clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, con
     size = clip.width, clip.height
     score, known = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (score, known))
     least = round((config.blob * clip.width / 640) ** 2)
-    moving = _areas(score > config.grow, score > config.seed, least)
-    moving = ~_areas(~moving, ~moving, least)
+    moving = seeded(score > config.grow, score > config.seed, least, connectivity=4)
+    moving |= cv2.resize(fleeting.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > _PART
+    moving = ~seeded(~moving, ~moving, least, connectivity=4)
     unknown = known < _UNKNOWN
-    unknown = _areas(unknown, unknown, least)
+    unknown = seeded(unknown, unknown, least, connectivity=4)
     return np.where(moving, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
-
-
-def _areas(mask: Mask, seeds: Mask, least: int) -> Mask:
-    """The connected areas of a mask that hold a seed and at least so many pixels."""
-    count, numbers, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
-    keep = about[:, cv2.CC_STAT_AREA] >= least
-    keep[0] = False
-    seeded = np.zeros(count, bool)
-    seeded[np.unique(np.asarray(numbers, np.int32)[seeds & mask])] = True
-    return (keep & seeded)[np.asarray(numbers, np.int32)]
 
 
 class _Spread:

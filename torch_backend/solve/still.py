@@ -256,7 +256,11 @@ def inside(at: tuple[Map, Map], shape: tuple[int, ...]) -> Mask:
 
 def brightness(values: Map, others: Map, found: Mask) -> tuple[float, float]:
     """Factor and offset that make `others` look like `values` where they are `found`: exposure drifts in a clip."""
-    a, b = values[::4, ::4][found[::4, ::4]], others[::4, ::4][found[::4, ::4]]
+    return fitted_brightness(values[::4, ::4][found[::4, ::4]], others[::4, ::4][found[::4, ::4]])
+
+
+def fitted_brightness(a: Map, b: Map) -> tuple[float, float]:
+    """Factor and offset that make values `b` [P] look like `a`; 1 and 0 if they are few."""
     if len(a) < FEW:
         return 1.0, 0.0
     spread = float(b.var())

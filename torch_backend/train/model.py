@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -93,3 +94,18 @@ def render(
         background=background,
         **options,
     )
+
+
+def gathered(
+    state: Mapping[str, Tensor], viewmat: Tensor, K: Tensor, width: int, height: int, weights: Tensor
+) -> Tensor:
+    """[N, C]: what one camera sees of each Gaussian, the sum of its alpha * T over the pixels, weighted by [H, W, C].
+
+    The weight of a Gaussian at a pixel is what the pixel gains by the Gaussian's colour: a gradient gathers it.
+    """
+    held = {name: value.detach() for name, value in state.items()}
+    with torch.enable_grad():
+        ink = torch.zeros(len(held["means"]), weights.shape[2], device=weights.device, requires_grad=True)
+        out = render(held, 0, viewmat, K, width, height, colors=ink, with_contributions=False)
+        (found,) = torch.autograd.grad(out.colors[0, ..., 3:], ink, weights.to(ink))
+    return found

@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..deformation import GateConfig, change_of, painted, stays_open
+from ..deformation import Deltas, GateConfig, change_of, painted, stays_open
 from ..scene import Scene
 from ..solve.motion import MOVING
 from ..supervision.support import SEEN_WEIGHT
-from .model import render
+from .model import DynamicModel, gathered
 
 if TYPE_CHECKING:
     from .trainer import Trainer
@@ -57,25 +57,17 @@ def moving_frames(trainer: Trainer, share: float) -> Tensor:
     if trainer.movers is None:
         raise ValueError("the shot has no motion mattes")
     model, height, width = trainer.model, trainer.height, trainer.width
-    state = {name: p.detach() for name, p in model.gaussians.params.items()}
+    state = model.gaussians.params
     counts = torch.zeros(len(model.gaussians), dtype=torch.long, device=model.device)
-    background = torch.cat([trainer.background, trainer.background.new_zeros(1)])
     for n, index in enumerate(trainer.train_ids):
         movers = trainer.movers[n]
         if n in trainer.unusable | trainer.needs.held or not bool(movers.any()):
             continue
         trainer.report.check_cancelled()
         where = movers.to(model.device, torch.float32)
-        ink = torch.zeros(len(model.gaussians), 1, device=model.device, requires_grad=True)
-        out = render(
-            state, model.sh_degree, trainer.viewmats[index], trainer.Ks[index], width, height, colors=ink,
-            background=background, with_depth=False, with_contributions=True,
-        )  # fmt: skip
-        if out.weight_sum is None:
-            raise RuntimeError("the frame was rendered without contributions")
-        (on_movers,) = torch.autograd.grad(out.colors[0, ..., 3], ink, where)
-        painted_here = out.weight_sum[0]
-        counts += (painted_here > SEEN_WEIGHT) & (on_movers[:, 0] > share * painted_here)
+        camera = trainer.viewmats[index], trainer.Ks[index], width, height
+        on_movers, painted_here = gathered(state, *camera, torch.stack([where, torch.ones_like(where)], -1)).unbind(1)
+        counts += (painted_here > SEEN_WEIGHT) & (on_movers > share * painted_here)
     return counts
 
 
@@ -95,13 +87,7 @@ def harden(trainer: Trainer) -> bool:
     """Closes for good what did not move; its mean change stays. False while nothing moves at all: the trial goes on."""
     model, config = trainer.model, trainer.config.gate
     rows = model.open_rows()
-    count = len(trainer.centres)
-    picked = np.unique(np.linspace(0, count - 1, min(MOMENTS, count)).round().astype(int)).tolist()
-    moments = [model.deltas(rows, trainer.centres[n : n + 1]) for n in picked]
-    asked = [moment for moment in moments if moment is not None]
-    seen = model.gaussians.support[rows][:, picked].T
-    pixels = pixels_per_unit(trainer, rows)
-    change, mean = change_of(model.gaussians, rows, asked, pixels, config, seen)
+    change, mean = _changes(model, rows, pixels_per_unit(trainer, rows), config)
     # What is on trial by its matte has no still quarter among it that could say how large noise is.
     noise = config.noise if trainer.movers is None else 0.0
     stays = stays_open(model.gaussians, rows, change, config, noise)
@@ -113,6 +99,22 @@ def harden(trainer: Trainer) -> bool:
             param.data[closed] = moved[name][closed]
     model.gaussians.open[closed] = False
     return True
+
+
+@torch.no_grad()
+def mean_of(model: DynamicModel, rows: Tensor) -> dict[str, Tensor]:
+    """Parameters of open Gaussians `rows` [M] at the mean of what they are when somebody sees them."""
+    _, mean = _changes(model, rows, torch.zeros(len(rows), device=model.device), GateConfig())
+    return {name: value.detach()[rows] for name, value in model.moved(rows, mean).items()}
+
+
+def _changes(model: DynamicModel, rows: Tensor, pixels: Tensor, config: GateConfig) -> tuple[Tensor, Deltas]:
+    """`change_of` at up to `MOMENTS` times of the clip."""
+    count = len(model.centres)
+    picked = np.unique(np.linspace(0, count - 1, min(MOMENTS, count)).round().astype(int)).tolist()
+    moments = [model.deltas(rows, model.centres[n : n + 1]) for n in picked]
+    asked = [moment for moment in moments if moment is not None]
+    return change_of(model.gaussians, rows, asked, pixels, config, model.gaussians.support[rows][:, picked].T)
 
 
 def pixels_per_unit(trainer: Trainer, rows: Tensor) -> Tensor:

@@ -181,7 +181,9 @@ class Needs:
         if value is None:
             return
         self.measured.append((trainer.iteration, len(trainer.model.gaussians), value))
-        if not self.joined and self.growing:
+        # While a field is on trial probes fall and rise by it: one measured 3 steps after it had opened ended growth.
+        on_trial = "opened" in self.facts and "hardened" not in self.facts
+        if not self.joined and self.growing and not on_trial:
             gain = growth_gain(self.measured)
             self.facts["growth_gain_db"] = gain
             if gain is not None and gain < self.config.growth_gain:

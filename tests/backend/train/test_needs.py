@@ -180,6 +180,18 @@ def test_growth_ends_when_it_gains_too_little(long_world, quiet, tmp_path):
     assert len(bound.model.gaussians) <= at_end < 1000
 
 
+def test_growth_is_not_judged_while_a_field_is_on_trial(long_world, quiet):
+    """What the probes lose as a field opens says nothing of the Gaussians."""
+    trainer = trainer_of(long_world, quiet, needs__growth_gain=1e9)
+    ended = []
+    for facts in ({}, {"opened": {}}, {"opened": {}, "hardened": 60}):
+        trainer.needs.facts, trainer.needs.growth_ended = dict(facts), None
+        trainer.needs.measured = [(n, round(500 * 1.1**n), 20.0 + 0.1 * n) for n in range(6)]
+        trainer.needs._measure(trainer)
+        ended.append(trainer.needs.growth_ended is not None)
+    assert ended == [True, False, True]
+
+
 def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     trainer = finish(trainer_of(long_world, quiet, needs__stop_gain=1e9), tmp_path)
     assert trainer.needs.stopped == 80  # the first measurement after the gate has given up waiting for motion

@@ -1,0 +1,41 @@
+"""Regions of a matte as wholes: what hangs together is kept or let go together, so that no outline of it stays.
+
+Pure functions on masks [h, w], bool. Beyond the border nothing counts.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .reproject import narrowed, resized, widened
+
+
+def opened(mask: Tensor, by: int) -> Tensor:
+    """The mask without what is narrower than 2 `by` + 1 pixels: outlines, which errors of depth explain."""
+    return widened(narrowed(mask.float(), by), by) > 0.5
+
+
+def closed(mask: Tensor, by: int) -> Tensor:
+    """The mask with holes and gaps filled that are about 2 `by` pixels wide or less."""
+    if by <= 0:
+        return mask
+    h, w = mask.shape
+    half = (resized(mask.float(), (w + 1) // 2, (h + 1) // 2) > 0.4).float()  # a quarter of the work
+    filled = narrowed(widened(half, (by + 1) // 2), (by + 1) // 2)
+    return mask | (resized(filled, w, h) > 0.5)
+
+
+def grown(seeds: Tensor, where: Tensor, reach: int, thin: int = 0) -> Tensor:
+    """`seeds`, and of `where` what hangs together with them and lies within `reach` pixels of them, going along it.
+
+    What of `where` is narrower than 2 `thin` + 1 pixels leads nowhere.
+    """
+    h, w = seeds.shape
+    size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work; regions are larger than its pixels
+    found, inside = (resized(mask.float(), *size) > 0.4 for mask in (seeds, where))
+    inside = (opened(inside, (thin + 1) // 2) | found).float()
+    found = found.float()
+    for _ in range((reach + 1) // 2):
+        found = torch.minimum(widened(found, 1), inside)
+    return seeds | (where & (resized(found, w, h) > 0.25))

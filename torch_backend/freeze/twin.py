@@ -1,0 +1,145 @@
+"""Never worse than a static model: what the field harms in a frozen scene is closed before the instant is developed.
+
+A field is trained to explain every frame at its own time. Time standing still asks it for something nobody checked:
+how the world of t* looks from the other poses, the wall behind a person, say, that the field let fade while she stood
+there. The static twin of a frozen scene has the same Gaussians, the open ones at the mean of the times at which they
+were seen. Scene and twin are held against plates: that of t*, and the still pixels of others, all over the clip. A
+Gaussian stays open where plate t* is better for it and the others are no worse; one that moves in plate t*, where that
+gains more than the others lose. It is asked of neighbours together: errors are noisy, and things move in pieces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from ..scene import Scene
+from ..train import LoadedRun
+from ..train.model import gathered, render
+from ..train.movers import mean_of
+from .query import FrozenGaussians
+from .sightings import MovingOf
+from .working import WorkingPlates, showing, spread
+
+_SEEN = 0.05
+"""Pixels that a plate has to see of a Gaussian before it counts."""
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """How a frozen scene is compared with its static twin."""
+
+    width: int = 320
+    """Pixels of the pictures that are compared, at most; never above the working frames'."""
+    plates: int = 12
+    """Trained frames that are looked at beside t*, at most, evenly over the clip."""
+    margin: float = 2.0
+    """Pixels of pictures 640 wide around what moves that do not count as still."""
+    neighbours: int = 16
+    """So many nearest open Gaussians are asked together."""
+    rounds: int = 2
+    """Comparisons: what stays open is held against the twin again without what was closed."""
+
+
+def settled(
+    run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int, moving: MovingOf,
+    config: TwinConfig | None = None,
+) -> FrozenGaussians:  # fmt: skip
+    """A run's scene at t*, in which what only does harm there stands still: `closed`.
+
+    Args:
+        frozen: the run's own Gaussians at t*, nothing behind them.
+        t_star: frame number; one that the run was not trained on is judged by the trained plates beside it.
+        moving: what moves in the clip's frames.
+    """
+    config = config or TwinConfig()
+    rows = run.model.open_rows()
+    if not len(rows):
+        return frozen
+    plates = WorkingPlates(scene, config.width, moving, config.margin, frozen.support.device)
+    movers = (plates.moving_share(frozen, t_star) > 0.5).float()
+    here = showing(run.train_frames, t_star)
+    others = [frame for frame in spread(run.train_frames, config.plates) if frame not in here]
+    for _ in range(config.rounds):
+        left = rows[frozen.motion[rows] > 0.5]
+        if not len(left):
+            break
+        pair = _Pair(run, plates, frozen, closed(run, frozen, left), left, movers)
+        near = _nearest(frozen.state["means"][left], config.neighbours)
+        gain, harm = -pair.worse(here, near, still=False), pair.worse(others, near)
+        stays = ((gain > 0.0) & (harm <= 0.0)) | ((movers[left] > 0.5) & (gain > harm))
+        if bool(stays.all()):
+            break
+        frozen = closed(run, frozen, left[~stays])
+    return frozen
+
+
+@torch.no_grad()
+def closed(run: LoadedRun, frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
+    """A frozen scene in which `rows` [M] int64 of the run's Gaussians are what they are on average, and do not move."""
+    mean, state = mean_of(run.model, rows), dict(frozen.state)
+    for name, value in state.items():
+        state[name] = value.index_copy(0, rows, mean[name])
+    support, motion = (v.index_fill(0, rows, to) for v, to in ((frozen.support, 1.0), (frozen.motion, 0.0)))
+    return replace(frozen, state=state, support=support, motion=motion)
+
+
+class _Pair:
+    """A frozen scene and its twin, which differ by `rows` [M]; `movers` [N] is 1 for what moves in plate t*."""
+
+    def __init__(
+        self, run: LoadedRun, plates: WorkingPlates, frozen: FrozenGaussians, twin: FrozenGaussians, rows: Tensor,
+        movers: Tensor,
+    ) -> None:  # fmt: skip
+        self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, twin)
+        self.marks = torch.stack([torch.zeros_like(movers).index_fill(0, rows, 1.0), movers], dim=1)
+
+    def worse(self, frames: list[int], near: Tensor, still: bool = True) -> Tensor:
+        """[M]: squared error of the scene over that of its twin, in pixels, for the mean frame that sees a Gaussian.
+
+        A pixel's difference is shared by the Gaussians that paint it in either; each is given the mean of those `near`
+        [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*.
+        """
+        sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
+        for frame in frames:
+            worse, seen = self._blamed(frame, still).unbind(1)
+            sees = seen[near].mean(1) > _SEEN
+            sums, counts = sums + torch.where(sees, worse[near].mean(1), 0.0), counts + sees
+        return sums / counts.clamp_min(1.0)
+
+    def _blamed(self, frame: int, still: bool) -> Tensor:
+        """[M, 2]: how much worse a frame is for each of the rows, and how many pixels it sees of it."""
+        camera, plate = self.plates.camera(frame), self.plates.picture(frame)
+        errors, paints = [], []
+        counts = self.plates.matte(frame) < 0.5 if still else torch.ones(plate.shape[:2], device=plate.device) > 0
+        for scene in self.scenes:
+            picture, marks = self._shown(scene, frame)
+            errors.append((picture - plate).square().mean(-1))
+            paints.append(marks[..., 0])
+            counts &= (marks[..., 1] < 0.1) | (not still)
+        worse = (errors[0] - errors[1]) * counts / (paints[0] + paints[1]).clamp_min(1e-2)
+        weights = torch.stack([worse, counts.float()], dim=-1)
+        ours, twins = (gathered(scene.state, *camera, weights)[self.rows] for scene in self.scenes)
+        return ours + twins
+
+    @torch.no_grad()
+    def _shown(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:
+        """(picture [H, W, 3] in 0..1, marks [H, W, 2]) of a scene from the camera of a frame, over grey."""
+        grey = torch.tensor([0.5, 0.5, 0.5, 0.0, 0.0], device=self.marks.device)
+        out = render(
+            scene.state, scene.sh_degree, *self.plates.camera(frame), background=grey, colors=self.marks,
+            with_contributions=False,
+        )  # fmt: skip
+        time = self.plates.scene.time_of_frame(frame)
+        return self.run.model.exposure.apply(out.colors[0, ..., :3], time).clamp(0.0, 1.0), out.colors[0, ..., 3:]
+
+
+def _nearest(means: Tensor, count: int) -> Tensor:
+    """[M, K] int64: the nearest of means [M, 3] to each, itself among them."""
+    count = min(count, len(means))
+    found = KDTree(means.cpu().numpy()).query(means.cpu().numpy(), k=count)[1].reshape(len(means), count)
+    return torch.from_numpy(np.ascontiguousarray(found, np.int64)).to(means.device)
