@@ -112,7 +112,7 @@ def test_what_a_take_leaves(trained, takes):
     assert read_png(folder / "preview" / "000101.png").shape == (48, 64, 3)
     ply = read_ply(folder / "frozen.ply")
     kept = load_checkpoint(world.shot.run("main") / "developed" / "000105.safetensors")[0]
-    assert facts["developed"] == [105] and len(ply.means) == len(kept["origin"]), "the developed instant"
+    assert facts["developed"] == [105] and len(ply.means) == len(kept["state.means"]), "the developed instant"
     assert np.median(ply.means[:, 2]) == pytest.approx(4.0, rel=0.1)
 
 
