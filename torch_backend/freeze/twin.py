@@ -1,11 +1,12 @@
-"""Never worse than a static model: what the field harms in a frozen scene is closed before the instant is developed.
+"""No worse than a static model: what the field harms in a frozen scene is closed before the instant is developed.
 
 A field is trained to explain every frame at its own time. Time standing still asks it for something nobody checked:
 how the world of t* looks from the other poses, the wall behind a person, say, that the field let fade while she stood
 there. The static twin of a frozen scene has the same Gaussians, the open ones at the mean of the times at which they
 were seen. Scene and twin are held against plates: that of t*, and the still pixels of others, all over the clip. A
-Gaussian stays open where plate t* is better for it and the others are no worse; one that moves in plate t*, where that
-gains more than the others lose. It is asked of neighbours together: errors are noisy, and things move in pieces.
+Gaussian is closed where the others are worse for it by more than plate t* gains. It is asked of neighbours together:
+errors are noisy, and things move in pieces. Where it makes no difference it stays open: mattes miss what sways, and to
+such pixels, which they call still, a mean is always nearer.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def settled(
         pair = _Pair(run, plates, frozen, closed(run, frozen, left), left, movers)
         near = _nearest(frozen.state["means"][left], config.neighbours)
         gain, harm = -pair.worse(here, near, still=False), pair.worse(others, near)
-        stays = ((gain > 0.0) & (harm <= 0.0)) | ((movers[left] > 0.5) & (gain > harm))
+        stays = (harm <= 0.0) | (gain > harm)
         if bool(stays.all()):
             break
         frozen = closed(run, frozen, left[~stays])
