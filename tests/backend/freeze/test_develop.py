@@ -160,7 +160,7 @@ def test_what_has_gone_in_the_other_plates_is_not_erased(trained, made):
     """In plates far from t* the patch stands elsewhere, and the wall is seen where it stood."""
     world, _ = trained
     run, scene, frozen, _ = made
-    config = DevelopConfig(steps=200, harm=99.0)  # whatever it does to frames that are left out
+    config = DevelopConfig(steps=200, gain=-99.0)  # whatever it does to frames that are left out
     now = develop(run, scene, frozen, T_STAR, motion_mattes(world.shot), config)
     before, after = (scores(world, run, scene, f, (113, 114, 115))[0] for f in (frozen, now))
     assert after > before - 1.0 and not torch.equal(now.state["sh0"], frozen.state["sh0"])
@@ -179,7 +179,7 @@ def test_a_kept_instant_is_read_back_to_the_bit(trained, made):
 def test_an_instant_that_developing_would_harm_is_kept_as_it_was(trained, made):
     world, _ = trained
     run, scene, frozen, _ = made
-    config, path = dataclasses.replace(SHORT, harm=-99.0), developed_path(run, 106)
+    config, path = dataclasses.replace(SHORT, gain=99.0), developed_path(run, 106)
     try:
         now = developed(world.shot, run, scene, 106, frozen, config)
         again = load_developed(world.shot, run, 106, frozen, config)
@@ -222,7 +222,7 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
 
 def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(apart):
     shot, run, scene, _ = apart
-    held, config = 109, DevelopConfig(steps=100, harm=99.0)
+    held, config = 109, DevelopConfig(steps=100, gain=-99.0)
     assert held not in run.train_frames
     frozen, mattes = field(run, scene, held), motion_mattes(shot)
     made = [develop(run, scene, settled(run, scene, frozen, held, mattes), held, mattes, config)]
