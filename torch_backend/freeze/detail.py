@@ -406,10 +406,13 @@ class Detailer:
 
     def _travel(self, shot: _Shot, frame: int) -> Tensor:
         """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
-        moved = self._displacements(shot, [frame])[0][0]
+        h, w = shot.depth.shape
+        size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: Gaussians of what moves are larger than its pixels
+        moved, points = self._displacements(shot, [frame], size)[0][0], shot.points[::2, ::2]
         view = self.seen.view(frame)
-        ends = project(shot.points + moved, view.viewmat, view.K)[0]
-        return (ends - project(shot.points, view.viewmat, view.K)[0]).norm(dim=-1) / self.seen.unit
+        ends = project(points + moved, view.viewmat, view.K)[0]
+        travel = (ends - project(points, view.viewmat, view.K)[0]).norm(dim=-1) / self.seen.unit
+        return resized(travel, w, h)
 
     def _places(self, shot: _Shot, leading: int, own: bool, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """(ST [H, W, 2] into the leading plate, [H, W] 1 within it): the identity on the clip's own poses."""
@@ -450,17 +453,22 @@ class Detailer:
 
     def _agreed(self, shot: _Shot, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
         """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
+        h, w = shot.depth.shape
         if shot.t not in chosen:
             return [torch.ones_like(shot.depth) for _ in chosen]
-        truth = self.seen.seen(shot.t, shot.points)
+        points = shot.points[::2, ::2]  # a quarter of the work: it is low-passed
+        truth = self.seen.seen(shot.t, points)
         told = look_up(self.seen.view(shot.t).picture.float(), truth.pixels)
         out = []
         for frame, way in zip(chosen, moved, strict=True):
-            there = self.seen.seen(frame, shot.points + way)
+            if frame == shot.t:
+                out.append(torch.ones_like(shot.depth))
+                continue
+            there = self.seen.seen(frame, points + way[::2, ::2])
             says = look_up(self.seen.view(frame).picture.float(), there.pixels)
             both = (truth.visible * there.visible)[..., None]
-            off = self.seen.difference(says * both, told * both, 1.0)
-            out.append(torch.exp(-(off / self.config.agreement).square()))
+            off = self.seen.difference(says * both, told * both, 0.5)
+            out.append(resized(torch.exp(-(off / self.config.agreement).square()), w, h))
         return out
 
     def _rest(self, shot: _Shot, fillers: _Fillers, matte: Tensor, rows: slice) -> _Rest:
@@ -481,11 +489,15 @@ class Detailer:
         doubt = look_up(shot.doubt, small)
         weights, places = [], []
         untold = 1.0 - unknown
-        if shot.t in fillers.chosen:  # the better plate t* shows it, the less another time is needed
-            untold = untold * (1.0 - self._near(shot, shot.t, self.seen.seen(shot.t, points)))
+        truth = self.seen.seen(shot.t, points) if shot.t in fillers.chosen else None
+        if truth is not None:  # the better plate t* shows it, the less another time is needed
+            untold = untold * (1.0 - self._near(shot, shot.t, truth))
         for n, frame in enumerate(fillers.chosen):
-            there = points if frame == shot.t else points + look_up(fillers.moved[n], small)
-            sighting = self._doubted(self.seen.seen(frame, there), doubt)
+            if truth is not None and frame == shot.t:
+                sighting = truth
+            else:
+                sighting = self.seen.seen(frame, points + look_up(fillers.moved[n], small))
+            sighting = self._doubted(sighting, doubt)
             sway = self._sway(frame, points, sighting) * untold * look_up(fillers.agreed[n], small)
             weights.append(self._weight(shot, frame, sighting, motion, sway))
             places.append(sighting.pixels * larger)
@@ -553,9 +565,14 @@ class Detailer:
             have = have + gains[frame]
         return chosen
 
-    def _displacements(self, shot: _Shot, chosen: list[int]) -> tuple[list[Tensor], Tensor]:
-        """([h, w, 3] scene units from t* to each plate of what is seen, [h, w] share whose way nobody knows)."""
-        h, w = shot.depth.shape
+    def _displacements(
+        self, shot: _Shot, chosen: list[int], size: tuple[int, int] | None = None
+    ) -> tuple[list[Tensor], Tensor]:
+        """([h, w, 3] scene units from t* to each plate of what is seen, [h, w] share whose way nobody knows).
+
+        `size` (w, h) None: that of decisions.
+        """
+        w, h = size or shot.depth.shape[::-1]
         rows, state = self.seen.rows, shot.frozen.state
         strangers = self.seen.stage.strangers(shot.frozen)
         extra = torch.zeros(len(strangers), 3 * len(chosen) + 1, device=state["means"].device)

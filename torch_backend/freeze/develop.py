@@ -43,8 +43,8 @@ class DevelopConfig:
     probes: int = 6
     """Trained frames that are left out, at most, to see whether developing helped."""
     gain: float = 0.2
-    """dB that the still pixels of the frames left out must gain: by less, at the size of the run, frozen truth lost half
-    a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it."""
+    """dB that the still pixels of the frames left out must gain: by less, at the size of the run, frozen truth lost
+    half a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it."""
     instant_share: float = 0.1
     """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training."""
     margin: int = 2

@@ -13,7 +13,7 @@ from .reproject import narrowed, resized, widened
 
 def opened(mask: Tensor, by: int) -> Tensor:
     """The mask without what is narrower than 2 `by` + 1 pixels: outlines, which errors of depth explain."""
-    return widened(narrowed(mask.float(), by), by) > 0.5
+    return widened(narrowed(mask.float(), by), by) > 0.5 if bool(mask.any()) else mask
 
 
 def closed(mask: Tensor, by: int) -> Tensor:
