@@ -8,7 +8,7 @@ from benchmarks.model import OF_FROZEN, main
 def test_a_trained_run_is_judged_frozen_and_developed_on_frames_that_it_has_not_seen(trained, tmp_path):
     world, _ = trained
     command = [str(world.shot.root), "--run", "main", "--results", str(tmp_path), "--t-star", "103", "--develop"]
-    assert main([*command, "--develop-set", "steps=40", "harm=99", "--held", "1"]) == 0
+    assert main([*command, "--develop-set", "steps=40", "gain=-99", "--held", "1"]) == 0
     result = json.loads((tmp_path / "model.json").read_text())
     figures = result["figures"]
     assert all(20.0 < figures[f"{kind}_large_{n}"] < 60.0 for kind in ("field", "developed") for n in OF_FROZEN[:2])
