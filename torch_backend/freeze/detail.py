@@ -68,7 +68,7 @@ class DetailConfig:
     believed there if it bears the motion out: sways too small for the flow."""
     borne_out: float = 0.03
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
-    agreed: float = 0.15
+    alike: float = 0.15
     """Low-passed difference of the frozen render and its own plate, display-referred, up to which they agree."""
     denied: float = 0.15
     """Low-passed difference of the frozen render and its own plate, display-referred, from which on that plate is not
@@ -381,7 +381,7 @@ class Detailer:
             found, both = torch.maximum(found, sighting.visible * sighting.moving), both * sighting.moving
         if len(around) == 2:
             found = torch.maximum(found, both)
-        near = widened((off > self.config.agreed).float(), round(self.config.margin * self.seen.unit))
+        near = widened((off > self.config.alike).float(), round(self.config.margin * self.seen.unit))
         return (resized(found, w, h) > 0.5) & (near > 0.5)
 
     def _denied(self, truth: Sighting, off: Tensor) -> Tensor:
