@@ -849,14 +849,19 @@ def open_regular(path: str | Path) -> BinaryIO:
     FileNotFoundError or another OSError of the system's; ValueError names a path that holds something else.
     """
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-    handle = os.open(path, flags)
+    # One owner of the handle from the start: closed twice, by us and by a file object that goes, an interrupt between
+    # the two would read as a fault of the disk.
     try:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
+        source = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115 -- it is what we return
+    except IsADirectoryError:
+        raise ValueError(f"{path} is not a file: remove it") from None
+    try:
+        if not stat.S_ISREG(os.fstat(source.fileno()).st_mode):
             raise ValueError(f"{path} is not a file: remove it")
-        return open(handle, "rb")
     except BaseException:
-        os.close(handle)
+        source.close()
         raise
+    return source
 
 
 def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:

@@ -1,7 +1,9 @@
 """What crosses the wall: versions, types, camera paths."""
 
 import dataclasses
+import gc
 import math
+import os
 import subprocess
 import sys
 import time
@@ -62,6 +64,35 @@ def child_process() -> subprocess.Popen[bytes]:
     assert child.stdout is not None
     child.stdout.readline()  # before, the system may still show it without its command line
     return child
+
+
+def test_an_interrupt_while_a_file_is_opened_closes_it_once(tmp_path):
+    """Ctrl-C between the call of `open` and its return read as a fault of the disk: "Bad file descriptor"."""
+    path = tmp_path / "shot.json"
+    path.write_text("{}")
+
+    def press(frame, event: str, called) -> None:
+        if event == "c_return" and called is open:
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+
+    before = os.listdir("/dev/fd") if os.path.isdir("/dev/fd") else []
+    sys.setprofile(press)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            contract.read_json(path)
+    finally:
+        sys.setprofile(None)
+    gc.collect()
+    assert before == (os.listdir("/dev/fd") if os.path.isdir("/dev/fd") else [])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_what_is_no_file_is_refused_without_waiting(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(ValueError, match="is not a file: remove it"):
+            contract.open_regular(path)
 
 
 def test_a_process_is_known_by_its_start_and_command():
