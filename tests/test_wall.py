@@ -72,6 +72,11 @@ def not_for_the_addon(name: str) -> bool:
     return parts[0] not in {*BLENDER, *sys.stdlib_module_names, "numpy", "splannequin_addon"}
 
 
+def not_for_the_contract(name: str) -> bool:
+    parts = name.split(".")
+    return parts[:2] != ["torch_backend", "contract"] and parts[0] not in sys.stdlib_module_names
+
+
 def not_for_the_backend(name: str) -> bool:
     return name.split(".")[0] in {*BLENDER, "splannequin_addon", "splannequin"}
 
@@ -181,6 +186,12 @@ def test_backend_never_imports_blender(path: Path):
     assert not [f"{path}:{line}: {name}" for line, name in found if not_for_the_backend(name)]
 
 
+@pytest.mark.parametrize("path", sources("torch_backend/contract"), ids=lambda p: p.name)
+def test_the_contract_imports_the_standard_library_and_itself(path: Path):
+    found = imports(read(path), package_of(path))
+    assert not [f"{path}:{line}: {name}" for line, name in found if not_for_the_contract(name)]
+
+
 @pytest.mark.parametrize("path", sources("torch_backend"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_a_station_imports_only_stations_before_it(path: Path):
     station = station_of(path.relative_to(ROOT / "torch_backend").with_suffix("").parts)
@@ -229,6 +240,11 @@ def test_light_modules_load_nothing_heavy(module: str):
 )
 def test_the_scan_sees_a_breach_from_the_addon(source: str):
     assert any(not_for_the_addon(name) for _, name in imports(ast.parse(source), ["splannequin_addon"]))
+
+
+@pytest.mark.parametrize("source", ["import numpy", "import bpy", "from ..shot import Shot", "from .. import shot"])
+def test_the_scan_sees_a_breach_from_the_contract(source: str):
+    assert any(not_for_the_contract(name) for _, name in imports(ast.parse(source), ["torch_backend", "contract"]))
 
 
 @pytest.mark.parametrize(
