@@ -142,7 +142,7 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
     """`freeze CLIP`: import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
     began = time.perf_counter()
     output = _output(args)
-    shot = output / (args.shot_name + shots.SHOT_SUFFIX)
+    shot = output / (args.shot_name + contract.SHOT_SUFFIX)
     scene, fresh = _scene(args.blend)
     scene.splannequin.shot_path = str(shot)
     requests = {
@@ -165,7 +165,7 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
     stages["bake"] = round(time.perf_counter() - since, 2)
     source = str(shots.read(shot).info.get("source", args.clip))
     summary = contract.summarise(str(shot), source, results, stages, time.perf_counter() - began)
-    jobs.write_json(output / "summary.json", {**summary, **baked})
+    jobs.write_json(output / contract.SUMMARY_FILE, {**summary, **baked})
     for line in summary["verdict"]:
         console.say(line)
     console.say(f"Composited frames: {baked['composited_dir']}")
@@ -196,10 +196,10 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
         params.first, params.last, params.step = span.start, span.stop - 1, span.step
         params.device = _device(args)
         steps.run(scene, "freeze", params, console)
-    if cameras.find(scene, shot, "CAMERA") is None and (shot / "solve" / "cameras.json").is_file():
+    if cameras.find(scene, shot, "CAMERA") is None and contract.ShotFolder(shot).cameras.is_file():
         steps.load_camera(scene, shot)
     baked = _bake(scene, fresh, shot, args.take, output, console, span, args.as_warp or None)
-    path = output / "summary.json"
+    path = output / contract.SUMMARY_FILE
     summary = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
     jobs.write_json(path, {**summary, **baked})

@@ -117,7 +117,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
         if args.t_star is not None and not info.first <= args.t_star <= info.last:  # said before hours of training
             raise ValueError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
     summary = contract.summarise(str(shot.root), shot.info().source, results, stages, time.perf_counter() - started)
-    write_json(output / "summary.json", summary)
+    write_json(output / contract.SUMMARY_FILE, summary)
     print_summary(summary, console)
     return ExitCode.OK
 

@@ -6,7 +6,10 @@ Blender writes `request.json` and starts `python -m torch_backend run-job FOLDER
 
 from __future__ import annotations
 
+import dataclasses
 import os
+import time
+import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +18,9 @@ from typing import Any, Protocol
 from .errors import ExitCode, JobError
 from .options import PARAMS, check_params
 from .processes import process
+from .shot_folder import ShotFolder
 from .typed import CONTRACT_VERSION, from_dict
+from .writing import write_json
 
 STATUS_VERSION = 2
 """Of status.json: 2 has the host."""
@@ -24,6 +29,8 @@ STATUS_FILE = "status.json"
 EVENTS_FILE = "events.jsonl"
 LOG_FILE = "log.txt"
 CANCEL_FILE = "cancel"
+STEP_FILE = "step"
+"""Name of the panel's step that asked for the job; Blender's own."""
 JOB_COMMAND = "-m torch_backend run-job"
 """How the process of a job was called, but for its Python and the job's folder."""
 HEARTBEAT_SECONDS = 2.0
@@ -153,3 +160,23 @@ def runs_job(pid: int, started: float, folder: Path) -> bool:
         return bool(ours) and os.path.isabs(told) and os.path.samefile(told, folder)
     except (OSError, ValueError):
         return False
+
+
+def new_job(shot: ShotFolder | Path, kind: str, params: Any) -> Path:
+    """Makes a job folder with its request in a shot; returns it.
+
+    Args:
+        shot: the shot folder. OSError, FileNotFoundError among them, if it cannot be written or is gone.
+        kind: of `PARAMS`.
+        params: the kind's dataclass; a dict of its fields as a request holds them.
+    """
+    if not isinstance(params, (PARAMS[kind], dict)):
+        raise ValueError(f"a {kind} job takes {PARAMS[kind].__name__}, not {type(params).__name__}")
+    there = shot if isinstance(shot, ShotFolder) else ShotFolder(shot)
+    folder = there.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
+    there.jobs.mkdir(exist_ok=True)
+    folder.mkdir()
+    values: dict[str, Any] = params if isinstance(params, dict) else dataclasses.asdict(params)
+    request = JobRequest(kind=kind, shot=str(there.root), params=values)
+    write_json(folder / REQUEST_FILE, dataclasses.asdict(request), parents=False)
+    return folder

@@ -10,9 +10,8 @@ from .errors import ExitCode, JobError
 from .files import SHORT_JSON, checked_name, printable, read_json
 from .jobs import STATUS_FILE, WORK
 from .processes import host_name, runs_still
+from .shot_folder import ShotFolder
 from .typed import CONTRACT_VERSION, check_version, from_dict
-
-WRITER_FILE = "lock.json"
 
 
 @dataclass
@@ -41,7 +40,7 @@ class Writer:
 
 def read_writer(shot: Path) -> Writer | None:
     """Who writes into a shot, as its lock says, dead or alive; None without a lock. ValueError on a damaged one."""
-    path = shot / WRITER_FILE
+    path = ShotFolder(shot).lock
     try:
         data = read_json(path, SHORT_JSON)
     except FileNotFoundError:
@@ -53,7 +52,7 @@ def read_writer(shot: Path) -> Writer | None:
 def gives_back(shot: Path, writer: Writer) -> bool:
     """True if the job that holds the shot has told its end: it lets go of the lock in a moment."""
     try:
-        status = read_json(shot / "jobs" / checked_name(writer.job, "job") / STATUS_FILE, SHORT_JSON)
+        status = read_json(ShotFolder(shot).jobs / checked_name(writer.job, "job") / STATUS_FILE, SHORT_JSON)
     except (OSError, ValueError):
         return False
     return status.get("state") in ("done", "failed", "cancelled") and status.get("pid") == writer.pid
@@ -67,7 +66,7 @@ def busy(shot: Path, writer: Writer) -> JobError:
     except (OSError, OverflowError, ValueError):
         since = "an unknown time"
     what, where = WORK.get(writer.kind, "A step"), printable(writer.host.partition(" (")[0], 80)
-    hint, lock = "Wait for it or cancel it.", shot / WRITER_FILE
+    hint, lock = "Wait for it or cancel it.", ShotFolder(shot).lock
     if writer.host != host_name():
         hint = f"Wait for it or cancel it there. If {where} surely works on it no longer, delete {lock}."
     return JobError(f"{what} of {shot.name} has been running on {where} since {since}.", hint, ExitCode.USAGE)
