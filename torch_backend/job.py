@@ -282,7 +282,7 @@ def _signals_cancel(reporter: JobReporter) -> Iterator[None]:
 def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
     from .footage import FootageConfig, import_footage
 
-    config = FootageConfig(params.first, params.last, params.step, params.working_height, params.fps, params.layer)
+    config = FootageConfig(**{one.name: getattr(params, one.name) for one in dataclasses.fields(FootageConfig)})
     return import_footage(shot, params.source, config, report)
 
 

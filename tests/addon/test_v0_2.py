@@ -62,30 +62,11 @@ def test_an_old_shot_is_shown_whole(addon, tmp_path):
     assert addon("steps").complete(root, "freeze") and not addon("steps").may_be_stale(root, "freeze")
 
 
-def asked(headless, contract, args: argparse.Namespace) -> dict[str, object]:
-    """Kind of job -> parameters that a parsed command line asks for."""
-    kind = args.run.__name__
-    if kind == "import_clip":
-        return {"import": headless._import_params(args)}
-    if kind == "solve":
-        given = str(Path(args.cameras).absolute()) if args.cameras else ""
-        return {"solve": contract.SolveParams(camera_model=args.camera_model, cameras=given)}
-    if kind == "train":
-        return {"train": headless._train_params(args)}
-    if kind == "freeze":
-        solve = contract.SolveParams(camera_model=args.camera_model)
-        return {
-            "import": headless._import_params(args), "solve": solve,
-            "train": headless._train_params(args), "freeze": headless._freeze_params(args),
-        }  # fmt: skip
-    return {}
-
-
 def test_old_command_lines_ask_for_the_same(addon, contract):
     headless = addon("headless")
     for line in LINES:
         args = headless.parser().parse_args(line["argv"])
-        found = asked(headless, contract, args)
+        found = headless.asked(args)
         assert found.keys() == line["asks"].keys(), line["argv"]
         for kind, params in found.items():
             told = dataclasses.asdict(params)

@@ -22,26 +22,6 @@ OPTIONS = json.loads((OLD / "options.json").read_text(encoding="utf-8"))["backen
 PATHS = ("cameras", "camera_path")
 
 
-def asked(args) -> dict[str, object]:
-    """Kind of job -> parameters that a parsed command line asks for."""
-    if args.command == "import":
-        return {"import": cli._import_params(args)}
-    if args.command == "solve":
-        given = str(Path(args.cameras).absolute()) if args.cameras else ""
-        return {"solve": contract.SolveParams(camera_model=args.camera_model, cameras=given)}
-    if args.command == "train":
-        return {"train": cli._train_params(args)}
-    if args.command == "take":
-        return {"freeze": cli._freeze_params(args)}
-    if args.command == "freeze":
-        solve = contract.SolveParams(camera_model=args.camera_model)
-        return {
-            "import": cli._import_params(args), "solve": solve,
-            "train": cli._train_params(args), "freeze": cli._freeze_params(args),
-        }  # fmt: skip
-    return {}
-
-
 @pytest.fixture
 def shot(tmp_path: Path) -> Shot:
     root = tmp_path / "old.splannequin"
@@ -79,7 +59,7 @@ def test_old_jobs_are_told_and_can_be_asked_for_again(shot: Shot, capsys):
 @pytest.mark.parametrize("line", LINES, ids=lambda line: " ".join(line["argv"]))
 def test_an_old_command_line_asks_for_the_same(line):
     args = cli.parser().parse_args(line["argv"])
-    found = asked(args)
+    found = cli.asked(args)
     assert found.keys() == line["asks"].keys()
     for kind, params in found.items():
         told = dataclasses.asdict(params)

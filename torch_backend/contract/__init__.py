@@ -1,7 +1,7 @@
 """What crosses the wall between Blender and the backend. Standard library only: both sides read this package.
 
     errors          exit codes, and the failure that an artist reads
-    options         what each step may be asked for
+    options         what each step may be asked for: option_table makes command lines, panel and manual of it
     jobs            a job's folder: request, status, events
     processes       children, and which process lives
     lock            one writer per shot
@@ -55,6 +55,9 @@ from .frame_layers import (
     EXR_LAYERS,
     NO_DEPTH,
 )
+from .hosts import (
+    host_names,
+)
 from .jobs import (
     CANCEL_FILE,
     EVENTS_FILE,
@@ -87,7 +90,22 @@ from .lock import (
     gives_back,
     read_writer,
 )
+from .option_table import (
+    SWITCH,
+    Limit,
+    Option,
+    add_options,
+    asked,
+    default_of,
+    limits_of,
+    option,
+    options_of,
+    overscan,
+    panel,
+)
 from .options import (
+    CAMERA_MODELS,
+    COMMANDS,
     DETECTORS,
     DEVICES,
     HOST_CONFIGS,
@@ -98,15 +116,13 @@ from .options import (
     PARAMS,
     PRESET_STEPS,
     PRESET_WIDTHS,
+    QUERIES,
     SUPERVISIONS,
-    SWITCH,
     FreezeParams,
     ImportParams,
-    Limit,
     SolveParams,
     TrainParams,
     check_params,
-    overscan,
 )
 from .processes import (
     GRACE_SECONDS,
@@ -197,10 +213,12 @@ from .writing import (
 
 __all__ = [
     "CAMERAS_FILE",
+    "CAMERA_MODELS",
     "CANCEL_FILE",
     "CHECKPOINT_FILE",
     "COLMAP_FOLDER",
     "COLMAP_LOG",
+    "COMMANDS",
     "CONFIG_FILE",
     "CONTACT_SHEET_FILE",
     "CONTRACT_VERSION",
@@ -243,6 +261,7 @@ __all__ = [
     "PRESET_STEPS",
     "PRESET_WIDTHS",
     "PREVIEWS_FOLDER",
+    "QUERIES",
     "RAW_FOLDER",
     "REQUEST_FILE",
     "RUNS_FOLDER",
@@ -278,6 +297,7 @@ __all__ = [
     "JobRequest",
     "Limit",
     "LiveView",
+    "Option",
     "Process",
     "Reporter",
     "RunFolder",
@@ -288,6 +308,8 @@ __all__ = [
     "TrainParams",
     "Verdict",
     "Writer",
+    "add_options",
+    "asked",
     "atomic_path",
     "busy",
     "check_params",
@@ -295,6 +317,7 @@ __all__ = [
     "checked_name",
     "checkpoint_facts",
     "content_key",
+    "default_of",
     "discard_unborn",
     "disk_error",
     "end_with_starter",
@@ -304,15 +327,20 @@ __all__ = [
     "gives_back",
     "gone",
     "host_name",
+    "host_names",
     "is_disk_full",
     "is_link",
+    "limits_of",
     "locked",
     "make_folder",
     "measured",
     "need_disk",
     "new_job",
     "open_regular",
+    "option",
+    "options_of",
     "overscan",
+    "panel",
     "path_error",
     "printable",
     "process",
