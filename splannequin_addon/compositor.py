@@ -31,10 +31,8 @@ _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 _BEFORE = "splannequin_before"
 _WARPS = "splannequin_warps"
 _CG = "cg"
-_LAYERS = ("Combined", "Depth", "Support", "Motion")
-"""Of a frozen frame; `_GRAIN` and `_DETAIL` are in some."""
-_DETAIL = ("Plate", "Source", "Splat")
-"""Of a frozen frame that was made of plates, too."""
+_LAYERS = tuple(layer.name for layer in contract.layers_of(""))
+"""Of every frozen frame; what else is in the table is in some."""
 _FROZEN, _DEPTH = "Frozen", "Depth in scene units"
 """Nodes inside the group."""
 _GAP = 200.0
@@ -450,14 +448,7 @@ _LOOKS = (
     (_INVENTED, 0.0, "1: what splats made up is tinted, what comes from a plate is not"),
 )
 """Factors of what only takes with detail can show."""
-_OUT = (
-    ("Image", "NodeSocketColor", "Frozen frame, scene-linear"),
-    ("Depth", "NodeSocketFloat", "Distance along the camera's axis in scene units; 1e10 where there is nothing"),
-    ("Support", "NodeSocketFloat", "1 where the footage saw this at the frozen instant, 0 where it is a guess"),
-    ("Motion", "NodeSocketFloat", "1 where things move in the footage, 0 where they never do"),
-    ("Plate", "NodeSocketFloat", "1 where the pixel is a plate's, 0 where splats made it up"),
-    ("Source", "NodeSocketFloat", "Number of the frame whose plate gives most of the pixel"),
-)
+_OUT = tuple((layer.output, layer.socket, layer.tip) for layer in contract.FRAME_LAYERS if layer.output)
 
 
 def _factor(socket: Any, value: float) -> None:
@@ -644,7 +635,7 @@ def _fill_group(scene: Any, node: Any, take: Take, image: Any, warp: Any | None)
     enter.location, frozen.location = (-2 * _GAP, 150.0), (-3 * _GAP, -100.0)
     mix.location, depth.location, leave.location = (3 * _GAP, 150.0), (_GAP, -100.0), (4 * _GAP, 0.0)
 
-    layers = {n: frozen.outputs[n] for n in (*_LAYERS, _GRAIN, *_DETAIL) if n in frozen.outputs}
+    layers = {n: frozen.outputs[n] for n in (layer.name for layer in contract.FRAME_LAYERS) if n in frozen.outputs}
     if warp is not None:
         layers["Combined"] = _warped(group, enter, layers["Combined"], warp, take)
     if "Plate" in layers:
@@ -664,9 +655,9 @@ def _fill_group(scene: Any, node: Any, take: Take, image: Any, warp: Any | None)
         whole = compat.new_math_node(group, "ROUND")
         group.links.new(fitted["Source"], whole.inputs[0])
         fitted["Source"] = whole.outputs[0]
-    for name in ("Support", "Motion", "Plate", "Source"):
-        if name in fitted:
-            group.links.new(fitted[name], leave.inputs[name])
+    for layer in contract.FRAME_LAYERS:
+        if layer.output and layer.name in fitted and layer.name not in ("Combined", "Depth"):
+            group.links.new(fitted[layer.name], leave.inputs[layer.output])
     for name in old - shown:
         stale = bpy.data.images.get(name)
         if stale is not None and stale.users == 0:

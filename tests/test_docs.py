@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torch_backend.contract import COMMANDS, default_of, options_of
+from torch_backend.contract import COMMANDS, FRAME_LAYERS, default_of, options_of
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "README.md"]
@@ -84,3 +84,13 @@ def option_table(command: str) -> str:
 def test_the_user_guides_options_are_those_of_the_command_line():
     table = option_table("freeze")
     assert table in text_of(ROOT / "docs" / "user-guide.md"), f"put this table into docs/user-guide.md:\n\n{table}\n"
+
+
+def test_the_layers_of_a_frame_in_the_manual_are_those_of_the_table():
+    rows = [f"| `{one.shown}` | {one.stored} | {one.content} |" for one in FRAME_LAYERS]
+    guide = text_of(ROOT / "docs" / "user-guide.md")
+    assert "\n".join(f"  {row}" for row in rows) in guide, "put these rows into docs/user-guide.md:\n" + "\n".join(rows)
+    assert f"Combined, Alpha, {', '.join(one.name for one in FRAME_LAYERS[1:])}." in guide
+    page = text_of(MANUAL / "layers.md").split("## The freeze")[0]
+    page = re.findall(r"^\| `([^`]+)` \| ([\w, ]+) \|", page, re.MULTILINE)
+    assert dict(page) == {one.shown: "Combined, Alpha" if one.name == "Combined" else one.name for one in FRAME_LAYERS}

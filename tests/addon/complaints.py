@@ -110,9 +110,9 @@ ANSWERS = (
     Answer(
         5,
         "depth is 32-bit float",
-        "torch_backend/freeze/exr.py",
-        "(oiio.HALF,) * 4 + (oiio.FLOAT,)",
-        "(oiio.HALF,) * 4 + (oiio.HALF,)",
+        "torch_backend/contract/frame_layers.py",
+        '("Z",),\n        "float",',
+        '("Z",),\n        "half",',
         "tests/backend/freeze/test_exr.py::test_round_trip_keeps_depth_exact_and_the_rest_to_half",
     ),
     Answer(
@@ -174,9 +174,9 @@ ANSWERS = (
     Answer(
         10,
         "added steps have a file of their own until they are done",
-        "torch_backend/train/extend.py",
-        'EXTENSION_FILE = "extension.safetensors"',
-        'EXTENSION_FILE = "checkpoint.safetensors"',
+        "torch_backend/contract/shot_folder.py",
+        '"checkpoint.safetensors", "extension.safetensors"',
+        '"checkpoint.safetensors", "checkpoint.safetensors"',
         "tests/backend/train/test_extend.py::test_the_finished_run_stays_until_the_last_added_step",
     ),
     Answer(

@@ -52,8 +52,11 @@ from .files import (
     remove_link,
 )
 from .frame_layers import (
-    EXR_LAYERS,
+    FRAME_LAYERS,
     NO_DEPTH,
+    FrameLayer,
+    channels_of,
+    layers_of,
 )
 from .hosts import (
     host_names,
@@ -226,10 +229,10 @@ __all__ = [
     "DEVELOPED_FOLDER",
     "DEVICES",
     "EVENTS_FILE",
-    "EXR_LAYERS",
     "EXTENSION_FILE",
     "FRAMES_FILE",
     "FRAMES_FOLDER",
+    "FRAME_LAYERS",
     "GRACE_SECONDS",
     "HEARTBEAT_SECONDS",
     "HOSTS",
@@ -291,6 +294,7 @@ __all__ = [
     "Cancelled",
     "Event",
     "ExitCode",
+    "FrameLayer",
     "FreezeParams",
     "ImportParams",
     "JobError",
@@ -312,6 +316,7 @@ __all__ = [
     "asked",
     "atomic_path",
     "busy",
+    "channels_of",
     "check_params",
     "check_version",
     "checked_name",
@@ -330,6 +335,7 @@ __all__ = [
     "host_names",
     "is_disk_full",
     "is_link",
+    "layers_of",
     "limits_of",
     "locked",
     "make_folder",

@@ -1,8 +1,121 @@
-"""Frozen frames: what their layers hold."""
+"""The layers of a frozen frame, in one table: the EXR writer, the compositor and the manual read it."""
 
 from __future__ import annotations
 
-EXR_LAYERS = ("Combined", "Depth", "Support", "Motion")
-"""Passes of a frozen frame: premultiplied scene-linear RGBA, planar depth in solve units, two mattes in [0, 1]."""
+from dataclasses import dataclass
+
 NO_DEPTH = 1e10
 """Depth of a pixel that nothing covers (what Blender's own Z pass says)."""
+
+
+@dataclass(frozen=True)
+class FrameLayer:
+    """One layer of takes/NAME/NNNNNN.exr."""
+
+    name: str
+    """Socket of Blender's Image node, 4.2 to 5.2."""
+    channels: tuple[str, ...]
+    """Channels of the file, in order. One letter after the dot makes a value, R G B A a colour; see freeze/exr.py."""
+    stored: str
+    """half or float."""
+    shown: str
+    """Its channels as the user guide writes them."""
+    content: str
+    """What it holds, for the user guide."""
+    part: str = ""
+    """Empty: every frame has it; grain, detail: those frames that were made with it."""
+    output: str = ""
+    """Output of the compositor group that gives it; empty: none does."""
+    tip: str = ""
+    """Tooltip of that output."""
+    socket: str = "NodeSocketFloat"
+    """Type of that output."""
+
+
+FRAME_LAYERS = (
+    FrameLayer(
+        "Combined",
+        ("R", "G", "B", "A"),
+        "half",
+        "R G B A",
+        "scene-linear, Rec.709 primaries, premultiplied",
+        output="Image",
+        tip="Frozen frame, scene-linear",
+        socket="NodeSocketColor",
+    ),
+    FrameLayer(
+        "Depth",
+        ("Z",),
+        "float",
+        "Z",
+        "depth along the camera's axis, in solve units (scaled to the scene's at bake); 1e10 where alpha is 0",
+        output="Depth",
+        tip="Distance along the camera's axis in scene units; 1e10 where there is nothing",
+    ),
+    FrameLayer(
+        "Support",
+        ("Support.V",),
+        "half",
+        "Support.V",
+        "1: this surface was seen near t*; 0: it is a guess",
+        output="Support",
+        tip="1 where the footage saw this at the frozen instant, 0 where it is a guess",
+    ),
+    FrameLayer(
+        "Motion",
+        ("Motion.V",),
+        "half",
+        "Motion.V",
+        "how much of the pixel belongs to something that moves in the clip",
+        output="Motion",
+        tip="1 where things move in the footage, 0 where they never do",
+    ),
+    FrameLayer(
+        "Grain",
+        ("Grain.R", "Grain.G", "Grain.B", "Grain.A"),
+        "half",
+        "Grain.R G B",
+        "what added to `R G B` gives the frame the plate's grain, another one on every frame; 0 where the pixel is "
+        "plate",
+        part="grain",
+    ),
+    FrameLayer(
+        "Splat",
+        ("Splat.R", "Splat.G", "Splat.B", "Splat.A"),
+        "half",
+        "Splat.R G B A",
+        "the frame of splats alone; not with `--detail off`, like the next two",
+        part="detail",
+    ),
+    FrameLayer(
+        "Plate",
+        ("Plate.V",),
+        "half",
+        "Plate.V",
+        "share of the pixel that is plate; 0: splats made it up",
+        part="detail",
+        output="Plate",
+        tip="1 where the pixel is a plate's, 0 where splats made it up",
+    ),
+    FrameLayer(
+        "Source",
+        ("Source.V",),
+        "float",  # a half counts frames up to 2048 only
+        "Source.V",
+        "number of the frame whose plate gives most of the pixel; 0 where none does",
+        part="detail",
+        output="Source",
+        tip="Number of the frame whose plate gives most of the pixel",
+    ),
+)
+"""In the order of the file."""
+
+
+def layers_of(part: str) -> tuple[FrameLayer, ...]:
+    """The layers of a part, in the order of the file."""
+    return tuple(layer for layer in FRAME_LAYERS if layer.part == part)
+
+
+def channels_of(part: str) -> tuple[str, ...]:
+    """Channel names of a part's layers, in the order of the file."""
+    return tuple(channel for layer in layers_of(part) for channel in layer.channels)

@@ -25,16 +25,15 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
+from ..contract import channels_of, layers_of
 from ..shot import atomic_path
 
-CHANNELS = ("R", "G", "B", "A", "Z", "Support.V", "Motion.V")
+CHANNELS = channels_of("")
 """Channel names in the order of the arrays: colour, depth, support matte, motion matte."""
-GRAIN_CHANNELS = ("Grain.R", "Grain.G", "Grain.B", "Grain.A")
+GRAIN_CHANNELS = channels_of("grain")
 """Channel names of the grain, which a frame may lack."""
-DETAIL_CHANNELS = ("Splat.R", "Splat.G", "Splat.B", "Splat.A", "Plate.V", "Source.V")
+DETAIL_CHANNELS = channels_of("detail")
 """Channel names of `DetailLayers`, which a frame of splats alone lacks."""
-BLENDER_SOCKETS = ("Combined", "Alpha", "Depth", "Motion", "Support")
-"""Outputs of Blender's compositor Image node for such a file, 4.2 to 5.2."""
 HALF_MAX = 65504.0
 """Largest finite half float; brighter colour is clamped to it."""
 EXR_VERSION = 1
@@ -42,9 +41,11 @@ EXR_VERSION = 1
 COLOR_SPACE = "lin_rec709_scene"
 """Scene-linear, Rec.709 / sRGB primaries, D65 (ASWF colour interop id, written as `colorInteropID`)."""
 
-_FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) + (oiio.HALF,) * 2
-# A half counts frames up to 2048 only.
-_DETAIL_FORMATS = (oiio.HALF,) * 5 + (oiio.FLOAT,)
+_STORAGE = {"half": oiio.HALF, "float": oiio.FLOAT}
+_FORMATS, _GRAIN_FORMATS, _DETAIL_FORMATS = (
+    tuple(_STORAGE[layer.stored] for layer in layers_of(part) for _ in layer.channels)
+    for part in ("", "grain", "detail")
+)
 _CHANNELS_OF = {"rgba": (4,), "splat": (4,), "grain": (3,)}
 _ROWS = 64
 _PLATE_STEPS = 256.0
@@ -161,7 +162,7 @@ def write_frozen_exr(
     names, formats = CHANNELS, _FORMATS
     if grain is not None:
         layers["grain"] = grain
-        names, formats = names + GRAIN_CHANNELS, formats + (oiio.HALF,) * len(GRAIN_CHANNELS)
+        names, formats = names + GRAIN_CHANNELS, formats + _GRAIN_FORMATS
     if detail is not None:
         layers |= {"splat": detail.splat, "plate": detail.plate, "source": detail.source}
         names, formats = names + DETAIL_CHANNELS, formats + _DETAIL_FORMATS
