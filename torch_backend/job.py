@@ -280,10 +280,9 @@ def _signals_cancel(reporter: JobReporter) -> Iterator[None]:
 
 
 def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
-    from .footage import FootageConfig, import_footage
+    from .footage import import_footage
 
-    config = FootageConfig(**{one.name: getattr(params, one.name) for one in dataclasses.fields(FootageConfig)})
-    return import_footage(shot, params.source, config, report)
+    return import_footage(shot, params.source, params, report)
 
 
 def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:

@@ -89,7 +89,7 @@ def test_the_command_line_takes_detail(addon, tmp_path):
     headless = addon("headless")
     for words, expected in (([], "on"), (["--detail", "off"], "off")):
         args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
-        assert headless._freeze_params(args).detail == expected
+        assert headless.asked(args)["freeze"].detail == expected
 
 
 def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
@@ -111,4 +111,4 @@ def test_the_command_line_takes_develop(addon, tmp_path):
     headless = addon("headless")
     for words, expected in (([], "on"), (["--develop", "off"], "off")):
         args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
-        assert headless._freeze_params(args).develop == expected
+        assert headless.asked(args)["freeze"].develop == expected

@@ -13,7 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import FRAMES_FILE, LAST_FRAME, PICTURE, RAW_FOLDER, JobError, Reporter, frame_file, read_json
+from ..contract import (
+    FRAMES_FILE,
+    LAST_FRAME,
+    PICTURE,
+    RAW_FOLDER,
+    ImportParams,
+    JobError,
+    Reporter,
+    frame_file,
+    read_json,
+)
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import is_whole_png, resize, working_size, write_png
@@ -32,22 +42,8 @@ _WRITERS = 2
 _DISK_CHECK_FRAMES = 16
 
 
-@dataclass
-class FootageConfig:
-    """What is taken of the footage, and how large."""
-
-    first: int | None = None
-    """First frame number to take; None: the first there is."""
-    last: int | None = None
-    """Last frame number to take, inclusive; None: the last there is."""
-    step: int = 0
-    """Every how many frames are solved and trained on; 0 aims at 68 of them. All are delivered whatever it is."""
-    working_height: int = 0
-    """Height in pixels of the working frames; 0: the source's, at most 720. Frames are never enlarged."""
-    fps: float = 0.0
-    """Rate of an image sequence, frames per second; 0: what its files say, else 24. Videos have their own clock."""
-    layer: str = ""
-    """Layer of the pictures of a sequence, by its name or the last part of it; empty: the picture itself."""
+FootageConfig = ImportParams
+"""What is taken of the footage, and how large. Which footage that is, is asked for apart: `source` is not looked at."""
 
 
 @dataclass
@@ -98,8 +94,13 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
 
 def import_key(info: SourceInfo, config: FootageConfig) -> str:
     """What tells an import from others: of which footage it is, and what was taken of it."""
-    asked = {name: value for name, value in asdict(config).items() if name != "layer" or value}
+    asked = {name: value for name, value in _taken(config).items() if name != "layer" or value}
     return content_key(FRAMES_VERSION, info.key, asked)
+
+
+def _taken(config: FootageConfig) -> dict[str, Any]:
+    """What was taken of the footage, wherever that lies by now."""
+    return {name: value for name, value in asdict(config).items() if name != "source"}
 
 
 def load_frames(shot: Shot) -> dict[str, Any]:
@@ -315,7 +316,7 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "extended": info.extended,
         "start": start,
         "step": step,
-        "config": asdict(config),
+        "config": _taken(config),
         "key": key,
         "frames": frames,
     }

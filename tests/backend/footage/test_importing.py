@@ -9,7 +9,9 @@ import pytest
 from torch_backend.contract import Cancelled, ExitCode, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.images import read_png, write_png
-from torch_backend.shot import Shot
+from torch_backend.footage.importing import import_key
+from torch_backend.footage.sources import open_source
+from torch_backend.shot import Shot, content_key
 
 
 @pytest.fixture
@@ -302,3 +304,15 @@ def test_frames_json_is_plain(shot, clip, recorder):
     record = json.loads((shot.frames / "frames.json").read_text())
     assert record["version"] == 1
     assert set(record["frames"][0]) == {"frame", "seconds", "file", "solve", "sharpness", "exposure", "flags"}
+
+
+def test_an_import_is_known_by_what_version_0_2_noted_of_it(shot, clip, recorder):
+    info = open_source(clip).info
+    asked = {"first": 2, "last": 19, "step": 2, "working_height": 96, "fps": 0.0}
+    config = FootageConfig(source=clip, **asked)
+    assert import_key(info, config) == content_key(1, info.key, asked)
+    named = FootageConfig(source=clip, layer="left", **asked)
+    assert import_key(info, named) == content_key(1, info.key, {**asked, "layer": "left"})
+    import_footage(shot, clip, config, recorder())
+    noted = json.loads(shot.listing.read_text())
+    assert noted["config"] == {**asked, "layer": ""} and noted["key"] == import_key(info, config)
