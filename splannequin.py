@@ -153,7 +153,16 @@ if str(ROOT) not in sys.path:  # -P and PYTHONSAFEPATH leave even a script's own
     sys.path.insert(0, str(ROOT))
 
 from torch_backend.cards import Card, nvidia_cards, why_unfit, why_unused  # noqa: E402  (needs 3.11)
-from torch_backend.contract import GRACE_SECONDS, ExitCode, program, python_child, read_json  # noqa: E402
+from torch_backend.contract import (  # noqa: E402
+    GRACE_SECONDS,
+    JOBS_FOLDER,
+    SHOT_SUFFIX,
+    STATUS_FILE,
+    ExitCode,
+    program,
+    python_child,
+    read_json,
+)
 from torch_backend.shot import is_disk_full, locked, write_json  # noqa: E402
 
 
@@ -707,7 +716,8 @@ def read_summary(output: Path) -> dict[str, Any]:
 def failed_job(output: Path) -> str:
     """The sentence of the newest job of the shots in `output`, if it failed; else nothing."""
     try:
-        statuses = sorted(output.glob("*.splannequin/jobs/*/status.json"), key=lambda path: path.stat().st_mtime)
+        found = output.glob(f"*{SHOT_SUFFIX}/{JOBS_FOLDER}/*/{STATUS_FILE}")
+        statuses = sorted(found, key=lambda path: path.stat().st_mtime)
         status = read_json(statuses[-1]) if statuses else {}
     except (OSError, ValueError):
         return ""
