@@ -65,12 +65,12 @@ def _need_warp(shot: Path, take: compositor.Take) -> None:
 def _sources(scene: Any, shot: Path, take: str) -> tuple[compositor.Take, Path | None]:
     """A take, and the first picture of its plate if there is one. JobError if the take has no frames."""
     try:
-        frozen = compositor.take_of(shot / "takes" / take, cameras.depth_scale(scene, shot))
+        frozen = compositor.take_of(contract.ShotFolder(shot).takes / take, cameras.depth_scale(scene, shot))
     except FileNotFoundError as error:
         raise contract.JobError(
             f"The take {take!r} of {shot.name} holds no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
         ) from error
-    plate = compositor.frame_path(shot / "frames", frozen.first, ".png")
+    plate = contract.ShotFolder(shot).plate(frozen.first)
     return frozen, plate if plate.is_file() else None
 
 
@@ -85,7 +85,7 @@ def _footage(scene: Any, shot: Path, plate: Path | None) -> list[Path]:
 def shown(scene: Any, shot: Path) -> str:
     """Name of the take of this shot that the scene's compositor shows; empty if there is none, or another shot's."""
     there = compositor.shown(scene)
-    return there[0].name if there is not None and there[0].parent == shot / "takes" else ""
+    return there[0].name if there is not None and there[0].parent == contract.ShotFolder(shot).takes else ""
 
 
 def stale_scale(scene: Any, shot: Path) -> bool:
@@ -117,7 +117,7 @@ def frames_of(scene: Any) -> range:
 
 def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
     """Those of some frames that a take lacks."""
-    there = set(compositor.frame_numbers(shot / "takes" / take))
+    there = set(compositor.frame_numbers(contract.ShotFolder(shot).takes / take))
     return [n for n in frames if n not in there]
 
 
@@ -144,7 +144,7 @@ def fit_take(scene: Any, shot: Path, take: str, new: bool = False) -> list[str]:
         take: name of the take.
         new: the scene is a new one, which takes the plate's size.
     """
-    frozen, state, render = compositor.take_of(shot / "takes" / take), shots.read(shot), scene.render
+    frozen, state, render = compositor.take_of(contract.ShotFolder(shot).takes / take), shots.read(shot), scene.render
     width, height = size = _plate_size(state) if new else (render.resolution_x, render.resolution_y)
     alike = abs(width * frozen.size[1] - height * frozen.size[0]) <= 0.02 * width * frozen.size[1]
     if frozen.size[0] > width or (new and not alike):  # of a camera of the artist's own
@@ -157,7 +157,7 @@ def fit_take(scene: Any, shot: Path, take: str, new: bool = False) -> list[str]:
 
 def _plate_size(state: shots.ShotState) -> tuple[int, int]:
     """Width and height of the undistorted plate in pixels, (0, 0) before the import."""
-    solved = state.folder / "solve" / "cameras.json"
+    solved = contract.ShotFolder(state.folder).cameras
     if not solved.is_file():
         return state.size
     path = contract.CameraPath.load(solved)

@@ -203,7 +203,7 @@ def build(scene: Any, shot: Path) -> Any:
         FileNotFoundError: there is no solve.
         ValueError: a file of it is broken, or Blender cannot show the plate. The scene is then as it was.
     """
-    path = contract.CameraPath.load(shot / "solve" / "cameras.json")
+    path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
     xyz, rgb = _points(shot)
     floor, unsolved = _floor(shot), guesses.ranges(path, guesses.solved(shot, path))
     with intact.scene_of(scene):
@@ -367,7 +367,7 @@ def _show_plate(data: Any, shot: Path, name: str) -> None:
     if span is None:
         return
     first, last = span
-    path = compositor.frame_path(shot / "frames", first, ".png")
+    path = contract.ShotFolder(shot).plate(first)
     if not path.is_file():
         return
     background = data.background_images.new()
@@ -381,13 +381,13 @@ def _show_plate(data: Any, shot: Path, name: str) -> None:
 
 def _floor(shot: Path) -> tuple[Sequence[float], float] | None:
     """The floor that the solve found (torch_backend/solve/floor.py); None if it found none, or did not look."""
-    found = contract.read_json(shot / "solve" / "solve.json").get("floor")
+    found = contract.read_json(contract.ShotFolder(shot).solve_record).get("floor")
     return (found["normal"], float(found["height"])) if found else None
 
 
 def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:
     """Sparse points of the solve: xyz [P, 3] float32 in solve units, rgb [P, 3] uint8; empty without them."""
-    file = shot / "solve" / "points.npz"
+    file = contract.ShotFolder(shot).points
     if not file.is_file():
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     with np.load(file, allow_pickle=False) as stored:

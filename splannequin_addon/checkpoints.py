@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..torch_backend import contract
+from ..torch_backend.contract import RunFolder
 from . import kept
-
-CHECKPOINT = "checkpoint.safetensors"
-EXTENSION = "extension.safetensors"
-"""Of steps that are added to a finished run and are not done."""
-NEXT = "next"
-"""Folder in a run's: of trainings that will take the run's place when they are done."""
-_LONGEST = 1 << 22
 
 
 def facts(path: Path) -> dict[str, Any]:
@@ -31,18 +22,14 @@ def facts(path: Path) -> dict[str, Any]:
 
 def _facts(path: Path) -> dict[str, Any]:
     try:
-        with contract.open_regular(path) as source:
-            (length,) = struct.unpack("<Q", source.read(8))
-            header = json.loads(source.read(length)) if length < _LONGEST else {}
-        told = json.loads(header["__metadata__"]["splannequin"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, struct.error):
+        return contract.checkpoint_facts(path)
+    except (OSError, ValueError):
         return {}
-    return told if isinstance(told, dict) else {}
 
 
 def paused(run: Path) -> dict[str, Any] | None:
     """Of a run that has a checkpoint and is not finished: at which `iteration` of `end`, `preset` and `config`."""
-    told = facts(run / CHECKPOINT)
+    told = facts(RunFolder(run).checkpoint)
     try:
         config = told["config"]
         asked: contract.TrainParams = contract.from_dict(contract.TrainParams, params_of(config))
@@ -59,7 +46,7 @@ class _Count:
 
 def anew(run: Path) -> dict[str, Any] | None:
     """Of a run that is trained anew, paused or at work: as `paused`, of the training that was saved last."""
-    saved = sorted((run / NEXT).glob(f"*/{CHECKPOINT}"), key=_saved)
+    saved = sorted(RunFolder(run).next.glob(f"*/{contract.CHECKPOINT_FILE}"), key=_saved)
     told = paused(saved[-1].parent) if saved else None
     return None if told is None else {**told, "folder": saved[-1].parent}
 
@@ -73,9 +60,10 @@ def _saved(path: Path) -> float:
 
 def extension(run: Path) -> dict[str, int] | None:
     """Of steps that were begun to be added to a finished run: how many of `steps` are `done`."""
-    if not (run / EXTENSION).is_file():
+    there = RunFolder(run)
+    if not there.extension.is_file():
         return None
-    told, base = facts(run / EXTENSION), facts(run / CHECKPOINT)
+    told, base = facts(there.extension), facts(there.checkpoint)
     try:
         last = told["extensions"][-1]
         if (told["key"], last["from_iteration"]) != (base["key"], base["iteration"]):
@@ -100,17 +88,16 @@ def params_of(config: dict[str, Any]) -> dict[str, Any]:
 
 def other_cameras(shot: Path, run: Path) -> bool:
     """True if the shot was solved again, with another result, after the run was trained."""
-    cameras, trained = shot / "solve" / "cameras.json", run / CHECKPOINT
+    cameras, there = contract.ShotFolder(shot).cameras, RunFolder(run)
     try:
-        if cameras.stat().st_mtime <= trained.stat().st_mtime:
+        if cameras.stat().st_mtime <= there.checkpoint.stat().st_mtime:
             return False
-        told = kept.of(run / "config.json", contract.read_json)["solve"]
+        told = kept.of(there.config, contract.read_json)["solve"]
         return kept.of(cameras, _key) != told
     except (OSError, ValueError, KeyError):
         return False
 
 
 def _key(cameras: Path) -> str:
-    """What a run notes of the solve it was trained on: as torch_backend.shot.content_key."""
-    text = json.dumps(contract.read_json(cameras), sort_keys=True)
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
+    """What a run notes of the solve it was trained on."""
+    return contract.content_key(contract.read_json(cameras))

@@ -78,7 +78,7 @@ def told(result: dict[str, Any]) -> str:
 
 def solved(shot: Path, path: contract.CameraPath) -> set[int]:
     """Frames that the solve was to find; all of them if nothing says otherwise."""
-    listing = shot / "frames" / "frames.json"
+    listing = contract.ShotFolder(shot).listing
     left_out: set[int] = set()
     if listing.is_file():
         left_out = {int(f["frame"]) for f in contract.read_json(listing)["frames"] if not f.get("solve", True)}

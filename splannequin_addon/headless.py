@@ -91,7 +91,7 @@ def main(argv: Sequence[str]) -> int:
         args = parser().parse_args(list(argv))
         if getattr(args, "tied", False):
             contract.end_with_starter()
-        return int(args.run(args, Console(args.json)))
+        return int(args.does(args, Console(args.json)))
     except SystemExit as stop:
         return int(stop.code or 0)
     except (contract.Cancelled, KeyboardInterrupt):
@@ -116,13 +116,12 @@ def main(argv: Sequence[str]) -> int:
 
 def import_clip(args: argparse.Namespace, console: Console) -> int:
     """`import SHOT CLIP`."""
-    return _one_step(args, console, "footage", _import_params(args))
+    return _one_step(args, console, "footage")
 
 
 def solve(args: argparse.Namespace, console: Console) -> int:
     """`solve SHOT`."""
-    given = str(Path(args.cameras).absolute()) if args.cameras else ""
-    return _one_step(args, console, "camera", contract.SolveParams(camera_model=args.camera_model, cameras=given))
+    return _one_step(args, console, "camera")
 
 
 def export(args: argparse.Namespace, console: Console) -> int:
@@ -135,27 +134,23 @@ def export(args: argparse.Namespace, console: Console) -> int:
 
 def train(args: argparse.Namespace, console: Console) -> int:
     """`train SHOT`."""
-    return _one_step(args, console, "train", _train_params(args))
+    return _one_step(args, console, "train")
 
 
 def freeze(args: argparse.Namespace, console: Console) -> int:
     """`freeze CLIP`: import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
     began = time.perf_counter()
     output = _output(args)
-    shot = output / (args.shot_name + shots.SHOT_SUFFIX)
+    shot = output / (args.shot_name + contract.SHOT_SUFFIX)
     scene, fresh = _scene(args.blend)
     scene.splannequin.shot_path = str(shot)
-    requests = {
-        "footage": _import_params(args),
-        "camera": contract.SolveParams(camera_model=args.camera_model),
-        "train": _train_params(args),
-        "freeze": _freeze_params(args),
-    }
+    requests = asked(args)
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
-    for step, params in requests.items():
+    for step in ("footage", "camera", "train", "freeze"):
         since = time.perf_counter()
         kind = steps.STEPS[step].kind
+        params = requests[kind]
         results[kind], notes = steps.run(scene, step, params, console)
         stages[kind] = round(time.perf_counter() - since, 2)
         for note in notes:
@@ -165,7 +160,7 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
     stages["bake"] = round(time.perf_counter() - since, 2)
     source = str(shots.read(shot).info.get("source", args.clip))
     summary = contract.summarise(str(shot), source, results, stages, time.perf_counter() - began)
-    jobs.write_json(output / "summary.json", {**summary, **baked})
+    jobs.write_json(output / contract.SUMMARY_FILE, {**summary, **baked})
     for line in summary["verdict"]:
         console.say(line)
     console.say(f"Composited frames: {baked['composited_dir']}")
@@ -196,10 +191,10 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
         params.first, params.last, params.step = span.start, span.stop - 1, span.step
         params.device = _device(args)
         steps.run(scene, "freeze", params, console)
-    if cameras.find(scene, shot, "CAMERA") is None and (shot / "solve" / "cameras.json").is_file():
+    if cameras.find(scene, shot, "CAMERA") is None and contract.ShotFolder(shot).cameras.is_file():
         steps.load_camera(scene, shot)
     baked = _bake(scene, fresh, shot, args.take, output, console, span, args.as_warp or None)
-    path = output / "summary.json"
+    path = output / contract.SUMMARY_FILE
     summary = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
     jobs.write_json(path, {**summary, **baked})
@@ -245,7 +240,8 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
 # ------------------------------------------------------------------------------------------------- inside
 
 
-def _one_step(args: argparse.Namespace, console: Console, step: str, params: Any) -> int:
+def _one_step(args: argparse.Namespace, console: Console, step: str) -> int:
+    (params,) = asked(args).values()
     scene = bpy.context.scene
     scene.splannequin.shot_path = str(Path(args.shot).absolute())
     job = steps.begin(scene, step, params)
@@ -329,46 +325,10 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
         files.save_version = backups
 
 
-def _import_params(args: argparse.Namespace) -> contract.ImportParams:
-    clip = args.clip if "://" in args.clip else str(Path(args.clip).absolute())
-    return contract.ImportParams(clip, args.first, args.last, args.step, args.working_height, args.fps, args.layer)
-
-
-def _train_params(args: argparse.Namespace) -> contract.TrainParams:
-    return contract.TrainParams(
-        run=args.run_name,
-        preset=args.preset,
-        method=args.method,
-        host=args.host,
-        host_config=args.host_config,
-        detector=args.detector,
-        supervision=args.supervision,
-        iterations=args.iterations,
-        width=args.width,
-        max_gaussians=args.max_gaussians,
-        holdout=args.holdout,
-        seed=args.seed,
-        resume=not args.restart,
-        device=_device(args),
-        extend=getattr(args, "extend", 0),
-    )
-
-
-def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
-    return contract.FreezeParams(
-        run=args.run_name,
-        take=args.take,
-        t_star=args.t_star,
-        camera_path=str(Path(args.camera_path).absolute()) if args.camera_path else "",
-        query=args.freeze_query,
-        width=args.freeze_width,
-        overscan=args.overscan,
-        grain=not args.no_grain,
-        detail=args.detail,
-        develop=args.develop,
-        only_missing=True,
-        device=_device(args),
-    )
+def asked(args: argparse.Namespace) -> dict[str, Any]:
+    """Kind of job -> parameters that a parsed command line asks for; none of a command that starts no job."""
+    kinds = contract.COMMANDS.get(args.command, {})
+    return contract.asked(args, kinds, args.command, {"device": backend.device()})
 
 
 def _device(args: argparse.Namespace) -> str:
@@ -394,6 +354,10 @@ def _output(args: argparse.Namespace) -> Path:
     return output
 
 
+_UNSET = {"device": "as the preferences say"}
+"""Field -> what is taken for it where a command says nothing."""
+
+
 def parser() -> argparse.ArgumentParser:
     """The grammar of the command line."""
     codes = "exit codes: " + ", ".join(f"{c.value} {c.name.lower()}" for c in ExitCode)
@@ -407,52 +371,25 @@ def parser() -> argparse.ArgumentParser:
     def add(name: str, run: Any, text: str) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text, epilog=codes)
         command.add_argument("--json", action="store_true", help="print events as JSON lines instead of text")
-        command.set_defaults(run=run)
+        command.set_defaults(does=run)
         return command
 
-    one = add("import", import_clip, "Footage into a shot folder.")
-    one.add_argument("shot", help="shot folder, made if it is not there")
-    _add_import_flags(one)
-    one = add("solve", solve, "Cameras of a shot.")
-    one.add_argument("shot", help="shot folder")
-    _add_solve_flags(one)
-    one.add_argument(
-        "--cameras", default="", metavar="PATH",
-        help="take these cameras instead: a COLMAP folder, a transforms.json or a camera path",
-    )  # fmt: skip
+    def on_a_shot(name: str, run: Any, text: str, shot: str = "shot folder") -> None:
+        command = add(name, run, text)
+        command.add_argument("shot", help=shot)
+        contract.add_options(command, contract.COMMANDS[name], name, _UNSET)
+
+    on_a_shot("import", import_clip, "Footage into a shot folder.", "shot folder, made if it is not there")
+    on_a_shot("solve", solve, "Cameras of a shot.")
+    on_a_shot("train", train, "Train a run of a shot.")
     one = add("export", export, "Cameras and points of a solved shot for other programs.")
     one.add_argument("shot", help="shot folder")
     one.add_argument("--format", default="colmap", choices=("colmap", "nerfstudio"), help="what to write")
     one.add_argument("--text", action="store_true", help="a COLMAP model as .txt instead of .bin")
     one.add_argument("--output", required=True, metavar="DIR", help="folder to write into")
-    one = add("train", train, "Train a run of a shot.")
-    one.add_argument("shot", help="shot folder")
-    _add_train_flags(one)
-    text = "add N steps to a finished run, which keeps its settings (other flags are passed over)"
-    one.add_argument("--extend", type=int, default=0, metavar="N", help=text)
-    _add_device_flag(one)
     whole = add("freeze", freeze, "Clip to baked shot: import, solve, train, freeze, bake; writes OUTPUT/shot.blend.")
-    _add_import_flags(whole)
-    _add_solve_flags(whole)
-    _add_train_flags(whole)
-    _add_device_flag(whole)
-    whole.add_argument("--t-star", type=int, help="frame number at which time stands still (default: suggested)")
-    whole.add_argument("--take", default="freeze", help="name of the take")
-    text = "JSON camera path to render from (default: the clip's poses)"
-    whole.add_argument("--camera-path", default="", metavar="FILE", help=text)
-    whole.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"), help="see the user guide")
-    text = "width of the frozen frames in pixels (0: the source's own)"
-    whole.add_argument("--freeze-width", type=int, default=0, help=text)
-    text = "on: frozen frames are made of the plates, where they can be believed; off: of the splats alone"
-    whole.add_argument("--detail", default="on", choices=contract.SWITCH, help=text)
-    text = "on: the instant is trained on as the still scene that it is; off: it stays as the run has it"
-    whole.add_argument("--develop", default="on", choices=contract.SWITCH, help=text)
-    whole.add_argument(
-        "--overscan", type=contract.overscan, default=0.0, metavar="PERCENT", help="beyond the frame, or: lens"
-    )
-    text = "leave the plate's grain out of the files: a third smaller"
-    whole.add_argument("--no-grain", action="store_true", help=text)
-    whole.add_argument("--shot-name", default="shot", help="name of the shot folder in OUTPUT")
+    contract.add_options(whole, contract.COMMANDS["freeze"], "freeze", _UNSET)
+    whole.add_argument("--shot-name", default="shot", metavar="NAME", help="name of the shot folder in OUTPUT")
     whole.add_argument("--output", default="output", metavar="DIR", help="folder for everything that comes out")
     whole.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
     one = add("bake", bake_take, "A frozen take through the compositor; writes DIR/composited and DIR/shot.blend.")
@@ -462,7 +399,8 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--first", type=int, help="first frame to bake (default: the take's, or the .blend's range)")
     one.add_argument("--last", type=int, help="last frame to bake, inclusive")
     one.add_argument("--step", type=int, default=0, help="bake every n-th frame (0: the scene's step)")
-    _add_device_flag(one)
+    text = "where to freeze what is missing (default: as the preferences say)"
+    one.add_argument("--device", default="", choices=contract.DEVICES, help=text)
     one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
     text = "freeze the plate that the .blend shows by the take's warp, instead of showing the take's frames"
     one.add_argument("--as-warp", action="store_true", help=text)
@@ -474,41 +412,3 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("shot", help="shot folder")
     add("doctor", doctor, "What this Blender and its backend can do, as JSON.")
     return top
-
-
-def _add_import_flags(to: argparse.ArgumentParser) -> None:
-    to.add_argument("clip", help="video file, image sequence or pattern (shot.####.exr)")
-    to.add_argument("--first", type=int, help="first frame number")
-    to.add_argument("--last", type=int, help="last frame number, inclusive")
-    to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
-    to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
-    to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
-    to.add_argument("--layer", default="", metavar="NAME", help="EXR layer or part to take (default: the picture)")
-
-
-def _add_solve_flags(to: argparse.ArgumentParser) -> None:
-    to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"), help="lens")
-
-
-def _add_device_flag(to: argparse.ArgumentParser) -> None:
-    text = "where to train and freeze (default: as the preferences say)"
-    to.add_argument("--device", default="", choices=contract.DEVICES, help=text)
-
-
-def _add_train_flags(to: argparse.ArgumentParser) -> None:
-    # dest: `run` is the command's function.
-    to.add_argument("--run", dest="run_name", default="main", help="name of the run")
-    to.add_argument("--preset", default="preview", choices=tuple(contract.PRESET_STEPS), help="how much to spend")
-    to.add_argument("--method", default="auto", choices=contract.METHODS, help="a host's name: all move")
-    to.add_argument("--host", default="hexplane", choices=contract.HOSTS, help="which host `auto` puts behind the gate")
-    text = "our numbers or the published ones"
-    to.add_argument("--host-config", default="default", choices=contract.HOST_CONFIGS, help=text)
-    to.add_argument("--supervision", default="support", choices=contract.SUPERVISIONS, help="see the user guide")
-    text = "paper: what tells an ill-supervised Gaussian"
-    to.add_argument("--detector", default="grad_norm", choices=contract.DETECTORS, help=text)
-    to.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
-    to.add_argument("--width", type=int, default=0, help="width of the training images in pixels (0: the preset's)")
-    to.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
-    to.add_argument("--holdout", type=int, default=-1, help="keep every n-th frame out for testing (0: none)")
-    to.add_argument("--seed", type=int, default=0, help="random seed")
-    to.add_argument("--restart", action="store_true", help="do not go on from the run's checkpoint")

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,15 +85,7 @@ class Job:
 
 def new_job(shot: Path, kind: str, params: Any) -> Job:
     """Makes a job folder in `shot` with its request. `params` is the kind's dataclass of `contract.PARAMS`."""
-    if not isinstance(params, contract.PARAMS[kind]):
-        raise ValueError(f"a {kind} job takes {contract.PARAMS[kind].__name__}, not {type(params).__name__}")
-    folder = shot / "jobs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
-    folder.parent.mkdir(exist_ok=True)
-    folder.mkdir()
-    values = dataclasses.asdict(params)
-    request = contract.JobRequest(kind=kind, shot=str(shot), params=values)
-    write_json(folder / contract.REQUEST_FILE, dataclasses.asdict(request))
-    return Job(folder, kind, values)
+    return Job(contract.new_job(shot, kind, params), kind, dataclasses.asdict(params))
 
 
 def start(job: Job, python: str, package_root: Path) -> None:
@@ -294,7 +285,8 @@ def open_job(folder: Path) -> Job | None:
 def latest(shot: Path) -> dict[str, Job]:
     """The newest job of each kind in a shot, polled once: those that run are found again here."""
     found: dict[str, Job] = {}
-    folders = sorted((shot / "jobs").glob("*/"), key=lambda p: p.name, reverse=True) if shot.is_dir() else []
+    there = contract.ShotFolder(shot).jobs
+    folders = sorted(there.glob("*/"), key=lambda p: p.name, reverse=True) if shot.is_dir() else []
     for folder in folders:
         kind = next((k for k in contract.PARAMS if f"-{k}-" in folder.name), None)
         if kind is None or kind in found:
@@ -323,22 +315,8 @@ def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Writes a JSON object beside `path`, fsyncs, renames over it: a reader never sees half a file.
-
-    Makes its folder, but not what that is in: FileNotFoundError in a shot that was moved or deleted.
-    """
-    path.parent.mkdir(exist_ok=True)
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    beside.unlink(missing_ok=True)  # a link that another hand left there would be followed
-    try:
-        with open(beside, "x", encoding="utf-8", newline="\n") as out:
-            out.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
-            out.flush()
-            os.fsync(out.fileno())
-        os.replace(beside, path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
+    """As the contract's, but makes no folder above the file's own: FileNotFoundError in a shot that was moved."""
+    contract.write_json(path, data, parents=False)
 
 
 def _read_status(folder: Path) -> contract.Status | None:

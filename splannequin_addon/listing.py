@@ -95,7 +95,7 @@ def remove(shot: Path, folder: Path, wait: bool) -> None:
     """
     if contract.is_link(folder.parent):
         raise OSError(errno.EPERM, f"{folder.parent.name} is a link to another folder: remove it there", str(folder))
-    trash = shot / "trash"
+    trash = contract.ShotFolder(shot).trash
     if contract.is_link(trash):
         contract.remove_link(trash)
     if contract.is_link(folder):

@@ -22,7 +22,6 @@ import numpy as np
 from ..torch_backend import contract
 from . import jobs
 
-_LOG = "live.log"
 _PATIENCE_SECONDS = 10.0
 """How long a closed child may take to end by itself."""
 
@@ -172,7 +171,7 @@ def open_session(shot: Path, run: str, python: str, package_root: Path) -> Sessi
         package_root: folder that holds `torch_backend`.
     """
     session = Session(shot, run)
-    log = shot / "jobs" / _LOG
+    log = contract.ShotFolder(shot).live_log
     hidden: dict[str, Any] = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
     try:
         log.parent.mkdir(parents=True, exist_ok=True)

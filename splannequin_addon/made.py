@@ -13,7 +13,8 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, PointerProperty, StringProperty
 
-from . import compositor, shots
+from ..torch_backend import contract
+from . import compositor
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""
@@ -38,7 +39,7 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
 
 def name_of(shot: Path) -> str:
     """Name of a shot, from its folder."""
-    return shot.name.removesuffix(shots.SHOT_SUFFIX)
+    return shot.name.removesuffix(contract.SHOT_SUFFIX)
 
 
 def of(scene: Any, shot: Path) -> Any | None:

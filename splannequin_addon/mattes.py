@@ -19,25 +19,23 @@ from ..torch_backend import contract
 from . import compositor, icons, made, steps, supervisor
 from .translations import tr
 
-PAINTED = "motion_paint"
-"""Folder of the painted mattes in the shot."""
 _FRAME, _SHOT = "splannequin_matte", "splannequin_matte_shot"
 """Properties of the images that are painted on: frame number, and shot folder as a .blend holds it."""
 
 
 def found_file(shot: Path, frame: int) -> Path:
     """Where the solve keeps the matte of a frame."""
-    return shot / "solve" / "motion" / contract.frame_file(frame, ".png")
+    return contract.ShotFolder(shot).matte(frame)
 
 
 def painted_file(shot: Path, frame: int) -> Path:
     """Where the painted one is kept."""
-    return shot / PAINTED / contract.frame_file(frame, ".png")
+    return contract.ShotFolder(shot).painted_matte(frame)
 
 
 def load_sequence(shot: Path) -> tuple[Any, int, int]:
     """The found mattes as an image sequence, and their first and last frame. JobError if there are none."""
-    frames = sorted(int(p.stem) for p in (shot / "solve" / "motion").glob("*.png") if p.stem.isdecimal())
+    frames = sorted(int(p.stem) for p in contract.ShotFolder(shot).motion.glob("*.png") if p.stem.isdecimal())
     if not frames:
         raise no_matte(shot)
     image = compositor.load_sequence(found_file(shot, frames[0]), f"Motion {made.name_of(shot)}", "srgb")

@@ -85,7 +85,7 @@ def _shot_of(scene: Any) -> Path:
 
 def _centres(scene: Any, shot: Path) -> tuple[np.ndarray, np.ndarray]:
     """Where the camera was and its upward directions, [F, 3] each, world."""
-    poses = cameras.poses(contract.CameraPath.load(shot / "solve" / "cameras.json"))
+    poses = cameras.poses(contract.CameraPath.load(contract.ShotFolder(shot).cameras))
     poses = np.array(cameras.find(scene, shot, "EMPTY").matrix_world, dtype=np.float64) @ poses
     return poses[:, :3, 3], poses[:, :3, 1]
 

@@ -67,7 +67,7 @@ def log_of(watch: supervisor.Watch, step: str) -> Path | None:
     job = watch.jobs.get(step)
     if job is None:
         return None
-    logs = [job.folder / contract.LOG_FILE, *([watch.shot / "solve" / "colmap.log"] if step == "camera" else [])]
+    logs = [job.folder / contract.LOG_FILE, *([contract.ShotFolder(watch.shot).colmap_log] if step == "camera" else [])]
     return next((log for log in logs if _written(log)), None)
 
 

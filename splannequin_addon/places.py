@@ -150,8 +150,8 @@ def _known(path: Path, name: str) -> bool:
     """True if what the setting `name` is about is there; of a clip its shot is enough."""
     try:
         if name in ("clip", "cameras_path"):
-            return _there(path) or (name == "clip" and (shot_list.beside(path) / "shot.json").is_file())
-        return (path / "shot.json").is_file()
+            return _there(path) or (name == "clip" and contract.ShotFolder(shot_list.beside(path)).info_path.is_file())
+        return contract.ShotFolder(path).info_path.is_file()
     except OSError:
         return False
 

@@ -66,9 +66,9 @@ def remove(scene: Any, shot: Path) -> bool:
 def _frames(shot: Path) -> tuple[int, int, Path] | None:
     """First and last frame of an import, and the first one's picture."""
     try:
-        listed = contract.read_json(shot / "frames" / "frames.json")["frames"]
+        listed = contract.read_json(contract.ShotFolder(shot).listing)["frames"]
         first, last, name = int(listed[0]["frame"]), int(listed[-1]["frame"]), Path(str(listed[0]["file"])).name
     except (OSError, ValueError, KeyError, IndexError, TypeError):
         return None
-    path = shot / "frames" / "raw" / name
+    path = contract.ShotFolder(shot).raw / name
     return (first, last, path) if path.is_file() else None

@@ -19,11 +19,8 @@ from ..torch_backend import contract
 from . import compat, made
 from .translations import tr
 
-PRESETS = [
-    ("preview", "Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
-    ("standard", "Standard", "640 pixels wide, 9000 steps: for most shots"),
-    ("final", "Final", "1280 pixels wide, 30000 steps, most Gaussians: takes longest"),
-]
+PRESETS: list[tuple[str, str, str]] = contract.panel(contract.TrainParams, "preset")["items"]
+"""(identifier, name, tooltip) of each."""
 
 
 def names_of(props: Any, kind: str) -> list[tuple[str, str]]:
@@ -62,8 +59,7 @@ class ShotSettings:
     """One shot and what is to be done with it. What is named here is put away when another shot is chosen."""
 
     clip: StringProperty(
-        name="Clip",
-        description="Video file, or one image of a numbered sequence, of people holding still",
+        **contract.panel(contract.ImportParams, "source"),
         subtype="FILE_PATH",
         options=compat.PATH_OPTIONS,
     )
@@ -82,32 +78,28 @@ class ShotSettings:
     use_range: BoolProperty(
         name="Only a Range", description="Import a part of the clip instead of all of it", default=False, options=set()
     )
-    first: IntProperty(name="First", description="First frame number of the clip to import", default=1, options=set())
-    last: IntProperty(name="Last", description="Last frame number to import, inclusive", default=250, options=set())
+    first: IntProperty(
+        **contract.panel(contract.ImportParams, "first", 1),
+        options=set(),
+    )
+    last: IntProperty(
+        **contract.panel(contract.ImportParams, "last", 250),
+        options=set(),
+    )
     solve_step: IntProperty(
-        name="Solve Every",
-        description="Every how many frames the camera is solved and trained on, all are delivered; 0: chosen by the "
-        "clip's length. Smaller where a solve loses its way, 1: every frame",
-        default=0,
+        **contract.panel(contract.ImportParams, "step"),
         min=0,
         soft_max=10,
         options=set(),
     )
     fps: FloatProperty(
-        name="Frame Rate",
-        description="Frames per second of an image sequence; 0: what its files say, else 24. A video has its own",
-        default=0.0,
+        **contract.panel(contract.ImportParams, "fps"),
         min=0.0,
         soft_max=120.0,
         options=set(),
     )
     camera_model: EnumProperty(
-        name="Lens",
-        description="How the lens bends straight lines",
-        items=[
-            ("SIMPLE_RADIAL", "Ordinary", "One coefficient: phones, most cameras"),
-            ("OPENCV", "Strong", "Four coefficients: action cameras, very wide lenses"),
-        ],
+        **contract.panel(contract.SolveParams, "camera_model"),
         options=set(),
     )
     cameras_from: EnumProperty(
@@ -121,9 +113,7 @@ class ShotSettings:
         options=set(),
     )
     cameras_path: StringProperty(
-        name="Cameras",
-        description="Folder of a COLMAP model or one of its files, a transforms.json, or a camera path. "
-        "Pictures are matched to the clip's frames by the number in their names",
+        **contract.panel(contract.SolveParams, "cameras"),
         subtype="FILE_PATH",
         options=compat.PATH_OPTIONS,
     )
@@ -134,24 +124,18 @@ class ShotSettings:
         options=set(),
     )
     preset: EnumProperty(
-        name="Preset",
-        description="How much to spend on training",
-        items=PRESETS,
+        **contract.panel(contract.TrainParams, "preset"),
         options=set(),
         update=_preset_chosen,
     )
     extend_steps: IntProperty(
-        name="More Steps",
-        description="How many steps Train On adds to a finished run; a third of the preset's at first",
-        default=_third_of(contract.PRESET_STEPS["preview"]),
+        **contract.panel(contract.TrainParams, "extend", _third_of(contract.PRESET_STEPS["preview"])),
         min=10,
         soft_max=30_000,
         options=set(),
     )
     run_name: StringProperty(
-        name="Run",
-        description="Name of the training run; a new name keeps the old",
-        default="main",
+        **contract.panel(contract.TrainParams, "run"),
         options=set(),
         search=lambda props, context, text: names_of(props, "runs"),
         search_options={"SUGGESTION"},
@@ -163,10 +147,7 @@ class ShotSettings:
         options=set(),
     )
     t_star: IntProperty(
-        name="t*",
-        description="Frame number of the clip at which time stands still. Keyed, it is followed frame by frame: "
-        "freeze, hold and release",
-        default=1,
+        **contract.panel(contract.FreezeParams, "t_star", 1),
         options={"ANIMATABLE"},
     )
     path_camera: PointerProperty(
@@ -177,25 +158,15 @@ class ShotSettings:
         options=set(),
     )
     detail: BoolProperty(
-        name="Detail",
-        description="Make frozen frames of the plates, where they can be believed: as sharp as the plate. "
-        "Off: of the splats alone, soft throughout",
-        default=True,
+        **contract.panel(contract.FreezeParams, "detail"),
         options=set(),
     )
     develop: BoolProperty(
-        name="Develop",
-        description="Train the frozen instant on as the still scene that it is, before it is rendered: what moves is "
-        "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each "
-        "t*. Off: the instant as the training left it",
-        default=True,
+        **contract.panel(contract.FreezeParams, "develop"),
         options=set(),
     )
     freeze_width: IntProperty(
-        name="Width",
-        description="Width in pixels of the frozen frames; 0: the source's own, or as the scene renders from a camera "
-        "of your own",
-        default=0,
+        **contract.panel(contract.FreezeParams, "width"),
         min=0,
         max=16384,
         options=set(),
@@ -222,9 +193,7 @@ class ShotSettings:
         options=set(),
     )
     take_name: StringProperty(
-        name="Take",
-        description="Name of the frozen frames; a new name keeps the old",
-        default="freeze",
+        **contract.panel(contract.FreezeParams, "take"),
         options=set(),
         search=lambda props, context, text: names_of(props, "takes"),
         search_options={"SUGGESTION"},

@@ -14,7 +14,8 @@ from typing import Any
 
 import bpy
 
-from . import cameras, compat, made, props, scene_setup, shots
+from ..torch_backend import contract
+from . import cameras, compat, made, props, scene_setup
 
 _T_STAR = "splannequin.t_star"
 """Data path of the one setting that can be keyed."""
@@ -36,7 +37,7 @@ def folder_of(one: Any) -> Path | None:
 
 def beside(clip: Path) -> Path:
     """The shot folder of a clip for which none was chosen."""
-    return clip.with_name(clip.stem + shots.SHOT_SUFFIX)
+    return clip.with_name(clip.stem + contract.SHOT_SUFFIX)
 
 
 def settings(scene: Any) -> list[Any]:

@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from ..torch_backend import contract
+from ..torch_backend.contract import ShotFolder
 from . import checkpoints, jobs, kept
-
-SHOT_SUFFIX = ".splannequin"
-EXR = ".exr"
 
 
 @dataclass
@@ -61,59 +59,61 @@ class ShotState:
 
 def create(folder: Path, name: str = "") -> None:
     """Makes an empty shot folder, or checks the one that is there. ValueError on one from a newer Splannequin."""
-    path = folder / "shot.json"
+    path = ShotFolder(folder).info_path
     if os.path.lexists(path):
         _typed(_Info, path)
         return
     folder.mkdir(parents=True, exist_ok=True)
-    jobs.write_json(path, {"version": 1, "name": name or folder.name.removesuffix(SHOT_SUFFIX), "created": time.time()})
+    called = name or folder.name.removesuffix(contract.SHOT_SUFFIX)
+    jobs.write_json(path, {"version": 1, "name": called, "created": time.time()})
 
 
 def read(folder: Path) -> ShotState:
     """The state of the shot in a folder; an empty state if there is none. ValueError on a broken or newer file."""
-    state = ShotState(folder)
-    if not (folder / "shot.json").is_file():
+    state, there = ShotState(folder), ShotFolder(folder)
+    if not there.info_path.is_file():
         return state
-    state.info = _typed(_Info, folder / "shot.json")
-    listing = folder / "frames" / "frames.json"
-    if listing.is_file():
-        state.frames, state.beside = kept.of(listing, _listed)
-    if (folder / "solve" / "cameras.json").is_file():
-        state.solve = _typed(_Solve, folder / "solve" / "solve.json")
-    state.runs = _named(_Run, folder / "runs", "summary.json", state.damaged["run"])
+    state.info = _typed(_Info, there.info_path)
+    if there.listing.is_file():
+        state.frames, state.beside = kept.of(there.listing, _listed)
+    if there.cameras.is_file():
+        state.solve = _typed(_Solve, there.solve_record)
+    state.runs = _named(_Run, there.runs, contract.SUMMARY_FILE, state.damaged["run"])
     for name, run in state.runs.items():
-        run["extension"] = checkpoints.extension(folder / "runs" / name)
-    for name in _names(folder / "runs", checkpoints.CHECKPOINT):
+        run["extension"] = checkpoints.extension(there.runs / name)
+    for name in _names(there.runs, contract.CHECKPOINT_FILE):
         known = name in state.runs or name in state.damaged["run"]
-        told = None if known else checkpoints.paused(folder / "runs" / name)
+        told = None if known else checkpoints.paused(there.runs / name)
         if told is not None:
             state.unfinished[name] = told
     for name, run in [*state.runs.items(), *state.unfinished.items()]:
-        run["anew"] = checkpoints.anew(folder / "runs" / name)
+        place = contract.RunFolder(there.runs / name)
+        run["anew"] = checkpoints.anew(place.root)
         if run["anew"] is not None:
             run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
-            run["anew"]["history"] = _history(run["anew"]["folder"] / "metrics.jsonl")
-        run["other_cameras"] = checkpoints.other_cameras(folder, folder / "runs" / name)
-        metrics = folder / "runs" / name / "metrics.jsonl"
-        run["history"] = kept.of(metrics, _history) if metrics.is_file() else []
-        run["preview"] = max((folder / "runs" / name / "previews").glob("*.png"), default=None)
-    state.takes = _named(_Take, folder / "takes", "take.json", state.damaged["take"])
+            run["anew"]["history"] = _history(contract.RunFolder(run["anew"]["folder"]).metrics)
+        run["other_cameras"] = checkpoints.other_cameras(folder, place.root)
+        run["history"] = kept.of(place.metrics, _history) if place.metrics.is_file() else []
+        run["preview"] = max(place.previews.glob("*.png"), default=None)
+    state.takes = _named(_Take, there.takes, contract.TAKE_FILE, state.damaged["take"])
     for name, take in state.takes.items():
-        take["frame_count"] = kept.of(folder / "takes" / name, _frame_count)
+        take["frame_count"] = kept.of(there.takes / name, _frame_count)
     return state
 
 
 def stamp(folder: Path) -> tuple[float, ...]:
     """Changes when something in the shot did: cheap to ask for on every tick."""
-    parts = ("shot.json", "frames/frames.json", "solve/solve.json", "runs", "takes", "jobs")
-    deep = [p for name in ("runs", "takes") if (folder / name).is_dir() for p in (folder / name).iterdir()]
-    anew = [p for run in deep if (run / checkpoints.NEXT).is_dir() for p in (run / checkpoints.NEXT).iterdir()]
-    return tuple(_mtime(p) for p in [*(folder / part for part in parts), *deep, *anew])
+    there = ShotFolder(folder)
+    parts = (there.info_path, there.listing, there.solve_record, there.runs, there.takes, there.jobs)
+    deep = [p for place in (there.runs, there.takes) if place.is_dir() for p in place.iterdir()]
+    places = (contract.RunFolder(run).next for run in deep)
+    anew = [p for place in places if place.is_dir() for p in place.iterdir()]
+    return tuple(_mtime(p) for p in [*parts, *deep, *anew])
 
 
 def plate_range(folder: Path) -> tuple[int, int] | None:
     """First and last number of the undistorted plates, None before the solve."""
-    found = (contract.frame_number(p.stem) for p in (folder / "frames").glob("*.png"))
+    found = (contract.frame_number(p.stem) for p in ShotFolder(folder).frames.glob(f"*{contract.PICTURE}"))
     numbers = [number for number in found if number is not None]
     return (min(numbers), max(numbers)) if numbers else None
 
@@ -126,7 +126,7 @@ def _listed(path: Path) -> tuple[int, str]:
 
 def _frame_count(take: Path) -> int:
     with os.scandir(take) as entries:
-        return sum(1 for entry in entries if entry.name.endswith(EXR))
+        return sum(1 for entry in entries if entry.name.endswith(contract.LAYERS))
 
 
 def _history(path: Path) -> list[tuple[float, float]]:

@@ -20,7 +20,6 @@ import bpy
 from ..torch_backend import contract
 from . import backend, jobs
 
-TRACKING_FILE = Path("tracking") / "transforms.json"
 """What was read of a clip's tracking, in the shot folder."""
 LEAST_TRACKED = 8
 _LOOK_SECONDS = 0.1
@@ -43,11 +42,12 @@ def params(scene: Any, shot: Path | None) -> contract.SolveParams:
         asked.cameras = os.path.abspath(bpy.path.abspath(props.cameras_path))
     elif props.cameras_from == "TRACKING":
         data = transforms(props.tracking_clip)
-        if shot is None or not (shot / "shot.json").is_file():
+        if shot is None or not contract.ShotFolder(shot).info_path.is_file():
             raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
         backend.python()  # before anything is written: without a backend nothing would read it
-        jobs.write_json(shot / TRACKING_FILE, data)
-        asked.cameras = str(shot / TRACKING_FILE)
+        file = contract.ShotFolder(shot).tracking
+        jobs.write_json(file, data)
+        asked.cameras = str(file)
     return asked
 
 

@@ -67,9 +67,6 @@ STEPS = {
 }
 """The steps in order."""
 
-_STEP_FILE = "step"
-"""File of a job folder: name of the step that asked for the job."""
-
 
 def shot_folder(scene: Any) -> Path | None:
     """Folder of the scene's shot, of several the chosen one; None while neither it nor a clip is chosen."""
@@ -157,7 +154,7 @@ def freeze_from(scene: Any, path: contract.CameraPath, step: str = "freeze") -> 
     A bake is about a part of the take: where the camera was not looked at now, it stays as it was.
     """
     folder = _needed(scene, step)
-    file = folder / "paths" / f"{scene.splannequin.take_name}.json"
+    file = contract.ShotFolder(folder).camera_path(scene.splannequin.take_name)
     if step == "bake" and file.is_file():
         path = _with_rest(path, contract.CameraPath.load(file))
     jobs.write_json(file, path.to_json())
@@ -220,15 +217,16 @@ def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool
 def may_be_stale(shot: Path, take: str) -> bool:
     """True if a take's run was trained on after the take was frozen: the backend can tell which frames that changed."""
     facts = shots.read(shot).takes.get(take, {})
-    trained = shot / "runs" / str(facts.get("run", "")) / "checkpoint.safetensors"
-    told = shot / "takes" / take / "take.json"
+    there = contract.ShotFolder(shot)
+    trained = contract.RunFolder(there.runs / str(facts.get("run", ""))).checkpoint
+    told = contract.TakeFolder(there.takes / take).facts
     return trained.is_file() and told.is_file() and trained.stat().st_mtime > told.stat().st_mtime
 
 
 def _path_of(shot: Path, facts: dict[str, Any]) -> str:
     """File of the camera path that a take was seen from: as it was named, or in the shot, if that was moved since."""
     named = str(facts.get("camera_path", ""))
-    moved = shot / "paths" / f"{facts.get('take', '')}.json"
+    moved = contract.ShotFolder(shot).camera_path(str(facts.get("take", "")))
     return str(moved) if named and not Path(named).is_file() and moved.is_file() else named
 
 
@@ -255,7 +253,7 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
         if step == "footage":
             shots.create(folder)
         job = jobs.new_job(folder, STEPS[step].kind, params)
-        (job.folder / _STEP_FILE).write_text(step, encoding="utf-8")
+        (job.folder / contract.STEP_FILE).write_text(step, encoding="utf-8")
     except OSError as error:
         raise unwritable(folder, error, "Choose another shot folder.") from error
     try:
@@ -272,7 +270,7 @@ def _needed(scene: Any, step: str) -> Path:
     folder = shot_folder(scene)
     if folder is None:
         raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
-    if step != "footage" and not os.path.isfile(folder / "shot.json"):
+    if step != "footage" and not os.path.isfile(contract.ShotFolder(folder).info_path):
         if places.missing(scene, None):
             message, hint = f"The shot folder {folder} is not there any more.", "Press Locate and choose it."
             raise contract.JobError(message, hint, contract.ExitCode.USAGE)
@@ -295,7 +293,7 @@ def give_up(job: jobs.Job) -> None:
 def step_of(job: jobs.Job) -> str:
     """Name of the step that a job found in a shot folder belongs to: Freeze and Bake ask for the same kind."""
     try:
-        with contract.open_regular(job.folder / _STEP_FILE) as file:
+        with contract.open_regular(job.folder / contract.STEP_FILE) as file:
             told = file.read(100).decode("utf-8", "replace")
     except (OSError, ValueError):
         told = ""  # started from the backend's command line
@@ -408,7 +406,7 @@ def _fit(scene: Any, state: shots.ShotState, force_k: bool = False) -> list[str]
         return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]
     size, k = state.size, None
     if force_k:
-        path = contract.CameraPath.load(state.folder / "solve" / "cameras.json")
+        path = contract.CameraPath.load(contract.ShotFolder(state.folder).cameras)
         size = (path.width, path.height)
         k = (path.frames[0].K[0], path.frames[0].K[1], path.frames[0].K[2], path.frames[0].K[3])
     fps = float(state.info.get("fps", 0.0))

@@ -56,7 +56,7 @@ def begin(scene: Any) -> None:
     if bpy.app.background:
         raise contract.JobError("There is no view to draw in.", "Use Freeze.", contract.ExitCode.USAGE)
     shot, run = steps.shot_folder(scene), scene.splannequin.run_name
-    if shot is None or not (shot / "runs" / run / "checkpoint.safetensors").is_file():
+    if shot is None or not contract.RunFolder(contract.ShotFolder(shot).runs / run).checkpoint.is_file():
         raise contract.JobError(f"There is no trained run {run!r}.", "Train first.", contract.ExitCode.USAGE)
     end()
     _told = None

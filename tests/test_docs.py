@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from torch_backend.contract import COMMANDS, default_of, options_of
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "README.md"]
 MANUAL = ROOT / "docs" / "manual"
@@ -64,3 +66,21 @@ def test_what_the_manual_sets_in_italics_is_on_the_screen_or_in_a_message():
             if not plain.startswith(("Render >", "Splannequin")) and plain not in sources:
                 lost.append(f"{page.name}: {plain}")
     assert not lost
+
+
+def option_table(command: str) -> str:
+    """The options of a command as the user guide's table."""
+    rows = {}
+    for cls in COMMANDS[command].values():
+        for one, told in options_of(cls):
+            if told.flag.startswith("--") and (not told.commands or command in told.commands):
+                name = f"`{told.flag} {told.metavar}`" if told.metavar else f"`{told.flag}`"
+                default = default_of(one, told)
+                shown = f"`{default}`" if default and default == one.default else default
+                rows.setdefault(told.flag, f"| {name} | {told.help} | {shown} |".replace("t*", "t\\*"))
+    return "\n".join(["| option | what it does | default |", "|---|---|---|", *rows.values()])
+
+
+def test_the_user_guides_options_are_those_of_the_command_line():
+    table = option_table("freeze")
+    assert table in text_of(ROOT / "docs" / "user-guide.md"), f"put this table into docs/user-guide.md:\n\n{table}\n"

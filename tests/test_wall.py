@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from torch_backend.contract import shot_folder
+
 ROOT = Path(__file__).resolve().parent.parent
 BLENDER = {"bpy", "bpy_extras", "mathutils", "gpu", "gpu_extras", "bl_ext", "addon_utils", "blf", "bmesh"}
 STATIONS = (
@@ -65,11 +67,45 @@ def read(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
+LAYOUT = {
+    value
+    for name, told in vars(shot_folder).items()
+    if name.endswith(("_FILE", "_FILES", "_FOLDER", "_LOG", "_SUFFIX"))
+    for value in (told if isinstance(told, tuple) else (told,))
+}
+"""Names in a shot folder, as the contract spells them."""
+OTHER_FOLDERS = {
+    ("splannequin_addon/environment.py", "summary.json"),  # of the launcher, in an environment
+    ("splannequin_addon/environment.py", ".splannequin"),
+    ("torch_backend/report/records.py", "summary.json"),  # of a benchmark
+    ("torch_backend/solve/foreign.py", "colmap/sparse/0"),  # of another program
+}
+"""(file, name) of what is called like something of the shot, and is not."""
+
+
+def layout_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """(line, name) of what a file spells of the shot's layout: names of files anywhere, of folders where paths are
+    joined."""
+    joined = {id(n.right) for n in ast.walk(tree) if isinstance(n, ast.BinOp) and isinstance(n.op, ast.Div)}
+    docs = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
+            first, _, rest = node.value.partition("/")
+            whole = node.value in LAYOUT and ("." in node.value or id(node) in joined)
+            if whole or (first in LAYOUT and rest and " " not in rest):
+                yield node.lineno, node.value
+
+
 def not_for_the_addon(name: str) -> bool:
     parts = name.split(".")
     if parts[0] == "torch_backend":
         return parts[1:2] != ["contract"]
     return parts[0] not in {*BLENDER, *sys.stdlib_module_names, "numpy", "splannequin_addon"}
+
+
+def not_for_the_contract(name: str) -> bool:
+    parts = name.split(".")
+    return parts[:2] != ["torch_backend", "contract"] and parts[0] not in sys.stdlib_module_names
 
 
 def not_for_the_backend(name: str) -> bool:
@@ -181,6 +217,12 @@ def test_backend_never_imports_blender(path: Path):
     assert not [f"{path}:{line}: {name}" for line, name in found if not_for_the_backend(name)]
 
 
+@pytest.mark.parametrize("path", sources("torch_backend/contract"), ids=lambda p: p.name)
+def test_the_contract_imports_the_standard_library_and_itself(path: Path):
+    found = imports(read(path), package_of(path))
+    assert not [f"{path}:{line}: {name}" for line, name in found if not_for_the_contract(name)]
+
+
 @pytest.mark.parametrize("path", sources("torch_backend"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_a_station_imports_only_stations_before_it(path: Path):
     station = station_of(path.relative_to(ROOT / "torch_backend").with_suffix("").parts)
@@ -193,6 +235,31 @@ def test_a_station_imports_only_stations_before_it(path: Path):
         if parts[0] == "torch_backend" and len(parts) > 1 and station_of(parts[1:]) not in {*allowed, "__version__"}:
             wrong.append(f"{path}:{line}: {name}")
     assert not wrong
+
+
+def test_only_the_contract_spells_the_layout_of_a_shot():
+    contract = ROOT / "torch_backend" / "contract"
+    wrong = []
+    for path in [*sources("splannequin_addon"), *sources("torch_backend")]:
+        file = path.relative_to(ROOT).as_posix()
+        found = layout_names(read(path)) if contract not in path.parents else ()
+        wrong += [f"{file}:{line}: {name}" for line, name in found if (file, name) not in OTHER_FOLDERS]
+    assert not wrong, "ask contract.ShotFolder, RunFolder or TakeFolder for these paths"
+
+
+@pytest.mark.parametrize(
+    ("source", "spelled"),
+    [
+        ("path = shot / 'solve' / 'cameras.json'", 2),
+        ("path = 'frames/raw'", 1),
+        ("for folder in ('summary.json',): pass", 1),
+        ("record['frames']", 0),
+        ("text = 'jobs/second of the machine'", 0),
+        ("contract.ShotFolder(shot).cameras", 0),
+    ],
+)
+def test_the_scan_sees_a_name_of_the_layout(source: str, spelled: int):
+    assert len(list(layout_names(ast.parse(source)))) == spelled
 
 
 def test_nothing_runs_what_a_file_says():
@@ -229,6 +296,11 @@ def test_light_modules_load_nothing_heavy(module: str):
 )
 def test_the_scan_sees_a_breach_from_the_addon(source: str):
     assert any(not_for_the_addon(name) for _, name in imports(ast.parse(source), ["splannequin_addon"]))
+
+
+@pytest.mark.parametrize("source", ["import numpy", "import bpy", "from ..shot import Shot", "from .. import shot"])
+def test_the_scan_sees_a_breach_from_the_contract(source: str):
+    assert any(not_for_the_contract(name) for _, name in imports(ast.parse(source), ["torch_backend", "contract"]))
 
 
 @pytest.mark.parametrize(

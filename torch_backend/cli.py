@@ -10,7 +10,6 @@ import dataclasses
 import io
 import json
 import os
-import re
 import sys
 import time
 from collections.abc import Sequence
@@ -117,19 +116,19 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
         if args.t_star is not None and not info.first <= args.t_star <= info.last:  # said before hours of training
             raise ValueError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
     summary = contract.summarise(str(shot.root), shot.info().source, results, stages, time.perf_counter() - started)
-    write_json(output / "summary.json", summary)
+    write_json(output / contract.SUMMARY_FILE, summary)
     print_summary(summary, console)
     return ExitCode.OK
 
 
+def asked(args: argparse.Namespace) -> dict[str, Any]:
+    """Kind of job -> parameters that a parsed command line asks for; none of a command that starts no job."""
+    return contract.asked(args, contract.COMMANDS.get(args.command, {}), args.command)
+
+
 def _requests(args: argparse.Namespace) -> dict[str, Any]:
     """Kind of job -> parameters of `freeze CLIP`. ValueError or JobError on what cannot be, before any work is done."""
-    requests = {
-        "import": _import_params(args),
-        "solve": contract.SolveParams(camera_model=args.camera_model),
-        "train": _train_params(args),
-        "freeze": _freeze_params(args),
-    }
+    requests = asked(args)
     for params in requests.values():
         contract.check_params(params)
     for name, what in ((args.run, "run"), (args.take, "take"), (args.shot_name, "shot")):
@@ -245,60 +244,6 @@ def stmaps(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
-def _train_params(args: argparse.Namespace) -> contract.TrainParams:
-    return contract.TrainParams(
-        run=args.run,
-        preset=args.preset,
-        method=args.method,
-        host=args.host,
-        host_config=args.host_config,
-        detector=args.detector,
-        supervision=args.supervision,
-        iterations=args.iterations,
-        width=args.width,
-        max_gaussians=args.max_gaussians,
-        holdout=args.holdout,
-        seed=args.seed,
-        resume=not args.restart,
-        device=args.device,
-        extend=getattr(args, "extend", 0),
-    )
-
-
-def _freeze_params(args: argparse.Namespace) -> contract.FreezeParams:
-    return contract.FreezeParams(
-        run=args.run,
-        take=args.take,
-        t_star=args.t_star,
-        camera_path=str(Path(args.camera_path).absolute()) if args.camera_path else "",
-        query=args.freeze_query,
-        width=args.freeze_width,
-        overscan=args.overscan,
-        grain=not args.no_grain,
-        detail=args.detail,
-        develop=args.develop,
-        only_missing=True,
-        device=args.device,
-    )
-
-
-def _import_params(args: argparse.Namespace) -> contract.ImportParams:
-    span = (args.first, args.last)
-    return contract.ImportParams(_source(args.clip), *span, args.step, args.working_height, args.fps, args.layer)
-
-
-def _overscan(text: str) -> float:
-    """As `contract.overscan`; argparse shows the sentence of this kind of error only."""
-    try:
-        return contract.overscan(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _source(clip: str) -> str:
-    return clip if not clip or "://" in clip else str(Path(clip).absolute())
-
-
 def _give_up(error: OSError, where: Path, hint: str = "Choose another --output folder.") -> NoReturn:
     """Ends the command on a folder that cannot be written, in one sentence."""
     told = path_error(error) or contract.JobError(
@@ -321,18 +266,13 @@ def parser() -> argparse.ArgumentParser:
 
     live = commands.add_parser("live", help="draw frozen views as they are asked for on standard input (for Blender)")
     live.add_argument("shot", help="shot folder")
-    live.add_argument("--run", default="main", help="name of the run")
-    _add_device_flag(live)
+    live.add_argument("--run", default="main", metavar="NAME", help="name of the run")
+    live.add_argument("--device", default="auto", choices=DEVICES, help="where to draw")
 
     whole = commands.add_parser("freeze", help="clip to frozen frames: import, solve, train, freeze")
-    whole.add_argument("clip", help="video file, image sequence or pattern (shot.####.exr)")
+    contract.add_options(whole, contract.COMMANDS["freeze"], "freeze")
     whole.add_argument("--output", default="output", metavar="DIR", help="folder for the shot and summary.json")
-    whole.add_argument("--shot-name", default="shot", help="name of the shot folder inside it")
-    _add_import_flags(whole)
-    _add_lens_flag(whole)
-    _add_train_flags(whole)
-    _add_freeze_flags(whole)
-    _add_device_flag(whole)
+    whole.add_argument("--shot-name", default="shot", metavar="NAME", help="name of the shot folder inside it")
 
     for name, text in (
         ("import", "footage into a shot"),
@@ -342,24 +282,7 @@ def parser() -> argparse.ArgumentParser:
     ):
         one = commands.add_parser(name, help=f"one step on a shot folder: {text}")
         one.add_argument("shot", help="shot folder")
-        if name == "import":
-            one.add_argument("clip")
-            _add_import_flags(one)
-        elif name == "solve":
-            _add_lens_flag(one)
-            one.add_argument(
-                "--cameras", default="", metavar="PATH",
-                help="take these cameras instead: a COLMAP folder, a transforms.json or a camera path",
-            )  # fmt: skip
-        elif name == "train":
-            _add_train_flags(one)
-            text = "add N steps to a finished run, which keeps its settings (other flags are passed over)"
-            one.add_argument("--extend", type=int, default=0, metavar="N", help=text)
-            _add_device_flag(one)
-        else:
-            _add_freeze_flags(one)
-            _add_device_flag(one)
-            one.add_argument("--run", default="main", help="run to freeze")
+        contract.add_options(one, contract.COMMANDS[name], name)
     maps = commands.add_parser("stmaps", help="ST maps of the lens, both ways, into the shot's solve folder")
     maps.add_argument("shot", help="shot folder")
     maps.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")
@@ -372,70 +295,6 @@ def parser() -> argparse.ArgumentParser:
     state.add_argument("shot")
     commands.add_parser("doctor", help="what this environment can do, as JSON")
     return top
-
-
-def _add_import_flags(to: argparse.ArgumentParser) -> None:
-    to.add_argument("--first", type=int, help="first frame number")
-    to.add_argument("--last", type=int, help="last frame number, inclusive")
-    to.add_argument("--step", type=int, default=0, help="solve and train on every n-th frame (0: choose)")
-    to.add_argument("--working-height", type=int, default=0, help="height of the working frames in pixels")
-    to.add_argument("--fps", type=float, default=0.0, help="frames per second of a sequence (0: its files', else 24)")
-    to.add_argument("--layer", default="", metavar="NAME", help="EXR layer or part to take (default: the picture)")
-
-
-def _add_lens_flag(to: argparse.ArgumentParser) -> None:
-    to.add_argument("--camera-model", default="SIMPLE_RADIAL", choices=("SIMPLE_RADIAL", "OPENCV"), help="lens")
-
-
-def host_names() -> tuple[str, ...]:
-    """Names of the hosts, read from their files: help and wrong names need no torch."""
-    files = sorted((Path(__file__).parent / "deformation").glob("*.py"))
-    found = (re.search(r'^HOST = HostSpec\(\s*"(\w+)"', f.read_text(encoding="utf-8"), re.MULTILINE) for f in files)
-    return tuple(sorted(match[1] for match in found if match))
-
-
-def _add_train_flags(to: argparse.ArgumentParser) -> None:
-    to.add_argument("--run", default="main", help="name of the run")
-    to.add_argument("--preset", default="preview", choices=("preview", "standard", "final"))
-    names = host_names()
-    to.add_argument("--method", default="auto", choices=("auto", *names, "static"), help="a host's name: all move")
-    to.add_argument("--host", default="hexplane", choices=names, help="which host `auto` puts behind the gate")
-    to.add_argument(
-        "--host-config", default="default", choices=("default", "reference"), help="our numbers or the published ones"
-    )
-    to.add_argument("--supervision", default="support", choices=("support", "paper", "none"))
-    to.add_argument(
-        "--detector", default="grad_norm", choices=("weight", "grad_norm", "grad_signed"),
-        help="paper: what tells an ill-supervised Gaussian",
-    )  # fmt: skip
-    to.add_argument("--iterations", type=int, default=0, help="training steps (0: the preset's)")
-    to.add_argument("--width", type=int, default=0, help="width of the training images in pixels (0: the preset's)")
-    to.add_argument("--max-gaussians", type=int, default=0, help="budget (0: the preset's)")
-    to.add_argument("--holdout", type=int, default=-1, help="keep every n-th frame out for testing (0: none)")
-    to.add_argument("--seed", type=int, default=0)
-    to.add_argument("--restart", action="store_true", help="do not go on from the run's checkpoint")
-
-
-def _add_freeze_flags(to: argparse.ArgumentParser) -> None:
-    to.add_argument("--take", default="freeze", help="name of the take")
-    to.add_argument("--t-star", type=int, help="frame number at which time stands still (default: suggested)")
-    to.add_argument("--camera-path", default="", help="JSON camera path to render from (default: the clip's poses)")
-    to.add_argument("--freeze-query", default="nearest", choices=("nearest", "plain"))
-    text = "width of the frozen frames in pixels (0: the source's own)"
-    to.add_argument("--freeze-width", type=int, default=0, help=text)
-    text = "on: frozen frames are made of the plates, where they can be believed; off: of the splats alone"
-    to.add_argument("--detail", default="on", choices=contract.SWITCH, help=text)
-    text = "on: the instant is trained on as the still scene that it is; off: it stays as the run has it"
-    to.add_argument("--develop", default="on", choices=contract.SWITCH, help=text)
-    to.add_argument(
-        "--overscan", type=_overscan, default=0.0, metavar="PERCENT",
-        help="picture beyond the frame on every side, or `lens`: what the way back through the lens needs",
-    )  # fmt: skip
-    to.add_argument("--no-grain", action="store_true", help="leave the plate's grain out of the files: a third smaller")
-
-
-def _add_device_flag(to: argparse.ArgumentParser) -> None:
-    to.add_argument("--device", default="auto", choices=DEVICES, help="where to train and freeze")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -477,16 +336,11 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
         from .live import run_live
 
         return run_live(args.shot, args.run, args.device)
-    if args.command == "import":
-        run_station(_begun(args.shot), "import", _import_params(args), console)
-    elif args.command == "solve":
-        given = str(Path(args.cameras).absolute()) if args.cameras else ""
-        params = contract.SolveParams(camera_model=args.camera_model, cameras=given)
-        run_station(Shot.open(args.shot), "solve", params, console)
-    elif args.command == "train":
-        print_verdict(run_station(Shot.open(args.shot), "train", _train_params(args), console), console)
-    elif args.command == "take":
-        print_verdict(run_station(Shot.open(args.shot), "freeze", _freeze_params(args), console), console)
-    else:
-        return {"status": status, "doctor": doctor, "export": export, "stmaps": stmaps}[args.command](args, console)
-    return ExitCode.OK
+    if args.command in contract.COMMANDS:
+        ((kind, params),) = asked(args).items()
+        shot = _begun(args.shot) if kind == "import" else Shot.open(args.shot)
+        result = run_station(shot, kind, params, console)
+        if kind in ("train", "freeze"):
+            print_verdict(result, console)
+        return ExitCode.OK
+    return {"status": status, "doctor": doctor, "export": export, "stmaps": stmaps}[args.command](args, console)

@@ -15,13 +15,13 @@ import sys
 import threading
 import time
 import traceback
-import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from . import contract
 from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status
+from .contract import new_job as new_job
 from .shot import Shot, disk_error, is_disk_full, path_error, working_on, write_json
 from .writer import only_writer
 
@@ -158,17 +158,6 @@ class JobReporter:
                 pass
 
 
-def new_job(shot: Shot, kind: str, params: Any) -> Path:
-    """Makes a job folder with its request; returns it."""
-    folder = shot.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
-    shot.jobs.mkdir(exist_ok=True)
-    folder.mkdir()
-    values: dict[str, Any] = params if isinstance(params, dict) else dataclasses.asdict(params)
-    request = JobRequest(kind=kind, shot=str(shot.root), params=values)
-    write_json(folder / contract.REQUEST_FILE, dataclasses.asdict(request))
-    return folder
-
-
 def run_job(folder: str | Path, listener: Listener | None = None, alone: bool = True) -> tuple[int, Any]:
     """Runs the request in `folder` to its end. Returns (exit code, result or None); never raises for a failed job.
 
@@ -293,7 +282,7 @@ def _signals_cancel(reporter: JobReporter) -> Iterator[None]:
 def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
     from .footage import FootageConfig, import_footage
 
-    config = FootageConfig(params.first, params.last, params.step, params.working_height, params.fps, params.layer)
+    config = FootageConfig(**{one.name: getattr(params, one.name) for one in dataclasses.fields(FootageConfig)})
     return import_footage(shot, params.source, config, report)
 
 

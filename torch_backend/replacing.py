@@ -15,12 +15,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from .contract import CAMERAS_FILE, COLMAP_FOLDER, FRAMES_FOLDER, POINTS_FILE, SOLVE_FILE, SOLVE_FOLDER
 from .shot import Shot, make_folder, replace_file
 
 _NEXT, _PARTIAL = "next", "next.partial"
-_LAST = ("solve.json", "cameras.json", "points.npz")
+_LAST = (SOLVE_FILE, CAMERAS_FILE, POINTS_FILE)
 """What is moved after all others, the last one first here: they tell a reader that there is a solve."""
-_TARGETS = (Path("frames"), Path("solve"), Path("solve", "colmap"))
+_TARGETS = (Path(FRAMES_FOLDER), Path(SOLVE_FOLDER), Path(SOLVE_FOLDER, COLMAP_FOLDER))
 """Folders of the shot that a solve has files in; to no other one anything is moved."""
 
 
@@ -42,13 +43,13 @@ def replacing_solve(shot: Shot) -> Iterator[Staged]:
     open elsewhere): the new solve is kept, and moved when the shot is opened again.
     """
     partial = shot.solve / _PARTIAL
-    staged = Staged(partial / "frames", partial / "solve")
+    staged = Staged(partial / FRAMES_FOLDER, partial / SOLVE_FOLDER)
     shutil.rmtree(partial, ignore_errors=True)
     for folder in (staged.frames, staged.solve):
         make_folder(folder)
     try:
         yield staged
-        _drop_stale(shot.solve / "colmap", staged.solve / "colmap")
+        _drop_stale(shot.colmap, staged.solve / COLMAP_FOLDER)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise

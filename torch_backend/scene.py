@@ -81,7 +81,7 @@ def load_scene(shot: Shot) -> Scene:
     path, sparse, table = load_cameras(shot), load_points(shot), frame_table(shot)
     frames = [camera.frame for camera in path.frames]
     if not set(frames) <= set(table):
-        raise damaged(shot.solve / "cameras.json", f"frame {min(set(frames) - set(table))} was not imported")
+        raise damaged(shot.cameras, f"frame {min(set(frames) - set(table))} was not imported")
     viewmats = np.array([camera.viewmat for camera in path.frames], dtype=np.float64).reshape(-1, 4, 4)
     solved = [i for i, c in enumerate(path.frames) if c.source == "registered" and table[c.frame]["solve"]]
     if len(solved) < 3:

@@ -49,7 +49,7 @@ def only_writer(root: Path, kind: str, job: str) -> Iterator[Writer]:
 
 
 def _take(root: Path, mine: Writer) -> None:
-    path, until = root / contract.WRITER_FILE, time.monotonic() + _SECONDS
+    path, until = contract.ShotFolder(root).lock, time.monotonic() + _SECONDS
     while not _make(path, mine):
         try:
             there = contract.read_writer(root)

@@ -37,7 +37,8 @@ def test_source_and_zip_are_valid_and_hold_what_is_needed(packager, root, tmp_pa
         "LICENSE", "README.md", "__init__.py", "blender_manifest.toml", "pyproject.toml", "requirements",
         "splannequin.py", "splannequin_addon", "torch_backend",
     }  # fmt: skip
-    assert {"splannequin_addon/registration.py", "torch_backend/contract.py", "requirements/backend.txt"} <= set(names)
+    assert {"splannequin_addon/registration.py", "requirements/backend.txt"} <= set(names)
+    assert {"torch_backend/contract/__init__.py", "torch_backend/contract/options.py"} <= set(names)
     assert {"splannequin_addon/translations/__init__.py", "splannequin_addon/translations/de_DE.py"} <= set(names)
     assert not [n for n in names if "__pycache__" in n or n.endswith((".pyc", ".whl", ".so", ".pyd"))]
 

@@ -11,7 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from torch_backend.contract import ExitCode, python_child
+from torch_backend.contract import HOSTS, ExitCode, host_names, python_child
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png, resize
 from torch_backend.freeze.exr import read_frozen_exr
@@ -94,13 +94,21 @@ def test_wrong_input_is_one_sentence(tmp_path, arguments, code, word):
 
 
 def test_hosts_are_known_by_their_files_alone():
-    from torch_backend.cli import host_names
     from torch_backend.deformation import hosts
 
-    assert host_names() == tuple(hosts())
+    assert HOSTS == host_names() == tuple(hosts())
     refused = run("train", "no.splannequin", "--method", "nerf")
     assert refused.returncode == ExitCode.USAGE
     assert "control_points" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    "made", ['HOST = HostSpec("fourth", Config)', 'HOST: HostSpec = HostSpec(\n    config=Config, name="fourth")']
+)
+def test_a_host_is_known_however_its_file_names_it(tmp_path, made):
+    (tmp_path / "fourth.py").write_text(f"from .protocol import HostSpec\n\n{made}\n", encoding="utf-8")
+    (tmp_path / "protocol.py").write_text("HOSTS = ('none',)\nHOST_WORDS = dict(name='none')\n", encoding="utf-8")
+    assert host_names(tmp_path) == ("fourth",)
 
 
 def test_export_writes_and_refuses_in_words(world, tmp_path):

@@ -99,7 +99,7 @@ def test_child_process_reports_an_unreadable_clip(shot, tmp_path):
     clip.write_text("not a video")
     folder = job.new_job(shot, "import", contract.ImportParams(source=str(clip)))
     command = contract.python_child(sys.executable, "torch_backend", "run-job", str(folder))
-    environ = {**os.environ, "PYTHONPATH": str(Path(contract.__file__).parents[1])}
+    environ = {**os.environ, "PYTHONPATH": str(Path(contract.__file__).parents[2])}
     done = subprocess.run(**command, env=environ, capture_output=True, text=True, check=False)
     assert done.returncode == ExitCode.FOOTAGE
     assert "Traceback" not in done.stdout + done.stderr

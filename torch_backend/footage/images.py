@@ -21,7 +21,7 @@ import scipy.sparse as sparse
 from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
-from ..contract import ExitCode, JobError, open_regular
+from ..contract import FRAMES_FOLDER, RAW_FOLDER, ExitCode, JobError, open_regular
 from ..shot import atomic_path
 
 PNG_COMPRESSION = 2
@@ -29,8 +29,8 @@ PNG_COMPRESSION = 2
 
 _FULL_BYTES = 4 << 20
 _MADE_BY = {
-    "raw": ("Import the clip again.", ExitCode.FOOTAGE),
-    "frames": ("Solve the camera again.", ExitCode.SOLVE),
+    RAW_FOLDER: ("Import the clip again.", ExitCode.FOOTAGE),
+    FRAMES_FOLDER: ("Solve the camera again.", ExitCode.SOLVE),
 }
 """Folder of working frames -> what makes them anew, and the exit code."""
 

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import LAST_FRAME, JobError, Reporter, frame_file, read_json
+from ..contract import FRAMES_FILE, LAST_FRAME, PICTURE, RAW_FOLDER, JobError, Reporter, frame_file, read_json
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import is_whole_png, resize, working_size, write_png
 from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, SourceInfo, footage_error, frame_words, open_source
 
 FRAMES_VERSION = 1
-FRAMES_FILE = "frames.json"
 LEAST_FRAMES = 8
 MANY_FRAMES = 1500
 EXPOSURE_DRIFT_STOPS = 1.0
@@ -78,14 +77,14 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     _check_range(opened, config)
     key = import_key(opened.info, config)
     restore_folder(shot.frames)
-    for folder in (shot.frames / "raw", shot.solve):
+    for folder in (shot.raw, shot.solve):
         shot.own(folder)
     done = _finished(shot, key)
     if done is not None:
         report.progress("import", 1, 1, "already imported")
         return _result(shot, done)
     with replacing_folder(shot.frames) as fresh:
-        extracted = _extract(shot, opened, config, fresh / "raw", report)
+        extracted = _extract(shot, opened, config, fresh / RAW_FOLDER, report)
         _refuse_unusable(extracted.measures)
         for message, hint in opened.warnings + _remarks(extracted):
             report.warning(message, hint)
@@ -105,7 +104,7 @@ def import_key(info: SourceInfo, config: FootageConfig) -> str:
 
 def load_frames(shot: Shot) -> dict[str, Any]:
     """frames.json of a finished import. JobError says to import first, or again if it is damaged."""
-    path = shot.frames / FRAMES_FILE
+    path = shot.listing
     if not path.is_file():
         raise footage_error(f"The shot {shot.root.name} has no frames yet.", "Import footage first.")
     try:
@@ -201,7 +200,7 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
 
 def _work(frame: SourceFrame, width: int, height: int, into: Path) -> FrameMeasures:
     pixels = resize(frame.pixels, width, height)
-    write_png(into / frame_file(frame.number, ".png"), pixels)
+    write_png(into / frame_file(frame.number, PICTURE), pixels)
     measures = measure(frame.number, pixels)
     if frame.corrupt:
         measures.flags.append("corrupt")
@@ -296,7 +295,7 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         {
             "frame": m.frame,
             "seconds": round(seconds - start, 6),
-            "file": "raw/" + frame_file(m.frame, ".png"),
+            "file": f"{RAW_FOLDER}/{frame_file(m.frame, PICTURE)}",
             "solve": m.frame in solved,
             "sharpness": round(m.sharpness, 3),
             "exposure": round(m.exposure, 4),

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..contract import ExitCode, JobError, frame_file
+from ..contract import ExitCode, JobError
 from ..shot import Shot, content_key
 from ..solve.plate_lens import PlateLens, load_plate_lenses
 from ..solve.stored import load_cameras, load_record
@@ -63,7 +63,7 @@ class Plates:
         load_cameras(shot)
         record = load_frames(shot)
         # Cameras may come without the record of a solve: a scene of truth has none.
-        solved = load_record(shot) if (shot.solve / "solve.json").is_file() else {}
+        solved = load_record(shot) if shot.solve_record.is_file() else {}
         self._shot = shot
         self._files = {int(row["frame"]): str(row["file"]) for row in record["frames"]}
         self.frames = sorted(self._files)
@@ -117,7 +117,7 @@ class Plates:
 
     def _read(self, frame: int) -> NDArray:
         if self._reader is None:
-            picture = read_frame(self._shot.frames / frame_file(frame, ".png"))
+            picture = read_frame(self._shot.plate(frame))
             return codes.resize_plate(picture, self.width, self.height)
         try:
             picture = self._reader.plate(frame)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..contract import JobError, Reporter, frame_file
+from ..contract import DEVELOPED_FOLDER, JobError, Reporter, frame_file
 from ..gaussians.model import PARAM_NAMES
 from ..scene import Scene
 from ..shot import Shot, content_key, path_error
@@ -25,7 +25,7 @@ from .query import FrozenGaussians, freeze_at, span_of
 from .sightings import motion_mattes
 from .twin import settled
 
-FOLDER = "developed"
+FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
 VERSION = 2
 """Rises when instants developed before are not to be used any more."""

@@ -14,7 +14,14 @@ import torch
 from torch import Tensor
 
 from ..contract import (
+    CONTACT_SHEET_FILE,
     NO_DEPTH,
+    PLY_FILE,
+    TAKE_FILE,
+    TAKE_PREVIEW_FOLDER,
+    TAKE_REDISTORT,
+    TAKE_STATE_FILE,
+    VIDEO_FILE,
     CameraPath,
     ExitCode,
     FreezeParams,
@@ -32,7 +39,7 @@ from ..gaussians.ply import write_ply
 from ..scene import Scene, frame_table, load_scene
 from ..shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, write_json
 from ..solve.motion import find_motion, motion_key
-from ..solve.stmap import TAKE_REDISTORT, margin, write_take_map
+from ..solve.stmap import margin, write_take_map
 from ..train import LoadedRun, choose_device, load_run
 from ..train.anew import SUMMARY_FILE
 from .bands import bands
@@ -68,7 +75,7 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     whole = plan(scene, params, t_star, width, height)
     frames = in_range(whole, params)
     folder = shot.own(shot.take(params.take))
-    for inner in ("preview", TAKE_REDISTORT.parent, WARPS):
+    for inner in (TAKE_PREVIEW_FOLDER, TAKE_REDISTORT.parent, WARPS):
         shot.own(folder / inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
     grain = plate_grain(shot, scene) if params.grain else None
@@ -183,7 +190,7 @@ def detail_key(shot: Shot, detail: Detailer | None) -> str:
 
 def plate_grain(shot: Shot, scene: Scene) -> Grain:
     """Grain of the shot's undistorted frames, which frozen ones are mixed with."""
-    files = [shot.frames / frame_file(n, ".png") for n in scene.frames]
+    files = [shot.plate(n) for n in scene.frames]
     return measure_plate([path for path in files if path.is_file()])
 
 
@@ -289,14 +296,14 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams,
 
     A frame that is not asked for now stays if it is right: a part of the range does not undo the rest of the take.
     """
-    state = folder / "state.json"
-    if not state.is_file() and frames_in([*folder.glob("*.exr"), *(folder / "preview").glob("*.png")]):
+    state = folder / TAKE_STATE_FILE
+    if not state.is_file() and frames_in([*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]):
         raise JobError(
             f"{folder} holds numbered pictures that were not made here.",
             "Name another take, or move them away.",
             ExitCode.FREEZE,
         )
-    make_folder(folder / "preview")
+    make_folder(folder / TAKE_PREVIEW_FOLDER)
     if with_warps:
         make_folder(folder / WARPS)
     # Frames without a key of their own are of before grain, too.
@@ -306,12 +313,13 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams,
         told = read_key(folder / frame_file(n, ".exr"))
         right = n in keys and (told == keys[n] or (told == "" and old_are_right))
         warped = not with_warps or (folder / WARPS / frame_file(n, ".exr")).is_file()
-        if right and warped and (folder / "preview" / frame_file(n, ".png")).is_file():
+        if right and warped and (folder / TAKE_PREVIEW_FOLDER / frame_file(n, ".png")).is_file():
             done.add(n)
-    stale = [p for p in [*folder.glob("*.exr"), *(folder / "preview").glob("*.png")] if _FRAME.fullmatch(p.stem)]
+    pictures = [*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]
+    stale = [p for p in pictures if _FRAME.fullmatch(p.stem)]
     stale = [p for p in stale if int(p.stem) not in done]
     stale += [folder / WARPS / frame_file(int(p.stem), ".exr") for p in stale if p.suffix == ".exr"]
-    for old in [folder / "take.json", *stale] if stale else ():
+    for old in [folder / TAKE_FILE, *stale] if stale else ():
         old.unlink(missing_ok=True)
     write_json(state, {"version": 1, "key": key})
     return done
@@ -356,7 +364,7 @@ def _write_frame(
     folder: Path, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, look: Look, key: str
 ) -> None:
     """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
-    write_png(folder / "preview" / frame_file(output.frame, ".png"), _preview(image, look))
+    write_png(folder / TAKE_PREVIEW_FOLDER / frame_file(output.frame, ".png"), _preview(image, look))
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ torch.from_numpy(scene.centre)
     size = tuple(image.alpha.shape)
@@ -481,7 +489,7 @@ def _finish(
     folder, run, size = shot.take(params.take), look.run, look.size
     numbers = [f.frame for f in frames]
     report.progress("finishing the take", 0, 3, "contact sheet")
-    previews = [folder / "preview" / frame_file(n, ".png") for n in numbers]
+    previews = [folder / TAKE_PREVIEW_FOLDER / frame_file(n, ".png") for n in numbers]
     made_of = _made_of(folder, numbers, look, shares)
     asked = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
     verdict = judge_take({"t_star_frame": t_star, **asked, "detail": made_of.get("detail")}, run_verdict(run))
@@ -489,11 +497,11 @@ def _finish(
     sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
     report.check_cancelled()
     report.progress("finishing the take", 1, 3, "video")
-    note = write_video(folder / "video.mp4", (read_png(p) for p in previews), shot.info().fps or 24.0)
+    note = write_video(folder / VIDEO_FILE, (read_png(p) for p in previews), shot.info().fps or 24.0)
     if note:
         report.warning(note)
     report.progress("finishing the take", 2, 3, "PLY")
-    _write_ply(folder / "frozen.ply", look.instants.at(float(t_star), report), scene)
+    _write_ply(folder / PLY_FILE, look.instants.at(float(t_star), report), scene)
     redistort = _redistort(shot, folder, size, look.beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
@@ -518,12 +526,12 @@ def _finish(
         "grain": None if look.grain is None else look.grain.to_json(),
         "exr_dir": str(folder),
         "contact_sheet": str(sheet),
-        "video": str(folder / "video.mp4"),
-        "ply": str(folder / "frozen.ply"),
+        "video": str(folder / VIDEO_FILE),
+        "ply": str(folder / PLY_FILE),
         **made_of,
         **({} if verdict is None else {"verdict": vars(verdict)}),
     }
-    write_json(folder / "take.json", facts)
+    write_json(folder / TAKE_FILE, facts)
     shot.update(t_star=t_star)
     report.image("contact sheet", sheet)
     report.progress("finishing the take", 3, 3, "done")
@@ -569,9 +577,9 @@ def _contact_sheet(
     shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int,
     verdict: Verdict | None,
 ) -> Path:  # fmt: skip
-    plates = [shot.frames / frame_file(n, ".png") for n in numbers]
+    plates = [shot.plate(n) for n in numbers]
     own_poses = not params.camera_path and all(p.is_file() for p in plates)
-    path = shot.take(params.take) / "contact_sheet.png"
+    path = shot.take(params.take) / CONTACT_SHEET_FILE
     note, doubt = ("", set()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
     write_contact_sheet(
         path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt

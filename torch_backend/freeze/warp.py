@@ -31,9 +31,10 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from ..contract import WARP_FOLDER
 from .exr import check_finite, linear_spec, set_margin, write_exr
 
-FOLDER = "warp"
+FOLDER = WARP_FOLDER
 """Folder of the warps in a take's."""
 CHANNELS = ("R", "G", "B", "A", "ST.X", "ST.Y", "ST.Z", "Matte.V")
 """Fill and alpha of the whole frame; s, t and 1; matte."""

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import JobError, Reporter, frame_file, read_json
+from ..contract import CHECKPOINT_FILE, METRICS_FILE, SUMMARY_FILE, JobError, Reporter, read_json
 from ..footage.images import write_png
 from ..footage.plates import Plates
 from ..freeze.detail import Detailer
@@ -124,11 +124,11 @@ def evaluate_run(
             of.frozen_fps = _fps(next(iter(frozen.values())), scene, name)
             _Keeper(truth, frozen, (run.width, run.height), results, run_id, name).keep(of)
     plates = _Keeper(truth, frozen, (run.width, run.height), results, run_id).plates(shown[SPLATS].two_instants)
-    summary = read_json(run.folder / "summary.json")
-    tensors, _ = load_checkpoint(run.folder / "checkpoint.safetensors")
+    summary = read_json(run.folder / SUMMARY_FILE)
+    tensors, _ = load_checkpoint(run.folder / CHECKPOINT_FILE)
     return {
         **{name: summary[name] for name in ("iterations", "train_seconds", "gaussians", "moving_share")},
-        "step_ms": last_third_step_ms(run.folder / "metrics.jsonl", summary["iterations"]),
+        "step_ms": last_third_step_ms(run.folder / METRICS_FILE, summary["iterations"]),
         "heldout_psnr_db": summary["heldout_psnr_db"],
         "heldout": [_of_frame(truth, run, scene, frame) for frame in held_out],
         "width": run.width,
@@ -203,7 +203,7 @@ def _of_frame(truth: TruthScene, run: LoadedRun, scene: Scene, frame: int) -> He
         background=background, with_depth=False, with_contributions=False,
     )  # fmt: skip
     image = model.exposure.apply(out.colors[0], time_of).cpu()
-    plate = read_image(truth.shot.frames / frame_file(frame, ".png"), *size)
+    plate = read_image(truth.shot.plate(frame), *size)
     return HeldOut(frame, psnr_by_region(image, plate, truth.frame_regions(frame, *size)))
 
 
@@ -320,7 +320,7 @@ class _Keeper:
     def _plate(self, frame: int) -> str:
         path = f"{self._common}/plate_{frame:06d}.png"
         if not (self._results / path).is_file():
-            self._write(path, read_image(self._truth.shot.frames / frame_file(frame, ".png"), *self._size))
+            self._write(path, read_image(self._truth.shot.plate(frame), *self._size))
         return path
 
     def _write(self, path: str, image: Tensor) -> None:

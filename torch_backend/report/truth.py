@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from ..contract import check_version, frame_file, read_json
+from ..contract import check_version, read_json
 from ..scene import load_scene, read_image
 from ..shot import Shot, content_key
 from ..solve.motion import motion_key
@@ -97,7 +97,7 @@ class TruthFolder:
             self._regions = [str(name) for name in facts["regions"]]
         except KeyError as error:
             raise ValueError(f"{self.folder / 'truth.json'} has no {error}") from error
-        self.key = content_key(facts, read_json(self.shot.solve / "cameras.json"))
+        self.key = content_key(facts, read_json(self.shot.cameras))
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
         """All poses that have a truth."""
@@ -142,7 +142,7 @@ class RealScene:
         solved = [self._scene.frames[i] for i in self._scene.solved]
         picked = np.linspace(0, len(solved) - 1, min(instants, len(solved))).round().astype(int)
         self.t_stars = [solved[i] for i in picked]
-        self.key = content_key(read_json(shot.solve / "cameras.json"), self.t_stars, motion_key(shot))
+        self.key = content_key(read_json(shot.cameras), self.t_stars, motion_key(shot))
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
         """Held-out frames more than a quarter of the clip away from t*."""
@@ -150,7 +150,7 @@ class RealScene:
 
     def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
         """The plate at the pose."""
-        return read_image(self.shot.frames / frame_file(pose, ".png"), width, height)
+        return read_image(self.shot.plate(pose), width, height)
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
         """The rigid pixels of the plate; one counts if nearly all of it is."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraPath, ExitCode, JobError, frame_file
+from ..contract import PICTURE, CameraPath, ExitCode, JobError, frame_file
 from ..shot import Shot, write_atomic, write_json
 from .colmap_files import PARTS, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints, write_model
 from .stored import load_cameras, load_points
@@ -58,7 +58,7 @@ def _model(path: CameraPath, points: dict[str, NDArray]) -> ColmapModel:
     for number, frame in enumerate(path.frames, start=1):
         lens = lenses.setdefault(tuple(frame.K), len(lenses) + 1)
         pose = np.reshape(np.array(frame.viewmat, np.float64), (4, 4))[:3]
-        images.append(ColmapImage(number, frame_file(frame.frame, ".png"), lens, pose))
+        images.append(ColmapImage(number, frame_file(frame.frame, PICTURE), lens, pose))
     cameras = {n: ColmapCamera(n, "PINHOLE", path.width, path.height, K) for K, n in lenses.items()}
     xyz, error = points["xyz"].astype(np.float64), points["error"].astype(np.float64)
     return ColmapModel(cameras, images, ColmapPoints(xyz, points["rgb"], error, [np.zeros(0, np.int64)] * len(xyz)))
@@ -69,7 +69,7 @@ def _write_transforms(shot: Shot, path: CameraPath, points: dict[str, NDArray], 
     frames = []
     for frame in path.frames:
         to_world = np.linalg.inv(np.reshape(np.array(frame.viewmat, np.float64), (4, 4))) @ _TO_OPENGL
-        row: dict[str, Any] = {"file_path": _seen_from(folder, shot.frames / frame_file(frame.frame, ".png"))}
+        row: dict[str, Any] = {"file_path": _seen_from(folder, shot.plate(frame.frame))}
         row["transform_matrix"] = to_world.tolist()
         if shared != frame.K:
             row |= _intrinsics(frame.K)

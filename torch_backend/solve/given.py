@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import ExitCode, JobError, Reporter
+from ..contract import POINTS_FILE, REQUEST_FILE, ExitCode, JobError, Reporter
 from ..shot import Shot, write_json
 from . import foreign
 from .child import run_worker
@@ -92,7 +92,7 @@ def take_over(
     own = points is not None and _enough(points, centres)
     registered = [f["frame"] for f in listed if f["solve"] and f["frame"] in matched.cameras]
     request = {
-        "images": str(shot.frames / "raw"),
+        "images": str(shot.raw),
         "solved": [names[n] for n in registered],
         "others": [],
         "camera_model": "PINHOLE",
@@ -105,12 +105,12 @@ def take_over(
             "triangulate": not own,
         },
     }
-    write_json(scratch / "request.json", request)
-    answer = run_worker(scratch / "request.json", shot.solve / "colmap.log", report)["result"]
+    write_json(scratch / REQUEST_FILE, request)
+    answer = run_worker(scratch / REQUEST_FILE, shot.colmap_log, report)["result"]
     (scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
     if own and points is not None:
         angle = float(points.pop("angle"))
-        np.savez(scratch / "points.npz", **points)  # pyright: ignore[reportArgumentType]
+        np.savez(scratch / POINTS_FILE, **points)  # pyright: ignore[reportArgumentType]
         _write_model(scratch / "model", lenses, poses, points)
         known = points["error"][points["error"] > 0]
         answer = {

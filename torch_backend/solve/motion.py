@@ -16,9 +16,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import ExitCode, JobError, Reporter, frame_file, open_regular, read_json
+from ..contract import (
+    MOTION_FILE,
+    MOTION_UNFINISHED_FILE,
+    PAINTED_FOLDER,
+    ExitCode,
+    JobError,
+    Reporter,
+    open_regular,
+    read_json,
+)
 from ..footage.images import is_whole_png
-from ..footage.importing import FRAMES_FILE
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
 from .flow import FlowConfig
 from .moving import Clip, mattes
@@ -27,9 +35,9 @@ from .stored import load_cameras
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
 MOTION_VERSION = 3
-FOLDER, PAINTED = "motion", "motion_paint"
-"""Of the found mattes, in the solve's folder, and of the painted ones, in the shot's."""
-_RECORD, _UNFINISHED = "motion.json", "unfinished.json"
+PAINTED = PAINTED_FOLDER
+"""Of painted mattes, in the shot's folder."""
+_RECORD, _UNFINISHED = MOTION_FILE, MOTION_UNFINISHED_FILE
 _LABELS = np.array([STILL, UNKNOWN, MOVING], np.uint8)
 
 
@@ -50,10 +58,10 @@ def find_motion(shot: Shot, report: Reporter, config: FlowConfig | None = None) 
     """
     config = config or FlowConfig()
     key = _solve_key(shot, config)
-    folder = shot.own(shot.solve / FOLDER)
+    folder = shot.own(shot.motion)
     done = _record(folder / _RECORD)
     path = load_cameras(shot)
-    files = {camera.frame: folder / frame_file(camera.frame, ".png") for camera in path.frames}
+    files = {camera.frame: shot.matte(camera.frame) for camera in path.frames}
     if done.get("key") == key and all(is_whole_png(file) for file in files.values()):
         return MotionResult(**done["result"])
     need_disk(shot.root, 0.1 * path.width * path.height * len(files), "The motion matte")
@@ -94,7 +102,7 @@ def _shares(labels: NDArray[np.uint8]) -> tuple[float, float, float]:
 def _solve_key(shot: Shot, config: FlowConfig) -> str:
     """Identifies the cameras and frames that a matte is made from; of a shot without them, what it has."""
     digests = []
-    for file in (shot.solve / "cameras.json", shot.frames / FRAMES_FILE):
+    for file in (shot.cameras, shot.listing):
         with contextlib.suppress(OSError, ValueError), open_regular(file) as handle:
             digests.append(hashlib.sha256(handle.read()).hexdigest())
     return content_key(MOTION_VERSION, config, digests)
@@ -116,7 +124,7 @@ def _record(path: Path) -> dict[str, Any]:
 
 def is_found(shot: Shot, config: FlowConfig | None = None) -> bool:
     """True if the shot has mattes of the solve that it has now."""
-    return _record(shot.solve / FOLDER / _RECORD).get("key") == _solve_key(shot, config or FlowConfig())
+    return _record(shot.motion / _RECORD).get("key") == _solve_key(shot, config or FlowConfig())
 
 
 def motion_key(shot: Shot, with_found: bool = True) -> str:
@@ -124,8 +132,8 @@ def motion_key(shot: Shot, with_found: bool = True) -> str:
 
     Painted ones count by content: a shot that was copied is still the same shot, and a run of it goes on.
     """
-    found = _record(shot.solve / FOLDER / _RECORD).get("key") if with_found and is_found(shot) else None
-    painted = sorted(p for p in (shot.root / PAINTED).glob("*.png") if p.is_file())
+    found = _record(shot.motion / _RECORD).get("key") if with_found and is_found(shot) else None
+    painted = sorted(p for p in shot.painted.glob("*.png") if p.is_file())
     return content_key(found, [[p.name, hashlib.sha256(p.read_bytes()).hexdigest()] for p in painted])
 
 
@@ -134,8 +142,8 @@ def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
 
     Where an artist painted, that is it. JobError if a file of it is damaged.
     """
-    path = shot.solve / FOLDER / frame_file(frame, ".png")
-    painted = shot.root / PAINTED / frame_file(frame, ".png")
+    path = shot.matte(frame)
+    painted = shot.painted_matte(frame)
     found = _read_found(path) if path.is_file() and is_found(shot) else None
     if not painted.is_file():
         return found

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import Reporter, frame_file
+from ..contract import Reporter
 from ..footage import load_frames
 from ..footage.images import read_frame
 from ..shot import Shot
@@ -88,7 +88,7 @@ class Clip:
 
     def frame(self, index: int) -> tuple[NDArray[np.uint8], Sight]:
         """Any frame: grey in the flow's size, as `picture`, and in colour on the grid, with its camera."""
-        pixels = read_frame(self._shot.frames / frame_file(self.frames[index], ".png"))
+        pixels = read_frame(self._shot.plate(self.frames[index]))
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
         grey = _sized(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8), self.flow_size)
         colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))

@@ -96,4 +96,4 @@ def load_plate_lenses(shot: Shot) -> dict[int, PlateLens]:
             lenses[frame.frame] = shared.setdefault((n, tuple(frame.K)), PlateLens(known[n], (fx, fy, cx, cy)))
         return lenses
     except (ValueError, TypeError, KeyError, IndexError) as error:
-        raise damaged(shot.solve / "solve.json", error) from error
+        raise damaged(shot.solve_record, error) from error

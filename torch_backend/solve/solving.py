@@ -13,7 +13,22 @@ from typing import Any, NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraFrame, CameraPath, Cancelled, ExitCode, JobError, Reporter, frame_file, open_regular
+from ..contract import (
+    CAMERAS_FILE,
+    COLMAP_FOLDER,
+    PICTURE,
+    POINTS_FILE,
+    REQUEST_FILE,
+    SOLVE_FILE,
+    CameraFrame,
+    CameraPath,
+    Cancelled,
+    ExitCode,
+    JobError,
+    Reporter,
+    frame_file,
+    open_regular,
+)
 from ..footage import load_frames
 from ..footage.images import is_whole_png, read_frame, write_png
 from ..footage.sources import frame_words
@@ -97,7 +112,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
     _check(config)
-    for folder in (shot.frames, shot.solve / "colmap"):  # where files of before are replaced
+    for folder in (shot.frames, shot.colmap):  # where files of before are replaced
         shot.own(folder)
     settle_solve(shot)
     frames = load_frames(shot)
@@ -124,7 +139,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
         with replacing_solve(shot) as staged:
             result = _finish(shot, frames, answer, scratch, staged, key, report)
     except JobError as error:
-        error.add_note(_log_end(shot.solve / "colmap.log"))
+        error.add_note(_log_end(shot.colmap_log))
         raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -180,7 +195,7 @@ def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | 
         load_points(shot)
     except (JobError, ValueError):
         return None
-    plates = [shot.frames / frame_file(f["frame"], ".png") for f in frames["frames"]]
+    plates = [shot.plate(f["frame"]) for f in frames["frames"]]
     return record if all(is_whole_png(p) for p in plates) else None
 
 
@@ -189,7 +204,7 @@ def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
     bad = [f["frame"] for f in frames["frames"] if not is_whole_png(shot.frames / f["file"])]
     if bad:
         raise JobError(
-            f"Damaged or missing in {shot.frames / 'raw'}: {frame_words(bad)}.",
+            f"Damaged or missing in {shot.raw}: {frame_words(bad)}.",
             "Import the clip again.",
             ExitCode.FOOTAGE,
         )
@@ -202,7 +217,7 @@ def _ask_worker(
     for frame in frames["frames"]:
         names[bool(frame["solve"])].append(Path(frame["file"]).name)
     request = {
-        "images": str(shot.frames / "raw"),
+        "images": str(shot.raw),
         "solved": names[True],
         "others": names[False],
         "camera_model": config.camera_model,
@@ -211,8 +226,8 @@ def _ask_worker(
         "neighbours": config.neighbours if config.localise else 0,
         "threads": max(1, min(os.cpu_count() or 1, 16)),
     }
-    write_json(scratch / "request.json", request)
-    answer = run_worker(scratch / "request.json", shot.solve / "colmap.log", report)
+    write_json(scratch / REQUEST_FILE, request)
+    answer = run_worker(scratch / REQUEST_FILE, shot.colmap_log, report)
     if "failure" in answer:
         raise _failure(answer)
     return answer["result"]
@@ -345,15 +360,15 @@ def _finish(
     poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
     maps = [scratch / f"undistort_{n}.npz" for n in range(1 + max(p.get("lens", 0) for p in poses.values()))]
     path, lenses = _camera_path(frames, poses, [_pinhole(file) for file in maps])
-    with np.load(scratch / "points.npz", allow_pickle=False) as data:
+    with np.load(scratch / POINTS_FILE, allow_pickle=False) as data:
         points = filter_points({name: data[name] for name in data.files}, _centres(path))
     if "given" in answer:
         refuse_misfit(answer, len(points["xyz"]))
     _undistort_all(shot, frames, lenses, maps, staged.frames, report)
-    with atomic_path(staged.solve / "points.npz") as beside:
+    with atomic_path(staged.solve / POINTS_FILE) as beside:
         np.savez(beside, **points)  # pyright: ignore[reportArgumentType]
-    (scratch / "model").rename(staged.solve / "colmap")
-    write_json(staged.solve / "cameras.json", path.to_json())
+    (scratch / "model").rename(staged.solve / COLMAP_FOLDER)
+    write_json(staged.solve / CAMERAS_FILE, path.to_json())
     result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
     warnings = _warnings(frames, path, result, "given" in answer)
     warnings += doubts(answer) if "given" in answer else lens_remarks(answer)
@@ -380,7 +395,7 @@ def _finish(
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,
     }
-    write_json(staged.solve / "solve.json", record)
+    write_json(staged.solve / SOLVE_FILE, record)
     return result
 
 
@@ -451,7 +466,7 @@ def _undistort(
 
     def one(frame: dict[str, Any]) -> int:
         pixels = read_frame(shot.frames / frame["file"])
-        write_png(into / frame_file(frame["frame"], ".png"), undistort(pixels))
+        write_png(into / frame_file(frame["frame"], PICTURE), undistort(pixels))
         return frame["frame"]
 
     with ThreadPoolExecutor(_WRITERS) as pool:

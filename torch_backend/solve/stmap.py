@@ -16,14 +16,12 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from ..contract import ExitCode, FreezeParams, JobError
+from ..contract import STMAP_FILES, TAKE_REDISTORT, ExitCode, FreezeParams, JobError
 from ..shot import Shot, atomic_path, disk_error, is_disk_full, need_disk
 from .lens import Lens, load_lens
 
-UNDISTORT, REDISTORT = "stmap_undistort.exr", "stmap_redistort.exr"
+UNDISTORT, REDISTORT = STMAP_FILES
 """Names of the maps in a shot's solve/."""
-TAKE_REDISTORT = Path("stmap") / "redistort.exr"
-"""Name of the map of an overscanned take, in its folder: not beside the frames, which are counted."""
 LARGEST = 16_384
 """Most pixels of a map along a side."""
 _ROWS = 64

@@ -8,7 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraPath, ExitCode, JobError, check_version, open_regular, read_json
+from ..contract import (
+    CAMERAS_FILE,
+    POINTS_FILE,
+    SOLVE_FILE,
+    CameraPath,
+    ExitCode,
+    JobError,
+    check_version,
+    open_regular,
+    read_json,
+)
 from ..shot import Shot
 
 _POINTS = {"xyz": ("f", (3,)), "rgb": ("u", (3,)), "error": ("f", ()), "track": ("iu", ())}
@@ -17,7 +27,7 @@ _POINTS = {"xyz": ("f", (3,)), "rgb": ("u", (3,)), "error": ("f", ()), "track": 
 
 def load_cameras(shot: Shot) -> CameraPath:
     """cameras.json. JobError (SOLVE) if the shot is not solved or the file is damaged, ValueError if it is too new."""
-    path = _there(shot, "cameras.json")
+    path = _there(shot, CAMERAS_FILE)
     data = _object(path)
     check_version(data, path.name)
     try:
@@ -32,7 +42,7 @@ def load_cameras(shot: Shot) -> CameraPath:
 
 def load_record(shot: Shot) -> dict[str, Any]:
     """solve.json. JobError (SOLVE) if the shot is not solved or the file is damaged."""
-    return _object(_there(shot, "solve.json"))
+    return _object(_there(shot, SOLVE_FILE))
 
 
 def load_points(shot: Shot) -> dict[str, NDArray]:
@@ -40,7 +50,7 @@ def load_points(shot: Shot) -> dict[str, NDArray]:
 
     JobError (SOLVE) if the shot is not solved or the file is damaged.
     """
-    path = _there(shot, "points.npz")
+    path = _there(shot, POINTS_FILE)
     try:
         with open_regular(path) as handle, np.load(handle, allow_pickle=False) as data:
             points = {name: data[name] for name in _POINTS}

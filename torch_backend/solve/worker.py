@@ -29,6 +29,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from ..contract import POINTS_FILE
 from .lens import doubtful
 
 SEED = 0
@@ -462,7 +463,7 @@ def write_points(request: Request, model: pycolmap.Reconstruction) -> None:
     """points.npz of a model: what the parent filters."""
     points = [model.points3D[i] for i in sorted(model.points3D)]
     np.savez(
-        request.scratch / "points.npz",
+        request.scratch / POINTS_FILE,
         xyz=np.array([p.xyz for p in points], np.float32).reshape(-1, 3),
         rgb=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
         error=np.array([p.error for p in points], np.float32),

@@ -10,15 +10,11 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from ..contract import is_link, remove_link
+from ..contract import CONFIG_FILE, METRICS_FILE, NEXT_FOLDER, PREVIEWS_FOLDER, is_link, remove_link
+from ..contract import SUMMARY_FILE as SUMMARY_FILE
 from ..shot import replace_file
 from .checkpoint import CHECKPOINT_FILE, read_meta
 from .extend import EXTENSION_FILE
-
-NEXT_FOLDER = "next"
-"""In a run's folder: trainings that will take the run's place."""
-SUMMARY_FILE = "summary.json"
-"""A run's figures. It is written last: a folder of `NEXT_FOLDER` that has it is done."""
 
 
 def place_for(run: Path, key: str, resume: bool) -> Path:
@@ -38,12 +34,12 @@ def take_place(run: Path, done: Path) -> None:
     Every file is replaced at once, the checkpoint first: whoever freezes has the one or the other. `settle` goes on
     where a killed process stopped.
     """
-    for name in (CHECKPOINT_FILE, "config.json", "metrics.jsonl"):
+    for name in (CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE):
         if (done / name).is_file():
             replace_file(done / name, run / name)
-    if (done / "previews").is_dir():
-        shutil.rmtree(run / "previews", ignore_errors=True)
-        replace_file(done / "previews", run / "previews")
+    if (done / PREVIEWS_FOLDER).is_dir():
+        shutil.rmtree(run / PREVIEWS_FOLDER, ignore_errors=True)
+        replace_file(done / PREVIEWS_FOLDER, run / PREVIEWS_FOLDER)
     (run / EXTENSION_FILE).unlink(missing_ok=True)
     replace_file(done / SUMMARY_FILE, run / SUMMARY_FILE)
     shutil.rmtree(run / NEXT_FOLDER, ignore_errors=True)

@@ -14,12 +14,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from ..contract import CHECKPOINT_FILE as CHECKPOINT_FILE
 from ..contract import ExitCode, JobError, check_version
 from ..shot import atomic_path
 
 CHECKPOINT_VERSION = 1
-CHECKPOINT_FILE = "checkpoint.safetensors"
-"""Of a run, in its folder."""
 
 
 _DAMAGED = (SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError)

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..contract import EXTENSION_FILE as EXTENSION_FILE
 from .checkpoint import read_meta
 
-EXTENSION_FILE = "extension.safetensors"
-"""Checkpoint of an extension that is not done, beside the run's own."""
 _REWIND = 1.0 / 3.0
 """Most of the run's schedule, as a share of it, that the learning rates go back."""
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..contract import ExitCode, JobError, Reporter, TrainParams, read_json
+from ..contract import CONFIG_FILE, METRICS_FILE, PREVIEWS_FOLDER, ExitCode, JobError, Reporter, TrainParams, read_json
 from ..deformation import planes
 from ..footage.images import write_png
 from ..native import default_threads
@@ -20,7 +20,7 @@ from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
-from ..solve.motion import PAINTED, load_motion, motion_key
+from ..solve.motion import load_motion, motion_key
 from . import adam
 from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
@@ -75,7 +75,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         return extend_run(shot, params, report)
     config, device = config_from_params(params), _prepared_device(params, report)
     run = shot.own(shot.run(params.run))
-    shot.own(run / "previews")
+    shot.own(run / PREVIEWS_FOLDER)
     settle(run)
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
@@ -92,7 +92,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         report.progress("training", 1, 1, "already trained")
         return done
     folder = shot.own(place_for(run, key, params.resume))
-    shot.own(folder / "previews")
+    shot.own(folder / PREVIEWS_FOLDER)
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     if folder != run and params.resume:
         report.warning(
@@ -107,7 +107,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     resumed = _resume(trainer, checkpoint, params.resume, report)
     for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
         (folder / name).unlink(missing_ok=True)
-    write_json(folder / "config.json", {"version": 1, **identity, "config": config_to_json(config)})
+    write_json(folder / CONFIG_FILE, {"version": 1, **identity, "config": config_to_json(config)})
     metrics = Metrics(folder, report, trainer.iteration if resumed else -1)
     held_out = images[len(train) :]
 
@@ -133,7 +133,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if params.extend < 0:
         raise ValueError(f"extend is {params.extend}: it is a number of steps to add")
     folder, again = shot.own(shot.run(params.run)), "Train it without --extend first."
-    shot.own(folder / "previews")
+    shot.own(folder / PREVIEWS_FOLDER)
     settle(folder)
     checkpoint, beside = folder / CHECKPOINT_FILE, folder / EXTENSION_FILE
     facts = read_meta(checkpoint) if checkpoint.is_file() else {}
@@ -228,7 +228,7 @@ def finished(folder: Path, key: str) -> dict[str, Any] | None:
 
 def solve_key(shot: Shot) -> str:
     """Identifies the solved cameras, by content: a copied shot is still the same shot."""
-    return content_key(read_json(shot.solve / "cameras.json"))
+    return content_key(read_json(shot.cameras))
 
 
 def motion_of(shot: Shot, config: TrainConfig) -> str | None:
@@ -244,7 +244,7 @@ def trained_without(shot: Shot, run: Path, key: str) -> bool:
     A freeze finds mattes where the solve did not: that alone is no reason to train anew what it froze.
     """
     checkpoint = run / CHECKPOINT_FILE
-    if any((shot.root / PAINTED).glob("*.png")) or not checkpoint.is_file():
+    if any(shot.painted.glob("*.png")) or not checkpoint.is_file():
         return False
     return read_meta(checkpoint).get("key") == key
 
@@ -267,9 +267,9 @@ class Metrics:
 
     def __init__(self, folder: Path, report: Reporter, iteration: int) -> None:
         self.folder, self.report = folder, report
-        self.path = folder / "metrics.jsonl"
-        make_folder(folder / "previews")
-        for picture in (folder / "previews").glob("*.png"):
+        self.path = folder / METRICS_FILE
+        make_folder(folder / PREVIEWS_FOLDER)
+        for picture in (folder / PREVIEWS_FOLDER).glob("*.png"):
             if picture.stem.isdigit() and int(picture.stem) > iteration:
                 picture.unlink()
         lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
@@ -291,7 +291,7 @@ class Metrics:
             lines.write(json.dumps(row) + "\n")
         self.report.metric("training", row)
         index = test[len(test) // 2] if test else trainer.train_ids[len(trainer.train_ids) // 2]
-        preview = self.folder / "previews" / f"{trainer.iteration:06d}.png"
+        preview = self.folder / PREVIEWS_FOLDER / f"{trainer.iteration:06d}.png"
         save_png(preview, trainer.render_frame(index))
         self.report.image("preview", preview)
 

@@ -6,7 +6,6 @@ import shutil
 import numpy as np
 import pytest
 
-from torch_backend import shot as shot_module
 from torch_backend.contract import Cancelled, ExitCode, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.images import read_png, write_png
@@ -287,7 +286,7 @@ def test_the_listing_says_how_the_footage_was_read(shot, clip, sequence, recorde
 
 def test_a_full_disk_is_told_before_the_work(shot, clip, recorder, monkeypatch):
     usage = shutil.disk_usage(shot.root)._replace(free=1 << 20)
-    monkeypatch.setattr(shot_module.shutil, "disk_usage", lambda _: usage)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     error = refused(shot, recorder, clip)
     assert error.exit_code == ExitCode.DISK
     assert error.message.startswith("No space left in")

@@ -1,0 +1,76 @@
+"""How a command ends: its exit codes, and the failure that an artist reads."""
+
+from __future__ import annotations
+
+import enum
+import errno
+from pathlib import Path
+
+
+class ExitCode(enum.IntEnum):
+    """Exit codes of every command, documented in docs/troubleshooting.md."""
+
+    OK = 0
+    INTERNAL = 1
+    USAGE = 2
+    FOOTAGE = 3
+    SOLVE = 4
+    TRAIN = 5
+    FREEZE = 6
+    BAKE = 7
+    DISK = 8
+    ENVIRONMENT = 9
+    CANCELLED = 130
+
+
+class JobError(Exception):
+    """A failure that an artist reads: what was wrong and where, in one sentence, and what to do about it."""
+
+    def __init__(self, message: str, hint: str = "", exit_code: int = ExitCode.INTERNAL) -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+        self.exit_code = int(exit_code)
+
+
+class Cancelled(Exception):
+    """Raised by `Reporter.check_cancelled` when someone asked the job to stop."""
+
+
+def disk_error(folder: str | Path, detail: str = "the disk is full") -> JobError:
+    """The one sentence for a full disk."""
+    return JobError(
+        f"No space left in {folder}: {detail}.",
+        "Free some space or choose another output folder, then start again: finished work is kept.",
+        ExitCode.DISK,
+    )
+
+
+def is_disk_full(error: OSError) -> bool:
+    """True if the system refused to write for want of space or quota."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+_REFUSED = {
+    errno.ENAMETOOLONG: ("has a name that is too long for this system", "Choose a shorter one."),
+    errno.ENOTDIR: ("leads through a file where a folder is needed", "Choose another place."),
+    errno.EEXIST: ("is a file where a folder is needed", "Choose another place."),
+    errno.EISDIR: ("is a folder where a file is needed", "Choose another place."),
+    errno.ENOENT: ("does not exist", "Check the name."),
+    errno.ELOOP: ("is a link that leads to itself", "Choose another place."),
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS),
+        ("cannot be used: it is protected, or open elsewhere", "Close it, or choose another place."),
+    ),
+}
+
+
+def path_error(error: OSError) -> JobError | None:
+    """The sentence for a file or folder that the system refuses, or for a full disk; None if it is about no path."""
+    where = error.filename2 or error.filename
+    if is_disk_full(error):
+        return disk_error(where or "the output folder")
+    if not where or error.errno not in _REFUSED:
+        return None
+    what, hint = _REFUSED[error.errno]
+    return JobError(f"{where} {what}.", hint, ExitCode.USAGE)

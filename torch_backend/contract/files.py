@@ -1,0 +1,134 @@
+"""Files that may come from anywhere: read without waiting, never endless, never through a link unseen."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+import sys
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+LONGEST_JSON = 1 << 28
+"""Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
+SHORT_JSON = 1 << 20
+"""Bytes of a file that Blender reads between two turns of its timer: a status, a run's figures."""
+LONGEST_LINE = 1 << 20
+"""Bytes of a line of events.jsonl or metrics.jsonl that are read."""
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """Opens a regular file (or a link to one) for reading, without ever waiting for it.
+
+    A shot folder may come from anywhere: a pipe would hold up Blender's main thread, a device would fill its memory.
+    FileNotFoundError or another OSError of the system's; ValueError names a path that holds something else.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+    # One owner of the handle from the start: closed twice, by us and by a file object that goes, an interrupt between
+    # the two would read as a fault of the disk.
+    try:
+        source = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115 -- it is what we return
+    except IsADirectoryError:
+        raise ValueError(f"{path} is not a file: remove it") from None
+    try:
+        if not stat.S_ISREG(os.fstat(source.fileno()).st_mode):
+            raise ValueError(f"{path} is not a file: remove it")
+    except BaseException:
+        source.close()
+        raise
+    return source
+
+
+def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
+    """A JSON object from a file of at most `longest` bytes.
+
+    FileNotFoundError, or ValueError naming the file and what is wrong in it.
+    """
+    with open_regular(path) as source:
+        text = source.read(longest + 1)
+    if len(text) > longest:
+        raise ValueError(f"{path} is longer than {longest >> 20} MB: nothing of ours is")
+    try:
+        data = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:  # ValueError: no JSON, no UTF-8, or a number of too many digits
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{path} should hold a JSON object, found {type(data).__name__}")
+    return data
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def read_lines(
+    path: str | Path, start: int = 0, longest: int = LONGEST_LINE
+) -> Generator[tuple[bytes, int], None, None]:
+    """Whole lines of a file that grows, from a byte on: (line, where the next one begins).
+
+    One longer than `longest` bytes is passed over: (b"", where it goes on). OSError or ValueError as `open_regular`.
+    """
+    with open_regular(path) as source:
+        source.seek(start)
+        inside = False  # of a line that is too long
+        while line := source.readline(longest):
+            start += len(line)
+            whole = line.endswith(b"\n")
+            if not whole and len(line) < longest:
+                return  # half written: it is read with the next call
+            yield (line if whole and not inside else b""), start
+            inside = not whole
+
+
+def printable(text: str, longest: int = 2000) -> str:
+    """Text from a file as it may be shown or printed: no escape codes or other control characters, and not endless."""
+    return "".join(c if c.isprintable() else " " for c in text[:longest])
+
+
+def checked_name(name: str, what: str) -> str:
+    """`name` if it is safe as a folder name on every system; ValueError otherwise."""
+    if not _NAME.fullmatch(name) or name.endswith((".", " ")):
+        raise ValueError(f"{what} name {name!r} should be 1 to 64 letters, digits, spaces, '.', '_' or '-'")
+    if name.partition(".")[0].rstrip().upper() in _DEVICES:
+        raise ValueError(f"{what} name {name!r} is the name of a device on Windows: choose another one")
+    return name
+
+
+_NAME = re.compile(r"\w[\w .-]{0,63}")
+_DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in "0123456789¹²³")}
+
+
+def frame_number(stem: str) -> int | None:
+    """Number of a frame's file by its name without suffix; None if it is no such file."""
+    return int(stem) if _NUMBER.fullmatch(stem) else None
+
+
+_NUMBER = re.compile(r"-?[0-9]{1,9}")
+
+
+def is_link(path: Path) -> bool:
+    """True for a symbolic link, and on Windows for a junction, whether or not it leads anywhere."""
+    try:
+        found = os.lstat(path)
+    except OSError:
+        return False
+    return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == _JUNCTION
+
+
+def remove_link(path: Path) -> None:
+    """Removes a link, never what it leads to."""
+    if sys.platform == "win32" and path.is_dir():
+        os.rmdir(path)  # how Windows removes a link to a folder
+    else:
+        os.unlink(path)
+
+
+_JUNCTION = 0xA0000003
+"""stat.IO_REPARSE_TAG_MOUNT_POINT, which only Windows has: its link between folders."""
+
+
+def frame_file(frame: int, suffix: str) -> str:
+    """File name of a frame: its number in the clip, six digits (a minus sign for negative ones) and a suffix."""
+    return f"{frame:06d}{suffix}"

@@ -1,0 +1,30 @@
+"""The hosts of the deformation, by their files: help and the panel need no torch to name them."""
+
+from __future__ import annotations
+
+import ast
+import functools
+from pathlib import Path
+
+_FOLDER = Path(__file__).resolve().parents[1] / "deformation"
+
+
+@functools.cache
+def host_names(folder: Path = _FOLDER) -> tuple[str, ...]:
+    """Names of the hosts in a folder: what each module's `HOST = HostSpec(...)` calls itself, first or as `name=`."""
+    found = set()
+    for file in folder.glob("*.py"):
+        source = file.read_text(encoding="utf-8")
+        if "\nHOST" in source:
+            found |= {name for node in ast.parse(source).body if (name := _name_of(node))}
+    return tuple(sorted(found))
+
+
+def _name_of(node: ast.stmt) -> str:
+    """The name in a statement that makes a module's HOST; empty for any other one."""
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    call = getattr(node, "value", None)
+    if not any(isinstance(t, ast.Name) and t.id == "HOST" for t in targets) or not isinstance(call, ast.Call):
+        return ""
+    given = [*call.args[:1], *(k.value for k in call.keywords if k.arg == "name")]
+    return next((str(one.value) for one in given if isinstance(one, ast.Constant)), "")

@@ -1,0 +1,97 @@
+"""What Blender and a live session say to each other: a request per view, and messages over a pipe."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+
+@dataclass
+class LiveView:
+    """What a live session is asked to draw: one view of the frozen scene."""
+
+    view: int
+    """Which of the asker's views it is for; a newer request for the same view takes an older one's place."""
+    seq: int
+    """Given back with the frame."""
+    viewmat: list[float]
+    """16 floats, world-to-camera, row-major, OpenCV axes, solve units."""
+    K: list[float]
+    """fx, fy, cx, cy in pixels of `width` x `height`."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    t_star: float
+    """Frame number of the clip at which time stands still."""
+    exposed_like: float | None = None
+    """Frame number whose exposure the camera has; None: t*'s."""
+    show: str = "color"
+    """color; guesses: colour, tinted where nobody saw it near t*; support or motion: that matte as a grey picture."""
+    detail: bool = False
+    """Make it of the plates, as a take is: it takes longer, and waits for all views that are not. Of `color` alone."""
+    develop: bool = True
+    """Show the instant developed, if it has been: see `FreezeParams.develop`."""
+
+    def __post_init__(self) -> None:
+        if len(self.viewmat) != 16 or len(self.K) != 4:
+            raise ValueError("a live view needs 16 numbers of viewmat and 4 of K")
+        if not all(math.isfinite(v) for v in (*self.viewmat, *self.K, self.t_star)):
+            raise ValueError("a live view is not finite")
+        if not (0 < self.width <= LIVE_LIMIT and 0 < self.height <= LIVE_LIMIT):
+            raise ValueError(f"a live view is {self.width} x {self.height} pixels: 1 to {LIVE_LIMIT} can be drawn")
+        if self.show not in LIVE_SHOWS:
+            raise ValueError(f"show is {self.show!r}: it should be one of {', '.join(LIVE_SHOWS)}")
+
+
+LIVE_LIMIT = 8192
+"""Most pixels of a live view along a side."""
+LIVE_SHOWS = ("color", "guesses", "support", "motion")
+"""What a live view can show."""
+_MESSAGE = struct.Struct("<4sIQ")
+"""Before every message: a mark, bytes of the header, bytes of the body."""
+_MARK = b"SPL1"
+_LONGEST = (1 << 20, 1 << 31)
+
+
+def write_message(stream: BinaryIO, header: Mapping[str, Any], body: bytes | memoryview = b"") -> None:
+    """Writes one message of a live session: a JSON object, then raw bytes. The stream's own errors pass through."""
+    text = json.dumps(header, allow_nan=False).encode()
+    stream.write(_MESSAGE.pack(_MARK, len(text), len(body)) + text)
+    stream.write(body)
+    stream.flush()
+
+
+def read_message(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
+    """The next message of a live session, as (header, body); None at the end of the stream.
+
+    ValueError on anything else than a message: what follows it cannot be understood either.
+    """
+    start = _read_exactly(stream, _MESSAGE.size)
+    if start is None:
+        return None
+    mark, long, size = _MESSAGE.unpack(start)
+    if mark != _MARK or long > _LONGEST[0] or size > _LONGEST[1]:
+        raise ValueError("the live session's stream holds something that is no message")
+    text, body = _read_exactly(stream, long), _read_exactly(stream, size)
+    if text is None or body is None:
+        return None
+    header = json.loads(text)
+    if not isinstance(header, dict):
+        raise ValueError("a live message's header should be a JSON object")
+    return header, body
+
+
+def _read_exactly(stream: BinaryIO, count: int) -> bytes | None:
+    parts, missing = [], count
+    while missing:
+        part = stream.read(missing)
+        if not part:
+            return None
+        parts.append(part)
+        missing -= len(part)
+    return b"".join(parts)

@@ -1,0 +1,404 @@
+"""What each step may be asked for: parameters, and their options in the one table (`option_table`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from .hosts import host_names
+from .option_table import SWITCH, Limit, Option, limits_of, option, overscan
+
+LAST_FRAME = 1_048_574
+"""Blender's last frame number: no scene reaches further."""
+PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
+"""Training steps of each preset."""
+PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
+"""Width in pixels of each preset's training images, never above the working frames'."""
+CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV")
+"""What `SolveParams.camera_model` may be."""
+HOSTS = host_names()
+"""Hosts of the deformation, as their files in deformation/ name themselves."""
+METHODS = ("auto", *HOSTS, "static")
+"""What `TrainParams.method` may be."""
+HOST_CONFIGS = ("default", "reference")
+"""What `TrainParams.host_config` may be."""
+SUPERVISIONS = ("support", "paper", "none")
+"""What `TrainParams.supervision` may be."""
+DETECTORS = ("weight", "grad_norm", "grad_signed")
+"""What `TrainParams.detector` may be."""
+QUERIES = ("nearest", "plain")
+"""What `FreezeParams.query` may be."""
+DEVICES = ("auto", "cpu", "cuda")
+"""Where a run may train and freeze."""
+
+_FRAMES = ((1 << 31) - 1) * 1.0
+_PRESET = {0: "the preset's"}
+_DEVICE = {"flag": "--device", "choices": DEVICES, "help": "where to train and freeze: `auto` takes an NVIDIA GPU"}
+
+
+@dataclass
+class ImportParams:
+    """Footage into a shot folder."""
+
+    source: str = option(
+        "",
+        flag="clip",
+        is_path=True,
+        help="video file, image sequence or pattern (shot.####.exr)",
+        label="Clip",
+        tip="Video file, or one image of a numbered sequence, of people holding still",
+    )
+    """Video file, image of a sequence, folder of images, or a pattern such as shot.####.exr."""
+    first: int | None = option(
+        None,
+        flag="--first",
+        metavar="N",
+        help="first frame number of the clip",
+        words="its first",
+        limit=Limit("first frame", -_FRAMES, _FRAMES),
+        label="First",
+        tip="First frame number of the clip to import",
+    )
+    """First frame number of the clip to take; None: the first there is."""
+    last: int | None = option(
+        None,
+        flag="--last",
+        metavar="N",
+        help="last frame number, inclusive",
+        words="its last",
+        limit=Limit("last frame", -_FRAMES, _FRAMES),
+        label="Last",
+        tip="Last frame number to import, inclusive",
+    )
+    """Last frame number to take, inclusive; None: the last there is."""
+    step: int = option(
+        0,
+        flag="--step",
+        metavar="N",
+        help="solve and train on every n-th frame; all frames are delivered whatever it is",
+        words="chosen",
+        limit=Limit("step between solved frames", 1, 100_000, {0: "one that is chosen"}),
+        label="Solve Every",
+        tip="Every how many frames the camera is solved and trained on, all are delivered; 0: chosen by the "
+        "clip's length. Smaller where a solve loses its way, 1: every frame",
+    )
+    """Every how many frames are solved and trained on; 0 chooses. All frames are delivered whatever it is."""
+    working_height: int = option(
+        0,
+        flag="--working-height",
+        metavar="PX",
+        help="height of the working frames",
+        words="the source's, at most 720",
+        limit=Limit("height of the working frames", 16, 16_384, {0: "the source's"}),
+    )
+    """Height in pixels of the working frames; 0: the source's, at most 720."""
+    fps: float = option(
+        0.0,
+        flag="--fps",
+        metavar="F",
+        help="frames per second of an image sequence",
+        words="its files', else 24",
+        label="Frame Rate",
+        tip="Frames per second of an image sequence; 0: what its files say, else 24. A video has its own",
+    )
+    """Frames per second of a sequence; 0: the footage's own, 24 for a sequence that says none."""
+    layer: str = option(
+        "",
+        flag="--layer",
+        metavar="NAME",
+        help="layer or part of an EXR sequence, by its name or the end of it",
+        words="the picture itself",
+    )
+    """Layer or part of a sequence's pictures to take, by its name or the end of it; empty: the picture itself."""
+
+
+@dataclass
+class SolveParams:
+    """Cameras from the working frames."""
+
+    camera_model: str = option(
+        "SIMPLE_RADIAL",
+        flag="--camera-model",
+        choices=CAMERA_MODELS,
+        help="lens: `SIMPLE_RADIAL`, or `OPENCV` for strong distortion",
+        label="Lens",
+        tip="How the lens bends straight lines",
+        items={
+            "SIMPLE_RADIAL": ("Ordinary", "One coefficient: phones, most cameras"),
+            "OPENCV": ("Strong", "Four coefficients: action cameras, very wide lenses"),
+        },
+    )
+    """COLMAP camera model: SIMPLE_RADIAL or OPENCV (strong or tangential distortion)."""
+    overlap: int = option(15, limit=Limit("number of following frames that are matched", 1, 1000))
+    """Each solved frame is matched with this many following ones (and with quadratically spaced ones beyond)."""
+    cameras: str = option(
+        "",
+        flag="--cameras",
+        metavar="PATH",
+        is_path=True,
+        commands=("solve",),
+        help="take these cameras instead: a COLMAP folder, a transforms.json or a camera path",
+        label="Cameras",
+        tip="Folder of a COLMAP model or one of its files, a transforms.json, or a camera path. "
+        "Pictures are matched to the clip's frames by the number in their names",
+    )
+    """Cameras to take instead of solving: a COLMAP model's folder, a nerfstudio transforms.json, or a CameraPath.
+    Pictures are matched to frames by number. Empty: solve."""
+
+
+@dataclass
+class TrainParams:
+    """One run of the trainer."""
+
+    run: str = option(
+        "main",
+        flag="--run",
+        metavar="NAME",
+        help="name of the run",
+        label="Run",
+        tip="Name of the training run; a new name keeps the old",
+    )
+    """Name of the run's folder in runs/."""
+    preset: str = option(
+        "preview",
+        flag="--preset",
+        choices=tuple(PRESET_STEPS),
+        help="`preview`, `standard`, `final`: iterations, size and number of Gaussians",
+        label="Preset",
+        tip="How much to spend on training",
+        items={
+            "preview": ("Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
+            "standard": ("Standard", "640 pixels wide, 9000 steps: for most shots"),
+            "final": ("Final", "1280 pixels wide, 30000 steps, most Gaussians: takes longest"),
+        },
+    )
+    """preview, standard or final."""
+    method: str = option(
+        "auto",
+        flag="--method",
+        choices=METHODS,
+        help="`auto` (a host behind the gate), `static` (nothing moves), or a host whose field moves everything: "
+        "`hexplane` (4DGaussians), `mlp` (Deformable 3DGS), `control_points` (SC-GS)",
+    )
+    """auto (the host behind the gate), static, or a host whose field moves all: hexplane, mlp, control_points."""
+    host: str = option("hexplane", flag="--host", choices=HOSTS, help="which host `auto` puts behind the gate")
+    """Which host `auto` puts behind the gate."""
+    host_config: str = option(
+        "default",
+        flag="--host-config",
+        choices=HOST_CONFIGS,
+        help="the host's numbers: `default` (ours), `reference` (published)",
+    )
+    """default (ours) or reference (the published sizes, rates and schedules, as shares of the run)."""
+    supervision: str = option(
+        "support",
+        flag="--supervision",
+        choices=SUPERVISIONS,
+        help="`support`, `paper`, `none`: what anchors ill-seen Gaussians",
+    )
+    """support, paper or none: which anchoring losses hold ill-supervised Gaussians."""
+    detector: str = option(
+        "grad_norm",
+        flag="--detector",
+        choices=DETECTORS,
+        help="`paper` only, what tells an ill-seen one: `grad_norm` (the paper), `grad_signed` (the published code), "
+        "`weight`",
+    )
+    """`paper`, who is ill-supervised: weight, grad_norm, or grad_signed (the published code's signed sum)."""
+    iterations: int = option(
+        0,
+        flag="--iterations",
+        metavar="N",
+        help="training steps",
+        words="the preset's",
+        limit=Limit("number of training steps (iterations)", 10, 10_000_000, _PRESET),
+    )
+    """Training steps; 0: the preset's."""
+    width: int = option(
+        0,
+        flag="--width",
+        metavar="PX",
+        help="width of the training images",
+        words="the preset's",
+        limit=Limit("width of the training images", 16, 16_384, _PRESET),
+    )
+    """Width in pixels of the training images; 0: the preset's."""
+    max_gaussians: int = option(
+        0,
+        flag="--max-gaussians",
+        metavar="N",
+        help="budget of Gaussians",
+        words="the preset's",
+        limit=Limit("budget of Gaussians", 100, 20_000_000, _PRESET),
+    )
+    """Budget of Gaussians; 0: the preset's."""
+    holdout: int = option(
+        -1,
+        flag="--holdout",
+        metavar="N",
+        help="keep every n-th frame out of training to measure on; 0: none",
+        words="`preview` 8, others none",
+        limit=Limit("distance between held-out frames", 2, 1_000_000, {0: "none", -1: "the preset's"}),
+    )
+    """Every how many frames one is kept out for testing; 0: none, -1: the preset's choice."""
+    seed: int = option(0, flag="--seed", metavar="N", help="random seed", limit=Limit("random seed", 0, (1 << 53) - 1))
+    """Random seed."""
+    resume: bool = option(True, flag="--restart", turns_off=True, help="do not go on from the run's checkpoint")
+    """Go on from the run's checkpoint if there is one."""
+    device: str = option("auto", **_DEVICE)
+    """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used. A run may go on on another device."""
+    extend: int = option(
+        0,
+        flag="--extend",
+        metavar="N",
+        commands=("train",),
+        help="add N steps to a finished run, which keeps its settings (other flags are passed over)",
+        words="none",
+        limit=Limit("number of steps to add", 1, 10_000_000, {0: "none"}),
+        label="More Steps",
+        tip="How many steps Train On adds to a finished run; a third of the preset's at first",
+    )
+    """Steps to add to a finished run, whose own settings are kept; 0: none."""
+
+
+@dataclass
+class FreezeParams:
+    """Frozen frames from a run."""
+
+    run: str = option("main", flag="--run", metavar="NAME", help="name of the run")
+    """Run to freeze."""
+    take: str = option(
+        "freeze",
+        flag="--take",
+        metavar="NAME",
+        help="name of the take",
+        label="Take",
+        tip="Name of the frozen frames; a new name keeps the old",
+    )
+    """Name of the take's folder in takes/."""
+    t_star: int | None = option(
+        None,
+        flag="--t-star",
+        metavar="N",
+        help="frame at which time stands still",
+        words="suggested from support and sharpness",
+        limit=Limit("t*", -_FRAMES, _FRAMES),
+        label="t*",
+        tip="Frame number of the clip at which time stands still. Keyed, it is followed frame by frame: "
+        "freeze, hold and release",
+    )
+    """Frame number of the clip at which time stands still; None: suggested from support and sharpness."""
+    t_star_per_frame: dict[str, float] = field(
+        default_factory=dict, metadata={"option": Option(limit=Limit("t* of a frame", -_FRAMES, _FRAMES))}
+    )
+    """Clip frame number -> t* as a frame number, one per output frame: freeze ramps. Overrides `t_star`."""
+    first: int | None = option(None, limit=Limit("first frame", -_FRAMES, _FRAMES))
+    """First output frame; None: the clip's first."""
+    last: int | None = option(None, limit=Limit("last frame", -_FRAMES, _FRAMES))
+    """Last output frame, inclusive; None: the clip's last."""
+    step: int = option(1, limit=Limit("step between frozen frames", 1, 1_000_000))
+    """Every how many frames, from `first`, one is rendered. Frames of the take that were rendered before stay."""
+    camera_path: str = option(
+        "",
+        flag="--camera-path",
+        metavar="FILE",
+        is_path=True,
+        help="JSON camera path to render from",
+        words="the clip's poses",
+    )
+    """JSON file of a CameraPath, in solve units, to render from; empty: the clip's own poses."""
+    query: str = option(
+        "nearest",
+        flag="--freeze-query",
+        choices=QUERIES,
+        help="`nearest`: each Gaussian at its nearest supported time; `plain`: at t* itself",
+    )
+    """nearest: each Gaussian is asked at its nearest supported time to t*; plain: at t* itself."""
+    width: int = option(
+        0,
+        flag="--freeze-width",
+        metavar="PX",
+        help="width of the frozen frames",
+        words="the source's own",
+        limit=Limit("width of the frozen frames", 16, 16_384, {0: "the source's"}),
+        label="Width",
+        tip="Width in pixels of the frozen frames; 0: the source's own, or as the scene renders from a camera "
+        "of your own",
+    )
+    """Width in pixels of the frozen frames; 0: the source's own."""
+    detail: str = option(
+        "on",
+        flag="--detail",
+        choices=SWITCH,
+        help="`on`: frozen frames are made of the plates, where they can be believed; `off`: of the splats alone",
+        label="Detail",
+        tip="Make frozen frames of the plates, where they can be believed: as sharp as the plate. "
+        "Off: of the splats alone, soft throughout",
+    )
+    """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
+    develop: str = option(
+        "on",
+        flag="--develop",
+        choices=SWITCH,
+        help="`on`: the instant is trained on as the still scene that it is, once for each t*, and what moves in the "
+        "model there only to the harm of other plates holds still; `off`: it stays as the run has it",
+        label="Develop",
+        tip="Train the frozen instant on as the still scene that it is, before it is rendered: what moves is "
+        "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each "
+        "t*. Off: the instant as the training left it",
+    )
+    """on: the instant is trained on as the still scene that it is, and kept with the run; off: it stays as the run has
+    it. Of keyed instants, six at most."""
+    overscan: float = option(
+        0.0,
+        flag="--overscan",
+        metavar="PERCENT",
+        parse=overscan,
+        help="picture beyond the frame on every side, or `lens`: as much as the way back through the lens needs",
+        limit=Limit("overscan in percent", 0, 100, {-1: "what the lens needs"}),
+    )
+    """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
+    lens needs. `width` is that of the frame without it."""
+    only_missing: bool = option(False, always=True)
+    """Keep frames of the take that are already rendered from the same run, t* and camera."""
+    grain: bool = option(
+        True, flag="--no-grain", turns_off=True, help="leave the plate's grain out of the files: a third smaller"
+    )
+    """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
+    device: str = option("auto", **_DEVICE)
+    """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
+
+
+PARAMS: dict[str, type] = {
+    "import": ImportParams,
+    "solve": SolveParams,
+    "train": TrainParams,
+    "freeze": FreezeParams,
+}
+"""Kind of job -> the dataclass of its parameters."""
+COMMANDS: dict[str, dict[str, type]] = {
+    "import": {"import": ImportParams},
+    "solve": {"solve": SolveParams},
+    "train": {"train": TrainParams},
+    "take": {"freeze": FreezeParams},
+    "freeze": PARAMS,
+}
+"""Command of a command line -> kind of job that it starts -> the dataclass of its parameters."""
+LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.values()}
+"""The numbers of each kind of parameters, by field."""
+
+
+def check_params(params: Any) -> None:
+    """ValueError, in a sentence, names the first number of a job's parameters that is out of its `LIMITS`."""
+    for name, limit in LIMITS.get(type(params), {}).items():
+        given = getattr(params, name)
+        values = given.values() if isinstance(given, dict) else (given,)
+        for value in values:
+            if value is None or value in limit.also or limit.low <= value <= limit.high:  # NaN is none of them
+                continue
+            also = "".join(f", or {value} for {meaning}" for value, meaning in limit.also.items())
+            message = f"The {limit.what} is {value}: it should be {limit.low:.0f} to {limit.high:.0f}{also}."
+            raise ValueError(message)
+    odd = [key for key in getattr(params, "t_star_per_frame", {}) if not key.lstrip("-").isdecimal()]
+    if odd:
+        raise ValueError(f"t* is given for frame {odd[0]!r}: it should be the number of a frame.")

@@ -1,0 +1,203 @@
+"""Processes: how a child is started, when it ends with its starter, and which one lives."""
+
+from __future__ import annotations
+
+import _thread
+import calendar
+import contextlib
+import functools
+import hashlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .errors import ExitCode
+
+GRACE_SECONDS = 30.0
+"""How long a cancelled process may take for its checkpoint before it is ended by force."""
+
+
+def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]:
+    """`args` and `cwd` of the `Popen` that runs a module of ours; paths in `words` should be absolute.
+
+    Python takes modules from the folder that it stands in, and a shot folder may come from anywhere: -P says no. The
+    child stands beside its interpreter, where nobody puts files for it: a loader of libraries still looks there
+    (Windows always, Linux with an empty entry in LD_LIBRARY_PATH). It is neither the shot's folder nor the extension's:
+    Windows keeps the folder that a process stands in from being moved or removed.
+    """
+    python = os.path.abspath(python)
+    return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
+
+
+def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
+    """Stops this process, as Ctrl-C does, once its standard input closes: its starter holds that open, however it ends.
+
+    A checkpoint may take `grace_seconds`; then the process ends at once, with the group that it leads (POSIX).
+    """
+    starter = os.dup(0)
+    # Nobody else has it: on Windows a child of ours that inherits a pipe hangs at its start while we read from that.
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    watch = functools.partial(_stop_when_alone, starter, grace_seconds)
+    threading.Thread(target=watch, name="end with starter", daemon=True).start()
+
+
+def _stop_when_alone(starter: int, grace_seconds: float) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(starter, 1):
+            pass
+    if sys.platform == "win32":
+        _thread.interrupt_main()
+    else:  # a signal of its own also ends a wait of the main thread
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    time.sleep(grace_seconds)
+    if sys.platform != "win32" and os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(ExitCode.CANCELLED)
+
+
+def program(name: str) -> str | None:
+    """Absolute path of a program on the PATH; None if there is none, or if the folder we stand in has one to offer.
+
+    `shutil.which` looks into that folder first on Windows, and it may be one that came with a .blend or a clip.
+    """
+    found = shutil.which(name)
+    return found if found and os.path.isabs(found) else None
+
+
+@functools.cache
+def host_name() -> str:
+    """This computer as files name it: its name, and in brackets what tells it from another one of the same name.
+
+    On Linux that is a hash of the machine's id and, in a container, of its process ids' namespace; on Windows of the
+    machine's GUID; elsewhere there is none.
+    """
+    marks = []
+    if sys.platform == "win32":
+        import winreg
+
+        with contextlib.suppress(OSError):
+            with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, r"SOFTWARE\Microsoft\Cryptography") as known:
+                marks.append(str(winreg.QueryValueEx(known, "MachineGuid")[0]))
+    else:
+        with contextlib.suppress(OSError):
+            marks.append(Path("/etc/machine-id").read_text(encoding="ascii", errors="replace").strip())
+        with contextlib.suppress(OSError):
+            marks.append(os.readlink("/proc/self/ns/pid"))
+    mark = hashlib.sha256("\n".join(marks).encode()).hexdigest()[:8]
+    return f"{socket.gethostname()} ({mark})" if any(marks) else socket.gethostname()
+
+
+@dataclass(frozen=True)
+class Process:
+    """What the system says of a living process."""
+
+    started: float
+    """When it started, in the system's own unit: only to be compared with another answer. 0 if it does not tell."""
+    command: str
+    """Its command line, arguments separated by spaces; empty if the system does not tell."""
+
+
+def process(pid: int) -> Process | None:
+    """A living process of this computer; None if there is none of that id. Standard library, on all three systems."""
+    if not (isinstance(pid, int) and 0 < pid < 1 << 31):
+        return None
+    if sys.platform == "win32":
+        return _process_of_windows(pid)
+    try:
+        os.kill(pid, 0)  # asks only: no signal is sent
+    except ProcessLookupError:
+        return None
+    except OSError:
+        pass  # somebody else's, but there
+    return _process_of_proc(pid) if Path("/proc/self/stat").exists() else process_of_ps(pid)
+
+
+def process_start(pid: int) -> float:
+    """`Process.started` of a process; 0 if there is none or the system does not tell."""
+    found = process(pid)
+    return found.started if found is not None else 0.0
+
+
+def runs_still(pid: int, started: float) -> bool:
+    """True if a process of this computer lives that has this id and start; one that is only stopped does.
+
+    Where the system tells no start, a process of this id is taken for it: a job is not declared dead on a guess.
+    """
+    found = process(pid)
+    return found is not None and (not found.started or not started or found.started == started)
+
+
+def _process_of_proc(pid: int) -> Process | None:
+    """From /proc. Start in clock ticks since boot."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        fields = text.rpartition(")")[2].split()
+        if fields[0] in ("Z", "X"):
+            return None  # it has ended: only its exit code is kept for its parent
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        return Process(float(fields[19]), " ".join(os.fsdecode(word) for word in words).rstrip(" "))
+    except (OSError, ValueError, IndexError):
+        return Process(0.0, "")  # hidden from us, or ending just now
+
+
+def process_of_ps(pid: int) -> Process | None:
+    """From `ps`, on systems without /proc (macOS). Start in seconds since the epoch, whole ones."""
+    command = ["/bin/ps", "-ww", "-o", "stat=,lstart=,command=", "-p", str(pid)]
+    environ = {"LC_ALL": "C", "TZ": "UTC0", "PATH": "/usr/bin:/bin"}
+    try:
+        # close_fds=False: macOS then spawns it without copying the parent, which may be a heavy Blender.
+        told = subprocess.run(command, capture_output=True, env=environ, close_fds=False, timeout=5.0, check=False)
+        state, _, month, day, clock, year, line = os.fsdecode(told.stdout).strip("\n").split(None, 6)
+        if state.startswith("Z"):
+            return None
+        hours, minutes, seconds = map(int, clock.split(":"))
+        when = (int(year), _MONTHS.index(month) + 1, int(day), hours, minutes, seconds)
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return Process(0.0, "")
+    return Process(float(calendar.timegm((*when, 0, 0, 0))), line)
+
+
+_MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
+
+
+def _process_of_windows(pid: int) -> Process | None:
+    """From the Windows API. Start in units of 100 ns since 1601; the command line since Windows 8.1."""
+    if sys.platform != "win32":
+        return None
+    import ctypes
+    from ctypes import wintypes
+
+    class UnicodeString(ctypes.Structure):
+        _fields_ = [("length", wintypes.USHORT), ("room", wintypes.USHORT), ("text", ctypes.c_void_p)]
+
+    kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+    kernel.OpenProcess.restype = wintypes.HANDLE
+    opened = kernel.OpenProcess(wintypes.DWORD(0x1000), False, wintypes.DWORD(pid))  # PROCESS_QUERY_LIMITED_INFORMATION
+    if not opened:
+        return None if ctypes.get_last_error() == 87 else Process(0.0, "")  # ERROR_INVALID_PARAMETER: no such process
+    handle = wintypes.HANDLE(opened)
+    try:
+        code, times = wintypes.DWORD(), [wintypes.FILETIME() for _ in range(4)]
+        if kernel.GetExitCodeProcess(handle, ctypes.byref(code)) and code.value != 259:  # STILL_ACTIVE
+            return None
+        told = kernel.GetProcessTimes(handle, *(ctypes.byref(time) for time in times))
+        started = times[0].dwHighDateTime << 32 | times[0].dwLowDateTime if told else 0
+        room, needed = ctypes.create_string_buffer(1 << 17), wintypes.ULONG()
+        query = ctypes.WinDLL("ntdll").NtQueryInformationProcess  # 60: ProcessCommandLineInformation
+        if query(handle, 60, room, wintypes.ULONG(len(room)), ctypes.byref(needed)):
+            return Process(float(started), "")
+        line = UnicodeString.from_buffer(room)
+        text = ctypes.string_at(line.text, line.length).decode("utf-16-le", "replace") if line.text else ""
+        return Process(float(started), text.replace('"', ""))
+    finally:
+        kernel.CloseHandle(handle)

@@ -1,0 +1,95 @@
+"""What came out of a step: its verdict, and the figures of a whole run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from .files import printable
+from .typed import CONTRACT_VERSION, from_dict
+
+
+def measured(row: Mapping[str, Any]) -> tuple[float, float] | None:
+    """(seconds of training, dB on frames kept out) of a measurement; None if it is none, or holds no plain numbers."""
+    seconds, quality = row.get("seconds"), row.get("heldout_psnr_db")
+    if any(isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e9 for v in (seconds, quality)):
+        return None
+    return float(seconds), float(quality)  # pyright: ignore[reportArgumentType]
+
+
+VERDICT_WORDS = {"good": "Good.", "fair": "Fair.", "poor": "Poor."}
+"""Good: it holds. Fair: it holds but for what is named. Poor: it is not worth going on from. As they are shown."""
+_MOST_LINES = 12
+
+
+@dataclass
+class Verdict:
+    """What an artist should know of a run or a take; stands in a run's summary.json and in a take.json."""
+
+    word: str
+    """One of `VERDICT_WORDS`."""
+    sentences: list[str]
+    """What is so."""
+    where: list[dict[str, Any]] = field(default_factory=list)
+    """Where it will not hold, worst first: `first` and `last` frame number, and `region` of the picture in words."""
+    advice: list[str] = field(default_factory=list)
+    """What to do about it."""
+
+    def lines(self) -> list[str]:
+        """All of it as it is printed and drawn; the word stands before the first sentence."""
+        return [f"{VERDICT_WORDS[self.word]} {self.sentences[0]}", *self.sentences[1:], *self.advice]
+
+
+def verdict_of(told: Mapping[str, Any]) -> Verdict | None:
+    """The verdict in a summary.json or take.json, which may come from anywhere; None if there is none to be shown."""
+    data = told.get("verdict")
+    if not isinstance(data, dict):
+        return None
+    try:
+        found: Verdict = from_dict(Verdict, data)
+    except ValueError:
+        return None
+    texts = [*found.sentences, *found.advice]
+    if found.word not in VERDICT_WORDS or not found.sentences or not all(isinstance(text, str) for text in texts):
+        return None
+    shown, advice = ([printable(text, 300) for text in part[:_MOST_LINES]] for part in (found.sentences, found.advice))
+    return Verdict(found.word, shown, found.where, advice)
+
+
+def verdict_lines(*told: Mapping[str, Any]) -> list[str]:
+    """The lines of the verdicts that summaries or takes hold; none where there is no verdict."""
+    found = (verdict_of(one) for one in told)
+    lines = (line for verdict in found if verdict is not None for line in verdict.lines())
+    return list(dict.fromkeys(lines))  # a take repeats what its run's verdict found amiss
+
+
+def summarise(
+    shot: str, source: str, results: Mapping[str, Mapping[str, Any]], stages: Mapping[str, float], wall_seconds: float
+) -> dict[str, Any]:
+    """The figures of a whole run as DIR/summary.json holds them; units in the key names.
+
+    Args:
+        shot: absolute path of the shot folder.
+        source: footage as given.
+        results: what the jobs "solve", "train" and "freeze" answered in their `done` event.
+        stages: seconds by kind of job.
+        wall_seconds: seconds in all.
+    """
+    train, freeze, solve = results["train"], results["freeze"], results["solve"]
+    return {
+        "version": CONTRACT_VERSION,
+        "shot": shot,
+        "source": source,
+        **{k: solve[k] for k in ("frames", "solved_frames", "registered", "reprojection_error_px")},
+        **{k: train[k] for k in ("gaussians", "moving_share", "train_seconds", "iterations", "heldout_psnr_db")},
+        "train_width_px": train["width_px"],
+        "modelled": train.get("modelled", []),
+        "quality": train.get("quality", ""),
+        "verdict": verdict_lines(train, freeze),
+        **{k: (freeze.get("detail") or {}).get(k) for k in ("plate_share", "invented_share")},
+        **{k: freeze[k] for k in ("t_star_frame", "exr_dir", "contact_sheet", "video", "ply", "take")},
+        "run": train["run"],
+        "wall_seconds_by_stage": dict(stages),
+        "wall_seconds": round(wall_seconds, 2),
+    }

@@ -1,0 +1,264 @@
+"""The shot folder: where everything of a shot lies. No other file of the project spells these names.
+
+shot.json                        what is told of the shot
+lock.json                        who writes into it
+frames/NNNNNN.png                undistorted plates
+frames/frames.json, frames/raw/  listing of the imported frames, and themselves
+solve/                           cameras.json, solve.json, points.npz, colmap/, colmap.log, ST maps of the lens
+solve/motion/                    mattes of what moves, as found; motion_paint/ as painted
+runs/NAME/                       a run: `RunFolder`
+takes/NAME/                      frozen frames: `TakeFolder`
+jobs/ID/                         requests and what became of them: `jobs`
+paths/, tracking/                cameras that Blender sent
+trash/                           what was removed and is being deleted
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from .files import checked_name, frame_file
+
+SHOT_SUFFIX = ".splannequin"
+"""Of a shot folder's own name."""
+INFO_FILE, WRITER_FILE = "shot.json", "lock.json"
+FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER = "frames", "solve", "runs", "takes", "jobs"
+FRAMES_FILE, RAW_FOLDER = "frames.json", "raw"
+CAMERAS_FILE, SOLVE_FILE, POINTS_FILE = "cameras.json", "solve.json", "points.npz"
+COLMAP_FOLDER, COLMAP_LOG = "colmap", "colmap.log"
+STMAP_FILES = ("stmap_undistort.exr", "stmap_redistort.exr")
+"""Of the solve: from the distorted frames to the undistorted ones, and back."""
+MOTION_FOLDER, MOTION_FILE, MOTION_UNFINISHED_FILE = "motion", "motion.json", "unfinished.json"
+PAINTED_FOLDER = "motion_paint"
+CHECKPOINT_FILE, EXTENSION_FILE = "checkpoint.safetensors", "extension.safetensors"
+"""Of a run: itself, and steps that are added to it and are not done."""
+CONFIG_FILE, METRICS_FILE, SUMMARY_FILE = "config.json", "metrics.jsonl", "summary.json"
+PREVIEWS_FOLDER, NEXT_FOLDER, DEVELOPED_FOLDER = "previews", "next", "developed"
+"""In a run's folder: pictures of the training, trainings that will take the run's place, developed instants."""
+TAKE_FILE, TAKE_STATE_FILE = "take.json", "state.json"
+TAKE_PREVIEW_FOLDER, WARP_FOLDER = "preview", "warp"
+CONTACT_SHEET_FILE, VIDEO_FILE, PLY_FILE = "contact_sheet.png", "video.mp4", "frozen.ply"
+TAKE_REDISTORT = Path("stmap") / "redistort.exr"
+"""Of a take with overscan: the way back through the lens."""
+LIVE_LOG = "live.log"
+PICTURE, LAYERS = ".png", ".exr"
+"""Suffixes of plates, mattes and previews; of frozen frames."""
+
+
+class ShotFolder:
+    """Paths in a shot folder. Holds no state, and says nothing of what is there."""
+
+    def __init__(self, root: str | Path) -> None:
+        self.root = Path(root).absolute()
+
+    @property
+    def info_path(self) -> Path:
+        return self.root / INFO_FILE
+
+    @property
+    def frames(self) -> Path:
+        return self.root / FRAMES_FOLDER
+
+    @property
+    def listing(self) -> Path:
+        """What was imported."""
+        return self.frames / FRAMES_FILE
+
+    @property
+    def raw(self) -> Path:
+        """Frames as imported, with the lens's distortion."""
+        return self.frames / RAW_FOLDER
+
+    def plate(self, frame: int) -> Path:
+        """The undistorted plate of a frame."""
+        return self.frames / frame_file(frame, PICTURE)
+
+    @property
+    def solve(self) -> Path:
+        return self.root / SOLVE_FOLDER
+
+    @property
+    def cameras(self) -> Path:
+        """A `CameraPath` of all frames: there is a solve if it is there."""
+        return self.solve / CAMERAS_FILE
+
+    @property
+    def solve_record(self) -> Path:
+        """Figures of the solve."""
+        return self.solve / SOLVE_FILE
+
+    @property
+    def points(self) -> Path:
+        return self.solve / POINTS_FILE
+
+    @property
+    def colmap(self) -> Path:
+        """The solver's model."""
+        return self.solve / COLMAP_FOLDER
+
+    @property
+    def colmap_log(self) -> Path:
+        return self.solve / COLMAP_LOG
+
+    @property
+    def motion(self) -> Path:
+        """Mattes of what moves, as found."""
+        return self.solve / MOTION_FOLDER
+
+    def matte(self, frame: int) -> Path:
+        """The found matte of a frame."""
+        return self.motion / frame_file(frame, PICTURE)
+
+    @property
+    def painted(self) -> Path:
+        """Mattes of what moves, as painted."""
+        return self.root / PAINTED_FOLDER
+
+    def painted_matte(self, frame: int) -> Path:
+        """The painted matte of a frame."""
+        return self.painted / frame_file(frame, PICTURE)
+
+    @property
+    def runs(self) -> Path:
+        return self.root / RUNS_FOLDER
+
+    @property
+    def takes(self) -> Path:
+        return self.root / TAKES_FOLDER
+
+    @property
+    def jobs(self) -> Path:
+        return self.root / JOBS_FOLDER
+
+    @property
+    def live_log(self) -> Path:
+        """What the last live session complained of."""
+        return self.jobs / LIVE_LOG
+
+    @property
+    def lock(self) -> Path:
+        return self.root / WRITER_FILE
+
+    @property
+    def trash(self) -> Path:
+        """What was removed, until it is deleted."""
+        return self.root / "trash"
+
+    @property
+    def tracking(self) -> Path:
+        """Cameras of Blender's own tracking, as a transforms.json."""
+        return self.root / "tracking" / "transforms.json"
+
+    def camera_path(self, take: str) -> Path:
+        """Camera that Blender sent for a take."""
+        return self.root / "paths" / f"{take}.json"
+
+    def run(self, name: str) -> Path:
+        """Folder of a run; ValueError if the name could leave it."""
+        return self.runs / checked_name(name, "run")
+
+    def take(self, name: str) -> Path:
+        """Folder of a take; ValueError if the name could leave it."""
+        return self.takes / checked_name(name, "take")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths in the folder of a run, or of a training that will take its place."""
+
+    root: Path
+    """runs/NAME, or runs/NAME/next/KEY."""
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.root / CHECKPOINT_FILE
+
+    @property
+    def extension(self) -> Path:
+        """Steps that are added to the run and are not done."""
+        return self.root / EXTENSION_FILE
+
+    @property
+    def config(self) -> Path:
+        return self.root / CONFIG_FILE
+
+    @property
+    def metrics(self) -> Path:
+        """A measurement per line."""
+        return self.root / METRICS_FILE
+
+    @property
+    def summary(self) -> Path:
+        """Figures; written last, so the run is finished if it is there."""
+        return self.root / SUMMARY_FILE
+
+    @property
+    def previews(self) -> Path:
+        return self.root / PREVIEWS_FOLDER
+
+    @property
+    def next(self) -> Path:
+        """Trainings that will take the run's place when they are done, by key."""
+        return self.root / NEXT_FOLDER
+
+    @property
+    def developed(self) -> Path:
+        """Developed instants, by frame."""
+        return self.root / DEVELOPED_FOLDER
+
+
+@dataclass(frozen=True)
+class TakeFolder:
+    """Paths in the folder of a take."""
+
+    root: Path
+    """takes/NAME."""
+
+    @property
+    def facts(self) -> Path:
+        """What the take is; written last, so it is finished if it is there."""
+        return self.root / TAKE_FILE
+
+    @property
+    def state(self) -> Path:
+        """Key of what the take is being made of."""
+        return self.root / TAKE_STATE_FILE
+
+    def frame(self, number: int) -> Path:
+        """A frozen frame with its layers."""
+        return self.root / frame_file(number, LAYERS)
+
+    @property
+    def previews(self) -> Path:
+        return self.root / TAKE_PREVIEW_FOLDER
+
+    def preview(self, number: int) -> Path:
+        """A frozen frame as it looks."""
+        return self.previews / frame_file(number, PICTURE)
+
+    @property
+    def warps(self) -> Path:
+        return self.root / WARP_FOLDER
+
+    def warp(self, number: int) -> Path:
+        """How the plate of a frame is warped to its frozen frame."""
+        return self.warps / frame_file(number, LAYERS)
+
+    @property
+    def contact_sheet(self) -> Path:
+        return self.root / CONTACT_SHEET_FILE
+
+    @property
+    def video(self) -> Path:
+        return self.root / VIDEO_FILE
+
+    @property
+    def ply(self) -> Path:
+        """The frozen Gaussians, for other programs."""
+        return self.root / PLY_FILE
+
+    @property
+    def redistort(self) -> Path:
+        """The way back through the lens, of a take with overscan."""
+        return self.root / TAKE_REDISTORT

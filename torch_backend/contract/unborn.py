@@ -1,0 +1,57 @@
+"""What an import that did not end well left of the shot that it was to begin."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from pathlib import Path
+
+from .errors import ExitCode
+from .files import read_json
+from .jobs import LOG_FILE, STATUS_FILE, Status
+from .lock import read_writer
+from .shot_folder import FRAMES_FOLDER, INFO_FILE, JOBS_FOLDER, RUNS_FOLDER, SOLVE_FOLDER, TAKES_FOLDER, ShotFolder
+from .typed import from_dict
+
+_UNBORN = {INFO_FILE, JOBS_FOLDER, FRAMES_FOLDER}
+"""What an import that did not end well may leave in a shot folder."""
+_WORK = {SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER}
+
+
+def discard_unborn(shot: Path) -> bool:
+    """Takes away what a failed import left of a shot that it was to begin. True if it did; what cannot go stays.
+
+    A shot that has a frame, or anything else that took work, is left alone, and so are files that are not ours. Kept is
+    also the log of a job that ended without a sentence of its own.
+    """
+    there = ShotFolder(shot)
+    try:
+        names = {p.name for p in shot.iterdir()}
+        frames = [p for p in there.frames.rglob("*") if not p.is_dir()] if FRAMES_FOLDER in names else []
+        jobs = list(there.jobs.iterdir()) if JOBS_FOLDER in names else []
+        if INFO_FILE not in names or frames or names & _WORK or there.jobs.is_symlink():
+            return False
+        if not all("-import-" in job.name and not job.is_symlink() and _said_why(job) for job in jobs):
+            return False
+        writer = read_writer(shot)
+        if writer is not None and writer.works():
+            return False
+        for name in _UNBORN & names - {INFO_FILE}:
+            shutil.rmtree(shot / name, ignore_errors=True)  # a link is left alone
+        there.lock.unlink(missing_ok=True)
+        there.info_path.unlink()
+        with contextlib.suppress(OSError):  # it holds something of the artist's
+            shot.rmdir()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _said_why(job: Path) -> bool:
+    """True if a job ended in a sentence, or was cancelled, or never wrote a word: nobody needs its log."""
+    status = from_dict(Status, read_json(job / STATUS_FILE)) if (job / STATUS_FILE).is_file() else None
+    log = job / LOG_FILE
+    if status is not None and not status.ended:
+        return False
+    named = status is not None and (status.state == "cancelled" or status.exit_code != ExitCode.INTERNAL)
+    return named or not log.is_file() or not log.stat().st_size

@@ -1,0 +1,193 @@
+"""How files of a shot are written: beside their place, fsynced, and renamed over it, so no reader sees half a file."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from .errors import disk_error
+from .files import is_link, remove_link
+
+_worked_on: list[Path] = []
+"""Shot folders that jobs of this process work on."""
+
+
+@contextlib.contextmanager
+def working_on(*roots: Path) -> Iterator[None]:
+    """While it lasts, `make_folder` makes nothing of a shot whose own folder was moved or deleted."""
+    _worked_on.extend(roots)
+    try:
+        yield
+    finally:
+        for root in roots:
+            _worked_on.remove(root)
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder and those above it, if they are not there.
+
+    FileNotFoundError if it belongs to a shot that a job works on and whose own folder is gone: what is written under
+    its old name would look like a shot, and hold next to nothing of it.
+    """
+    root = next((root for root in _worked_on if root == path or root in path.parents), None)
+    if root is None:
+        path.mkdir(parents=True, exist_ok=True)
+        return
+    if root == path:
+        root.stat()
+    for part in reversed([path, *path.parents][: len(path.relative_to(root).parts)]):
+        part.mkdir(exist_ok=True)  # one by one: the system refuses the first without the shot's folder
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path, parents: bool = True) -> Iterator[Path]:
+    """A path beside `path`, with the same suffix, to write to; fsynced and renamed over `path` if all went well.
+
+    Its folder is made, and with `parents` what that is in; FileNotFoundError without, in a shot that was moved.
+    """
+    path = Path(path)
+    if parents:
+        make_folder(path.parent)
+    else:
+        path.parent.mkdir(exist_ok=True)
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    beside.unlink(missing_ok=True)  # a link that another hand left there would be followed
+    try:
+        yield beside
+        with open(beside, "rb+") as handle:
+            os.fsync(handle.fileno())
+        replace_file(beside, path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def replacing_folder(path: str | Path) -> Iterator[Path]:
+    """Yields an empty folder beside `path`, which takes its place if the block ends well, whole or not at all.
+
+    Until then, and if the block fails, `path` stays as it was. What a killed process left is swept by the next one:
+    a folder that had been moved aside is put back if nothing took its place.
+    """
+    path = Path(path)
+    fresh, aside = path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
+    restore_folder(path)
+    _discard(fresh)
+    make_folder(fresh)
+    try:
+        yield fresh
+        if os.path.lexists(path):
+            replace_file(path, aside)
+        replace_file(fresh, path)
+    except BaseException:
+        restore_folder(path)
+        raise
+    finally:
+        _discard(fresh)
+    _discard(aside)
+
+
+def restore_folder(path: Path) -> None:
+    """Puts back the folder that `replacing_folder` moved aside and was killed; if it was replaced, removes it."""
+    aside = path.with_name(f".{path.name}.old")
+    if aside.is_dir() and not os.path.lexists(path):
+        replace_file(aside, path)
+    _discard(aside)
+
+
+def _discard(folder: Path) -> None:
+    """Removes a folder, or a link to one without following it."""
+    if is_link(folder):
+        remove_link(folder)
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def replace_file(source: Path, target: Path) -> None:
+    """Renames over `target`; on Windows a reader may hold it open for a moment, so that is tried for two seconds."""
+    for attempt in range(40):
+        try:
+            os.replace(source, target)
+            return
+        except PermissionError:
+            if os.name != "nt" or attempt == 39:
+                raise
+            time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
+    """Holds a lock file, after waiting for whoever has it; `waiting` is called once if it has to.
+
+    The system frees it when this process ends, however that comes about.
+    """
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a+b") as lock:
+        told = False
+        while not try_lock(lock.fileno()):
+            if not told and waiting is not None:
+                waiting()
+                told = True
+            time.sleep(0.2)
+        yield
+
+
+def try_lock(handle: int) -> bool:
+    """Locks an open file for this process, without waiting; False if another one has it. Closing it gives it back."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            os.lseek(handle, 0, os.SEEK_SET)
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def write_atomic(path: str | Path, data: bytes, parents: bool = True) -> None:
+    """Writes a whole file, or leaves what was there. `parents`: see `atomic_path`."""
+    with atomic_path(path, parents) as beside:
+        beside.write_bytes(data)
+
+
+def write_json(path: str | Path, data: Mapping[str, Any], parents: bool = True) -> None:
+    """Writes a JSON object. ValueError on NaN or infinity: other programs read these files. `parents`: see
+    `atomic_path`."""
+    write_atomic(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"), parents)
+
+
+def content_key(*parts: Any) -> str:
+    """Short hash of JSON-able values and of files (given as Path: size and modification time), for "already done?"."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            found = part.stat()
+            part = [part.name, found.st_size, found.st_mtime_ns]
+        elif dataclasses.is_dataclass(part) and not isinstance(part, type):
+            part = dataclasses.asdict(part)
+        digest.update(json.dumps(part, sort_keys=True, default=str).encode("utf-8"))
+    return digest.hexdigest()[:16]
+
+
+def need_disk(folder: str | Path, byte_count: float, what: str) -> None:
+    """JobError if the disk of `folder` has no room for `byte_count` bytes more."""
+    there = Path(folder).absolute()
+    while not there.exists():
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if free < byte_count:
+        raise disk_error(folder, f"{what} needs about {byte_count / 1e6:.0f} MB, {free / 1e6:.0f} MB are free")
