@@ -17,23 +17,20 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
+
+from .kernel_text import kernel_text
 
 Launch = Callable[[int, int, int], None]
 """A compiled snippet, called as f(address of the block, stage, worker)."""
 _lock = threading.RLock()
 _pools: dict[int, ThreadPoolExecutor] = {}
 
-PRELUDE = r"""
-typedef float F __attribute__((ext_vector_type(16)));
-#define FN(...) [&](__VA_ARGS__) __attribute__((always_inline))
-auto load = FN(const float* p) -> F { F v; __builtin_memcpy(&v, p, 64); return v; };
-auto store = FN(float* p, F v) -> void { __builtin_memcpy(p, &v, 64); };
-auto take = FN() -> long long { return __atomic_fetch_add(&P.counter, 1, __ATOMIC_RELAXED); };
-"""
+PRELUDE = kernel_text(Path(__file__).with_name("kernels") / "prelude.cpp")
 POINTER, INTEGER = (ctypes.c_uint64, "float*"), (ctypes.c_int64, "long long")
 """Kinds of a block's fields: (ctypes, C)."""
 
