@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 from ..gaussians.model import SH_C0
 from .geometry import farthest_points, near_identity, nearest, rigid_rotations, rotation_matrices
+from .geometry import warm_up as warm_up_nearest
 from .mlp import Trunk, blurred, linear
 from .protocol import (
     Deformation,
@@ -523,4 +524,8 @@ def _restore(config: ControlPointsConfig, tensors: dict[str, Tensor]) -> Control
     return field
 
 
-HOST = HostSpec("control_points", ControlPointsConfig, _reference, _create, _restore)
+def _warm_up(config: ControlPointsConfig) -> None:
+    warm_up_nearest()
+
+
+HOST = HostSpec("control_points", ControlPointsConfig, _reference, _create, _restore, _warm_up)

@@ -255,7 +255,8 @@ def _bend(plane: Tensor, axis: int) -> Tensor:
 
 
 def _create(config: HexPlaneConfig, start: Start) -> HexPlane:
-    config = replace(config, time_nodes=config.time_nodes or max(4, round(start.frames / 2)))
+    nodes = config.time_nodes or start.time_nodes() or max(4, round(start.frames / 2))
+    config = replace(config, time_nodes=nodes)
     box = start.box
     if config.published:
         box = torch.stack([start.points.amin(0), start.points.amax(0)])
@@ -271,4 +272,9 @@ def _restore(config: HexPlaneConfig, tensors: dict[str, Tensor]) -> HexPlane:
     return field
 
 
-HOST = HostSpec("hexplane", HexPlaneConfig, _reference, _create, _restore)
+def _warm_up(config: HexPlaneConfig) -> None:
+    if config.features % compiled.LANES == 0:
+        compiled.warm_up(config.features)
+
+
+HOST = HostSpec("hexplane", HexPlaneConfig, _reference, _create, _restore, _warm_up)

@@ -111,6 +111,9 @@ class Start:
     """K - 1, how many SH bases beyond the constant one a Gaussian has."""
     generator: torch.Generator
     """Source of every random draw."""
+    time_nodes: Callable[[], int] = lambda: 0
+    """How many nodes a time axis needs for what these Gaussians do; 0: it cannot be told. Renders dozens of frames to
+    find out, so only a host that has such an axis should ask."""
 
 
 @dataclass
@@ -195,6 +198,8 @@ class HostSpec:
     """A new field from its numbers."""
     restore: Callable[[Any, dict[str, Tensor]], Deformation]
     """The field of a checkpoint, from its numbers and the checkpoint's tensors."""
+    warm_up: Callable[[Any], None] = lambda settings: None
+    """Compiles, from the main thread of a run on the CPU, what a field of these numbers will call."""
 
 
 def field_box(means: Tensor) -> Tensor:

@@ -78,6 +78,18 @@ class SupervisionConfig:
         if self.pulls not in ("all", "field"):
             raise ValueError(f"pulls is {self.pulls!r}: it should be all or field")
 
+    def hidden_due(self, iteration: int) -> bool:
+        """Is it marked at this step who could not be seen in the frame?"""
+        return self.preset == "support" and self.anchor == "hidden" and iteration % self.look_every == 0
+
+    def anchors_due(self, iteration: int, progress: float) -> bool:
+        """Does `support` anchor at this step? `progress` is the share of the run that is done."""
+        return self.preset == "support" and progress >= self.start and iteration % self.support_every == 0
+
+    def paper_due(self, iteration: int, progress: float) -> bool:
+        """Does `paper` act at this step?"""
+        return self.preset == "paper" and progress >= self.start and iteration % self.every == 0
+
 
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
 """Weights of the attributes in `support`, so that typical deltas of each count alike; means in scene units."""
