@@ -4,8 +4,8 @@ A launch runs on the calling thread and releases the GIL, so workers are Python 
 block as `P` and hands itself units by `take()`, an atomic counter; what a unit writes belongs to it alone, so results
 do not depend on the number of threads. `PRELUDE` gives 16-lane float vectors.
 
-The environment variable OMP_WAIT_POLICY=passive should be set before torch is imported (`torch_backend/__init__.py`
-does): spinning OpenMP threads would take the cores.
+The environment variable OMP_WAIT_POLICY=passive should be set before torch is imported (`cli.main` does): spinning
+OpenMP threads would take the cores.
 """
 
 import contextlib

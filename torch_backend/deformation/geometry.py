@@ -80,16 +80,13 @@ def _quotients(s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-def farthest_points(features: Tensor, count: int, chosen: Tensor | None = None) -> Tensor:
-    """Indices int64 [<= count] of features [N, D], each the farthest from those before it and from `chosen` [C, D].
+def farthest_points(features: Tensor, count: int) -> Tensor:
+    """Indices int64 [<= count] of features [N, D], each the farthest from those before it.
 
-    Starts at the one farthest from `chosen`, or nearest to the mean. Stops early when only duplicates are left.
+    Starts at the one nearest to the mean. Stops early when only duplicates are left.
     """
-    picked: list[int] = []
-    if chosen is None or not len(chosen):
-        picked.append(int((features - features.mean(0)).square().sum(1).argmin()))
-        chosen = features[picked]
-    distance = torch.cdist(features, chosen, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+    picked = [int((features - features.mean(0)).square().sum(1).argmin())]
+    distance = torch.cdist(features, features[picked], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
     while len(picked) < min(count, len(features)):
         index = int(distance.argmax())
         if not float(distance[index]) > 0.0:
@@ -145,7 +142,7 @@ def rigid_rotations(before: Tensor, after: Tensor, valid: Tensor) -> tuple[Tenso
     """Rotations that turn edges best: (R [M, 3, 3], usable bool [M]), without gradient.
 
     before, after: [M, K, 3] edges of M nodes; valid: bool [M, K]. det R is +1. A node whose edges are collapsed or not
-    finite is not usable and gets the identity (hard cases: "ARAP SVD").
+    finite is not usable and gets the identity: the gradient of the SVD is no number there.
     """
     with torch.no_grad():
         kept = valid[..., None].to(before.dtype)

@@ -57,7 +57,7 @@ MIN_SCALE = 1e-5
 
 
 def add_to_scale(log_scales: Tensor, delta: Tensor) -> Tensor:
-    """log(exp(log_scales) + delta), the published rule of Deformable 3DGS and SC-GS (method-hosts 1.2, 1.3).
+    """log(exp(log_scales) + delta), the published rule of Deformable 3DGS and SC-GS.
 
     The sum can leave the domain; it is held at MIN_SCALE, where it passes no gradient.
     """
@@ -65,7 +65,7 @@ def add_to_scale(log_scales: Tensor, delta: Tensor) -> Tensor:
 
 
 def add_to_unit_quat(quats: Tensor, delta: Tensor) -> Tensor:
-    """normalise(quats) + delta, Deformable 3DGS. Its rasteriser does not normalise the sum; ours does (1.2)."""
+    """normalise(quats) + delta, Deformable 3DGS. Its rasteriser does not normalise the sum; ours does."""
     return F.normalize(quats, dim=1) + delta
 
 
@@ -171,9 +171,6 @@ class Deformation(nn.Module):
     def rehearsal(self) -> float:
         """Share of the run that the pre-stage takes; 0: there is none."""
         return 0.0
-
-    def cover(self, means: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        """Called when more Gaussians have opened; means [N, 3] are those of all open ones."""
 
     def state(self) -> dict[str, Tensor]:
         """Tensors for a checkpoint, names starting with `field.`."""

@@ -46,8 +46,8 @@ class SupervisionConfig:
     grad_signed: by its signed sum over x and y, as the published code does; weight: by what they contribute."""
     pulls: str = "field"
     """`paper`, what its terms pull. field: the field alone. all: the canonical parameters too, as the published code
-    does (method-hosts 2.11): it detaches the reference state and not what both states share, so canonical parameters
-    follow a difference that does not depend on them. Published configurations (`host_config`) set all."""
+    does: it detaches the reference state and not what both states share, so canonical parameters follow a difference
+    that does not depend on them. Published configurations (`host_config`) set all."""
     support_every: int = 4
     """`support` acts every so many iterations."""
     support_weight: float = 0.2
@@ -245,7 +245,7 @@ def well_supervised(
     config: SupervisionConfig, weight: Tensor, norm: Tensor, pull: Tensor, K: Tensor, viewmat: Tensor, means: Tensor,
     size: tuple[int, int],
 ) -> Tensor:  # fmt: skip
-    """bool [M]: on which Gaussians an image acts, by the configured detector (method-hosts 2.2).
+    """bool [M]: on which Gaussians an image acts, by the configured detector.
 
     grad_signed adds the components of the screen gradient in NDC, as the published code does, so that about half of
     the Gaussians that an image does act on fail. The rasteriser tells the gradient's norm; its components are those of
