@@ -118,7 +118,8 @@ class DetailedFrame:
     support: Tensor
     """[H, W] as in `FrozenImage`."""
     motion: Tensor
-    """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell."""
+    """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell. On the clip's own
+    poses 1 also where the frame's own plate shows what moves and is let go of: where it is 0 that plate may stand."""
     leading: int
     """Frame number of the plate that `st` looks into."""
     st: Tensor
@@ -160,6 +161,8 @@ class _Shot:
     """Pixels of decisions per pixel of the picture."""
     doubt: Tensor
     """[h, w] in 0..1: where plates of other times are believed only if they agree with the model."""
+    moved: Tensor
+    """[h, w] in 0..1: what moves in the clip, at t* or in the frame's own plate; else `motion`."""
 
     @property
     def centre(self) -> Tensor:
@@ -292,7 +295,7 @@ class Detailer:
         motion = resized(image.motion, w, h)
         own = self._is_own(output, width, height)
         nothing = torch.zeros_like(motion)
-        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing)
+        return _Shot(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing, motion)
 
     def _is_own(self, output: OutputFrame, width: int, height: int) -> bool:
         """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
@@ -322,8 +325,9 @@ class Detailer:
     ) -> tuple[Tensor, Tensor, bool]:
         """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
 
-        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's; and
-        `shot.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so.
+        Also settles `shot.motion`: by the mattes of plate t* where that sees the point, else by the model's;
+        `shot.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so; and
+        `shot.moved`.
         """
         rows, columns = shot.image.alpha.shape
         lead = self.seen.seen(leading, shot.points)
@@ -334,6 +338,7 @@ class Detailer:
             shot.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
         else:
             shot.motion = torch.maximum(shot.motion, lead.moving) if own else shot.motion
+        shot.moved = shot.motion
         st, within = self._places(shot, leading, own, size)
         if own and leading != output.frame:  # its own plate is withheld
             return torch.zeros(rows, columns, device="cpu"), st, own
@@ -349,8 +354,11 @@ class Detailer:
                 wrong = wrong | self._denied(truth, off)
             wrong = closed(self.seen.whole(wrong, off), round(self.config.gap * self.seen.unit))
         shot.doubt = widened(wrong.float(), round(self.config.margin * self.seen.unit))
-        matte = 1.0 - blurred(shot.doubt, self.config.feather * self.seen.unit)
-        if not own:
+        let_go = blurred(shot.doubt, self.config.feather * self.seen.unit)
+        matte = 1.0 - let_go
+        if own:
+            shot.moved = torch.maximum(shot.motion, let_go)
+        else:
             error = self._parallax(shot, leading, shot.depth)
             matte = matte * lead.visible * torch.exp(-error.square())
         return resized(matte, columns, rows) * within, st, own
@@ -616,7 +624,7 @@ class Detailer:
             image.color if ours else torch.empty(rows, columns, 3, device="cpu"),
             image.alpha if ours else image.alpha.clone(), splat.color, splat.alpha,
             torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
-            image.support, resized(shot.motion, columns, rows), leading, st, matte,
+            image.support, resized(shot.moved, columns, rows), leading, st, matte,
             torch.zeros(rows, columns, 3, device="cpu"),
         )  # fmt: skip
         for band in parts:
