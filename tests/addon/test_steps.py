@@ -94,7 +94,10 @@ def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, sh
     bpy.ops.splannequin.load_camera()
     bpy.ops.splannequin.insert_freeze()
     assert scene.view_settings.view_transform == "Standard" and scene.render.dither_intensity == 0.0
+    notes = addon("supervisor").watch_of(shot).notes
+    assert notes["camera"] and notes["bake"]
     assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
+    assert set(notes) == {"bake"}, "nothing says any more that the shot's camera is the scene's"
     assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == names
     assert settings == (scene.view_settings.view_transform, scene.render.dither_intensity, scene.render.resolution_x)
     assert not any(map(lambda key: key.startswith("splannequin_"), scene.keys()))
