@@ -93,7 +93,7 @@ def view_train(scene: Any, state: shots.ShotState | None) -> View:
         return View(False, True, [], "Learn the scene and what moves in it.")
     psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
     quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
-    size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % move"
+    size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % may move"
     verdict = contract.verdict_lines(run)
     if run.get("quality") == "Poor" and not verdict:  # trained by an older version
         verdict = ["It is poor: take a range in which nobody walks, or solve the camera again."]

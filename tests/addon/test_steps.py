@@ -176,7 +176,7 @@ def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
     shown = {step: view(with_shot, state) for step, view in panel.VIEWS.items()}
     assert shown["footage"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
     assert shown["camera"].state == ["A good solve."] and "load it" in shown["camera"].advice
-    assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % move"]
+    assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % may move"]
     assert shown["freeze"].state == ["Take freeze: 3 frames, 16 x 12", "Time stands still at frame 6"]
     assert not shown["bake"].done and shown["bake"].ready
 
