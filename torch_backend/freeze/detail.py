@@ -66,7 +66,8 @@ class DetailedFrame:
     support: Tensor
     """[H, W] as in `FrozenImage`."""
     motion: Tensor
-    """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell."""
+    """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell. On the clip's own
+    poses 1 also where the frame's own plate shows what moves and is let go of: where it is 0 that plate may stand."""
     leading: int
     """Frame number of the plate that `st` looks into."""
     st: Tensor
@@ -192,7 +193,7 @@ class Detailer:
             image.color if ours else torch.empty(rows, columns, 3, device="cpu"),
             image.alpha if ours else image.alpha.clone(), splat.color, splat.alpha,
             torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
-            image.support, resized(posed.motion, columns, rows), leading, st, matte,
+            image.support, resized(posed.moved, columns, rows), leading, st, matte,
             torch.zeros(rows, columns, 3, device="cpu"),
         )  # fmt: skip
         for band in parts:

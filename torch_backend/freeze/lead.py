@@ -38,8 +38,9 @@ def leading_matte(
 ) -> tuple[Tensor, Tensor, bool]:
     """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
 
-    Also settles `posed.motion`: by the mattes of plate t* where that sees the point, else by the model's; and
-    `posed.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so.
+    Also settles `posed.motion`: by the mattes of plate t* where that sees the point, else by the model's;
+    `posed.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so; and
+    `posed.moved`.
     """
     rows, columns = posed.image.alpha.shape
     lead = sightings.seen(leading, posed.points)
@@ -50,6 +51,7 @@ def leading_matte(
         posed.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
     else:
         posed.motion = torch.maximum(posed.motion, lead.moving) if own else posed.motion
+    posed.moved = posed.motion
     st, within = _places(sightings, posed, leading, own, size)
     if own and leading != output.frame:  # its own plate is withheld
         return torch.zeros(rows, columns, device="cpu"), st, own
@@ -69,8 +71,11 @@ def leading_matte(
             wrong = wrong | _denied(sightings, config, truth, off)
         wrong = closed(sightings.whole(wrong, off), round(config.gap * sightings.unit))
     posed.doubt = widened(wrong.float(), round(config.margin * sightings.unit))
-    matte = 1.0 - blurred(posed.doubt, config.feather * sightings.unit)
-    if not own:
+    let_go = blurred(posed.doubt, config.feather * sightings.unit)
+    matte = 1.0 - let_go
+    if own:
+        posed.moved = torch.maximum(posed.motion, let_go)
+    else:
         error = parallax(sightings, config, posed, leading, posed.depth)
         matte = matte * lead.visible * torch.exp(-error.square())
     return resized(matte, columns, rows) * within, st, own

@@ -41,6 +41,8 @@ class PosedFrame:
     """Pixels of decisions per pixel of the picture."""
     doubt: Tensor
     """[h, w] in 0..1: where plates of other times are believed only if they agree with the model."""
+    moved: Tensor
+    """[h, w] in 0..1: what moves in the clip, at t* or in the frame's own plate; else `motion`."""
 
     @property
     def centre(self) -> Tensor:
@@ -75,7 +77,7 @@ def posed_frame(
     motion = resized(image.motion, w, h)
     own = _is_own(sightings, output, width, height)
     nothing = torch.zeros_like(motion)
-    return PosedFrame(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing)
+    return PosedFrame(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing, motion)
 
 
 def _is_own(sightings: Sightings, output: OutputFrame, width: int, height: int) -> bool:
