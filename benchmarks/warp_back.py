@@ -94,6 +94,8 @@ def _write(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width, _ = pixels.shape
     out = oiio.ImageOutput.create(str(path))
+    if out is None:
+        raise OSError(f"{path}: {oiio.geterror()}")
     if not (out.open(str(path), oiio.ImageSpec(width, height, 3, oiio.FLOAT)) and out.write_image(pixels)):
         raise OSError(f"{path}: {out.geterror()}")
     out.close()
@@ -125,7 +127,7 @@ def inside(ask: dict[str, Any]) -> None:
     spec.loader.exec_module(module)
     package = module.load_package()
     package.register()
-    import bpy
+    import bpy  # pyright: ignore[reportMissingImports]
 
     work = Path(ask["work"])
     for name in ("delivered", "graded"):
@@ -138,7 +140,7 @@ def inside(ask: dict[str, Any]) -> None:
 
 def _through_the_group(package: str, ask: dict[str, Any], folder: Path, frame: int) -> np.ndarray:
     """[H, W, 3] float32: a plate of `folder`, warped by the take, as it leaves the compositor."""
-    import bpy
+    import bpy  # pyright: ignore[reportMissingImports]
 
     compat, compositor, steps = (
         importlib.import_module(f"{package}.splannequin_addon.{name}") for name in ("compat", "compositor", "steps")
