@@ -89,8 +89,7 @@ for (int i = 0; i < 16; i++) {
 for (long long turn = 0; turn < P.n; turn++) {
 """ + _RESET + r"""
     for (int l = 0; l < 16; l++) {
-""" + source.HIT + source.BACKWARD_SUMS + r"""
-""" + source.ROWS + source.BACKWARD_ROW + r"""
+""" + source.HIT + source.BACKWARD_SUMS + source.ROWS + source.BACKWARD_ROW + r"""
         }
         all += s0 + s1 + s2 + s3 + s4 + s5 + ax + ay;
         for (int c = 0; c < NCH; c++) all += gc[c];

@@ -290,7 +290,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "figures": figures, "cpu_seconds": seconds, "develop_cpu_seconds": freezer.seconds,
         "gaussians": len(model.gaussians), "open": len(model.open_rows()),
         "iterations": trainer.iteration, "sh_degree": model.sh_degree, "t_stars": t_stars, "own": own,
-        "frozen": frozen, "held": instants, "needs": trainer.needs.state(), "config": config_to_json(config),
+        "frozen": frozen, "held": instants, "needs": trainer.policy.state(), "config": config_to_json(config),
         "develop_config": dataclasses.asdict(freezer.config),
     }  # fmt: skip
 

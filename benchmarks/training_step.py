@@ -108,8 +108,8 @@ def watch(trainer: Trainer, parts: Parts) -> None:
             patch(owner, name, label)
     if model.field is not None:
         patch(model.field, "regularisation", "field's penalties, forward")
-    if (id(trainer), "_render") not in patched:
-        render = parts.timed("rasterise, forward", trainer._render)
+    if (id(trainer), "render_trained") not in patched:
+        render = parts.timed("rasterise, forward", trainer.render_trained)
 
         def watched(state: dict[str, torch.Tensor], *args: Any, **options: Any) -> Any:
             out = render(state, *args, **options)
@@ -119,7 +119,7 @@ def watch(trainer: Trainer, parts: Parts) -> None:
                 leaf.register_hook(lambda _: parts.lap("rasterise, backward"))
             return out
 
-        trainer._render = watched  # type: ignore[method-assign]
+        trainer.render_trained = watched  # type: ignore[method-assign]
         backward = torch.Tensor.backward
 
         def whole(self: torch.Tensor, *args: Any, **kwargs: Any) -> None:
@@ -129,7 +129,7 @@ def watch(trainer: Trainer, parts: Parts) -> None:
             parts._inner[-1] += time.perf_counter() - since
 
         torch.Tensor.backward = whole  # type: ignore[method-assign]
-        patched.add((id(trainer), "_render"))
+        patched.add((id(trainer), "render_trained"))
     vars(trainer)["_timed"] = patched
 
 

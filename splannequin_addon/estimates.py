@@ -28,6 +28,8 @@ class Cost:
 def costs(state: shots.ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
     """The cost of every preset, and the run that it was told from, None if the shot has none that was timed."""
     timed = sorted((r for r in state.runs.values() if _per_step(r)), key=_size) if state is not None else []
+    # Where nothing may move a step is several times as fast.
+    timed = [run for run in timed if run.get("method") != "static"] or timed
     across = state.size[0] if state is not None else 0
     rows = []
     for preset, steps in contract.PRESET_STEPS.items():

@@ -15,7 +15,7 @@ from . import shots
 from .sentences import cells as _cells
 
 _RUN_HEAD = ("Run", "dB", "Size", "Move", "Time")
-_RUN_WIDTHS = (0.24, 0.19, 0.18, 0.23, 0.16)  # a sidebar of Blender's own width shows all of it
+_RUN_WIDTHS = (0.23, 0.19, 0.18, 0.2, 0.2)  # a sidebar of Blender's own width shows all of it
 _TAKE_HEAD = ("Take", "t*", "Frames", "Run")
 _TAKE_WIDTHS = (0.3, 0.18, 0.24, 0.28)
 

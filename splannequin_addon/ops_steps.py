@@ -277,7 +277,13 @@ class SPLANNEQUIN_OT_remove_shot(bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Removes what Splannequin put into the file."""
-        return _edit(self, context, "bake", steps.remove_all)
+
+        def remove(scene: Any, shot: Any) -> list[str]:
+            notes = steps.remove_all(scene, shot)
+            supervisor.watch_of(shot).notes.clear()  # they tell of what is no longer there
+            return notes
+
+        return _edit(self, context, "bake", remove)
 
 
 class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):

@@ -42,7 +42,7 @@ from .sentences import cells, wrap
 from .translations import tr
 
 CATEGORY = "Splannequin"
-_PRESET_WIDTHS = (0.34, 0.2, 0.2, 0.26)
+_PRESET_WIDTHS = (0.32, 0.17, 0.25, 0.26)
 
 
 @dataclass
@@ -93,7 +93,7 @@ def view_train(scene: Any, state: shots.ShotState | None) -> View:
         return View(False, True, [], "Learn the scene and what moves in it.")
     psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
     quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
-    size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % move"
+    size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % may move"
     verdict = contract.verdict_lines(run)
     if run.get("quality") == "Poor" and not verdict:  # trained by an older version
         verdict = ["It is poor: take a range in which nobody walks, or solve the camera again."]
@@ -446,7 +446,7 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
         props, (rows, told) = context.scene.splannequin, estimates.costs(state)
         column = layout.column(align=True)
         head = cells(column.row(align=True), _PRESET_WIDTHS)
-        for place, text in zip(head, ("Preset", "Pixels", "Steps", "About" if told else "Time"), strict=True):
+        for place, text in zip(head, ("Preset", "Pixels", "Steps", "Time"), strict=True):
             place.label(text=text)
         names = {name: label for name, label, _ in PRESETS}
         for row in rows:
@@ -459,7 +459,7 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
             words = "Preview took 150 s on two cores without a graphics card. Times here come with the first run."
         else:
             where = "graphics card" if told.get("device") == "cuda" else "processor"
-            words = f"As run {told.get('run', '')} took on the {where}; with a ? by pixels and steps."
+            words = f"By what run {told.get('run', '')} took on the {where}. With a ?: an estimate by pixels and steps."
         wrap(layout, context, words)
 
     def _plan(self, context: Any) -> training.Plan:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from typing import Any
 
@@ -9,6 +10,8 @@ from .translations import tr
 
 _LETTER = 6.2
 """Pixels of a letter on average, at a user interface scale of 1."""
+_UNIT = re.compile(r"(?<=\d) (?=(%|px|dB|fps|s|min|h|[KMG]B)(?!\w))")
+_BOUND = "\N{NO-BREAK SPACE}"
 
 
 def wrap(layout: Any, context: Any, text: str, icon: str = "NONE", margin: int = 50, width: int = 0) -> None:
@@ -26,8 +29,14 @@ def wrap(layout: Any, context: Any, text: str, icon: str = "NONE", margin: int =
     room -= 25 if icon != "NONE" else 0
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for number, line in enumerate(textwrap.wrap(tr(text), max(int(room / _LETTER), 16)) or [""]):
+    for number, line in enumerate(lines(tr(text), max(int(room / _LETTER), 16))):
         column.label(text=line, translate=False, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+def lines(text: str, letters: int) -> list[str]:
+    """A text in lines of at most so many letters, one at least; a figure stays with its unit."""
+    found = textwrap.wrap(_UNIT.sub(_BOUND, text), letters) or [""]
+    return [line.replace(_BOUND, " ") for line in found]
 
 
 def cells(line: Any, widths: tuple[float, ...]) -> list[Any]:

@@ -123,7 +123,10 @@ def reason(scene: Any) -> str:
     for rank, one in enumerate(suggestions()):
         if one["frame"] == at:
             share, sharp = round(100 * one["seen"]), round(100 * one["sharpness"])
-            return f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, as sharp as {sharp} %."
+            return (
+                f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, "
+                f"and is sharper than {sharp} % of the frames."
+            )
     suggested = f"Suggested: {', '.join(str(one['frame']) for one in suggestions())}."
     return f"Shown: frame {shown.pop()}. " + suggested if len(shown) == 1 and at not in shown else suggested
 

@@ -228,7 +228,7 @@ def test_a_station_imports_only_stations_before_it(path: Path):
     station = station_of(path.relative_to(ROOT / "torch_backend").with_suffix("").parts)
     if station not in STATIONS:
         return
-    allowed = {*STATIONS[: STATIONS.index(station) + 1], "contract", "shot", "replacing", "cards"}
+    allowed = {*STATIONS[: STATIONS.index(station) + 1], "contract", "shot", "replacing", "cards", "kernel_text"}
     wrong = []
     for line, name in imports(read(path), package_of(path)):
         parts = name.split(".")
@@ -260,6 +260,38 @@ def test_only_the_contract_spells_the_layout_of_a_shot():
 )
 def test_the_scan_sees_a_name_of_the_layout(source: str, spelled: int):
     assert len(list(layout_names(ast.parse(source)))) == spelled
+
+
+def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that import each other, however indirectly; `arrows`: module -> those it imports."""
+
+    def reached(start: str) -> set[str]:
+        found, waiting = set(), [start]
+        while waiting:
+            new = arrows[waiting.pop()] - found
+            found |= new
+            waiting += new
+        return found
+
+    beyond = {name: reached(name) for name in arrows}
+    groups = {frozenset(other for other in beyond[name] if name in beyond[other]) for name in arrows}
+    return sorted(sorted(group) for group in groups if group)
+
+
+@pytest.mark.parametrize("folder", ["deformation", "gaussians", "raster", "solve", "supervision", "train"])
+def test_no_modules_of_a_folder_import_each_other(folder: str):
+    """Not even for the names of types: who can name a class of the other knows it."""
+    paths = {path.stem: path for path in sources(f"torch_backend/{folder}") if path.stem != "__init__"}
+    arrows = {}
+    for stem, path in paths.items():
+        names = [name.split(".") for _, name in imports(read(path), package_of(path))]
+        arrows[stem] = {n[2] for n in names if n[:2] == ["torch_backend", folder] and n[2:] and n[2] in paths} - {stem}
+    assert circles(arrows) == []
+
+
+def test_the_scan_sees_a_circle():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+    assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
 
 
 def test_nothing_runs_what_a_file_says():

@@ -4,8 +4,8 @@ A launch runs on the calling thread and releases the GIL, so workers are Python 
 block as `P` and hands itself units by `take()`, an atomic counter; what a unit writes belongs to it alone, so results
 do not depend on the number of threads. `PRELUDE` gives 16-lane float vectors.
 
-The environment variable OMP_WAIT_POLICY=passive should be set before torch is imported (`torch_backend/__init__.py`
-does): spinning OpenMP threads would take the cores.
+The environment variable OMP_WAIT_POLICY=passive should be set before torch is imported (`cli.main` does): spinning
+OpenMP threads would take the cores.
 """
 
 import contextlib
@@ -17,23 +17,20 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
+
+from .kernel_text import kernel_text
 
 Launch = Callable[[int, int, int], None]
 """A compiled snippet, called as f(address of the block, stage, worker)."""
 _lock = threading.RLock()
 _pools: dict[int, ThreadPoolExecutor] = {}
 
-PRELUDE = r"""
-typedef float F __attribute__((ext_vector_type(16)));
-#define FN(...) [&](__VA_ARGS__) __attribute__((always_inline))
-auto load = FN(const float* p) -> F { F v; __builtin_memcpy(&v, p, 64); return v; };
-auto store = FN(float* p, F v) -> void { __builtin_memcpy(p, &v, 64); };
-auto take = FN() -> long long { return __atomic_fetch_add(&P.counter, 1, __ATOMIC_RELAXED); };
-"""
+PRELUDE = kernel_text(Path(__file__).with_name("kernels") / "prelude.cpp")
 POINTER, INTEGER = (ctypes.c_uint64, "float*"), (ctypes.c_int64, "long long")
 """Kinds of a block's fields: (ctypes, C)."""
 

@@ -39,6 +39,15 @@ def test_a_preset_that_was_run_takes_as_long_again_and_others_by_pixels_and_step
     assert rows["final"].seconds == 200.0 * 15 * 16
 
 
+def test_a_static_run_does_not_tell_how_long_one_with_motion_takes(costs):
+    runs = {"main": run(iterations=1000, train_seconds=100.0, method="auto")}
+    runs["still"] = run(run="still", iterations=2000, train_seconds=40.0, method="static")
+    rows, told = costs(runs)
+    assert told["run"] == "main" and rows["preview"].seconds == 200.0
+    rows, told = costs({"still": runs["still"]})
+    assert told["run"] == "still" and rows["preview"].seconds == 40.0, "better than nothing"
+
+
 def test_a_small_clip_is_not_enlarged(costs):
     rows, _ = costs({"main": run(width_px=320)}, width=640)
     assert (rows["standard"].width, rows["final"].width) == (640, 640)

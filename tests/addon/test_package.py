@@ -40,6 +40,9 @@ def test_source_and_zip_are_valid_and_hold_what_is_needed(packager, root, tmp_pa
     assert {"splannequin_addon/registration.py", "requirements/backend.txt"} <= set(names)
     assert {"torch_backend/contract/__init__.py", "torch_backend/contract/options.py"} <= set(names)
     assert {"splannequin_addon/translations/__init__.py", "splannequin_addon/translations/de_DE.py"} <= set(names)
+    # Kernels are no Python, and the rasteriser reads them at its first picture.
+    kernels = [p for p in (root / "torch_backend").rglob("kernels/**/*") if p.is_file()]
+    assert kernels and {p.relative_to(root).as_posix() for p in kernels} <= set(names)
     assert not [n for n in names if "__pycache__" in n or n.endswith((".pyc", ".whl", ".so", ".pyd"))]
 
 

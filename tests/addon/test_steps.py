@@ -94,7 +94,10 @@ def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, sh
     bpy.ops.splannequin.load_camera()
     bpy.ops.splannequin.insert_freeze()
     assert scene.view_settings.view_transform == "Standard" and scene.render.dither_intensity == 0.0
+    notes = addon("supervisor").watch_of(shot).notes
+    assert notes["camera"] and notes["bake"]
     assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
+    assert set(notes) == {"bake"}, "nothing says any more that the shot's camera is the scene's"
     assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == names
     assert settings == (scene.view_settings.view_transform, scene.render.dither_intensity, scene.render.resolution_x)
     assert not any(map(lambda key: key.startswith("splannequin_"), scene.keys()))
@@ -173,7 +176,7 @@ def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
     shown = {step: view(with_shot, state) for step, view in panel.VIEWS.items()}
     assert shown["footage"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
     assert shown["camera"].state == ["A good solve."] and "load it" in shown["camera"].advice
-    assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % move"]
+    assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % may move"]
     assert shown["freeze"].state == ["Take freeze: 3 frames, 16 x 12", "Time stands still at frame 6"]
     assert not shown["bake"].done and shown["bake"].ready
 

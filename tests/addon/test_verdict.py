@@ -112,3 +112,13 @@ def test_the_command_line_takes_develop(addon, tmp_path):
     for words, expected in (([], "on"), (["--develop", "off"], "off")):
         args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
         assert headless.asked(args)["freeze"].develop == expected
+
+
+def test_a_figure_stays_with_its_unit(addon):
+    lines = addon("sentences").lines
+    assert lines("Good. 97 % of the picture is plate, 3 % is a guess.", 37) == [
+        "Good. 97 % of the picture is plate,", "3 % is a guess.",
+    ]  # fmt: skip
+    assert lines("Good: 74 of 74 frames registered, 0.80 px.", 39)[-1] == "0.80 px."
+    assert lines("frames 7 to 9, 3 seconds", 13) == ["frames 7 to", "9, 3 seconds"], "no unit, no bond"
+    assert lines("", 16) == [""]

@@ -1,10 +1,10 @@
-"""Host C: sparse control points that carry the Gaussians round them (SC-GS; design: method-hosts 1.3).
+"""Host C: sparse control points that carry the Gaussians round them (SC-GS).
 
 Nodes move by a small network of place and time; a Gaussian follows its 3 nearest nodes in a space of place and learnt
 hyper-coordinates, each turning it about itself. Corrected against the published code: nodes are drawn from the
 Gaussians that move, so that no separate stage has to find them and the host works behind the gate; scales change in
-the log and one rotation serves both the frame of a node and the Gaussians in it; nodes are added where more Gaussians
-open. Positions of nodes and of Gaussians are detached throughout, as published.
+the log and one rotation serves both the frame of a node and the Gaussians in it. Positions of nodes and of Gaussians
+are detached throughout, as published.
 
 `reference` is the published host but for this: nodes are not densified and pruned once more at 10,000 steps of stage
 two (the screen gradients that decide it stay with the trainer, and its threshold is for the Gaussians' published
@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 from ..gaussians.model import SH_C0
 from .geometry import farthest_points, near_identity, nearest, rigid_rotations, rotation_matrices
+from .geometry import warm_up as warm_up_nearest
 from .mlp import Trunk, blurred, linear
 from .protocol import (
     Deformation,
@@ -274,27 +275,6 @@ class ControlPoints(Deformation):
         share = min(max((progress - first) / max(last - first, 1e-9), 0.0), 1.0)
         return c.arap * (c.arap_end / c.arap) ** share if c.arap > 0 else 0.0
 
-    @torch.no_grad()
-    def cover(self, means: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        """Adds nodes where open Gaussians [N, 3] stand farther from every node than two radii.
-
-        Farthest points of trajectories, up to the configured number of nodes again for each call.
-        """
-        distance = torch.cdist(means, self.places).amin(1)
-        lost = means[distance > 2.0 * self.log_radii.exp().median()]
-        if not len(lost) or self.config.published:
-            return
-        fresh = lost[farthest_points(self._paths(lost), self.config.nodes, self._paths(self.places))]
-        places = torch.cat([self.places, fresh])
-        radii = _radii(places, published=False)[len(self.places) :].log()
-        self.places = places
-        for name, rows in (
-            ("hyper", self.hyper.new_full((len(fresh), self.config.hyper), 1e-2)),
-            ("log_radii", radii),
-            ("weights", self.weights.new_zeros(len(fresh))),
-        ):
-            setattr(self, name, _with_rows(getattr(self, name), None, rows, optimizer))
-
     def _paths(self, places: Tensor) -> Tensor:
         """[R, 3 * 16]: trajectories of places [R, 3] as features, in which distance is root mean square distance."""
         times = torch.linspace(0.0, 1.0, _INSTANTS, device=places.device)
@@ -523,4 +503,8 @@ def _restore(config: ControlPointsConfig, tensors: dict[str, Tensor]) -> Control
     return field
 
 
-HOST = HostSpec("control_points", ControlPointsConfig, _reference, _create, _restore)
+def _warm_up(config: ControlPointsConfig) -> None:
+    warm_up_nearest()
+
+
+HOST = HostSpec("control_points", ControlPointsConfig, _reference, _create, _restore, _warm_up)

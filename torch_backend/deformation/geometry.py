@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet
 
 _SERIES = 0.25
@@ -78,16 +80,13 @@ def _quotients(s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-def farthest_points(features: Tensor, count: int, chosen: Tensor | None = None) -> Tensor:
-    """Indices int64 [<= count] of features [N, D], each the farthest from those before it and from `chosen` [C, D].
+def farthest_points(features: Tensor, count: int) -> Tensor:
+    """Indices int64 [<= count] of features [N, D], each the farthest from those before it.
 
-    Starts at the one farthest from `chosen`, or nearest to the mean. Stops early when only duplicates are left.
+    Starts at the one nearest to the mean. Stops early when only duplicates are left.
     """
-    picked: list[int] = []
-    if chosen is None or not len(chosen):
-        picked.append(int((features - features.mean(0)).square().sum(1).argmin()))
-        chosen = features[picked]
-    distance = torch.cdist(features, chosen, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+    picked = [int((features - features.mean(0)).square().sum(1).argmin())]
+    distance = torch.cdist(features, features[picked], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
     while len(picked) < min(count, len(features)):
         index = int(distance.argmax())
         if not float(distance[index]) > 0.0:
@@ -100,30 +99,7 @@ def farthest_points(features: Tensor, count: int, chosen: Tensor | None = None) 
 _MOST = 16
 """Most neighbours that the compiled search keeps."""
 
-_NEAREST = r"""
-// queries: [count][D]; points: [D][padded], the padding far away; index: [count][K].
-const long long D = P.dims, K = P.neighbours, Q = P.count, N = P.padded;
-for (long long first; (first = take() * 256) < Q;) {
-    long long last = first + 256 < Q ? first + 256 : Q;
-    for (long long m = first; m < last; m++) {
-        const float* query = P.queries + m * D;
-        long long* index = (long long*)P.index + m * K;
-        float best[@MOST@];
-        for (long long k = 0; k < K; k++) { best[k] = __builtin_inff(); index[k] = k; }
-        for (long long n = 0; n < N; n += 16) {
-            F squared = (F)0.f;
-            for (long long d = 0; d < D; d++) { F gap = load(P.points + d * N + n) - query[d]; squared += gap * gap; }
-            if (!(__builtin_reduce_min(squared) < best[K - 1])) continue;
-            float lanes[16]; store(lanes, squared);
-            for (int l = 0; l < 16; l++) if (lanes[l] < best[K - 1]) {
-                long long k = K - 1;
-                for (; k > 0 && best[k - 1] > lanes[l]; k--) { best[k] = best[k - 1]; index[k] = index[k - 1]; }
-                best[k] = lanes[l]; index[k] = n + l;
-            }
-        }
-    }
-}
-"""
+_NEAREST = Path(__file__).with_name("kernels") / "nearest.cpp"
 
 
 @functools.cache
@@ -132,7 +108,7 @@ def _search() -> Snippet:
         **dict.fromkeys(("queries", "points", "index"), POINTER),
         **dict.fromkeys(("count", "padded", "dims", "neighbours"), INTEGER),
     }
-    return Snippet("nearest", fields, _NEAREST.replace("@MOST@", str(_MOST)))
+    return Snippet("nearest", fields, kernel_text(_NEAREST).replace("@MOST@", str(_MOST)))
 
 
 def warm_up() -> None:
@@ -166,7 +142,7 @@ def rigid_rotations(before: Tensor, after: Tensor, valid: Tensor) -> tuple[Tenso
     """Rotations that turn edges best: (R [M, 3, 3], usable bool [M]), without gradient.
 
     before, after: [M, K, 3] edges of M nodes; valid: bool [M, K]. det R is +1. A node whose edges are collapsed or not
-    finite is not usable and gets the identity (hard cases: "ARAP SVD").
+    finite is not usable and gets the identity: the gradient of the SVD is no number there.
     """
     with torch.no_grad():
         kept = valid[..., None].to(before.dtype)

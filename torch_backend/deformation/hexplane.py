@@ -1,6 +1,6 @@
 """Host A: a HexPlane field and five heads (4DGaussians; numbers and departures in docs/architecture.md).
 
-Corrected against the published code (design: method-hosts 1.1): time is mapped to the whole plane, the heads' last
+Corrected against the published code: time is mapped to the whole plane, the heads' last
 layers start at zero so that the field starts as the identity, learning rates do not follow the scene's extent
 (the scene is normalised), smoothness acts along both axes of a spatial plane, the network bends by SiLU (with ReLU the
 whole trunk often dies in the first steps, and the field stands still for good), and sampling coordinates are detached:
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from . import planes as compiled
-from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, field_box, rate_scale
+from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_scale
 
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
 PUBLISHED_ITERATIONS = 33_000
@@ -166,35 +166,6 @@ class HexPlane(Deformation):
         levels = range(0, len(self.spatial), 3)
         return [plane for n in levels for plane in (*self.spatial[n : n + 3], *self.temporal[n : n + 3])]
 
-    def outside(self, means: Tensor) -> int:
-        """How many of means [M, 3] lie outside the box, where the field cannot tell them apart."""
-        return int(((means < self.box[0]) | (means > self.box[1])).any(1).sum())
-
-    @torch.no_grad()
-    def refit(self, box: Tensor) -> None:
-        """Resamples the planes for another box [2, 3]; inside the old one the field stays what it was."""
-        nodes = [self.config.resolution * level for level in self.config.levels]
-        box = box.to(self.box)
-        when = torch.linspace(-1.0, 1.0, self.config.time_nodes, device=box.device)
-        for level, count in enumerate(nodes):
-            at = box[0] + torch.linspace(0.0, 1.0, count, device=box.device)[:, None] * (box[1] - box[0])
-            old = 2.0 * (at - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
-            for k, (a, b) in enumerate(_SPATIAL):
-                _resample(self.spatial[3 * level + k], old[:, a], old[:, b])
-            for axis in range(3):
-                _resample(self.temporal[3 * level + axis], old[:, axis], when)
-        self.box.copy_(box)
-
-    @torch.no_grad()
-    def cover(self, means: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        """Refits the planes if more than 1 % of the means lie outside the box; the published field keeps its box."""
-        if self.config.published or self.outside(means) <= 0.01 * len(means):
-            return
-        wanted = field_box(means)
-        self.refit(torch.stack([torch.minimum(self.box[0], wanted[0]), torch.maximum(self.box[1], wanted[1])]))
-        for plane in [*self.spatial, *self.temporal]:
-            optimizer.state.pop(plane, None)
-
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Two groups: the planes and the network. Published: their schedule begins when the field does."""
         c = self.config
@@ -238,13 +209,6 @@ def _sample(plane: Tensor, first: Tensor, second: Tensor) -> Tensor:
     return F.grid_sample(plane, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
 
 
-def _resample(plane: Tensor, first: Tensor, second: Tensor) -> None:
-    """Replaces a plane [1, C, R_second, R_first] by its own samples at node coordinates in [-1, 1] (rim held)."""
-    y, x = torch.meshgrid(second, first, indexing="ij")
-    grid = torch.stack([x, y], dim=-1)[None]
-    plane.copy_(F.grid_sample(plane, grid, mode="bilinear", padding_mode="border", align_corners=True))
-
-
 def _bend(plane: Tensor, axis: int) -> Tensor:
     """Mean squared second difference along an axis."""
     count = plane.shape[axis]
@@ -255,7 +219,8 @@ def _bend(plane: Tensor, axis: int) -> Tensor:
 
 
 def _create(config: HexPlaneConfig, start: Start) -> HexPlane:
-    config = replace(config, time_nodes=config.time_nodes or max(4, round(start.frames / 2)))
+    nodes = config.time_nodes or start.time_nodes() or max(4, round(start.frames / 2))
+    config = replace(config, time_nodes=nodes)
     box = start.box
     if config.published:
         box = torch.stack([start.points.amin(0), start.points.amax(0)])
@@ -271,4 +236,9 @@ def _restore(config: HexPlaneConfig, tensors: dict[str, Tensor]) -> HexPlane:
     return field
 
 
-HOST = HostSpec("hexplane", HexPlaneConfig, _reference, _create, _restore)
+def _warm_up(config: HexPlaneConfig) -> None:
+    if config.features % compiled.LANES == 0:
+        compiled.warm_up(config.features)
+
+
+HOST = HostSpec("hexplane", HexPlaneConfig, _reference, _create, _restore, _warm_up)

@@ -1,4 +1,4 @@
-"""Host B: one network of encoded position and time (Deformable 3DGS; design: method-hosts 1.2).
+"""Host B: one network of encoded position and time (Deformable 3DGS).
 
 It moves means, rotations and scales; opacity and colour stay. Corrected against the published code: positions and
 times are scaled to [-1, 1] before they are encoded, scales change in the log and rotations by a quaternion product, so

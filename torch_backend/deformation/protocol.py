@@ -57,7 +57,7 @@ MIN_SCALE = 1e-5
 
 
 def add_to_scale(log_scales: Tensor, delta: Tensor) -> Tensor:
-    """log(exp(log_scales) + delta), the published rule of Deformable 3DGS and SC-GS (method-hosts 1.2, 1.3).
+    """log(exp(log_scales) + delta), the published rule of Deformable 3DGS and SC-GS.
 
     The sum can leave the domain; it is held at MIN_SCALE, where it passes no gradient.
     """
@@ -65,7 +65,7 @@ def add_to_scale(log_scales: Tensor, delta: Tensor) -> Tensor:
 
 
 def add_to_unit_quat(quats: Tensor, delta: Tensor) -> Tensor:
-    """normalise(quats) + delta, Deformable 3DGS. Its rasteriser does not normalise the sum; ours does (1.2)."""
+    """normalise(quats) + delta, Deformable 3DGS. Its rasteriser does not normalise the sum; ours does."""
     return F.normalize(quats, dim=1) + delta
 
 
@@ -111,6 +111,9 @@ class Start:
     """K - 1, how many SH bases beyond the constant one a Gaussian has."""
     generator: torch.Generator
     """Source of every random draw."""
+    time_nodes: Callable[[], int] = lambda: 0
+    """How many nodes a time axis needs for what these Gaussians do; 0: it cannot be told. Renders dozens of frames to
+    find out, so only a host that has such an axis should ask."""
 
 
 @dataclass
@@ -169,9 +172,6 @@ class Deformation(nn.Module):
         """Share of the run that the pre-stage takes; 0: there is none."""
         return 0.0
 
-    def cover(self, means: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        """Called when more Gaussians have opened; means [N, 3] are those of all open ones."""
-
     def state(self) -> dict[str, Tensor]:
         """Tensors for a checkpoint, names starting with `field.`."""
         return {f"field.{name}": value.detach() for name, value in self.state_dict().items()}
@@ -195,6 +195,8 @@ class HostSpec:
     """A new field from its numbers."""
     restore: Callable[[Any, dict[str, Tensor]], Deformation]
     """The field of a checkpoint, from its numbers and the checkpoint's tensors."""
+    warm_up: Callable[[Any], None] = lambda settings: None
+    """Compiles, from the main thread of a run on the CPU, what a field of these numbers will call."""
 
 
 def field_box(means: Tensor) -> Tensor:

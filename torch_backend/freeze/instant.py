@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians.model import SH_C0
-from ..raster import rasterize
 from ..scene import Scene, read_image, resize_intrinsics
 from ..train import LoadedRun
 from ..train.exposure import Exposure
+from ..train.model import gathered
 from .instant_depth import DepthConfig, Region, View, inverse_depth, own_motion
 from .instant_track import Track, TrackConfig, swing, tracks
 from .query import FrozenGaussians, FrozenImage, render_frozen
@@ -435,20 +435,11 @@ def _ghosts(bench: _Bench, frozen: FrozenGaussians, image: FrozenImage) -> tuple
 
 def _shares(bench: _Bench, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
     """What camera t* sees of each Gaussian, [N] each: inside a mask [h, w], and at all. Sums of alpha T over pixels."""
-    s, device = frozen.state, frozen.support.device
-    with torch.enable_grad():
-        # The weight of a Gaussian at a pixel is what the pixel gains by the Gaussian's colour: a gradient gathers it.
-        probe = torch.zeros(len(frozen.support), 2, device=device, requires_grad=True)
-        scene, i = bench._scene, bench.index
-        out = rasterize(
-            s["means"], s["quats"], s["log_scales"], s["opacity_logits"], probe,
-            viewmats=scene.viewmats[i : i + 1].to(device), Ks=bench._Ks[i : i + 1].to(device),
-            width=bench.width, height=bench.height,
-        )  # fmt: skip
-        where = torch.from_numpy(mask).to(device)
-        (out.colors[0, ..., 0][where].sum() + out.colors[0, ..., 1].sum()).backward()
-    assert probe.grad is not None
-    inside, whole = probe.grad.cpu().unbind(1)
+    device, scene, i = frozen.support.device, bench._scene, bench.index
+    where = torch.from_numpy(mask).to(device, torch.float32)
+    weights = torch.stack([where, torch.ones_like(where)], dim=-1)
+    camera = scene.viewmats[i].to(device), bench._Ks[i].to(device)
+    inside, whole = gathered(frozen.state, *camera, bench.width, bench.height, weights).cpu().unbind(1)
     return inside, whole
 
 

@@ -1,6 +1,6 @@
 """Growth within a budget: split what the image pulls hardest, drop what nobody sees.
 
-Departures from 3DGS (design: method-hosts 1.0): the signal is the sum of absolute screen gradients (clashing pulls
+Departures from 3DGS: the signal is the sum of absolute screen gradients (clashing pulls
 do not cancel); growth is a schedule towards a budget rather than a threshold, so a run's cost is known before it
 starts; a Gaussian is split along its longest axis into two that keep its second moment, never cloned in place,
 because twins at one place get the same gradient; opacities are not reset.

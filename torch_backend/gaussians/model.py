@@ -51,12 +51,6 @@ class Gaussians:
         """Highest degree that shN can hold."""
         return math.isqrt(1 + self.params["shN"].shape[1]) - 1
 
-    def sh(self, degree: int) -> Tensor:
-        """sh0 and shN up to `degree`, [N, (degree + 1)^2, 3]."""
-        if degree == 0:
-            return self.params["sh0"]
-        return torch.cat([self.params["sh0"], self.params["shN"][:, : sh_bases(degree) - 1]], dim=1)
-
     def adopt(self, name: str, shape: tuple[int, ...], value: float) -> nn.Parameter:
         """Gives every Gaussian a parameter of a host's own: [N, *shape], all `value`. ValueError for a taken name."""
         if name in self.params:

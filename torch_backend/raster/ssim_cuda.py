@@ -8,60 +8,18 @@ device, where tests compare it with float64.
 """
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..kernel_text import kernel_text
 from ..native import initialised_warp, launch_on
 from .ssim import WINDOW, _taps
 
-_SOURCE = r"""
-const int HALF = @HALF@;
-const float TAP[2 * HALF + 1] = {@TAPS@}, C1 = 1e-4f, C2 = 9e-4f, MID = 0.5f;
-const float* image = (const float*)images; const float* target = (const float*)targets;
-float* blurred = (float*)blurreds; float* back = (float*)backs;
-const int length = width * channels, count = height * length;
-const int h = tid / length, w = tid % length / channels;
-// The loops have constant bounds, so that the taps become constants of the code.
-#define TAPS_DOWN _Pragma("unroll") for (int k = -HALF; k <= HALF; k++) if (h + k >= 0 && h + k < height)
-#define TAPS_ALONG _Pragma("unroll") for (int k = -HALF; k <= HALF; k++) if (w + k >= 0 && w + k < width)
-float m[4] = {0.f, 0.f, 0.f, 0.f}, weight = 0.f;
-if (stage == 0) {
-    TAPS_DOWN {
-        float tap = TAP[k + HALF], x = image[tid + k * length] - MID, y = target[tid + k * length] - MID;
-        weight += tap; m[0] += tap * x; m[1] += tap * y; m[2] += tap * (x * x + y * y); m[3] += tap * x * y; }
-    for (int q = 0; q < 4; q++) blurred[q * count + tid] = m[q] / weight;
-} else if (stage == 1) {
-    TAPS_ALONG {
-        float tap = TAP[k + HALF];
-        weight += tap;
-        for (int q = 0; q < 4; q++) m[q] += tap * blurred[q * count + tid + k * channels]; }
-    float rx = 1.f / weight, u = m[0] * rx, v = m[1] * rx, square = m[2] * rx, both = m[3] * rx;
-    float mx = u + MID, my = v + MID;
-    float a1 = 2.f * mx * my + C1, a2 = 2.f * (both - u * v) + C2;
-    float b1 = mx * mx + my * my + C1, b2 = square - (u * u + v * v) + C2;
-    float inverse = 1.f / (b1 * b2), score = a1 * a2 * inverse;
-    ((float*)scores)[tid] = score;
-    if (!back) return;
-    float down = 0.f;
-    TAPS_DOWN down += TAP[k + HALF];
-    float share = rx / down, d1 = score * inverse * b2, d2 = score * inverse * b1;
-    // By the mean of x (inside the luminance, then inside the variances), by x^2, by x y.
-    back[tid] = share * (2.f * (my * (a2 * inverse) - mx * d1) + 2.f * (u * d2 - v * (a1 * inverse)));
-    back[count + tid] = share * -d2;
-    back[2 * count + tid] = share * (2.f * a1 * inverse);
-} else if (stage == 2) {
-    TAPS_DOWN
-        for (int q = 0; q < 3; q++) m[q] += TAP[k + HALF] * back[q * count + tid + k * length];
-    for (int q = 0; q < 3; q++) blurred[q * count + tid] = m[q];
-} else {
-    TAPS_ALONG
-        for (int q = 0; q < 3; q++) m[q] += TAP[k + HALF] * blurred[q * count + tid + k * channels];
-    back[tid] = (m[0] + 2.f * (image[tid] - MID) * m[1] + (target[tid] - MID) * m[2]) / (float)count;
-}
-"""
+_SOURCE = Path(__file__).with_name("kernels") / "ssim.cu"
 
 
 @functools.lru_cache(maxsize=1)
@@ -69,7 +27,7 @@ def kernel() -> Any:
     """The Warp kernel of all passes; compiled for a device at its first launch there."""
     wp = initialised_warp()
     taps = ", ".join(f"{tap:.9g}f" for tap in _taps())
-    source = _SOURCE.replace("@HALF@", str(WINDOW // 2)).replace("@TAPS@", taps)
+    source = kernel_text(_SOURCE).replace("@HALF@", str(WINDOW // 2)).replace("@TAPS@", taps)
 
     def ssim_pass(
         images: wp.uint64, targets: wp.uint64, blurreds: wp.uint64, backs: wp.uint64, scores: wp.uint64,

@@ -46,8 +46,8 @@ class SupervisionConfig:
     grad_signed: by its signed sum over x and y, as the published code does; weight: by what they contribute."""
     pulls: str = "field"
     """`paper`, what its terms pull. field: the field alone. all: the canonical parameters too, as the published code
-    does (method-hosts 2.11): it detaches the reference state and not what both states share, so canonical parameters
-    follow a difference that does not depend on them. Published configurations (`host_config`) set all."""
+    does: it detaches the reference state and not what both states share, so canonical parameters follow a difference
+    that does not depend on them. Published configurations (`host_config`) set all."""
     support_every: int = 4
     """`support` acts every so many iterations."""
     support_weight: float = 0.2
@@ -77,6 +77,18 @@ class SupervisionConfig:
             raise ValueError(f"anchor is {self.anchor!r}: it should be hidden or unsupported")
         if self.pulls not in ("all", "field"):
             raise ValueError(f"pulls is {self.pulls!r}: it should be all or field")
+
+    def hidden_due(self, iteration: int) -> bool:
+        """Is it marked at this step who could not be seen in the frame?"""
+        return self.preset == "support" and self.anchor == "hidden" and iteration % self.look_every == 0
+
+    def anchors_due(self, iteration: int, progress: float) -> bool:
+        """Does `support` anchor at this step? `progress` is the share of the run that is done."""
+        return self.preset == "support" and progress >= self.start and iteration % self.support_every == 0
+
+    def paper_due(self, iteration: int, progress: float) -> bool:
+        """Does `paper` act at this step?"""
+        return self.preset == "paper" and progress >= self.start and iteration % self.every == 0
 
 
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
@@ -233,7 +245,7 @@ def well_supervised(
     config: SupervisionConfig, weight: Tensor, norm: Tensor, pull: Tensor, K: Tensor, viewmat: Tensor, means: Tensor,
     size: tuple[int, int],
 ) -> Tensor:  # fmt: skip
-    """bool [M]: on which Gaussians an image acts, by the configured detector (method-hosts 2.2).
+    """bool [M]: on which Gaussians an image acts, by the configured detector.
 
     grad_signed adds the components of the screen gradient in NDC, as the published code does, so that about half of
     the Gaussians that an image does act on fail. The rasteriser tells the gradient's norm; its components are those of

@@ -8,11 +8,13 @@ runs over chunks on threads; on CUDA a Warp kernel does the same per element, an
 import functools
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet, initialised_warp, launch_on
 
 _CHUNK = 4096
@@ -21,75 +23,21 @@ _WHOLE, _REAL = 8, 8
 """Columns of a segment's tables: addresses of p, g, m, v, elements, row width (0: no rows), first chunk, address of
 the step count | rate, 1 - b1, 1 - b2, eps, low, high, rate / (1 - b1^t), 1 / sqrt(1 - b2^t). No p: only a check."""
 
-_SOURCE = r"""
-const long long CHUNK = @CHUNK@;
-auto root = FN(F x) -> F { return __builtin_elementwise_sqrt(x); };
-const long long* whole = (const long long*)P.whole;
-for (long long chunk, s = 0; (chunk = take()) < P.chunks;) {
-    while (s + 1 < P.segments && whole[(s + 1) * @WHOLE@ + 6] <= chunk) s++;
-    const long long* w = whole + s * @WHOLE@;
-    const float* r = P.real + s * @REAL@;
-    long long first = (chunk - w[6]) * CHUNK, last = first + CHUNK < w[4] ? first + CHUNK : w[4];
-    if (stage == 1 && !w[0]) continue;
-    float *p = (float*)w[0], *m = (float*)w[2], *v = (float*)w[3];
-    const float* g = (const float*)w[1];
-    if (stage == 0) {
-        // A value minus itself is 0 unless it is infinite or no number.
-        F odd = (F)0.f; float rest = 0.f; long long i = first;
-        for (; i + 16 <= last; i += 16) { F x = load(g + i); odd += x - x; }
-        for (; i < last; i++) rest += g[i] - g[i];
-        float lanes[16]; store(lanes, odd);
-        for (int l = 0; l < 16; l++) rest += lanes[l];
-        if (rest != 0.f) __atomic_store_n((int*)P.bad, 1, __ATOMIC_RELAXED);
-        continue;
-    }
-    float w1 = r[1], w2 = r[2], eps = r[3], low = r[4], high = r[5], step = r[6], spread = r[7];
-    auto update = FN(F G, F& M, F& V, F& X) -> void {
-        M += w1 * (G - M);
-        V += w2 * (G * G - V);
-        X -= step * (M / (root(V) * spread + eps));
-        X = X < low ? (F)low : (X > high ? (F)high : X); };
-    float edge[4][16] = {};
-    auto run = FN(long long i, long long count) -> void {
-        if (count == 16) {
-            F M = load(m + i), V = load(v + i), X = load(p + i);
-            update(load(g + i), M, V, X);
-            store(m + i, M); store(v + i, V); store(p + i, X);
-            return; }
-        for (long long l = 0; l < count; l++) {
-            edge[0][l] = g[i + l]; edge[1][l] = m[i + l]; edge[2][l] = v[i + l]; edge[3][l] = p[i + l]; }
-        F M = load(edge[1]), V = load(edge[2]), X = load(edge[3]);
-        update(load(edge[0]), M, V, X);
-        store(edge[1], M); store(edge[2], V); store(edge[3], X);
-        for (long long l = 0; l < count; l++) {
-            m[i + l] = edge[1][l]; v[i + l] = edge[2][l]; p[i + l] = edge[3][l]; } };
-    long long width = P.visible ? w[5] : 0;
-    const unsigned char* visible = (const unsigned char*)P.visible;
-    for (long long i = first; i < last;) {
-        // Runs of visible rows; a chunk may begin and end inside a row.
-        long long end = last;
-        if (width) {
-            long long row = i / width;
-            bool seen = visible[row];
-            while (row * width < last && visible[row] == (seen ? 1 : 0)) row++;
-            end = row * width < last ? row * width : last;
-            if (!seen) { i = end; continue; }
-        }
-        for (; i + 16 <= end; i += 16) run(i, 16);
-        if (i < end) { run(i, end - i); i = end; }
-    }
-}
-"""
+_KERNELS = Path(__file__).with_name("kernels")
+
+
+def _source(name: str) -> str:
+    text = kernel_text(_KERNELS / name)
+    return text.replace("@CHUNK@", str(_CHUNK)).replace("@WHOLE@", str(_WHOLE)).replace("@REAL@", str(_REAL))
 
 
 @functools.lru_cache(maxsize=1)
 def _snippet() -> Snippet:
-    source = _SOURCE.replace("@CHUNK@", str(_CHUNK)).replace("@WHOLE@", str(_WHOLE)).replace("@REAL@", str(_REAL))
     fields = {
         **dict.fromkeys(("whole", "real", "bad", "visible"), POINTER),
         **dict.fromkeys(("segments", "chunks"), INTEGER),
     }
-    return Snippet("adam", fields, source)
+    return Snippet("adam", fields, _source("adam.cpp"))
 
 
 def warm_up() -> None:
@@ -97,45 +45,17 @@ def warm_up() -> None:
     _snippet().warm_up()
 
 
-_ELEMENT = r"""
-// stage 0: check one gradient; 1: advance one segment's step count; 2: update one element.
-const wp::int64* whole = (const wp::int64*)wholes; float* real = (float*)reals; int* bad = (int*)flag;
-if (stage == 1) {
-    const wp::int64* w = whole + tid * @WHOLE@; float* r = real + tid * @REAL@; float* t = (float*)w[7];
-    if (bad[0] || !t) return;
-    t[0] += 1.f;
-    r[6] = (float)(r[0] / (1.0 - wp::pow(1.0 - (double)r[1], (double)t[0])));
-    r[7] = (float)(1.0 / wp::sqrt(1.0 - wp::pow(1.0 - (double)r[2], (double)t[0])));
-    return; }
-wp::int64 chunk = tid / @CHUNK@, s = 0, high = segments;
-while (high - s > 1) {
-    wp::int64 middle = (s + high) / 2;
-    if (whole[middle * @WHOLE@ + 6] <= chunk) s = middle; else high = middle; }
-const wp::int64* w = whole + s * @WHOLE@; const float* r = real + s * @REAL@;
-wp::int64 i = (chunk - w[6]) * @CHUNK@ + tid % @CHUNK@;
-if (i >= w[4]) return;
-const float* g = (const float*)w[1];
-if (stage == 0) { float odd = g[i] - g[i]; if (!(odd == 0.f)) bad[0] = 1; return; }
-if (bad[0] || !w[0] || (w[5] > 0 && visible && !((const unsigned char*)visible)[i / w[5]])) return;
-float *p = (float*)w[0], *m = (float*)w[2], *v = (float*)w[3];
-float M = m[i] + r[1] * (g[i] - m[i]), V = v[i] + r[2] * (g[i] * g[i] - v[i]);
-float X = p[i] - r[6] * (M / (wp::sqrt(V) * r[7] + r[3]));
-m[i] = M; v[i] = V; p[i] = X < r[4] ? r[4] : (X > r[5] ? r[5] : X);
-"""
-
-
 @functools.lru_cache(maxsize=1)
 def _kernel() -> Any:
-    """The Warp kernel of `_ELEMENT`, for CUDA; it runs on Warp's cpu device too, where tests compare it."""
+    """The Warp kernel of `adam.cu`, for CUDA; it runs on Warp's cpu device too, where tests compare it."""
     wp = initialised_warp()
-    source = _ELEMENT.replace("@CHUNK@", str(_CHUNK)).replace("@WHOLE@", str(_WHOLE)).replace("@REAL@", str(_REAL))
 
     def adam_element(
         wholes: wp.uint64, reals: wp.uint64, flag: wp.uint64, visible: wp.uint64, segments: wp.int32, stage: wp.int32,
         tid: wp.int32,
     ): ...  # fmt: skip
 
-    native = wp.func_native(source)(adam_element)
+    native = wp.func_native(_source("adam.cu"))(adam_element)
 
     def entry(
         wholes: wp.uint64, reals: wp.uint64, flag: wp.uint64, visible: wp.uint64, segments: wp.int32, stage: wp.int32

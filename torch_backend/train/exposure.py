@@ -2,7 +2,7 @@
 
 A camera on automatic changes by several percent within a second (measured on the bundled clip: docs/benchmarks.md).
 Left alone, the gate would open for it and the field would learn it as motion; so it is fitted from the first step on,
-long before the gate opens (design: hard-cases, "Exposure drift").
+long before the gate opens.
 """
 
 from __future__ import annotations

@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..deformation import Deformation, Deltas, apply_deltas
+from ..deformation import Deformation, Deltas, apply_deltas, host
 from ..gaussians import Gaussians, sh_bases
 from ..raster import RasterOutput, rasterize
+from .config import TrainConfig
 from .exposure import Exposure
 
 
@@ -64,6 +65,20 @@ class DynamicModel:
             return self.moved(rows, self.deltas(rows, when))
         deltas = self.field(self.gaussians.params["means"].detach()[rows], when, self.gaussians.own(rows))
         return apply_deltas(self.gaussians, rows, deltas, self.field.rules, canonical=False)
+
+
+def restore_model(
+    tensors: dict[str, Tensor], meta: dict[str, Any], config: TrainConfig, device: torch.device | str = "cpu"
+) -> DynamicModel:
+    """The model of a checkpoint, without its optimiser, on `device`."""
+    centres = tensors["centres"].to(device, copy=True)
+    gaussians = Gaussians.from_state(tensors, len(centres)).to(torch.device(device))
+    field = None
+    if any(name.startswith("field.") for name in tensors):
+        field = host(config.host).restore(config.field, tensors).to(device)
+    exposure = Exposure(centres, config.exposure)
+    exposure.values.data.copy_(tensors["exposure"])
+    return DynamicModel(gaussians, field, centres, int(meta["sh_degree"]), exposure)
 
 
 def render(

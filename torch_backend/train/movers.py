@@ -7,7 +7,6 @@ waving hands closed. Unknown counts as still. A shot without mattes is trained b
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -20,9 +19,7 @@ from ..scene import Scene
 from ..solve.motion import MOVING
 from ..supervision.support import SEEN_WEIGHT
 from .model import DynamicModel, gathered
-
-if TYPE_CHECKING:
-    from .trainer import Trainer
+from .run_view import RunView
 
 MOMENTS = 16
 """Times and cameras at which it is asked whether a Gaussian moves."""
@@ -48,50 +45,50 @@ def load_movers(mattes: Mattes, scene: Scene, indices: list[int], width: int, he
     return movers if found else None
 
 
-def moving_frames(trainer: Trainer, share: float) -> Tensor:
+def moving_frames(run: RunView, share: float) -> Tensor:
     """int [N]: in how many trained frames each Gaussian lies in what moves, by what it paints there.
 
     It counts where it is really seen, in front of what it stands before: at least `share` of its alpha * T over the
     frame's pixels falls on movers. The static model is asked; frames that are kept back or unusable are not.
     """
-    if trainer.movers is None:
+    if run.movers is None:
         raise ValueError("the shot has no motion mattes")
-    model, height, width = trainer.model, trainer.height, trainer.width
+    model, height, width = run.model, run.height, run.width
     state = model.gaussians.params
     counts = torch.zeros(len(model.gaussians), dtype=torch.long, device=model.device)
-    for n, index in enumerate(trainer.train_ids):
-        movers = trainer.movers[n]
-        if n in trainer.unusable | trainer.needs.held or not bool(movers.any()):
+    for n, index in enumerate(run.train_ids):
+        movers = run.movers[n]
+        if n in run.frames_left_out or not bool(movers.any()):
             continue
-        trainer.report.check_cancelled()
+        run.report.check_cancelled()
         where = movers.to(model.device, torch.float32)
-        camera = trainer.viewmats[index], trainer.Ks[index], width, height
+        camera = run.viewmats[index], run.Ks[index], width, height
         on_movers, painted_here = gathered(state, *camera, torch.stack([where, torch.ones_like(where)], -1)).unbind(1)
         counts += (painted_here > SEEN_WEIGHT) & (on_movers > share * painted_here)
     return counts
 
 
-def on_trial(trainer: Trainer) -> Tensor:
+def on_trial(run: RunView) -> Tensor:
     """bool [N]: who the gate opens on trial: all that is painted, or of it what moves in several frames and often."""
-    gate: GateConfig = trainer.config.gate
-    candidates = painted(trainer.model.gaussians)
-    if trainer.movers is None:
+    gate: GateConfig = run.config.gate
+    candidates = painted(run.model.gaussians)
+    if run.movers is None:
         return candidates
-    moving = moving_frames(trainer, gate.moving_share)
-    often = moving >= gate.moving_often * trainer.model.gaussians.support.sum(1)
+    moving = moving_frames(run, gate.moving_share)
+    often = moving >= gate.moving_often * run.model.gaussians.support.sum(1)
     return candidates & often & (moving >= gate.moving_frames)
 
 
 @torch.no_grad()
-def harden(trainer: Trainer) -> bool:
+def harden(run: RunView) -> bool:
     """Closes for good what did not move; its mean change stays. False while nothing moves at all: the trial goes on."""
-    model, config = trainer.model, trainer.config.gate
+    model, config = run.model, run.config.gate
     rows = model.open_rows()
-    change, mean = _changes(model, rows, pixels_per_unit(trainer, rows), config)
+    change, mean = _changes(model, rows, pixels_per_unit(run, rows), config)
     # What is on trial by its matte has no still quarter among it that could say how large noise is.
-    noise = config.noise if trainer.movers is None else 0.0
+    noise = config.noise if run.movers is None else 0.0
     stays = stays_open(model.gaussians, rows, change, config, noise)
-    if not bool(stays.any()) and trainer.progress < config.give_up:
+    if not bool(stays.any()) and run.progress < config.give_up:
         return False
     closed, moved = rows[~stays], model.moved(rows, mean)
     for name, param in model.gaussians.params.items():
@@ -117,18 +114,18 @@ def _changes(model: DynamicModel, rows: Tensor, pixels: Tensor, config: GateConf
     return change_of(model.gaussians, rows, asked, pixels, config, model.gaussians.support[rows][:, picked].T)
 
 
-def pixels_per_unit(trainer: Trainer, rows: Tensor) -> Tensor:
+def pixels_per_unit(run: RunView, rows: Tensor) -> Tensor:
     """[M] pixels of pictures `GateConfig.WIDTH` wide per scene unit, where a camera that saw each of `rows` is nearest.
 
     0 for what no asked camera saw.
     """
-    means = trainer.model.gaussians.params["means"].detach()[rows]
-    nearest = torch.full((len(rows),), torch.inf, device=trainer.device)
-    frames = range(0, len(trainer.train_ids), max(1, len(trainer.train_ids) // MOMENTS))
+    means = run.model.gaussians.params["means"].detach()[rows]
+    nearest = torch.full((len(rows),), torch.inf, device=run.device)
+    frames = range(0, len(run.train_ids), max(1, len(run.train_ids) // MOMENTS))
     for frame in frames:
-        view = trainer.viewmats[trainer.train_ids[frame]]
+        view = run.viewmats[run.train_ids[frame]]
         depth = means @ view[2, :3] + view[2, 3]
-        seen = trainer.model.gaussians.support[rows, trainer.bin_of_frame(frame)] & (depth > 1e-3)
+        seen = run.model.gaussians.support[rows, run.bin_of_frame(frame)] & (depth > 1e-3)
         nearest = torch.where(seen, torch.minimum(nearest, depth), nearest)
-    focal = trainer.Ks[trainer.train_ids[0], 0, 0] * (GateConfig.WIDTH / trainer.width)
+    focal = run.Ks[run.train_ids[0], 0, 0] * (GateConfig.WIDTH / run.width)
     return torch.where(nearest.isfinite(), focal / nearest, 0.0)

@@ -11,33 +11,27 @@ on nothing but the run's numbers, and their state is in the checkpoint: a resume
   what growth gained is below it as well. It errs on the side of growing.
 - End: when the probes gain nothing more. By then they are trained on, so what they gain is at least what a frame kept
   back would gain: this too errs on the side of going on.
-- Time nodes: from how long what the static model gets wrong stays the same (`correlation_frames`).
+- Time nodes: from how long what the static model gets wrong stays the same (`residual.correlation_frames`).
+
+The policy sees a run through `Probe` and changes nothing of it: the trainer carries out what `decide` yields, and reads
+the rest, which stands until the run is over, from the policy's properties.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
-import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
-
-from ..gaussians import Gaussians, sh_bases
-from ..scene import resize_intrinsics
-from .model import render
-
-if TYPE_CHECKING:
-    from .trainer import Trainer
+from torch import Tensor
 
 _LEAST_PROBES, _MOST_PROBES = 3, 12
 _GROWN = 1.2
 """Growth is judged over measurements between which the Gaussians grew by this factor, at least `_POINTS` of them."""
 _POINTS = 4
-_LOOKED_AT = 48
-"""Most frames whose residual is looked at for the time nodes."""
 
 
 @dataclass
@@ -101,11 +95,130 @@ def lasting(since: float, now: float) -> float:
     return (0.1**since - 0.1) / max(1e-6, 0.1**since - 0.1**now)
 
 
-class Needs:
+class Probe(Protocol):
+    """What the policy sees of a run in training."""
+
+    @property
+    def iteration(self) -> int:
+        """Steps that are done."""
+        ...
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done."""
+        ...
+
+    @property
+    def gaussian_count(self) -> int:
+        """Gaussians there are now."""
+        ...
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree in use."""
+        ...
+
+    def probe_psnr(
+        self,
+        frames: list[int],
+        *,
+        sh_degree: int | None = None,
+        exposure: bool = True,
+        field: bool = True,
+        viewmats: Tensor | None = None,
+    ) -> float | None:
+        """Mean PSNR in dB on trained frames (positions); None if it is no number.
+
+        With another SH degree, without the exposure or the field (None if the run has none), or seen from other cameras
+        [F, 4, 4] of the scene's frames.
+        """
+        ...
+
+    def correlation_frames(self) -> float | None:
+        """As `residual.correlation_frames`, of what the static model lacks where Gaussians are open."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunSchedule:
+    """What of a run's configuration decisions hang on. Shares are of the run's length."""
+
+    iterations: int
+    """Training steps, if nothing ends the run before."""
+    densify_every: int
+    """Steps between two rounds of densification."""
+    densify_stop: float
+    """Share at which growth ends of itself."""
+    give_up: float
+    """Share at which the gate's trial is over, whatever moved."""
+    sh_every: float
+    """The SH degree rises by one every this share; 0: it is the highest from the start."""
+
+
+@dataclass(frozen=True)
+class LimitHarmonics:
+    """A decision: the harmonics above a degree go, with their moments, and do not come back."""
+
+    degree: int
+    """Highest SH degree from now on."""
+
+
+@dataclass(frozen=True)
+class FieldOpened:
+    """When the field was made."""
+
+    iteration: int
+    """Steps that were done."""
+    seconds: float
+    """Seconds of training until then."""
+
+
+@dataclass
+class RunFacts:
+    """What a run learnt about itself on the way. None: not measured, or it has not happened (yet)."""
+
+    growth_gain_db: float | None = None
+    """dB per 10 % more Gaussians when growth was judged last, what optimisation gained meanwhile included."""
+    opened: FieldOpened | None = None
+    """When the field was made."""
+    hardened: int | None = None
+    """Iteration at which the gate closed what did not move."""
+    correlation_frames: float | None = None
+    """Frames until half of what the static model lacks has changed."""
+    time_nodes: int | None = None
+    """Nodes of the field's time axis that follow from it."""
+    poses_gain_db: float | None = None
+    """What refined cameras gained on the probes."""
+    exposure_gain_db: float | None = None
+    """What the exposure is worth on the probes, as they join."""
+    field_gain_db: float | None = None
+    """What motion is worth on them."""
+    probe_psnr_db: float | None = None
+    """What the whole model reaches on them."""
+
+    @property
+    def on_trial(self) -> bool:
+        """Is there a field of which it is not yet known who moves?"""
+        return self.opened is not None and self.hardened is None
+
+    def to_json(self) -> dict[str, Any]:
+        """Those that are known."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> RunFacts:
+        """Inverse of `to_json`."""
+        known = {field.name: data[field.name] for field in dataclasses.fields(cls) if field.name in data}
+        if known.get("opened") is not None:
+            known["opened"] = FieldOpened(**known["opened"])
+        return cls(**known)
+
+
+class StoppingPolicy:
     """Probe frames and decisions of one run. `frames`: how many it trains on; 0: it decides nothing."""
 
-    def __init__(self, config: NeedsConfig, frames: int) -> None:
-        self.config = config
+    def __init__(self, config: NeedsConfig, frames: int, schedule: RunSchedule) -> None:
+        self.config, self.frames, self.schedule = config, frames, schedule
         self.probes = probe_frames(frames, config.probes, config.least)
         self.joined = not self.probes
         self.measured: list[tuple[int, int, float]] = []
@@ -113,23 +226,25 @@ class Needs:
         self.sh_limit: int | None = None
         self.growth_ended: int | None = None
         self.stopped: int | None = None
-        self.facts: dict[str, Any] = {}
+        self.facts = RunFacts()
 
     def state(self) -> dict[str, Any]:
         """JSON-able, for a checkpoint."""
         return {
             "joined": self.joined, "measured": self.measured, "degrees": list(self.degrees.items()),
-            "sh_limit": self.sh_limit, "growth_ended": self.growth_ended, "stopped": self.stopped, "facts": self.facts,
+            "sh_limit": self.sh_limit, "growth_ended": self.growth_ended, "stopped": self.stopped,
+            "facts": self.facts.to_json(),
         }  # fmt: skip
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         """Inverse of `state`."""
         self.joined, self.sh_limit = state["joined"], state["sh_limit"]
         self.measured = [(int(i), int(n), float(v)) for i, n, v in state["measured"]]
         self.degrees = {int(degree): float(gain) for degree, gain in state["degrees"]}
-        self.growth_ended, self.stopped, self.facts = state["growth_ended"], state["stopped"], state["facts"]
+        self.growth_ended, self.stopped = state["growth_ended"], state["stopped"]
+        self.facts = RunFacts.from_json(state["facts"])
 
-    # ------------------------------------------------------------------ what the trainer asks
+    # ------------------------------------------------------------------ what stands, for the trainer
 
     @property
     def held(self) -> set[int]:
@@ -145,310 +260,110 @@ class Needs:
         """May the Gaussians still become more?"""
         return self.growth_ended is None
 
-    def end(self, iterations: int) -> int:
+    @property
+    def end(self) -> int:
         """Iterations after which the run is over."""
-        return iterations if self.stopped is None else min(iterations, self.stopped + self._anneal(iterations))
+        iterations = self.schedule.iterations
+        return iterations if self.stopped is None else min(iterations, self.stopped + self._anneal)
 
     def rate_progress(self, iteration: int, iterations: int) -> float:
         """The progress at which learning rates are looked up: a run that has enough hastens to its end."""
         if self.stopped is None:
             return iteration / iterations
         at = self.stopped / iterations
-        return at + (1.0 - at) * min(1.0, (iteration - self.stopped) / self._anneal(iterations))
+        return at + (1.0 - at) * min(1.0, (iteration - self.stopped) / self._anneal)
 
-    def _anneal(self, iterations: int) -> int:
-        return max(1, round(self.config.anneal * iterations))
+    @property
+    def _anneal(self) -> int:
+        """Steps in which a run that has enough brings its learning rates to their end."""
+        return max(1, round(self.config.anneal * self.schedule.iterations))
 
     # ------------------------------------------------------------------ decisions
 
-    def decide(self, trainer: Trainer) -> None:
-        """Called between steps. A decision interrupted by a cancel is taken again when the run goes on."""
+    def decide(self, probe: Probe) -> Iterator[LimitHarmonics]:
+        """Called between steps; what it yields is carried out before the next is asked for.
+
+        A decision interrupted by a cancel is taken again when the run goes on.
+        """
         if not self.probes:
             return
-        c = trainer.config
-        grid = c.densify.every * max(1, round(self.config.every * c.iterations / c.densify.every))
+        s = self.schedule
+        grid = s.densify_every * max(1, round(self.config.every * s.iterations / s.densify_every))
         # Before a round of densification, when the splits of the last one have settled.
-        due = trainer.iteration > 0 and trainer.iteration % grid == 0
-        if due and self.stopped is None and (not self.measured or self.measured[-1][0] < trainer.iteration):
-            self._measure(trainer)
+        due = probe.iteration > 0 and probe.iteration % grid == 0
+        if due and self.stopped is None and (not self.measured or self.measured[-1][0] < probe.iteration):
+            self._measure(probe)
         if not self.joined:
-            self._judge_degree(trainer)
-            if trainer.progress >= self.config.join:
-                self._join(trainer)
+            if self._excess_degree(probe):
+                self.sh_limit = probe.sh_degree - 1
+                yield LimitHarmonics(self.sh_limit)
+            if probe.progress >= self.config.join:
+                self._join(probe)
 
-    def _measure(self, trainer: Trainer) -> None:
-        value = self._psnr(trainer)
+    def field_opened(self, iteration: int, seconds: float) -> None:
+        """The trainer made the field."""
+        self.facts.opened = FieldOpened(iteration, seconds)
+
+    def gate_hardened(self, iteration: int) -> None:
+        """The gate closed what did not move."""
+        self.facts.hardened = iteration
+
+    def _measure(self, probe: Probe) -> None:
+        value = probe.probe_psnr(self.probes)
         if value is None:
             return
-        self.measured.append((trainer.iteration, len(trainer.model.gaussians), value))
+        self.measured.append((probe.iteration, probe.gaussian_count, value))
         # While a field is on trial probes fall and rise by it: one measured 3 steps after it had opened ended growth.
-        on_trial = "opened" in self.facts and "hardened" not in self.facts
-        if not self.joined and self.growing and not on_trial:
-            gain = growth_gain(self.measured)
-            self.facts["growth_gain_db"] = gain
+        if not self.joined and self.growing and not self.facts.on_trial:
+            gain = self.facts.growth_gain_db = growth_gain(self.measured)
             if gain is not None and gain < self.config.growth_gain:
-                self.growth_ended = trainer.iteration
-        c = trainer.config
-        hardened = self.facts.get("hardened", c.gate.give_up * c.iterations) / c.iterations
-        over = trainer.progress > max(hardened, c.densify.stop if self.growing else 0.0)
-        gain = newest_gain(self.measured, trainer.iteration - round(self.config.stop_window * c.iterations))
-        early = trainer.iteration + self._anneal(c.iterations) < c.iterations
+                self.growth_ended = probe.iteration
+        s = self.schedule
+        hardened = (s.give_up * s.iterations if self.facts.hardened is None else self.facts.hardened) / s.iterations
+        over = probe.progress > max(hardened, s.densify_stop if self.growing else 0.0)
+        gain = newest_gain(self.measured, probe.iteration - round(self.config.stop_window * s.iterations))
+        early = probe.iteration + self._anneal < s.iterations
         if over and early and gain is not None and gain < self.config.stop_gain:
-            self.stopped = trainer.iteration
+            self.stopped = probe.iteration
 
-    def _judge_degree(self, trainer: Trainer) -> None:
-        c, degree = trainer.config, trainer.model.sh_degree
-        if degree == 0 or degree in self.degrees or self.sh_limit is not None or c.sh_every <= 0:
-            return
-        if int(trainer.progress / c.sh_every) <= degree and trainer.progress < self.config.join:
-            return
-        whole, cut = self._psnr(trainer), self._psnr(trainer, sh_degree=degree - 1)
+    def _excess_degree(self, probe: Probe) -> bool:
+        """Is it time to judge the SH degree in use, and does it gain too little?"""
+        every, degree = self.schedule.sh_every, probe.sh_degree
+        if degree == 0 or degree in self.degrees or self.sh_limit is not None or every <= 0:
+            return False
+        if int(probe.progress / every) <= degree and probe.progress < self.config.join:
+            return False
+        whole, cut = probe.probe_psnr(self.probes), probe.probe_psnr(self.probes, sh_degree=degree - 1)
         if whole is None or cut is None:
-            return
+            return False
         self.degrees[degree] = whole - cut
-        lasts = lasting(degree * c.sh_every, trainer.progress)
-        if (whole - cut) * lasts <= self.config.sh_gain:
-            self.sh_limit = trainer.model.sh_degree = degree - 1
-            limit_harmonics(trainer.model.gaussians, trainer.optimizer, degree - 1)
+        return (whole - cut) * lasting(degree * every, probe.progress) <= self.config.sh_gain
 
-    def judge_cameras(self, trainer: Trainer, refined: Tensor) -> None:
-        """What refined cameras [F, 4, 4] are worth, as they are about to replace those of the trainer."""
-        if self.joined or "poses_gain_db" in self.facts:
+    def judge_cameras(self, probe: Probe, refined: Tensor) -> None:
+        """What refined cameras [F, 4, 4] are worth, as they are about to replace those of the run."""
+        if self.joined or self.facts.poses_gain_db is not None:
             return
-        before, without = trainer.viewmats, self._psnr(trainer)
-        try:
-            trainer.viewmats = refined
-            value = self._psnr(trainer)
-        finally:
-            trainer.viewmats = before
-        self.facts["poses_gain_db"] = None if value is None or without is None else value - without
+        without, value = probe.probe_psnr(self.probes), probe.probe_psnr(self.probes, viewmats=refined)
+        self.facts.poses_gain_db = _difference(value, without)
 
-    def _join(self, trainer: Trainer) -> None:
+    def _join(self, probe: Probe) -> None:
         """The last look at frames that were not trained on: what exposure and motion are worth; then they join."""
-        whole = self._psnr(trainer)
-        for name, without in (("exposure", self._without_exposure), ("field", self._without_field)):
-            value = without(trainer)
-            self.facts[f"{name}_gain_db"] = None if whole is None or value is None else whole - value
-        self.facts["probe_psnr_db"] = whole
+        whole = probe.probe_psnr(self.probes)
+        self.facts.exposure_gain_db = _difference(whole, probe.probe_psnr(self.probes, exposure=False))
+        self.facts.field_gain_db = _difference(whole, probe.probe_psnr(self.probes, field=False))
+        self.facts.probe_psnr_db = whole
         self.joined = True
 
-    def _without_exposure(self, trainer: Trainer) -> float | None:
-        if not trainer.config.exposure.on:
-            return None
-        values = trainer.model.exposure.values
-        kept = values.data
-        try:
-            values.data = torch.zeros_like(kept)
-            return self._psnr(trainer)
-        finally:
-            values.data = kept
-
-    def _without_field(self, trainer: Trainer) -> float | None:
-        field = trainer.model.field
-        if field is None:
-            return None
-        try:
-            trainer.model.field = None
-            return self._psnr(trainer)
-        finally:
-            trainer.model.field = field
-
-    def _psnr(self, trainer: Trainer, sh_degree: int | None = None) -> float | None:
-        """Mean PSNR in dB on the probe frames; None if it is not a number."""
-        degree = trainer.model.sh_degree
-        try:
-            trainer.model.sh_degree = degree if sh_degree is None else sh_degree
-            value = trainer.heldout_psnr([trainer.train_ids[n] for n in self.probes], trainer.images[self.probes])
-        finally:
-            trainer.model.sh_degree = degree
-        return value if value is not None and math.isfinite(value) else None
-
-    def time_nodes(self, trainer: Trainer) -> int:
+    def time_nodes(self, probe: Probe) -> int:
         """How many nodes the time axis of a field needs for what the open Gaussians do; 0: nothing is decided."""
-        frames = len(trainer.train_ids)
-        most = max(4, round(frames / 2))
+        most = max(4, round(self.frames / 2))
         if not self.probes or most == 4:
             return 0
-        residual, weight = signed_residual(trainer, torch.nonzero(trainer.model.gaussians.open).flatten())
-        likely = likely_movers(residual, weight)
-        same = correlation_frames(residual[:, likely], weight[:, likely])
-        self.facts["correlation_frames"] = same
-        nodes = most if same is None else min(max(round((frames - 1) / same) + 1, 4), most)
-        self.facts["time_nodes"] = nodes
+        same = self.facts.correlation_frames = probe.correlation_frames()
+        nodes = most if same is None else min(max(round((self.frames - 1) / same) + 1, 4), most)
+        self.facts.time_nodes = nodes
         return nodes
 
 
-def limit_harmonics(model: Gaussians, optimizer: torch.optim.Optimizer, degree: int) -> None:
-    """Drops the harmonics above `degree` from shN, with their moments."""
-    old, bases = model.params["shN"], sh_bases(degree) - 1
-    new = nn.Parameter(old.detach()[:, :bases].contiguous())
-    state = optimizer.state.pop(old, None)
-    if state is not None:
-        optimizer.state[new] = {k: v[:, :bases].contiguous() if v.shape == old.shape else v for k, v in state.items()}
-    for group in optimizer.param_groups:
-        group["params"] = [new if p is old else p for p in group["params"]]
-    model.params["shN"] = new
-
-
-# ---------------------------------------------------------------------- how fast things move
-
-
-def signed_residual(trainer: Trainer, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """What the static model lacks at the Gaussians `rows` [M], frame by frame, at half the size.
-
-    Returns (residual [I, M], weight [I, M]): mean of image - render over the pixels that a Gaussian paints, by
-    alpha * T, grey, and the sum of those weights; 0 for frames that were not looked at.
-    """
-    out_of_use = trainer.unusable | trainer.needs.held
-    frames = [n for n in range(len(trainer.train_ids)) if n not in out_of_use]
-    if len(frames) > _LOOKED_AT:  # two stretches of neighbours: sparse frames would not show what is fast
-        half = _LOOKED_AT // 2
-        first, second = len(frames) // 4, 3 * len(frames) // 4
-        frames = frames[first - half // 2 :][:half] + frames[second - half // 2 :][:half]
-    model, (height, width) = trainer.model, (trainer.height // 2, trainer.width // 2)
-    state = {name: p.detach() for name, p in model.gaussians.params.items()}
-    residual = torch.zeros(len(trainer.train_ids), len(rows), device=model.device)
-    weight = torch.zeros_like(residual)
-    background = torch.cat([trainer.background, trainer.background.new_zeros(1)])
-    for n in frames:
-        index = trainer.train_ids[n]
-        K = resize_intrinsics(trainer.Ks[index].cpu(), trainer.width, trainer.height, width, height)
-        ink = torch.zeros(len(model.gaussians), 1, device=model.device, requires_grad=True)
-        out = render(
-            state, model.sh_degree, trainer.viewmats[index], K.to(model.device), width, height, colors=ink,
-            background=background, with_depth=False, with_contributions=True,
-        )  # fmt: skip
-        image = trainer.images[n].to(model.device, torch.float32).permute(2, 0, 1)
-        image = F.interpolate(image[None], (height, width), mode="area")[0].permute(1, 2, 0)
-        lack = (image - model.exposure.apply(out.colors[0, ..., :3].detach(), trainer.times[n])).mean(-1).detach()
-        if out.weight_sum is None:
-            raise RuntimeError("the frame was rendered without contributions")
-        (pulled,) = torch.autograd.grad(out.colors[0, ..., 3], ink, lack)
-        weight[n] = out.weight_sum[0][rows]
-        residual[n] = pulled[rows, 0] / weight[n].clamp_min(1e-6)
-    return residual, weight
-
-
-def likely_movers(residual: Tensor, weight: Tensor) -> Tensor:
-    """Indices of the tenth of M Gaussians whose residual [I, M] is most alike two frames apart (least 64 of them).
-
-    Noise is not alike, and what a static model merely fits badly is the same in all frames.
-    """
-    seen = (weight > 0.5).float()
-    value = (residual - (residual * seen).sum(0) / seen.sum(0).clamp_min(1.0)) * seen
-    pairs = (seen[2:] * seen[:-2]).sum(0)
-    alike = torch.where(pairs >= 4, (value[2:] * value[:-2]).sum(0) / pairs.clamp_min(1.0), -torch.inf)
-    return alike.topk(min(len(alike), max(64, len(alike) // 10))).indices
-
-
-def correlation_frames(residual: Tensor, weight: Tensor) -> float | None:
-    """How many frames it takes until half of a residual's agreement with itself one frame before is gone.
-
-    Of residual [I, M] of M Gaussians over I frames, where weight [I, M] > 0.5, pooled. For a swing of period P it is
-    near P / 6: linear interpolation between nodes that far apart misses 14 % of the swing at most. None where frames
-    next to each other have nothing in common: no node would be too many. At most I / 2.
-    """
-    seen = (weight > 0.5).double()
-    mean = (residual.double() * seen).sum(0) / seen.sum(0).clamp_min(1.0)
-    value = (residual.double() - mean) * seen
-
-    def agreement(lag: int) -> float | None:
-        here, there = slice(lag, None), slice(None, len(value) - lag)
-        pairs = float((seen[here] * seen[there]).sum())
-        return float((value[here] * value[there]).sum()) / pairs if pairs else None
-
-    alone, next_one = agreement(0), agreement(1)
-    if not alone or next_one is None or next_one < 0.1 * alone:
-        return None
-    before = next_one
-    for lag in range(2, max(3, len(value) // 2 + 1)):
-        here = agreement(lag)
-        if here is None:
-            return float(lag - 1)
-        if here < 0.5 * next_one:
-            return lag - 1 + (before - 0.5 * next_one) / (before - here)
-        before = here
-    return len(value) / 2
-
-
-# ---------------------------------------------------------------------- what the run says in the end
-
-
-def modelled(trainer: Trainer) -> list[dict[str, Any]]:
-    """Rows of the end-of-run table: what was modelled, what it cost, what it bought.
-
-    seconds of training, ms_per_step, bytes of parameters, gain_db on the probe frames: None where it was not measured.
-    """
-    model, c, needs, facts = trainer.model, trainer.config, trainer.needs, trainer.needs.facts
-    count = len(model.gaussians)
-    opened = facts.get("opened")
-    steps, seconds = trainer.iteration, trainer.trained_seconds
-    if opened:
-        steps, seconds = opened["iteration"], opened["seconds"]
-    plain = sum(p[:1].numel() for name, p in model.gaussians.params.items() if name != "shN")
-    rows = [
-        _row("static world", f"{count} Gaussians; {steps} steps", seconds, steps, 4 * plain * count),
-        _row("growth", _growth(trainer), size=4 * (plain + model.gaussians.params["shN"][:1].numel())
-             * (count - trainer.initial)),
-    ]  # fmt: skip
-    for degree in range(1, c.sh_degree + 1):
-        gain = needs.degrees.get(degree)
-        kept = degree <= model.sh_degree
-        detail = "kept" if kept else "dropped" if gain is not None else "not tried"
-        size = 4 * count * 3 * (2 * degree + 1) if kept else 0
-        rows.append(_row(f"SH degree {degree}", detail, size=size, gain=gain))
-    if c.exposure.on:
-        values = model.exposure.values
-        detail = f"{len(values)} times"
-        rows.append(_row("exposure", detail, size=4 * values.numel(), gain=facts.get("exposure_gain_db")))
-    if c.poses.on:
-        values = trainer.poses.values
-        turn = float(values.detach()[:, :3].norm(dim=1).mean()) * float(trainer.Ks[0, 0, 0])
-        detail = f"{len(values)} cameras, turned by {turn:.2f} px on average"
-        rows.append(_row("poses", detail, size=4 * values.numel(), gain=facts.get("poses_gain_db")))
-    if model.field is not None:
-        rows.append(_moving(trainer, trainer.iteration - steps, trainer.trained_seconds - seconds))
-        if c.supervision.preset != "none":
-            rows.append(_row("anchors", c.supervision.preset))
-    if needs.stopped is not None:
-        end = needs.end(c.iterations)
-        rows.append(_row("end", f"stopped at step {end} of {c.iterations}: nothing more was gained"))
-    rows += [_row("extension", f"{e.steps} steps from step {e.from_iteration} on") for e in trainer.extensions]
-    return rows
-
-
-def _row(
-    what: str, detail: str, seconds: float | None = None, steps: int = 0, size: int | None = None,
-    gain: float | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    return {
-        "what": what,
-        "detail": detail,
-        "seconds": None if seconds is None else round(seconds, 2),
-        "ms_per_step": None if seconds is None or not steps else round(1000.0 * seconds / steps, 2),
-        "bytes": size,
-        "gain_db": None if gain is None else round(gain, 3),
-    }
-
-
-def _growth(trainer: Trainer) -> str:
-    needs, count = trainer.needs, len(trainer.model.gaussians)
-    text = f"{trainer.initial} to {count} Gaussians"
-    if needs.growth_ended is not None:
-        text += f", ended at step {needs.growth_ended}"
-    gain = needs.facts.get("growth_gain_db")
-    return text if gain is None else f"{text}; at most {gain:.2f} dB per 10 % more"
-
-
-def _moving(trainer: Trainer, steps: int, seconds: float) -> dict[str, Any]:
-    model, gain = trainer.model, trainer.needs.facts.get("field_gain_db")
-    field = model.field
-    if field is None:
-        raise RuntimeError("nothing moves")
-    size = 4 * sum(p.numel() for p in field.parameters())
-    moving = len(model.open_rows())
-    detail = f"{moving} Gaussians ({100.0 * moving / max(1, len(model.gaussians)):.1f} %), {trainer.config.host}"
-    nodes = trainer.needs.facts.get("time_nodes")
-    if nodes:
-        detail += f", {nodes} time nodes"
-    return _row("moving Gaussians", f"{detail}; {steps} steps", seconds, steps, size, gain)
+def _difference(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else a - b

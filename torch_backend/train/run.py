@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..contract import CONFIG_FILE, METRICS_FILE, PREVIEWS_FOLDER, ExitCode, JobError, Reporter, TrainParams, read_json
-from ..deformation import planes
+from ..deformation import host
 from ..footage.images import write_png
 from ..native import default_threads
 from ..raster import cpu as raster_cpu
@@ -28,10 +28,10 @@ from .config import TrainConfig, config_from_json, config_from_params, config_to
 from .device import choose_device, unused_card
 from .evidence import gather
 from .extend import EXTENSION_FILE, pending
-from .model import DynamicModel
+from .model import DynamicModel, restore_model
+from .modelled import modelled
 from .movers import Mattes, load_movers
-from .needs import modelled
-from .trainer import Trainer, restore_model
+from .trainer import Trainer
 from .verdict import figures_of, told, warn
 
 _ATTEMPTS = 5
@@ -73,7 +73,8 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     """
     if params.extend:
         return extend_run(shot, params, report)
-    config, device = config_from_params(params), _prepared_device(params, report)
+    config = config_from_params(params)
+    device = _prepared_device(config, params, report)
     run = shot.own(shot.run(params.run))
     shot.own(run / PREVIEWS_FOLDER)
     settle(run)
@@ -150,7 +151,8 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if motion and motion not in (motion_key(shot), motion_key(shot, with_found=False)):
         message = f"The run {params.run!r} was trained with other motion mattes than the shot has now."
         raise JobError(message, "Train it again: it cannot be extended.", ExitCode.TRAIN)
-    config, device, scene = config_from_json(facts["config"]), _prepared_device(params, report), load_scene(shot)
+    config, scene = config_from_json(facts["config"]), load_scene(shot)
+    device = _prepared_device(config, params, report)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     size = training_size(scene, config.width)
     images = place_images(load_images(scene, train + test, *size, report), device)
@@ -183,15 +185,17 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     return summary
 
 
-def _prepared_device(params: TrainParams, report: Reporter) -> torch.device:
+def _prepared_device(config: TrainConfig, params: TrainParams, report: Reporter) -> torch.device:
     device = choose_device(params.device)
     unused = unused_card() if params.device == "auto" and device.type == "cpu" else None
     if unused is not None:
         report.warning(f"Training uses the processor, not the graphics card: {unused[0]}", unused[1])
     torch.set_num_threads(default_threads())
     if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
-        for module in (raster_cpu, ssim, adam, planes):
+        for module in (raster_cpu, ssim, adam):
             module.warm_up()
+        if config.method != "static":
+            host(config.host).warm_up(config.field)
     return device
 
 

@@ -14,44 +14,25 @@ import torch
 from torch import Tensor
 
 from ..contract import Cancelled, ExitCode, JobError, Reporter
-from ..deformation import (
-    Deformation,
-    Deltas,
-    Rehearsal,
-    Start,
-    field_box,
-    host,
-    split_deltas,
-)
-from ..gaussians import Densifier, Gaussians, initialise
+from ..deformation import Deformation, Deltas, Rehearsal, Start, field_box, host, split_deltas
+from ..gaussians import Densifier, initialise
 from ..raster import RasterOutput
 from ..scene import Scene
-from ..supervision import (
-    Anchored,
-    PaperView,
-    bin_of,
-    bin_times,
-    draw_anchored,
-    mark_hidden,
-    mark_seen,
-    paper_loss,
-    stillness,
-    support_loss,
-    well_supervised,
-)
-from .adam import FusedAdam
+from ..supervision import Anchored, bin_of, bin_times, draw_anchored, mark_hidden, mark_seen, stillness, support_loss
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
 from .extend import Extension
 from .losses import photometric, psnr
-from .model import DynamicModel, render
+from .model import DynamicModel, render, restore_model
 from .movers import harden, on_trial
-from .needs import Needs
+from .needs import RunSchedule, StoppingPolicy
+from .optimizer import add_field, limit_harmonics, optimizer_of, schedule_rates
+from .paper import paper_step
 from .poses import Poses, corrected
 from .repair import FieldMemory, drop_offenders, repair, unstable
+from .residual import correlation_of_movers
 
-_LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 _MAX_BAD_STEPS = 20
 _LOOK_EVERY = 10
 """Steps between two looks at what a GPU counted, and between two reports of progress."""
@@ -102,7 +83,9 @@ class Trainer:
         gaussians = gaussians.to(self.device)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
         self.initial = len(gaussians)
-        self.needs = Needs(config.needs, len(train) if config.decides else 0)
+        gate, densify = config.gate, config.densify
+        schedule = RunSchedule(config.iterations, densify.every, densify.stop, gate.give_up, config.sh_every)
+        self.policy = StoppingPolicy(config.needs, len(train) if config.decides else 0, schedule)
         self.extensions: list[Extension] = []
         self.iteration = 0
         self.trained_seconds = 0.0
@@ -115,7 +98,7 @@ class Trainer:
         self._extent = float((high - low).norm())
         self.poses = Poses(self.times, config.poses, self.device)
         self._refined = False
-        self.optimizer = self._gaussian_optimizer()
+        self.optimizer = optimizer_of(self.model, self.poses, config)
         self.densifier = Densifier(config.densify, len(gaussians), self.device)
         self._bad = torch.zeros(2, dtype=torch.int32, device=self.device)
         self._saved_at = time.perf_counter()
@@ -127,6 +110,21 @@ class Trainer:
         return self._bins[frame]
 
     @property
+    def frames_left_out(self) -> set[int]:
+        """Positions of the trained frames that are not trained on now: kept back as probes, or unusable."""
+        return self.unusable | self.policy.held
+
+    @property
+    def gaussian_count(self) -> int:
+        """Gaussians there are now."""
+        return len(self.model.gaussians)
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree in use."""
+        return self.model.sh_degree
+
+    @property
     def progress(self) -> float:
         """Share of the run that is done; an extended one stays at its end, where every schedule has run out."""
         return 1.0 if self.extensions else self.iteration / self.config.iterations
@@ -134,7 +132,7 @@ class Trainer:
     @property
     def end(self) -> int:
         """Iterations after which the run is over: the configured ones, or fewer if it has what the scene needs."""
-        return self.extensions[-1].end if self.extensions else self.needs.end(self.config.iterations)
+        return self.extensions[-1].end if self.extensions else self.policy.end
 
     def extend(self, steps: int, heldout_psnr_db: float | None) -> None:
         """Adds steps to a run that has ended; `heldout_psnr_db` is what it was worth on held-out frames until now.
@@ -142,7 +140,7 @@ class Trainer:
         The gate stays as it is, nothing grows, anchors and price go on in full, and no early end is looked for.
         """
         self.extensions.append(Extension(self.iteration, steps, heldout_psnr_db, self.trained_seconds))
-        self.needs.joined = True  # a run that ended early may still hold its probe frames back
+        self.policy.joined = True  # a run that ended early may still hold its probe frames back
 
     def run(self, checkpoint: Path, evaluate: Callable[[Trainer], None]) -> None:
         """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured."""
@@ -176,7 +174,7 @@ class Trainer:
 
     def step(self) -> Tensor:
         """One optimisation step on one training frame; returns its photometric loss (0-dim). Not finite: left out."""
-        frame = self._next_frame()
+        frame, supervision = self._next_frame(), self.config.supervision
         self._schedule()
         rows = self.model.open_rows()
         pairs = self._pairs_to_anchor(rows)
@@ -187,16 +185,17 @@ class Trainer:
         state = self.model.moved(rows, deltas)
         # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         background = torch.rand(3, generator=self.generator, device="cpu").to(self.device, non_blocking=True)
-        look = self._is_to_look()
-        out = self._render(state, frame, background=background, with_depth=look)
-        paper = self._paper_is_due()
-        if paper and len(rows):
+        moves = self.model.field is not None
+        marks_hidden = moves and supervision.hidden_due(self.iteration)
+        out = self.render_trained(state, frame, background=background, with_depth=marks_hidden)
+        paper = moves and supervision.paper_due(self.iteration, self.progress) and len(rows) > 0
+        if paper:
             state["means"].retain_grad()
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
-        loss = photometric(exposed, self._image(frame), self.config.dssim)
+        loss = photometric(exposed, self.image_of(frame), self.config.dssim)
         total = loss + self._regularisers(rows)
-        if deltas is not None and self.config.supervision.preset == "support":
-            price = stillness(deltas, len(self.model.gaussians), loss, self.progress, self.config.supervision)
+        if deltas is not None and supervision.preset == "support":
+            price = stillness(deltas, len(self.model.gaussians), loss, self.progress, supervision)
             total = total + self.config.field.still * price
         if self._refines_poses():
             total = total + self.poses.regularisation()
@@ -204,16 +203,24 @@ class Trainer:
             total = total + self._support_loss(pairs, anchored)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        if paper and len(rows):
-            self._paper_step(frame, rows, state, out)
+        if paper:
+            other = paper_step(self, frame, rows, state, out)
+            self._recent.extend([] if other is None else [other])
         self.optimizer.step(guard=[total])
         if self._refines_poses():
-            self.poses.settle(self.unusable | self.needs.held)
+            self.poses.settle(self.frames_left_out)
         applied = self.optimizer.applied
         if self.device.type == "cpu" and not bool(applied):
             self._left_out(frame)
             return loss.detach()
         self.bad_steps = 0
+        self._observe(frame, rows, state, out, applied)
+        return loss.detach()
+
+    def _observe(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput, applied: Tensor) -> None:
+        """After a step, applied or not (0-dim bool): what it tells the densifier and the support bitmap."""
+        if out.weight_sum is None:
+            raise RuntimeError("the frame was rendered without contributions")
         radii, weight = out.radii[0], out.weight_sum[0]
         if self.device.type != "cpu":
             left_out = ~applied
@@ -221,11 +228,10 @@ class Trainer:
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
         mark_seen(self.model.gaussians, self._bins[frame], weight)
-        if look:
+        if out.depth_median is not None:  # at steps that mark who was hidden
             index = self.train_ids[frame]
             view = (self.viewmats[index], self.Ks[index], out.depth_median[0])
             mark_hidden(self.model.gaussians, rows, self._bins[frame], state, *view)
-        return loss.detach()
 
     def _deltas(self, rows: Tensor, frame: int, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
         """The field for the frame's Gaussians and for the pairs to anchor, in one call: (of `rows`, of `pairs`)."""
@@ -243,7 +249,8 @@ class Trainer:
         where = torch.cat([means[rows], means.detach()[pairs.rows]])
         return split_deltas(field(where, times, self.model.gaussians.own(torch.cat([rows, pairs.rows]))), len(rows))
 
-    def _image(self, frame: int) -> Tensor:
+    def image_of(self, frame: int) -> Tensor:
+        """[H, W, 3] float32, the trained frame at position `frame`, on the device."""
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
 
     def _milestones(self) -> None:
@@ -251,14 +258,16 @@ class Trainer:
         if self.extensions:
             return
         c = self.config
-        self.needs.decide(self)
+        for decision in self.policy.decide(self):
+            self.model.sh_degree = decision.degree
+            limit_harmonics(self.model.gaussians, self.optimizer, decision.degree)
         degree = min(c.sh_degree, int(self.progress / c.sh_every)) if c.sh_every > 0 else c.sh_degree
-        self.model.sh_degree = self.needs.sh_degree(degree)
+        self.model.sh_degree = self.policy.sh_degree(degree)
         if c.poses.on and not self._refined and self.progress >= c.poses.until:
             self._freeze_poses()
         due = self.iteration > 0 and self.iteration % c.densify.every == 0
         if due and c.densify.start <= self.progress < 0.9:
-            self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress, self.needs.growing)
+            self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress, self.policy.growing)
         if c.method == "static":
             return
         if c.method == "auto":
@@ -279,7 +288,7 @@ class Trainer:
     def _freeze_poses(self) -> None:
         """From here on the corrected cameras are the cameras; a frame's that is not trained on too."""
         refined = corrected(self.viewmats, self.poses.at(self.scene.times))
-        self.needs.judge_cameras(self, refined)
+        self.policy.judge_cameras(self, refined)
         self.viewmats, self._refined = refined, True
 
     def _viewmat(self, index: int, frame: int | None = None) -> Tensor:
@@ -302,7 +311,7 @@ class Trainer:
     def _on_trial(self) -> bool:
         """Is the trial judged now? At `harden`, and as long as nothing has begun to move, again until `give_up`."""
         c = self.config
-        if self.model.field is None or "hardened" in self.needs.facts:
+        if self.model.field is None or self.policy.facts.hardened is not None:
             return False
         first, last, every = (round(share * c.iterations) for share in (c.gate.harden, c.gate.give_up, 0.05))
         return first <= self.iteration <= last and (
@@ -315,7 +324,7 @@ class Trainer:
         if self.model.field is None or not len(self.model.open_rows()):
             return
         if harden(self):
-            self.needs.facts["hardened"] = self.iteration
+            self.policy.gate_hardened(self.iteration)
             self._shift = self._shift[:0]
 
     def _create_field(self) -> None:
@@ -323,11 +332,11 @@ class Trainer:
         model, c = self.model.gaussians, self.config
         means = model.params["means"].detach()[model.open].cpu()
         harmonics = model.params["shN"].shape[1]
-        start = Start(means, field_box(means), self.scene.points, len(self.train_ids), harmonics, self.generator)
-        settings = c.field
-        if getattr(settings, "time_nodes", None) == 0 and (nodes := self.needs.time_nodes(self)):
-            settings = dataclasses.replace(settings, time_nodes=nodes)
-        field = host(c.host).create(settings, start).to(self.device)
+        start = Start(
+            means, field_box(means), self.scene.points, len(self.train_ids), harmonics, self.generator,
+            lambda: self.policy.time_nodes(self),
+        )  # fmt: skip
+        field = host(c.host).create(c.field, start).to(self.device)
         # Behind the gate the Gaussians that open say where the motion is.
         if field.rehearsal > 0 and c.method != "auto":
             self._rehearse(field)
@@ -335,16 +344,8 @@ class Trainer:
             model.adopt(name, owned.shape, owned.value)
         self.model.field = field
         self._memory.keep(field)
-        self.needs.facts["opened"] = {"iteration": self.iteration, "seconds": self.trained_seconds}
-        self._add_field_groups(field)
-
-    def _add_field_groups(self, field: Deformation) -> None:
-        for group in field.parameter_groups():
-            self.optimizer.add_param_group({**group, "lr_start": group["lr"]})
-        for name, owned in field.owned.items():
-            params = [self.model.gaussians.params[name]]
-            rates = {"lr": owned.lr, "lr_start": owned.lr, "lr_end": owned.lr_end}
-            self.optimizer.add_param_group({"params": params, "name": name, "rows": True, **rates})
+        self.policy.field_opened(self.iteration, self.trained_seconds)
+        add_field(self.optimizer, field, model)
 
     def _rehearse(self, field: Deformation) -> None:
         """The host's pre-stage; its steps are steps of the run. Interrupted, it starts again."""
@@ -352,8 +353,8 @@ class Trainer:
 
         def loss(state: dict[str, Tensor], frame: int) -> Tensor:
             self.report.check_cancelled()
-            out = self._render(state, frame, sh_degree=0, with_contributions=False)
-            return photometric(out.colors[0], self._image(frame), self.config.dssim)
+            out = self.render_trained(state, frame, sh_degree=0, with_contributions=False)
+            return photometric(out.colors[0], self.image_of(frame), self.config.dssim)
 
         points, colors = (t.to(self.device) for t in (self.scene.points, self.scene.colors))
         field.rehearse(Rehearsal(points, colors, self.times, steps, loss, self.generator))
@@ -366,7 +367,8 @@ class Trainer:
         """[3] what shows where nothing covers when a frame is measured or shown: mid grey."""
         return torch.full((3,), 0.5, device=self.device)
 
-    def _render(self, state: dict[str, Tensor], frame: int, **options: Any) -> Any:
+    def render_trained(self, state: dict[str, Tensor], frame: int, **options: Any) -> RasterOutput:
+        """Parameters `state` as the camera of the trained frame at position `frame` sees them, as training goes."""
         index = self.train_ids[frame]
         options.setdefault("background", self.background)
         options.setdefault("with_contributions", True)
@@ -379,7 +381,7 @@ class Trainer:
     def _next_frame(self) -> int:
         if not self.order:
             drawn = torch.randperm(len(self.train_ids), generator=self.generator, device="cpu").tolist()
-            out = self.unusable | self.needs.held
+            out = self.frames_left_out
             self.order = [frame for frame in drawn if frame not in out]
         self._recent.append(self.order[-1])
         return self.order.pop()
@@ -395,15 +397,9 @@ class Trainer:
             total = total + c.field_every * field.regularisation(self.progress, self.generator)
         return total
 
-    def _is_to_look(self) -> bool:
-        s = self.config.supervision
-        needed = s.preset == "support" and s.anchor == "hidden" and self.model.field is not None
-        return needed and self.iteration % s.look_every == 0
-
     def _pairs_to_anchor(self, rows: Tensor) -> Anchored | None:
         s = self.config.supervision
-        due = s.preset == "support" and self.progress >= s.start and self.iteration % s.support_every == 0
-        if self.model.field is None or not due:
+        if self.model.field is None or not s.anchors_due(self.iteration, self.progress):
             return None
         return draw_anchored(self.model.gaussians, rows, s, self.generator)
 
@@ -413,52 +409,6 @@ class Trainer:
             raise RuntimeError("pairs were drawn without a field")
         loss = support_loss(self.model.gaussians, field, pairs, here, self.centres, self.seconds, s)
         return s.support_every * loss
-
-    def _paper_is_due(self) -> bool:
-        s = self.config.supervision
-        on = s.preset == "paper" and self.progress >= s.start and self.model.field is not None
-        return on and self.iteration % s.every == 0
-
-    def _paper_step(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> None:
-        """Adds the paper's terms for this frame and a random other one; their gradients join the step's."""
-        other = int(torch.randint(len(self.train_ids), (1,), generator=self.generator, device="cpu"))
-        if self.times[other] == self.times[frame] or other in self.unusable | self.needs.held:
-            return
-        self._recent.append(other)
-        acted = self._acted(frame, rows, state, out)
-        other_state = self.model.state_at(self.times[other])
-        other_state["means"].retain_grad()
-        other_out = self._render(other_state, other)
-        exposed = self.model.exposure.apply(other_out.colors[0], self.times[other])
-        loss = photometric(exposed, self._image(other), self.config.dssim)
-        loss.backward(retain_graph=True)
-        other_acted = self._acted(other, rows, other_state, other_out)
-        every = self.config.supervision.pulls == "all"
-        if not every:
-            other_state = self.model.state_at(self.times[other], canonical=False)
-        views = [
-            self._paper_view(self.model.state_at(self.times[frame], canonical=every), frame, rows, acted),
-            self._paper_view(other_state, other, rows, other_acted),
-        ]
-        loss = paper_loss(views[0], views[1], self.progress, self.config.supervision)
-        if loss is not None and bool(torch.isfinite(loss)):
-            loss.backward()
-
-    def _acted(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> Tensor:
-        """bool [M]: on which of `rows` the frame acted; `out` and `state` after the frame's own backward pass."""
-        index, pull = self.train_ids[frame], state["means"].grad
-        if pull is None or out.weight_sum is None:
-            raise RuntimeError("the frame was rendered without gradients or contributions")
-        return well_supervised(
-            self.config.supervision, out.weight_sum[0][rows], out.means2d_grad[0][rows], pull[rows],
-            self.Ks[index], self.viewmats[index], state["means"].detach()[rows], (self.width, self.height),
-        )  # fmt: skip
-
-    def _paper_view(self, state: dict[str, Tensor], frame: int, rows: Tensor, acted: Tensor) -> PaperView:
-        index = self.train_ids[frame]
-        means = state["means"][rows].detach()
-        inside = inside_frustum(means, self.viewmats[index], self.Ks[index], self.width, self.height)
-        return PaperView(self.times[frame], {k: v[rows] for k, v in state.items()}, inside, acted)
 
     def _left_out(self, frame: int) -> None:
         """After a step that was left out on the CPU: repairs; a run that keeps failing ends in words."""
@@ -506,70 +456,64 @@ class Trainer:
     def _bad_images(self) -> list[int]:
         """Of the frames trained on lately, those whose image is not finite."""
         frames = sorted({*self._recent} - self.unusable)
-        return [frame for frame in frames if not bool(torch.isfinite(self._image(frame)).all())]
+        return [frame for frame in frames if not bool(torch.isfinite(self.image_of(frame)).all())]
 
     # ------------------------------------------------------------------ optimiser
 
-    def _gaussian_optimizer(self) -> FusedAdam:
-        c, p = self.config, self.model.gaussians.params
-        rates = {
-            "means": (c.lr_means, c.lr_means_end), "quats": (c.lr_quats, 0.1 * c.lr_quats),
-            "log_scales": (c.lr_scales, 0.1 * c.lr_scales), "opacity_logits": (c.lr_opacities, 0.1 * c.lr_opacities),
-            "sh0": (c.lr_sh0, 0.1 * c.lr_sh0), "shN": (c.lr_sh_rest, 0.1 * c.lr_sh_rest),
-        }  # fmt: skip
-        groups = [
-            {"params": [p[name]], "lr": start, "lr_start": start, "lr_end": end, "name": name, "rows": True}
-            for name, (start, end) in rates.items()
-        ]
-        groups[list(rates).index("log_scales")]["clamp"] = _LOG_SCALE_RANGE
-        e = self.model.exposure
-        groups.append(
-            {"params": [e.values], "lr": c.exposure.lr, "lr_start": c.exposure.lr, "lr_end": 0.1 * c.exposure.lr}
-        )
-        if c.poses.on:
-            groups.append(
-                {
-                    "params": [self.poses.values],
-                    "lr_start": c.poses.lr,
-                    "lr_end": 0.1 * c.poses.lr,
-                    "until": c.poses.until,
-                }
-            )
-        return FusedAdam(groups, eps=1e-15)
-
     def _schedule(self) -> None:
-        """Log-linear learning rates from start to end over the run or a host's part of it (3DGS get_expon_lr_func)."""
-        schedule = self.extensions[-1] if self.extensions else self.needs
-        progress = schedule.rate_progress(self.iteration, self.config.iterations)
-        for group in self.optimizer.param_groups:
-            since, until = group.get("since", 0.0), group.get("until", 1.0)
-            share = min(max((progress - since) / (until - since), 0.0), 1.0)
-            group["lr"] = group["lr_start"] * (group["lr_end"] / group["lr_start"]) ** share
+        schedule = self.extensions[-1] if self.extensions else self.policy
+        schedule_rates(self.optimizer, schedule.rate_progress(self.iteration, self.config.iterations))
 
     # ------------------------------------------------------------------ held-out frames
 
     @torch.no_grad()
-    def render_frame(self, index: int) -> Tensor:
-        """Frame `index` of the scene at its own time, [H, W, 3], not clamped."""
-        state = self.model.state_at(float(self.scene.times[index]))
-        out = render(
-            state, self.model.sh_degree, self._viewmat(index), self.Ks[index], self.width, self.height,
-            background=self.background, with_depth=False, with_contributions=False,
-        )  # fmt: skip
-        return self.model.exposure.apply(out.colors[0], float(self.scene.times[index]))
+    def render_frame(
+        self, index: int, *, sh_degree: int | None = None, exposure: bool = True, field: bool = True,
+        viewmats: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Frame `index` of the scene at its own time, [H, W, 3], not clamped.
 
-    def frame_psnrs(self, indices: list[int], images: Tensor) -> list[float]:
-        """PSNR in dB of each frame `indices` of the scene at its own time against images [I, H, W, 3]."""
+        With another SH degree, without exposure or field, or from other cameras [F, 4, 4] than the run's.
+        """
+        model, time = self.model, float(self.scene.times[index])
+        state = model.state_at(time) if field else model.moved(model.open_rows(), None)
+        viewmat = self._viewmat(index) if viewmats is None else viewmats[index]
+        out = render(
+            state, model.sh_degree if sh_degree is None else sh_degree, viewmat, self.Ks[index], self.width,
+            self.height, background=self.background, with_depth=False, with_contributions=False,
+        )  # fmt: skip
+        return model.exposure.apply(out.colors[0], time) if exposure else out.colors[0]
+
+    def frame_psnrs(self, indices: list[int], images: Tensor, **options: Any) -> list[float]:
+        """PSNR in dB of each frame `indices` of the scene at its own time against images [I, H, W, 3].
+
+        `options` go to `render_frame`.
+        """
         values = []
         for n, i in enumerate(indices):
             self.report.check_cancelled()
-            values.append(psnr(self.render_frame(i), images[n].to(self.device, torch.float32)))
+            values.append(psnr(self.render_frame(i, **options), images[n].to(self.device, torch.float32)))
         return values
 
     def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
         """Mean PSNR in dB over held-out frames at their own times; None if there are none."""
         values = self.frame_psnrs(indices, images)
         return sum(values) / len(values) if values else None
+
+    def probe_psnr(
+        self, frames: list[int], *, exposure: bool = True, field: bool = True, **options: Any
+    ) -> float | None:  # fmt: skip
+        """As `needs.Probe` says; `options` go to `render_frame`."""
+        if not (exposure or self.config.exposure.on) or not (field or self.model.field is not None) or not frames:
+            return None
+        indices, options = [self.train_ids[n] for n in frames], {**options, "exposure": exposure, "field": field}
+        values = self.frame_psnrs(indices, self.images[frames], **options)
+        value = sum(values) / len(values)
+        return value if math.isfinite(value) else None
+
+    def correlation_frames(self) -> float | None:
+        """As `needs.Probe` says."""
+        return correlation_of_movers(self)
 
     # ------------------------------------------------------------------ checkpoints
 
@@ -600,7 +544,7 @@ class Trainer:
             "iteration": self.iteration,
             "initial": self.initial,
             "extensions": [dataclasses.asdict(extension) for extension in self.extensions],
-            "needs": self.needs.state(),
+            "needs": self.policy.state(),
             "trained_seconds": self.trained_seconds,
             "sh_degree": self.model.sh_degree,
             "train_frames": [self.scene.frames[i] for i in self.train_ids],
@@ -619,9 +563,9 @@ class Trainer:
                 ExitCode.TRAIN,
             )  # fmt: skip
         self.model = restore_model(tensors, meta, self.config, self.device)
-        self.optimizer = self._gaussian_optimizer()
+        self.optimizer = optimizer_of(self.model, self.poses, self.config)
         if self.model.field is not None:
-            self._add_field_groups(self.model.field)
+            add_field(self.optimizer, self.model.field, self.model.gaussians)
         if self.config.poses.on:
             self.poses.values.data.copy_(tensors["poses"])
         restore_optimizer(self._named(), self.optimizer, tensors)
@@ -632,30 +576,7 @@ class Trainer:
         self.order = tensors["order"].tolist()
         self.iteration, self.initial = int(meta["iteration"]), int(meta["initial"])
         self.extensions = [Extension(**facts) for facts in meta.get("extensions", [])]
-        self.needs.restore(meta["needs"])
+        self.policy.restore(meta["needs"])
         if self.config.poses.on and self.progress >= self.config.poses.until:
             self._freeze_poses()
         self.trained_seconds = float(meta["trained_seconds"])
-
-
-def restore_model(
-    tensors: dict[str, Tensor], meta: dict[str, Any], config: TrainConfig, device: torch.device | str = "cpu"
-) -> DynamicModel:
-    """The model of a checkpoint, without its optimiser, on `device`."""
-    centres = tensors["centres"].to(device, copy=True)
-    gaussians = Gaussians.from_state(tensors, len(centres)).to(torch.device(device))
-    field = None
-    if any(name.startswith("field.") for name in tensors):
-        field = host(config.host).restore(config.field, tensors).to(device)
-    exposure = Exposure(centres, config.exposure)
-    exposure.values.data.copy_(tensors["exposure"])
-    return DynamicModel(gaussians, field, centres, int(meta["sh_degree"]), exposure)
-
-
-def inside_frustum(means: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:
-    """bool [M]: is the centre of means [M, 3] in front of the camera and inside its image."""
-    camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depth = camera[:, 2].clamp_min(1e-6)
-    x = camera[:, 0] / depth * K[0, 0] + K[0, 2]
-    y = camera[:, 1] / depth * K[1, 1] + K[1, 2]
-    return (camera[:, 2] > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)

@@ -4,8 +4,8 @@
 
 BLENDER has the extension installed, as for press_steps.py; the shot is of the bundled clip and has a take "freeze" with
 frame 48 (`freeze examples/sitting.mp4`, any preset). Exit status 0 if the take, put in at 50 %, fills the frame at
-100 %; a cube stands where Only Moving shows the plate, and its edge is soft; a grade behind the plate stays; the scene
-kept its size, and has its camera back in the end.
+100 %; a cube stands where Only Moving shows the plate, its edge is soft, and nobody's hand is there twice; a grade
+behind the plate stays; the scene kept its size, and has its camera back in the end.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ import press_steps as press
 
 FRAME, SIZE = 48, (1280, 720)
 GOOD = (
-    "size_kept", "filled", "cube_kept", "edge_soft", "as_plate", "grade_kept", "frozen", "links_back", "camera_back",
+    "size_kept", "filled", "cube_kept", "moved_once", "edge_soft", "as_plate", "grade_kept", "frozen", "links_back",
+    "camera_back",
 )  # fmt: skip
 
 
@@ -87,6 +88,8 @@ def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
     node.inputs["Only Moving"].default_value = 1.0
     moving = _render(work, "only-moving")
     told["cube_kept"] = bool(np.abs(moving - among)[solid & seen].max(axis=1).mean() < 0.05)
+    told["only_moving_differs"] = round(float((np.abs(moving - among).max(axis=2) > 0.2).mean()), 4)
+    told["moved_once"] = told["only_moving_differs"] < 0.003  # a hand that has gone elsewhere in the plate: 0.01
     yield from _show(work, "11-only-moving", "Rendering")
     bpy.data.objects.remove(next(o for o in scene.objects if o.type == "MESH" and not o.hide_render))
     _press("remove_shot")

@@ -288,7 +288,7 @@ def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
 
     window = bpy.context.window_manager.windows[0]
     wanted = f"bpy.ops.{operator}("
-    for _ in range(6):
+    for _ in range(12):
         area, region = _place(window, kind)
         shares = (0.8,) if operator.endswith(".cancel") else (0.33, 0.745, 0.85)  # small ones stand at the right
         rows = range(region.y + region.height - 8, region.y + 4, -9)

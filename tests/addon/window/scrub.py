@@ -2,9 +2,9 @@
 
     python tests/addon/window/scrub.py --blender BLENDER --shot SHOT.splannequin [--output docs/images]
 
-BLENDER has the extension installed, as for press_steps.py, and SPLANNEQUIN_PYTHON (or a checkout's .venv) names the
-backend. SPLANNEQUIN_WINDOW=960x600 asks for a smaller window. Prints the figures as JSON; pictures: the camera's view,
-made of plates, a free view with a cube among the people, the guesses.
+BLENDER has the extension installed, as for press_steps.py, and SPLANNEQUIN_BACKEND_PYTHON (or a checkout's .venv) names
+the backend. SPLANNEQUIN_WINDOW=960x600 asks for a smaller window. Prints the figures as JSON; pictures: the camera's
+view, made of plates, a free view with a cube among the people, the guesses.
 """
 
 from __future__ import annotations

@@ -188,7 +188,7 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     told["t_star"] = props.t_star
     yield from press._scroll_down()
     yield from press._shoot(work, "11-suggested")
-    props.extend_steps = 3000
+    props.extend_steps = 30000  # it is paused, however long the button takes to be found
     yield from _scroll_up()
     yield from press._click("splannequin.train")
     watch = press._supervisor().watch_of(shot)

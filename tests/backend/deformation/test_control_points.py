@@ -179,28 +179,6 @@ def test_arap_follows_the_published_schedule():
     assert module.rehearsal == pytest.approx(0.125)
 
 
-def test_nodes_join_where_gaussians_open_and_the_optimiser_keeps_its_memory():
-    module = field([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], nodes=8)
-    optimizer = torch.optim.Adam([{"params": g["params"], "lr": 1e-2} for g in module.parameter_groups()])
-    near, far = torch.rand(50, 3) * 0.1, torch.rand(50, 3) * 0.1 + 1.0
-    module(near, torch.tensor([0.5])).means.square().sum().backward()
-    optimizer.step()
-    before = optimizer.state[module.log_radii]["exp_avg"].clone()
-    module.cover(near, optimizer)
-    assert len(module.places) == 4
-    module.cover(torch.cat([near, far]), optimizer)
-    assert len(module.places) == 12
-    assert float((module.places[4:] - 1.05).abs().max()) <= 0.0501
-    assert module.hyper.shape == (12, 2)
-    kept = optimizer.state[module.log_radii]["exp_avg"]
-    assert torch.equal(kept[:4], before)
-    assert float(kept[4:].abs().max()) == 0.0
-    assert any(p is module.log_radii for g in optimizer.param_groups for p in g["params"])
-    optimizer.zero_grad()
-    module(far, torch.tensor([0.5])).means.square().sum().backward()
-    optimizer.step()
-
-
 def test_no_place_to_stand_is_refused():
     with pytest.raises(ValueError, match="at least one"):
         ControlPoints(ControlPointsConfig(), torch.zeros(0, 3), BOX, 10, torch.Generator())

@@ -94,31 +94,6 @@ def test_smoothness_sees_every_axis():
             assert float(module.regularisation().detach()) > flat
 
 
-def test_outside_is_counted():
-    x = torch.cat([points(4), BOX[1:] + 1.0])
-    assert field().outside(x) == 1
-
-
-def test_refit_keeps_the_field_and_resolves_more():
-    """Twice the box at twice the nodes would be exact; at the same nodes the field is kept to its own blur."""
-    module = stir(field())
-    with torch.no_grad():
-        for plane in module.spatial:
-            ramp = torch.linspace(0.2, 0.6, plane.shape[3])
-            plane.copy_(ramp[None, None, None, :] + 0.5 * torch.linspace(0, 1, plane.shape[2])[None, None, :, None])
-        for plane in module.temporal:
-            plane.copy_(torch.linspace(0.8, 1.2, plane.shape[3]).expand_as(plane))
-    x = points(50)
-    x = BOX[0] + 0.1 + 0.8 * (x - BOX[0])
-    before = module.features_at(x, torch.tensor([0.3]))
-    wider = torch.stack([BOX[0] - 0.5, BOX[1] + 0.5])
-    assert module.outside(wider) == 2
-    module.refit(wider)
-    assert module.outside(wider) == 0
-    after = module.features_at(x, torch.tensor([0.3]))
-    assert float((after - before).abs().max() / before.abs().max()) < 0.2
-
-
 def test_state_round_trip():
     one = stir(field())
     two = HexPlane(one.config, BOX + 1.0, torch.Generator().manual_seed(5))
@@ -150,9 +125,6 @@ def test_the_published_field_moves_everything_from_the_start():
     assert all(float(d.abs().max()) > 0 for d in deltas.values())
     assert torch.equal(module.box, torch.stack([start.points.amin(0), start.points.amax(0)]))
     assert module.temporal[0].shape[2] == 150
-    optimizer = torch.optim.Adam(module.parameters())
-    module.cover(points() + 100.0, optimizer)
-    assert torch.equal(module.box[0], start.points.amin(0))
 
 
 def test_the_published_field_reaches_only_the_upper_half_of_time():

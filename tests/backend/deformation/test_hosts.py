@@ -1,12 +1,14 @@
 """What every host keeps: found by its file, identity at the start, a rigid motion fitted, finite, restored."""
 
+import dataclasses
 import importlib
 import sys
 
 import pytest
 import torch
 
-from torch_backend.deformation import registry
+from torch_backend import native
+from torch_backend.deformation import geometry, planes, registry
 from torch_backend.deformation.protocol import Deltas, Rehearsal, Start, add_to_scale, apply_deltas, turn
 from torch_backend.gaussians import PARAM_NAMES, Gaussians
 
@@ -52,6 +54,39 @@ def test_the_hosts_of_the_issue_are_there():
         registry.host("nerf")
     with pytest.raises(ValueError, match="reference"):
         registry.host_config("mlp", "published", 100)
+
+
+def test_only_a_host_with_an_axis_to_size_asks_how_many_nodes_time_needs():
+    """To answer, the run renders dozens of frames."""
+    asked = []
+
+    def nodes():
+        asked.append(True)
+        return 7
+
+    for name in HOSTS:
+        for configuration in registry.CONFIGURATIONS:
+            begin = dataclasses.replace(start(cloud().params["means"].detach()), time_nodes=nodes)
+            field = registry.host(name).create(registry.host_config(name, configuration, 1000), begin)
+            assert bool(asked) == ((name, configuration) == ("hexplane", "default"))
+            assert not asked or field.config.time_nodes == 7
+            asked.clear()
+
+
+@pytest.mark.parametrize("name", ["hexplane", "control_points"])
+def test_what_a_host_calls_is_compiled_before_it_is_called(name, monkeypatch):
+    """From the main thread, before the clock of the first step: no snippet is compiled in a step."""
+    for made in (planes._sampler, planes._penalty, geometry._search):  # by another test
+        made.cache_clear()
+    spec = registry.host(name)
+    spec.warm_up(spec.settings())
+    compiled = []
+    monkeypatch.setattr(native, "build", lambda *_: compiled.append(True))
+    means = cloud().params["means"].detach()
+    field = create(name, means=means)
+    field(means, torch.tensor([0.5]), own_rows(field, len(means)))
+    field.regularisation(0.5, torch.Generator().manual_seed(0))
+    assert not compiled
 
 
 @pytest.mark.parametrize("name", HOSTS)

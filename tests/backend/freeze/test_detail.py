@@ -290,6 +290,19 @@ def test_the_plate_of_the_instant_is_its_own_frame(world, made):
         assert made(frame, frame).motion.numpy()[~widened(~world.seen_at(frame)[1], 3)].min() > 0.9
 
 
+@pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (10, 4)])
+def test_the_plate_may_stand_where_the_motion_matte_is_black(world, made, frame, t_star):
+    """Not so where the board stands in the frame's own plate and no longer at t*: the plate would show it twice."""
+    result = made(frame, t_star)
+    gone = world.seen_at(frame)[1] & ~world.truth(world.output(frame, t_star))[1]
+    assert gone.mean() > 0.02 and (result.motion.numpy()[gone] > 0.9).mean() > 0.95
+    share = result.motion.numpy()[..., None]
+    plate = world.plates().linear(frame).numpy()
+    through = share * result.linear.numpy() + (1.0 - share) * plate
+    assert np.abs(through - result.linear.numpy())[gone].mean() < 0.01
+    assert result.motion.mean() < 0.6, "the room stays as it was"
+
+
 def test_stripes_of_what_sways_come_from_other_plates_moved_as_the_model_moves_it(world):
     """At the end of its way the board moves by 2 pixels from one frame to the next: half a stripe."""
     output = world.output(12, 13)

@@ -26,7 +26,7 @@ class Remedy:
 
     name: str
     file: str
-    """Within torch_backend."""
+    """Within torch_backend; a folder of kernels stands for all of its files."""
     old: str
     new: str
     test: str
@@ -49,13 +49,19 @@ class Remedy:
     def node(self) -> str:
         return f"tests/backend/raster/{self.full_test}"
 
+    def texts(self, folder: Path) -> dict[Path, str]:
+        """Files of the copy of torch_backend in `folder` that may hold the text, and what they hold."""
+        path = folder / self.file
+        files = sorted(path.glob("*.c*")) if path.is_dir() else [path]
+        return {file: file.read_text(encoding="utf-8") for file in files}
+
     @property
     def command(self) -> list[str]:
         words = {"": "", "reference": "reference and not reference32"}.get(self.body, self.body)
         return [self.node, *(["-k", words] if words else [])]
 
 
-CPU, REFERENCE, CUDA, API = "raster/cpu_source.py", "raster/reference.py", "raster/cuda_source.py", "raster/api.py"
+CPU, REFERENCE, CUDA, API = "raster/kernels/cpu", "raster/reference.py", "raster/kernels/cuda", "raster/api.py"
 CPU_HOST = "raster/cpu.py"
 _NON_FINITE = "test_non_finite_gaussian_is_culled_and_the_others_stay"
 _ENORMOUS = "test_infinite_and_enormous_scales_are_culled"
@@ -216,7 +222,7 @@ REMEDIES = [
            "test_images_smaller_than_the_window_of_ssim_are_compared_by_l1_alone", ""),
     Remedy("SSIM refuses images below its window", "raster/ssim.py", " or min(image.shape[:2]) < WINDOW", "",
            "test_ssim.py::test_refuses_what_it_cannot_do", ""),
-    Remedy("SSIM's range is 1", "raster/ssim.py", "C1 = 1e-4f", "C1 = 6.5025f",
+    Remedy("SSIM's range is 1", "raster/kernels/ssim.cpp", "C1 = 1e-4f", "C1 = 6.5025f",
            "test_ssim_takes_one_as_the_range_of_the_data", "float32"),
     Remedy("SSIM's range is 1, in torch", "train/losses.py", "_C1, _C2 = 0.01**2, 0.03**2",
            "_C1, _C2 = 2.55**2, 7.65**2",
@@ -333,18 +339,19 @@ def _run(folder: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]
 
 def _try(folder: Path, remedy: Remedy) -> str:
     """Take one remedy out, run its test, put it back. What happened, in a word; 'noticed' is what should."""
-    path = folder / "torch_backend" / remedy.file
-    text = path.read_text(encoding="utf-8")
-    changed = text
+    texts = remedy.texts(folder / "torch_backend")
+    changed = dict(texts)
     for old, new in remedy.changes:
-        if old not in changed:
+        if not any(old in text for text in changed.values()):
             return "TEXT NOT FOUND"
-        changed = changed.replace(old, new)
-    path.write_text(changed, encoding="utf-8")
+        changed = {path: text.replace(old, new) for path, text in changed.items()}
     try:
+        for path, text in changed.items():
+            path.write_text(text, encoding="utf-8")
         code = _run(folder, remedy.command).returncode
     finally:
-        path.write_text(text, encoding="utf-8")
+        for path, text in texts.items():
+            path.write_text(text, encoding="utf-8")
     # 1: tests failed; below 0: the process died, as an out-of-bounds access makes it.
     return "noticed" if code == 1 or code < 0 else f"NOT NOTICED (pytest's exit code {code})"
 

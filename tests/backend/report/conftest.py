@@ -26,7 +26,7 @@ def frame() -> torch.Tensor:
 
 @pytest.fixture(scope="session")
 def damaged(frame):
-    """The damages of design/metrics.md: blur with sigma 1 and 3, and a ghost 6 px aside."""
+    """Damages that a metric has to tell: blur with sigma 1 and 3, and a ghost 6 px aside."""
 
     def blur(sigma: float) -> torch.Tensor:
         return torch.from_numpy(gaussian_filter(frame.numpy().astype(np.float64), (sigma, sigma, 0))).float()

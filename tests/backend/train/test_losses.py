@@ -37,7 +37,7 @@ def test_ssim_and_gradient_match_autograd_at_float64():
 
 
 def test_ssim_range_is_one():
-    """The published code ran SSIM with data_range 255 on [0, 1] images, which made it inert (method-hosts 2.17)."""
+    """The published code ran SSIM with data_range 255 on [0, 1] images, which made it inert."""
     x = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))
     noisy = (x + 0.1 * torch.randn(32, 32, 3, generator=torch.Generator().manual_seed(2))).clamp(0, 1)
     assert float(1 - ssim(noisy, x)) > 0.03

@@ -5,6 +5,7 @@ import io
 import json
 import math
 import sys
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -15,16 +16,23 @@ from torch_backend.freeze.query import freeze_at, render_frozen
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
 from torch_backend.train.checkpoint import load_checkpoint
+from torch_backend.train.model import restore_model
+from torch_backend.train.modelled import modelled
 from torch_backend.train.needs import (
-    correlation_frames,
+    FieldOpened,
+    LimitHarmonics,
+    NeedsConfig,
+    RunFacts,
+    RunSchedule,
+    StoppingPolicy,
     growth_gain,
     lasting,
-    limit_harmonics,
-    modelled,
     newest_gain,
     probe_frames,
 )
-from torch_backend.train.trainer import Trainer, restore_model
+from torch_backend.train.optimizer import limit_harmonics
+from torch_backend.train.residual import correlation_frames
+from torch_backend.train.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +132,7 @@ def test_dropped_harmonics_change_nothing_below(long_world, quiet):
 def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     never = {"needs__sh_gain": -1e9, "needs__growth_gain": -1e9}
     runs = [trainer_of(long_world, quiet, **never) for _ in range(2)]
-    probes = runs[0].needs.probes
+    probes = runs[0].policy.probes
     assert len(probes) == 3
     runs[1].images[probes] = 1.0  # as good as no picture at all
     for trainer in runs:
@@ -156,10 +164,10 @@ def test_a_degree_that_gains_too_little_is_dropped_for_good(long_world, quiet, t
     """What is left out is gone from the checkpoint too, and what stays can be frozen."""
     trainer = finish(trainer_of(long_world, quiet, needs__sh_gain=1e9), tmp_path)
     assert trainer.model.sh_degree == 0
-    assert trainer.needs.degrees.keys() == {1}
+    assert trainer.policy.degrees.keys() == {1}
     rows = {row["what"]: row for row in modelled(trainer)}
     assert rows["SH degree 1"]["detail"] == "dropped"
-    assert rows["SH degree 1"]["gain_db"] == pytest.approx(trainer.needs.degrees[1], abs=1e-3)
+    assert rows["SH degree 1"]["gain_db"] == pytest.approx(trainer.policy.degrees[1], abs=1e-3)
     model = restore_model(*load_checkpoint(tmp_path / "checkpoint.safetensors"), trainer.config)
     assert model.gaussians.params["shN"].shape[1] == 0
     scene = long_world[0]
@@ -172,11 +180,11 @@ def test_a_degree_that_gains_too_little_is_dropped_for_good(long_world, quiet, t
 def test_growth_ends_when_it_gains_too_little(long_world, quiet, tmp_path):
     changes = {"init__seeds": 0, "densify__budget": 1200, "iterations": 200}
     free = finish(trainer_of(long_world, quiet, needs__growth_gain=-1e9, **changes), tmp_path)
-    assert free.needs.growth_ended is None
+    assert free.policy.growth_ended is None
     assert len(free.model.gaussians) > 1000
     bound = finish(trainer_of(long_world, quiet, needs__growth_gain=1e9, **changes), tmp_path)
-    assert 0 < bound.needs.growth_ended < 0.6 * 200
-    at_end = dict((i, n) for i, n, _ in bound.needs.measured)[bound.needs.growth_ended]
+    assert 0 < bound.policy.growth_ended < 0.6 * 200
+    at_end = dict((i, n) for i, n, _ in bound.policy.measured)[bound.policy.growth_ended]
     assert len(bound.model.gaussians) <= at_end < 1000
 
 
@@ -184,17 +192,85 @@ def test_growth_is_not_judged_while_a_field_is_on_trial(long_world, quiet):
     """What the probes lose as a field opens says nothing of the Gaussians."""
     trainer = trainer_of(long_world, quiet, needs__growth_gain=1e9)
     ended = []
-    for facts in ({}, {"opened": {}}, {"opened": {}, "hardened": 60}):
-        trainer.needs.facts, trainer.needs.growth_ended = dict(facts), None
-        trainer.needs.measured = [(n, round(500 * 1.1**n), 20.0 + 0.1 * n) for n in range(6)]
-        trainer.needs._measure(trainer)
-        ended.append(trainer.needs.growth_ended is not None)
+    opened = FieldOpened(30, 1.0)
+    for facts in (RunFacts(), RunFacts(opened=opened), RunFacts(opened=opened, hardened=60)):
+        trainer.policy.facts, trainer.policy.growth_ended = facts, None
+        trainer.policy.measured = [(n, round(500 * 1.1**n), 20.0 + 0.1 * n) for n in range(6)]
+        trainer.policy._measure(trainer)
+        ended.append(trainer.policy.growth_ended is not None)
     assert ended == [True, False, True]
+
+
+@dataclass
+class Numbers:
+    """A run as the policy sees it, without one: PSNR by SH degree, and what exposure and field add."""
+
+    iteration: int
+    sh_degree: int = 1
+    gaussian_count: int = 1000
+    by_degree: tuple[float, ...] = (20.0, 20.01, 20.5)
+    steps: int = 100
+
+    @property
+    def progress(self):
+        return self.iteration / self.steps
+
+    def probe_psnr(self, frames, *, sh_degree=None, exposure=True, field=True, viewmats=None):
+        degree = self.sh_degree if sh_degree is None else sh_degree
+        without = 0.3 * (not exposure) + 0.2 * (not field)
+        return self.by_degree[degree] - without + (0.1 if viewmats is not None else 0.0)
+
+    def correlation_frames(self):
+        return 4.0
+
+
+def policy_of(**changes):
+    return StoppingPolicy(NeedsConfig(**changes), 60, RunSchedule(100, 10, 0.6, 0.7, 0.15))
+
+
+def test_the_policy_yields_a_decision_and_changes_nothing_of_the_run():
+    policy, run = policy_of(sh_gain=0.1), Numbers(35)
+    before = vars(run).copy()
+    decisions = policy.decide(run)
+    assert next(decisions) == LimitHarmonics(0)
+    assert vars(run) == before
+    assert policy.sh_degree(2) == 0
+    assert list(decisions) == []
+    assert list(policy.decide(run)) == []  # decided once
+    assert not list(policy_of(sh_gain=0.001).decide(run))
+
+
+def test_what_a_degree_was_dropped_from_is_what_joins():
+    """Where both fall on one step, the last look at the probes is at the model without the harmonics."""
+    policy, run = policy_of(sh_gain=0.1), Numbers(60)
+    for decision in policy.decide(run):
+        run.sh_degree = decision.degree
+    assert policy.held == set()
+    facts = policy.facts
+    assert facts.probe_psnr_db == 20.0
+    assert (facts.exposure_gain_db, facts.field_gain_db) == (pytest.approx(0.3), pytest.approx(0.2))
+
+
+def test_refined_cameras_are_judged_once_and_only_while_probes_are_held():
+    policy = policy_of()
+    policy.judge_cameras(Numbers(30), torch.eye(4)[None])
+    assert policy.facts.poses_gain_db == pytest.approx(0.1)
+    policy = policy_of()
+    policy.joined = True
+    policy.judge_cameras(Numbers(30), torch.eye(4)[None])
+    assert policy.facts.poses_gain_db is None
+
+
+def test_facts_come_back_from_runs_of_other_versions():
+    facts = RunFacts(growth_gain_db=0.1, opened=FieldOpened(100, 2.5), hardened=225)
+    assert facts.to_json() == {"growth_gain_db": 0.1, "opened": {"iteration": 100, "seconds": 2.5}, "hardened": 225}
+    assert RunFacts.from_json(facts.to_json()) == facts
+    assert RunFacts.from_json({**facts.to_json(), "poses_gain_db": None, "of_another_version": 1}) == facts
 
 
 def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     trainer = finish(trainer_of(long_world, quiet, needs__stop_gain=1e9), tmp_path)
-    assert trainer.needs.stopped == 80  # the first measurement after the gate has given up waiting for motion
+    assert trainer.policy.stopped == 80  # the first measurement after the gate has given up waiting for motion
     assert trainer.iteration == 90
     group = trainer.optimizer.param_groups[0]
     trainer._schedule()
@@ -206,7 +282,7 @@ def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     again.restore(tmp_path / "checkpoint.safetensors")
     assert again.end == 90
     on = finish(trainer_of(long_world, quiet, needs__stop_gain=-1e9), tmp_path)
-    assert on.needs.stopped is None
+    assert on.policy.stopped is None
     assert on.iteration == 100
 
 
@@ -223,7 +299,7 @@ def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
         resumed = trainer_of(long_world, quiet, **changes)
         resumed.restore(tmp_path / "broken.safetensors")
         finish(resumed, tmp_path)
-        expected, got = (copy.deepcopy(json.loads(json.dumps(t.needs.state()))) for t in (whole, resumed))
+        expected, got = (copy.deepcopy(json.loads(json.dumps(t.policy.state()))) for t in (whole, resumed))
         for state in (expected, got):
             (state["facts"].get("opened") or {}).pop("seconds", None)
         assert got == expected
@@ -236,17 +312,17 @@ def test_published_hosts_are_left_alone(long_world, quiet):
     scene, images = long_world
     for params in (TrainParams(method="hexplane"), TrainParams(host_config="reference")):
         trainer = Trainer(scene, images, scene.solved, config_from_params(params), quiet())
-        assert trainer.needs.probes == []
-        assert trainer.needs.held == set()
+        assert trainer.policy.probes == []
+        assert trainer.policy.held == set()
     for method in ("auto", "static"):  # the one is compared with the other: both decide
-        assert trainer_of(long_world, quiet, method=method).needs.held == set(probe_frames(len(scene.solved), 12))
+        assert trainer_of(long_world, quiet, method=method).policy.held == set(probe_frames(len(scene.solved), 12))
 
 
 def test_time_nodes_follow_the_motion(long_world, quiet, tmp_path):
     """One sway over the clip of 30 frames: half of the frames' number of nodes would be 15."""
     trainer = finish(trainer_of(long_world, quiet, iterations=300, needs__sh_gain=1e9), tmp_path)
     assert trainer.model.field is not None
-    nodes = trainer.needs.facts["time_nodes"]
+    nodes = trainer.policy.facts.time_nodes
     assert 4 <= nodes <= 12
     assert trainer.model.field.config.time_nodes == nodes
 

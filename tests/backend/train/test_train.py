@@ -15,7 +15,8 @@ from torch_backend.shot import Shot
 from torch_backend.train import PRESETS, config_from_params, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from torch_backend.train.config import config_from_json, config_to_json
-from torch_backend.train.trainer import Trainer, inside_frustum
+from torch_backend.train.paper import inside_frustum
+from torch_backend.train.trainer import Trainer
 
 
 def test_it_learns_and_reports(trained):

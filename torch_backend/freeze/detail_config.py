@@ -1,0 +1,59 @@
+"""Every number of plate detail: how plates are chosen, weighed and mixed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from .sightings import SightingConfig
+
+
+@dataclass(frozen=True)
+class DetailConfig:
+    """How plates are chosen, weighed and mixed. Lengths are in pixels of pictures 640 wide."""
+
+    sources: int = 5
+    """Plates that a frame is made of, at most: its own and that of t* among them."""
+    reach: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+    """How many frames before and after a pose plates are looked for that see what its own hides."""
+    depth_error: float = 0.15
+    """Share of the depth by which surfaces may be wrong: with the baseline, an error in pixels, at 1 of which a plate
+    is believed by half. A cautious figure: near plates are right where far ones only look so."""
+    margin: int = 2
+    """Pixels around what moves in which the leading plate is not believed: hair, motion blur, the flow's own error."""
+    feather: float = 1.5
+    """Sigma of the leading plate's matte along its border, pixels."""
+    doubt: float = 0.05
+    """Sum of weights at which a pixel is half plate, half splats: what plates say is believed in part, as it is wrong
+    in part. On truth the best share of a single plate's residual in what moves is 0.4 to 0.65."""
+    travel: float = 1.0
+    """Pixels that the model moves a point by, from t* to the frame's own plate, from which on that plate is not
+    believed there if it bears the motion out: sways too small for the flow."""
+    borne_out: float = 0.03
+    """By how much, display-referred, the plate's own time must explain it better than t* does."""
+    alike: float = 0.15
+    """Low-passed difference of the frozen render and its own plate, display-referred, up to which they agree."""
+    denied: float = 0.15
+    """Low-passed difference of the frozen render and its own plate, display-referred, from which on that plate is not
+    believed where plate t* agrees with the render: something held still that was elsewhere."""
+    own_time: float = 0.3
+    """Share of such a difference that must be gone in the render of the plate's own time."""
+    denied_too: float = 0.1
+    """The same, for what hangs together with such a spot."""
+    thin: int = 3
+    """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
+    gap: int = 4
+    """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
+    sees flickers from pixel to pixel."""
+    sway: float = 3.0
+    """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
+    sway_trust: float = 0.15
+    """How far a plate of another time is believed in what moves, where the model explains it. Depths that are off by a
+    pixel carry plate t* to a wrong place far away in pose; the own plate's residual is at its place, at another time:
+    either alone is worse than both."""
+    agreement: float = 0.03
+    """Low-passed difference, display-referred, between a plate of another time and plate t* at which the first is
+    believed 1/e in what moves: it may show another state."""
+    instant: bool = True
+    """Give what plate t* shows and the model lacks a surface of its own (`instant.py`)."""
+    sightings: SightingConfig = field(default_factory=SightingConfig)
+    """How plates are compared with the model."""

@@ -1,0 +1,197 @@
+"""What fills a frozen frame where its leading plate is not believed: splats, and what they missed of other plates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from .bands import look_up_near
+from .detail_config import DetailConfig
+from .posed import PosedFrame, displacements, parallax
+from .reproject import look_up, project, resized, unproject
+from .sightings import Sighting, Sightings
+
+WHOLE = 0.999
+"""Matte from which on the leading plate gives the whole pixel."""
+
+
+@dataclass
+class Fillers:
+    """The plates that fill what the leading one does not give."""
+
+    chosen: list[int]
+    """Their frame numbers."""
+    moved: list[Tensor]
+    """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
+    unknown: Tensor
+    """[h, w] in 0..1: share of it whose way nobody knows."""
+    agreed: list[Tensor]
+    """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
+    residuals: list[Tensor]
+    """[H, W, 3] float16 each, as `Sightings.residual`."""
+
+
+@dataclass
+class Rest:
+    """Pixels of some rows that the leading plate does not give, P of them."""
+
+    y: Tensor
+    """[P] int64 row, from the first of these rows."""
+    x: Tensor
+    """[P] int64 column."""
+    color: Tensor
+    """[P, 3] premultiplied, display-referred."""
+    share: Tensor
+    """[P] in 0..1: how much of it is plate."""
+    source: Tensor
+    """[P] number of the frame that gives most."""
+
+
+def fillers_of(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, matte: Tensor, leading: int, usable: list[int]
+) -> Fillers | None:
+    """The plates for what the leading one does not give; None if it gives everything."""
+    if not bool((matte < WHOLE).any()):
+        return None
+    chosen = _chosen(sightings, config, posed, matte, leading, usable)
+    moved, unknown = displacements(sightings, posed, chosen)
+    agreed = _agreed(sightings, config, posed, chosen, moved)
+    return Fillers(chosen, moved, unknown, agreed, [sightings.residual(frame) for frame in chosen])
+
+
+def _agreed(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], moved: list[Tensor]
+) -> list[Tensor]:
+    """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
+    h, w = posed.depth.shape
+    if posed.t not in chosen:
+        return [torch.ones_like(posed.depth) for _ in chosen]
+    points = posed.points[::2, ::2]  # a quarter of the work: it is low-passed
+    truth = sightings.seen(posed.t, points)
+    told = look_up(sightings.view(posed.t).picture.float(), truth.pixels)
+    out = []
+    for frame, way in zip(chosen, moved, strict=True):
+        if frame == posed.t:
+            out.append(torch.ones_like(posed.depth))
+            continue
+        there = sightings.seen(frame, points + way[::2, ::2])
+        says = look_up(sightings.view(frame).picture.float(), there.pixels)
+        both = (truth.visible * there.visible)[..., None]
+        off = sightings.difference(says * both, told * both, 0.5)
+        out.append(resized(torch.exp(-(off / config.agreement).square()), w, h))
+    return out
+
+
+def fill(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, fillers: Fillers, matte: Tensor, rows: slice
+) -> Rest:
+    """What the leading plate does not give of some rows: the splats, with what they missed from other plates."""
+    at = (matte[rows] < WHOLE).nonzero()
+    y, x = at[:, 0], at[:, 1]
+    count = len(at)
+    rest = Rest(y, x, posed.image.color[rows][y, x], *(torch.zeros(count, device="cpu") for _ in range(2)))
+    if not count:
+        return rest
+    pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
+    small = pixels * posed.per_pixel
+    points = unproject(pixels, posed.image.depth[rows][y, x], posed.viewmat, posed.K)
+    motion, unknown = look_up(posed.motion, small), look_up(fillers.unknown, small)
+    larger = torch.tensor(
+        [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
+    )
+    doubt = look_up(posed.doubt, small)
+    weights, places = [], []
+    untold = 1.0 - unknown
+    truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
+    if truth is not None:  # the better plate t* shows it, the less another time is needed
+        untold = untold * (1.0 - _near(sightings, config, posed, posed.t, truth))
+    for n, frame in enumerate(fillers.chosen):
+        if truth is not None and frame == posed.t:
+            sighting = truth
+        else:
+            sighting = sightings.seen(frame, points + look_up(fillers.moved[n], small))
+        sighting = _doubted(sighting, doubt)
+        sway = _sway(sightings, config, frame, points, sighting) * untold * look_up(fillers.agreed[n], small)
+        weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway))
+        places.append(sighting.pixels * larger)
+    believed = torch.stack(weights)
+    rest.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]
+    total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
+    rest.share = total / (total + config.doubt)
+    for n, residual in enumerate(fillers.residuals):
+        carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
+    rest.color += carried * rest.share[:, None]
+    return rest
+
+
+def _doubted(sighting: Sighting, doubt: Tensor) -> Sighting:
+    """The sighting, with what it shows of points in doubt [...] taken for moving where the model says otherwise."""
+    return replace(sighting, moving=torch.maximum(sighting.moving, doubt * (1.0 - sighting.explained)))
+
+
+def _sway(sightings: Sightings, config: DetailConfig, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
+    """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
+    view = sightings.view(frame)
+    travel = (project(points, view.viewmat, view.K)[0] - sighting.pixels).norm(dim=-1)
+    trust = torch.exp(-travel / (config.sway * sightings.unit))
+    return config.sway_trust * sighting.explained * trust
+
+
+def _near(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, sighting: Sighting) -> Tensor:
+    """[...] in 0..1: how surely a plate shows points where the depth says."""
+    return sighting.visible / (1.0 + parallax(sightings, config, posed, frame, sighting.depth))
+
+
+def _weight(
+    sightings: Sightings,
+    config: DetailConfig,
+    posed: PosedFrame,
+    frame: int,
+    sighting: Sighting,
+    motion: Tensor,
+    sway: Tensor,
+) -> Tensor:
+    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*."""
+    near = _near(sightings, config, posed, frame, sighting)
+    if frame == posed.t:
+        return near
+    still = (1.0 - motion) * (1.0 - sighting.moving)
+    return near * (still + (1.0 - still) * sway)
+
+
+def _chosen(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, matte: Tensor, leading: int, usable: list[int]
+) -> list[int]:
+    """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
+    h, w = posed.depth.shape
+    need = 1.0 - resized(matte, w, h)[::4, ::4]
+    points, motion, doubt = (of[::4, ::4] for of in (posed.points, posed.motion, posed.doubt))
+    k = sightings.frames.index(leading)
+    around = {k + side * step for step in config.reach for side in (-1, 1)} | {k}
+    reach = {sightings.frames[i] for i in around if 0 <= i < len(sightings.frames)} | {posed.t}
+    zero = torch.zeros_like(motion)
+    gains = {
+        frame: need
+        * _weight(sightings, config, posed, frame, _doubted(sightings.seen(frame, points), doubt), motion, zero)
+        for frame in sorted(reach)
+        if frame in usable
+    }
+    first = [frame for frame in (posed.t, leading) if frame in gains]
+    chosen, have = list(dict.fromkeys(first)), torch.zeros_like(need)
+    for frame in chosen:
+        have = have + gains[frame]
+    while len(chosen) < min(config.sources, len(gains)):
+        # Diminishing returns: a second plate of the same wall helps less than a first one of another.
+        worth = {
+            frame: float((torch.log1p(10.0 * (have + gain)) - torch.log1p(10.0 * have)).sum())
+            for frame, gain in gains.items()
+            if frame not in chosen
+        }
+        frame = max(worth, key=lambda candidate: worth[candidate])
+        if worth[frame] < 1e-3 * float(need.sum()):
+            break
+        chosen.append(frame)
+        have = have + gains[frame]
+    return chosen

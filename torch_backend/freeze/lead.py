@@ -1,0 +1,177 @@
+"""The plate that gives a frozen frame whole pixels: which one it is, and where nothing that moves is seen in it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .bands import bands
+from .detail_config import DetailConfig
+from .posed import PosedFrame, displacements, parallax
+from .query import OutputFrame
+from .regions import closed, opened
+from .reproject import blurred, pixel_centres, project, resized, unproject, widened
+from .sightings import Sighting, Sightings
+from .warp import snap
+
+
+def leading_plate(sightings: Sightings, output: OutputFrame, posed: PosedFrame, usable: list[int]) -> int:
+    """The frame's own plate, else the nearest in pose of those usable: in travel over depth, and in direction."""
+    if posed.own and output.frame in usable:
+        return output.frame
+    at = torch.tensor([sightings.index[frame] for frame in usable], device="cpu")
+    solid = posed.depth[posed.depth < 1e9]
+    depth = float(solid.median()) if len(solid) else 1.0
+    travel = (sightings.centres[at] - posed.centre).norm(dim=1) / max(depth, 1e-6)
+    turned = 1.0 - sightings.scene.viewmats[at][:, 2, :3] @ posed.viewmat[2, :3]
+    return usable[int((travel + turned).argmin())]
+
+
+def leading_matte(
+    sightings: Sightings,
+    config: DetailConfig,
+    output: OutputFrame,
+    posed: PosedFrame,
+    leading: int,
+    usable: list[int],
+    size: tuple[int, int],
+) -> tuple[Tensor, Tensor, bool]:
+    """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
+
+    Also settles `posed.motion`: by the mattes of plate t* where that sees the point, else by the model's;
+    `posed.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so; and
+    `posed.moved`.
+    """
+    rows, columns = posed.image.alpha.shape
+    lead = sightings.seen(leading, posed.points)
+    own = posed.own
+    truth = sightings.seen(posed.t, posed.points) if posed.t in usable else None
+    hidden = torch.minimum(posed.motion, lead.moving) if own else posed.motion
+    if truth is not None:
+        posed.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
+    else:
+        posed.motion = torch.maximum(posed.motion, lead.moving) if own else posed.motion
+    posed.moved = posed.motion
+    st, within = _places(sightings, posed, leading, own, size)
+    if own and leading != output.frame:  # its own plate is withheld
+        return torch.zeros(rows, columns, device="cpu"), st, own
+    if own and leading == output.t_star:  # its own plate shows the instant itself
+        return within, st, own
+    wrong = torch.maximum(posed.motion, lead.moving) > 0.5
+    if own:
+        off, gained = _off(sightings, posed, leading)
+        wrong = (
+            wrong
+            | _swayed(sightings, config, posed, leading, gained)
+            | _beside(sightings, config, posed, leading, usable, off)
+        )
+        # What the model lacks at the plate's own time, too, is its fault and no motion.
+        off = torch.where(gained > config.own_time * off, off, 0.0)
+        if truth is not None:
+            wrong = wrong | _denied(sightings, config, truth, off)
+        wrong = closed(sightings.whole(wrong, off), round(config.gap * sightings.unit))
+    posed.doubt = widened(wrong.float(), round(config.margin * sightings.unit))
+    let_go = blurred(posed.doubt, config.feather * sightings.unit)
+    matte = 1.0 - let_go
+    if own:
+        posed.moved = torch.maximum(posed.motion, let_go)
+    else:
+        error = parallax(sightings, config, posed, leading, posed.depth)
+        matte = matte * lead.visible * torch.exp(-error.square())
+    return resized(matte, columns, rows) * within, st, own
+
+
+def _off(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:
+    """([h, w] low-passed difference of the frozen render and its own plate, [h, w] by how much that is more than
+    the difference of the model at the plate's own time); 0 beyond the plate."""
+    h, w = posed.depth.shape
+    view = sightings.view(frame)
+    inside = _middle(view.missed, posed.depth)
+    off, gained = torch.zeros(h, w, device="cpu"), torch.zeros(h, w, device="cpu")
+    off[inside] = sightings.difference(view.picture.float(), resized(posed.image.color, w, h)[inside])
+    gained[inside] = off[inside] - view.missed.float()
+    return off, gained
+
+
+def _beside(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, usable: list[int], off: Tensor
+) -> Tensor:
+    """[h, w] bool: what the plate before or after sees and calls moving, or both call moving that is before it.
+
+    What only one of three finds would come and go. Where its own plate shows what the frozen render does (`off`)
+    nothing would, and the plate stays.
+    """
+    h, w = posed.depth.shape
+    at, points = usable.index(frame), posed.points[::2, ::2]  # a quarter of the work
+    around = usable[max(0, at - 1) : at] + usable[at + 1 : at + 2]
+    found, both = torch.zeros(points.shape[:2], device="cpu"), torch.ones(points.shape[:2], device="cpu")
+    for neighbour in around:
+        sighting = sightings.seen(neighbour, points)
+        found, both = torch.maximum(found, sighting.visible * sighting.moving), both * sighting.moving
+    if len(around) == 2:
+        found = torch.maximum(found, both)
+    near = widened((off > config.alike).float(), round(config.margin * sightings.unit))
+    return (resized(found, w, h) > 0.5) & (near > 0.5)
+
+
+def _denied(sightings: Sightings, config: DetailConfig, truth: Sighting, off: Tensor) -> Tensor:
+    """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate shows something else (`off`).
+
+    A hand that is held still where it was not at t* is still to the flow; a wrong depth explains edges only.
+    """
+    denied = (off > config.denied) & (truth.visible * truth.explained > 0.5)
+    spots = opened(denied, round(config.thin * sightings.unit))
+    return sightings.whole(spots, off, config.denied_too)
+
+
+def _swayed(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, gained: Tensor) -> Tensor:
+    """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
+
+    That is, the render of t* differs from the plate by more than the render of the plate's own time does (`gained`,
+    as `_off`). A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
+    that are.
+    """
+    out = (gained > config.borne_out) & (_travel(sightings, config, posed, frame) > config.travel)
+    # Outlines are errors of depth; what moves is a region.
+    return opened(out, round(config.thin * sightings.unit))
+
+
+def _travel(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int) -> Tensor:
+    """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
+    h, w = posed.depth.shape
+    size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: Gaussians of what moves are larger than its pixels
+    moved, points = displacements(sightings, posed, [frame], size)[0][0], posed.points[::2, ::2]
+    view = sightings.view(frame)
+    ends = project(points + moved, view.viewmat, view.K)[0]
+    travel = (ends - project(points, view.viewmat, view.K)[0]).norm(dim=-1) / sightings.unit
+    return resized(travel, w, h)
+
+
+def _places(
+    sightings: Sightings, posed: PosedFrame, leading: int, own: bool, size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """(ST [H, W, 2] into the leading plate, [H, W] 1 within it): the identity on the clip's own poses."""
+    rows, columns = posed.image.alpha.shape
+    if own:
+        x = (torch.arange(columns, device="cpu") + 0.5 - (columns - size[0]) // 2) / size[0]
+        y = (torch.arange(rows, device="cpu") + 0.5 - (rows - size[1]) // 2) / size[1]
+        share = torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)], dim=-1)
+    else:
+        viewmat, K = sightings.camera(leading, sightings.plates.width, sightings.plates.height)
+        whole = torch.tensor([sightings.plates.width, sightings.plates.height], device="cpu")
+        share = torch.empty(rows, columns, 2, device="cpu")
+        for band in bands(rows, columns):
+            pixels = pixel_centres(columns, band.stop - band.start)
+            pixels[..., 1] += band.start
+            points = unproject(pixels, posed.image.depth[band], posed.viewmat, posed.K)
+            share[band] = project(points, viewmat, K)[0] / whole
+    within = ((share > 0.0) & (share < 1.0)).all(dim=-1).float()
+    share[..., 1] = 1.0 - share[..., 1]
+    return snap(share.clamp_(-4.0, 5.0), (sightings.plates.width, sightings.plates.height)), within
+
+
+def _middle(inner: Tensor, outer: Tensor) -> tuple[slice, slice]:
+    """(rows, columns) of a picture [h, w, ...] that lies in the middle of a larger one."""
+    (rows, columns), (h, w) = outer.shape[:2], inner.shape[:2]
+    top, left = (rows - h) // 2, (columns - w) // 2
+    return slice(top, top + h), slice(left, left + w)

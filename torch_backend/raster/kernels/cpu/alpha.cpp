@@ -1,0 +1,8 @@
+// One row of one hit: alpha, weight, and the transmittance behind it.
+
+                F e = LANE + shifts[l][row], before = T[row];
+                F p = fma(A * e, e, (F)levels[l][row]);
+                F raw = exp2v(p), al = vmin(raw, (F)ALPHA_MAX);
+                al = ((p >= PMIN) & (before > T_STOP)) ? al : (F)0.f;
+                F w = al * before;
+                T[row] = fma(-al, before, before);

@@ -1,0 +1,5 @@
+// One row of one hit, forward, without the parts that depth and top contributor add.
+#include "alpha.cpp"
+
+                for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)channel[c], C[c][row]);
+                total += w; peak = vmax(peak, w);

@@ -1,0 +1,67 @@
+"""The optimiser of a run: which tensors in which groups, and the rates they are trained at."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+from ..deformation import Deformation
+from ..gaussians import Gaussians, sh_bases
+from .adam import FusedAdam
+from .config import TrainConfig
+from .model import DynamicModel
+from .poses import Poses
+
+_LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
+
+
+def optimizer_of(model: DynamicModel, poses: Poses, config: TrainConfig) -> FusedAdam:
+    """Adam over the Gaussians, the exposure and, where they are refined, the poses; a field joins by `add_field`."""
+    c, p = config, model.gaussians.params
+    rates = {
+        "means": (c.lr_means, c.lr_means_end), "quats": (c.lr_quats, 0.1 * c.lr_quats),
+        "log_scales": (c.lr_scales, 0.1 * c.lr_scales), "opacity_logits": (c.lr_opacities, 0.1 * c.lr_opacities),
+        "sh0": (c.lr_sh0, 0.1 * c.lr_sh0), "shN": (c.lr_sh_rest, 0.1 * c.lr_sh_rest),
+    }  # fmt: skip
+    groups = [
+        {"params": [p[name]], "lr": start, "lr_start": start, "lr_end": end, "name": name, "rows": True}
+        for name, (start, end) in rates.items()
+    ]
+    groups[list(rates).index("log_scales")]["clamp"] = _LOG_SCALE_RANGE
+    lr = c.exposure.lr
+    groups.append({"params": [model.exposure.values], "lr": lr, "lr_start": lr, "lr_end": 0.1 * lr})
+    if c.poses.on:
+        lr = c.poses.lr
+        groups.append({"params": [poses.values], "lr_start": lr, "lr_end": 0.1 * lr, "until": c.poses.until})
+    return FusedAdam(groups, eps=1e-15)
+
+
+def add_field(optimizer: FusedAdam, field: Deformation, model: Gaussians) -> None:
+    """Adds a field's parameters, and those of its own that each Gaussian has."""
+    for group in field.parameter_groups():
+        optimizer.add_param_group({**group, "lr_start": group["lr"]})
+    for name, owned in field.owned.items():
+        rates = {"lr": owned.lr, "lr_start": owned.lr, "lr_end": owned.lr_end}
+        optimizer.add_param_group({"params": [model.params[name]], "name": name, "rows": True, **rates})
+
+
+def schedule_rates(optimizer: FusedAdam, progress: float) -> None:
+    """Log-linear learning rates from start to end over the run or a host's part of it (3DGS get_expon_lr_func)."""
+    for group in optimizer.param_groups:
+        since, until = group.get("since", 0.0), group.get("until", 1.0)
+        share = min(max((progress - since) / (until - since), 0.0), 1.0)
+        group["lr"] = group["lr_start"] * (group["lr_end"] / group["lr_start"]) ** share
+
+
+def limit_harmonics(model: Gaussians, optimizer: torch.optim.Optimizer, degree: int) -> None:
+    """Drops the harmonics above `degree` from shN, with their moments."""
+    old, bases = model.params["shN"], sh_bases(degree) - 1
+    new = nn.Parameter(old.detach()[:, :bases].contiguous())
+    state = optimizer.state.pop(old, None)
+    if state is not None:
+        optimizer.state[new] = {k: v[:, :bases].contiguous() if v.shape == old.shape else v for k, v in state.items()}
+    for group in optimizer.param_groups:
+        group["params"] = [new if p is old else p for p in group["params"]]
+    model.params["shN"] = new

@@ -1,0 +1,95 @@
+"""The paper's terms of one training step: what two frames, seen at each other's time, say of each other's Gaussians."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from ..raster import RasterOutput
+from ..supervision import PaperView, paper_loss, well_supervised
+from .losses import photometric
+from .run_view import RunView
+
+
+class RenderedRun(RunView, Protocol):
+    """A run that can be asked for more pictures in the middle of a step; `Trainer` is one."""
+
+    generator: torch.Generator
+    """Source of every random draw."""
+
+    def render_trained(self, state: dict[str, Tensor], frame: int, **options: Any) -> RasterOutput:
+        """Parameters `state` as the camera of the trained frame at position `frame` sees them."""
+        ...
+
+    def image_of(self, frame: int) -> Tensor:
+        """[H, W, 3] float32, that frame, on the device."""
+        ...
+
+
+def paper_step(
+    run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput
+) -> int | None:
+    """Adds the paper's terms for this frame and a random other one; their gradients join the step's.
+
+    Args:
+        frame: position of the step's frame among the trained ones.
+        rows: [M] the Gaussians that move.
+        state: all parameters at the frame's time; means hold their gradient.
+        out: its picture, after the backward pass.
+
+    Returns the position of the other frame; None if the draw was of no use.
+    """
+    other = int(torch.randint(len(run.train_ids), (1,), generator=run.generator, device="cpu"))
+    if run.times[other] == run.times[frame] or other in run.frames_left_out:
+        return None
+    supervision, model = run.config.supervision, run.model
+    supervised = _supervised(run, frame, rows, state, out)
+    other_state = model.state_at(run.times[other])
+    other_state["means"].retain_grad()
+    other_out = run.render_trained(other_state, other)
+    exposed = model.exposure.apply(other_out.colors[0], run.times[other])
+    loss = photometric(exposed, run.image_of(other), run.config.dssim)
+    loss.backward(retain_graph=True)
+    other_supervised = _supervised(run, other, rows, other_state, other_out)
+    every = supervision.pulls == "all"
+    if not every:
+        other_state = model.state_at(run.times[other], canonical=False)
+    views = [
+        _view(run, model.state_at(run.times[frame], canonical=every), frame, rows, supervised),
+        _view(run, other_state, other, rows, other_supervised),
+    ]
+    loss = paper_loss(views[0], views[1], run.progress, supervision)
+    if loss is not None and bool(torch.isfinite(loss)):
+        loss.backward()
+    return other
+
+
+def _supervised(
+    run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput
+) -> Tensor:
+    """bool [M]: which of `rows` the frame supervises well; `out` and `state` after the frame's own backward pass."""
+    index, pull = run.train_ids[frame], state["means"].grad
+    if pull is None or out.weight_sum is None:
+        raise RuntimeError("the frame was rendered without gradients or contributions")
+    return well_supervised(
+        run.config.supervision, out.weight_sum[0][rows], out.means2d_grad[0][rows], pull[rows],
+        run.Ks[index], run.viewmats[index], state["means"].detach()[rows], (run.width, run.height),
+    )  # fmt: skip
+
+
+def _view(run: RenderedRun, state: dict[str, Tensor], frame: int, rows: Tensor, supervised: Tensor) -> PaperView:
+    index = run.train_ids[frame]
+    means = state["means"][rows].detach()
+    inside = inside_frustum(means, run.viewmats[index], run.Ks[index], run.width, run.height)
+    return PaperView(run.times[frame], {k: v[rows] for k, v in state.items()}, inside, supervised)
+
+
+def inside_frustum(means: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:
+    """bool [M]: is the centre of means [M, 3] in front of the camera and inside its image."""
+    camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depth = camera[:, 2].clamp_min(1e-6)
+    x = camera[:, 0] / depth * K[0, 0] + K[0, 2]
+    y = camera[:, 1] / depth * K[1, 1] + K[1, 2]
+    return (camera[:, 2] > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
