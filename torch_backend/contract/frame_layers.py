@@ -66,7 +66,7 @@ FRAME_LAYERS = (
         ("Motion.V",),
         "half",
         "Motion.V",
-        "how much of the pixel belongs to something that moves in the clip",
+        "how much of the pixel belongs to something that moves in the clip, at t* or in the frame's own plate",
         output="Motion",
         tip="1 where things move in the footage, 0 where they never do",
     ),
