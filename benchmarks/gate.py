@@ -44,7 +44,7 @@ def trained(shot: Shot, method: str, supervision: str, args: argparse.Namespace)
     trainer = Trainer(scene, load_images(scene, train, width, height), train, config, _Silent())
     since = time.perf_counter()
     while trainer.iteration < _SHARE * args.iterations:
-        trainer._milestones()
+        trainer.schedule_events()
         trainer.step()
         trainer.iteration += 1
     return trainer, 1e3 * (time.perf_counter() - since) / trainer.iteration

@@ -100,8 +100,8 @@ def watch(trainer: Trainer, parts: Parts) -> None:
         (trainer.optimizer, "step", "Adam"),
         (trainer.densifier, "observe", "densifier observes"),
         (module, "mark_seen", "support marked"),
-        (trainer, "_schedule", "learning rates"),
-        (trainer, "_milestones", "densification and gate"),
+        (trainer, "_schedule_rates", "learning rates"),
+        (trainer, "schedule_events", "densification and gate"),
         (trainer, "_next_frame", "frame drawn"),
     ):
         if hasattr(owner, name):
@@ -140,7 +140,7 @@ def measure(trainer: Trainer, parts: Parts, steps: int) -> dict[str, float]:
     whole = []
     for _ in range(steps):
         since = time.perf_counter()
-        trainer._milestones()
+        trainer.schedule_events()
         trainer.step()
         trainer.iteration += 1
         whole.append(1e3 * (time.perf_counter() - since))
@@ -172,7 +172,7 @@ def main() -> None:
     parts, results = Parts(), {}
     for share in args.at:
         while trainer.progress < share:
-            trainer._milestones()
+            trainer.schedule_events()
             trainer.step()
             trainer.iteration += 1
         label = f"at {share:.0%}: {len(trainer.model.gaussians)} Gaussians, {len(trainer.model.open_rows())} open"

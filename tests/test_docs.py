@@ -9,7 +9,8 @@ import pytest
 from torch_backend.contract import COMMANDS, FRAME_LAYERS, default_of, options_of
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "README.md"]
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "examples/README.md")]
+PAGES += sorted((ROOT / "docs").rglob("*.md"))
 MANUAL = ROOT / "docs" / "manual"
 STEPS = ("footage", "camera", "train", "freeze", "bake")
 
@@ -35,6 +36,28 @@ def test_links_and_pictures_are_there(page: Path):
         if not file.exists() or (anchor and anchor not in anchors(file)):
             broken.append(target)
     assert not broken
+
+
+def test_what_contributors_are_sent_to_is_there():
+    """Every file, folder and name of a test between backticks; `NAME` stands for the reader's own."""
+    page = text_of(ROOT / "CONTRIBUTING.md")
+    tests = "".join(text_of(path) for path in (ROOT / "tests").rglob("test_*.py"))
+    named = [word for word in re.findall(r"`([^`\n]+)`", page) if "NAME" not in word]
+    paths = {word for word in named if re.fullmatch(r"[\w.-]+(/[\w.-]+)+/?|\w+\.(py|toml)", word)}
+    run = re.findall(r"pytest -q (\S+)", page)
+    assert len(paths) > 30 and len(run) == 3
+    assert not sorted(path for path in {*paths, *run} if not (ROOT / path).exists())
+    assert not [word for word in named if word.startswith("test_") and f"def {word}(" not in tests]
+
+
+def test_the_forge_runs_the_commands_of_the_readme():
+    workflow = text_of(ROOT / ".github" / "workflows" / "two-commands.yml")
+    commands = re.findall(r"^python3 (splannequin\.py .+)$", text_of(ROOT / "README.md"), re.MULTILINE)
+    assert len(commands) == 2
+    for command in commands:
+        assert f"run: python {command.replace('CLIP.mp4', 'examples/sitting.mp4')}\n" in workflow
+    for system in ("ubuntu", "windows", "macos"):
+        assert f"{system}-latest" in workflow
 
 
 def test_the_manual_has_a_page_per_step_with_its_picture_and_its_button():

@@ -95,13 +95,13 @@ def change_of(
     opacity = model.params["opacity_logits"][rows]
     change = torch.zeros(len(rows), device=rows.device)
     for at, counted in zip(moments, counts, strict=True):
-        here = (at.means - mean.means).norm(dim=1) * pixels / config.pixels
+        departure = (at.means - mean.means).norm(dim=1) * pixels / config.pixels
         if at.sh0 is not None and mean.sh0 is not None:
-            here = torch.maximum(here, SH_C0 * (at.sh0 - mean.sh0).abs().amax((1, 2)) / config.color)
+            departure = torch.maximum(departure, SH_C0 * (at.sh0 - mean.sh0).abs().amax((1, 2)) / config.color)
         if at.opacity_logits is not None and mean.opacity_logits is not None:
             now, usual = torch.sigmoid(opacity + at.opacity_logits), torch.sigmoid(opacity + mean.opacity_logits)
-            here = torch.maximum(here, (now - usual).abs() / config.opacity)
-        change = torch.maximum(change, torch.where(counted > 0, here, 0.0))
+            departure = torch.maximum(departure, (now - usual).abs() / config.opacity)
+        change = torch.maximum(change, torch.where(counted > 0, departure, 0.0))
     return change, mean
 
 

@@ -101,7 +101,8 @@ class HexPlane(Deformation):
     def __init__(self, config: HexPlaneConfig, box: Tensor, generator: torch.Generator, harmonics: int = 0) -> None:
         super().__init__()
         if not bool((box[1] > box[0]).all()):
-            raise ValueError(f"box {box.tolist()} should have its maximum above its minimum on every axis")
+            bounds = [[float(v) for v in row] for row in box]
+            raise ValueError(f"box {bounds} should have its maximum above its minimum on every axis")
         self.config = config
         self.box: Tensor
         self.register_buffer("box", box.float().cpu())
@@ -137,7 +138,7 @@ class HexPlane(Deformation):
         planes = self._by_level()
         if compiled.supports(planes) and where.dtype == torch.float32:
             return compiled.features(torch.cat([where, when[:, None]], dim=1), planes)
-        parts = []
+        parts: list[Tensor] = []
         for level in range(len(self.config.levels)):
             product = where.new_ones(())
             for k, (a, b) in enumerate(_SPATIAL):
@@ -214,8 +215,8 @@ def _bend(plane: Tensor, axis: int) -> Tensor:
     count = plane.shape[axis]
     if count < 3:
         return plane.new_zeros(())
-    before, here, after = (plane.narrow(axis, start, count - 2) for start in (0, 1, 2))
-    return (before - 2.0 * here + after).square().mean()
+    before, middle, after = (plane.narrow(axis, start, count - 2) for start in (0, 1, 2))
+    return (before - 2.0 * middle + after).square().mean()
 
 
 def _create(config: HexPlaneConfig, start: Start) -> HexPlane:

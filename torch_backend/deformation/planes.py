@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -73,7 +74,7 @@ class _Product(torch.autograd.Function):
     """Features of points, with gradients for the planes and the points."""
 
     @staticmethod
-    def forward(ctx, where: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, where: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
         count, channels, levels = len(where), planes[0].shape[1], len(planes) // 6
         features = torch.empty(count, levels * channels, device="cpu")
         wanted = any(ctx.needs_input_grad)
@@ -90,8 +91,8 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        where, samples, *planes = ctx.saved_tensors
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        where, samples, *planes = cast(tuple[Tensor, ...], ctx.saved_tensors)
         out = [torch.empty_like(p) for p in planes]
         grad = grad.contiguous()
         pulls = torch.empty_like(where) if ctx.needs_input_grad[0] else None
@@ -121,7 +122,7 @@ class _Bend(torch.autograd.Function):
     """The penalty's value; its gradient is computed along with it, being linear in the incoming one."""
 
     @staticmethod
-    def forward(ctx, weights: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, weights: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
         grads = [torch.empty_like(p) for p in planes] if any(ctx.needs_input_grad) else []
         units = [(n, row) for n, p in enumerate(planes) for row in range(p.shape[2])]
         rows = torch.tensor(units, dtype=torch.int64, device="cpu")
@@ -136,7 +137,7 @@ class _Bend(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         return None, None, *(saved * grad for saved in ctx.saved_tensors)
 
 
@@ -146,7 +147,7 @@ def penalty(
     """Sum over planes [1, C, H, W] of weighted means: squared second differences down and along, and |1 - plane|."""
     if not supports(planes):
         raise ValueError("planes should be float32 on the CPU, channels last, with a multiple of 16 features")
-    scaled = []
+    scaled: list[tuple[float, float, float]] = []
     for plane, (down, along, still) in zip(planes, weights, strict=True):
         _, c, h, w = plane.shape
         scaled.append((down / max(1, c * (h - 2) * w), along / max(1, c * h * (w - 2)), still / (c * h * w)))

@@ -202,7 +202,7 @@ class HostSpec:
 def field_box(means: Tensor) -> Tensor:
     """Box [2, 3] that a field should resolve for the Gaussians means [M, 3]: robust bounds and a margin."""
     low, high = np.quantile(means.cpu().numpy(), (0.01, 0.99), axis=0)
-    low, high = torch.from_numpy(low).float().to(means.device), torch.from_numpy(high).float().to(means.device)
+    low, high = (torch.as_tensor(bound, dtype=torch.float32, device=means.device) for bound in (low, high))
     margin = 0.15 * (high - low).clamp_min(1e-2)
     return torch.stack([low - margin, high + margin])
 

@@ -17,6 +17,7 @@ the quadratic form of the conic by completed squares: no cancellation for long t
 
 import ctypes
 from pathlib import Path
+from typing import cast
 
 from ..kernel_text import kernel_text
 from . import constants as k
@@ -148,7 +149,7 @@ def assemble(stages: list[str], extra: dict[str, object]) -> str:
         text += f"if (stage == {number}) {{\n{stage}\n}}\n"
     for name, value in values.items():
         if isinstance(value, tuple):
-            shown = ", ".join(f"{v!r}f" for v in value)
+            shown = ", ".join(f"{float(v)!r}f" for v in cast(tuple[float, ...], value))
         elif isinstance(value, float):
             shown = repr(value)
         else:

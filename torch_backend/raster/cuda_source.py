@@ -187,7 +187,7 @@ def _backward_harmonics() -> str:
     )
 
 
-def _field(match: re.Match) -> str:
+def _field(match: re.Match[str]) -> str:
     name = match.group(1)
     return f"(({_POINTER[name]})args.{name})" if name in _POINTER else f"args.{name}"
 

@@ -14,7 +14,7 @@ import ctypes
 import functools
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -61,7 +61,7 @@ class _Block(ctypes.Structure):
 
 def _taps() -> list[float]:
     weights = torch.exp(-0.5 * (torch.arange(-_HALF, _HALF + 1, dtype=torch.float64) / SIGMA).square())
-    return (weights / weights.sum()).tolist()
+    return [float(weight) for weight in weights / weights.sum()]
 
 
 def _source() -> str:
@@ -157,15 +157,15 @@ class _Ssim(torch.autograd.Function):
     """Autograd's view; only the first image has a gradient."""
 
     @staticmethod
-    def forward(ctx, image: Tensor, target: Tensor, threads: int) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, image: Tensor, target: Tensor, threads: int) -> Tensor:  # type: ignore[override]
         value, gradient = _run(image.contiguous(), target.contiguous(), ctx.needs_input_grad[0], threads)
         ctx.save_for_backward(gradient)
         return value
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
-        (gradient,) = ctx.saved_tensors
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        (gradient,) = cast(tuple[Tensor, ...], ctx.saved_tensors)
         return grad * gradient, None, None
 
 

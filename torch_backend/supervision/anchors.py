@@ -135,7 +135,7 @@ def support_loss(
     model: Gaussians,
     field: Deformation,
     pairs: Anchored,
-    here: Deltas,
+    deltas: Deltas,
     centres: Tensor,
     seconds: float,
     config: SupervisionConfig,
@@ -145,7 +145,7 @@ def support_loss(
     Canonical parameters are not moved: only the field learns.
 
     Args:
-        here: the field's deltas of `pairs`, with gradient.
+        deltas: the field's deltas of `pairs`, with gradient.
         centres: [B] normalised times of the bins.
         seconds: length of the trained range, so that confidence decays in seconds.
     """
@@ -154,7 +154,7 @@ def support_loss(
     with torch.no_grad():
         means = model.params["means"][rows]
         own = model.own(torch.cat([rows, rows]))
-        there = field(torch.cat([means, means]), torch.cat([centres[left], centres[right]]), own)
+        anchors = field(torch.cat([means, means]), torch.cat([centres[left], centres[right]]), own)
         near_left = (centres[bins] - centres[left]) * seconds
         near_right = (centres[right] - centres[bins]) * seconds
         share = (near_left / (near_left + near_right).clamp_min(1e-6)).clamp(0.0, 1.0)
@@ -164,16 +164,16 @@ def support_loss(
         )
         confidence = torch.exp(-distance / config.support_seconds)
     total = torch.zeros_like(confidence)
-    held = there.moved()
-    for name, value in here.moved().items():
+    held = anchors.moved()
+    for name, value in deltas.moved().items():
         first, second = held[name].reshape(2, len(rows), -1)
         gap = value.reshape(len(rows), -1) - torch.lerp(first, second, share[:, None])
         total = total + _ATTRIBUTE_WEIGHTS[name] * (torch.sqrt(gap.square() + _KNEE**2) - _KNEE).sum(1)
     return config.support_weight * (pairs.weights * confidence * total).sum() / pairs.weights.sum().clamp_min(1.0)
 
 
-def stillness(here: Deltas, count: int, error: Tensor, progress: float, config: SupervisionConfig) -> Tensor:
-    """What the deltas `here` [M] of one frame cost in a model of `count` Gaussians.
+def stillness(deltas: Deltas, count: int, error: Tensor, progress: float, config: SupervisionConfig) -> Tensor:
+    """What the `deltas` [M] of one frame cost in a model of `count` Gaussians.
 
     At its own time a Gaussian is seen from one side only, so whatever a field does to it there to please that one
     frame goes unpunished, and shows as soon as the instant is seen from elsewhere. What moves must therefore be worth
@@ -186,8 +186,8 @@ def stillness(here: Deltas, count: int, error: Tensor, progress: float, config: 
             from any motion, a false one too.
         progress: share of the run that is done.
     """
-    total = here.means.new_zeros(len(here.means))
-    for name, value in here.moved().items():
+    total = deltas.means.new_zeros(len(deltas.means))
+    for name, value in deltas.moved().items():
         weight = _STILL_WEIGHTS[name]
         knee = config.still_knee * _STILL_WEIGHTS["means"] / weight
         total = total + weight * (torch.sqrt(value.reshape(len(value), -1).square().sum(1) + knee**2) - knee)
@@ -237,7 +237,7 @@ class PaperView:
     """Deformed parameters of M Gaussians (means, quats, log_scales, opacity_logits, sh0)."""
     inside: Tensor
     """bool [M]: the centre is inside the camera's frustum; False is the paper's `hidden`."""
-    acted: Tensor
+    supervised: Tensor
     """bool [M]: the view's image acts on it (`well_supervised`)."""
 
 
@@ -273,17 +273,17 @@ def paper_loss(one: PaperView, two: PaperView, progress: float, config: Supervis
     """The paper's two terms for a pair of views; None if no valid anchor was found.
 
     The later view's hidden Gaussians are held to the earlier view, the earlier view's defective ones to the later;
-    the reference must be well supervised (inside the frustum, acted on) and is detached. Mean over the selected
-    Gaussians, summed over the attributes.
+    the reference must be well supervised (inside the frustum, and the image acts on it) and is detached. Mean
+    over the selected Gaussians, summed over the attributes.
     """
     early, late = (one, two) if one.time < two.time else (two, one)
     if early.time == late.time:
         return None
     phi = math.exp(-config.tau * (late.time - early.time))
     linear = progress >= config.switch
-    hidden = ~late.inside & early.inside & early.acted
-    defective = early.inside & ~early.acted & late.inside & late.acted
-    terms = []
+    hidden = ~late.inside & early.inside & early.supervised
+    defective = early.inside & ~early.supervised & late.inside & late.supervised
+    terms: list[Tensor] = []
     if bool(hidden.any()):
         terms.append(config.weight_hidden * phi * _discrepancy(late.state, early.state, hidden, linear))
     if bool(defective.any()):

@@ -26,7 +26,7 @@ def bin_times(times: np.ndarray) -> Tensor:
         raise ValueError(f"{len(distinct)} distinct time: at least 2 are needed")
     if len(distinct) > MAX_BINS:
         distinct = (np.arange(MAX_BINS) + 0.5) / MAX_BINS
-    return torch.from_numpy(distinct).float()
+    return torch.as_tensor(distinct, device="cpu").float()
 
 
 def bin_of(centres: Tensor, time: float) -> int:

@@ -17,7 +17,7 @@ from .checkpoint import CHECKPOINT_FILE, read_meta
 from .extend import EXTENSION_FILE
 
 
-def place_for(run: Path, key: str, resume: bool) -> Path:
+def folder_for(run: Path, key: str, resume: bool) -> Path:
     """The folder in which settings of a key are trained: the run's own if it holds nothing else, or has begun them."""
     beside = run / NEXT_FOLDER / key
     if resume:
@@ -28,11 +28,11 @@ def place_for(run: Path, key: str, resume: bool) -> Path:
     return beside if (run / CHECKPOINT_FILE).is_file() else run
 
 
-def take_place(run: Path, done: Path) -> None:
-    """Moves what was trained in `done`, a folder of `place_for`, to the run's own; nothing else that was begun stays.
+def replace_run(run: Path, done: Path) -> None:
+    """Moves what was trained in `done`, a folder of `folder_for`, to the run's own; nothing else that was begun stays.
 
-    Every file is replaced at once, the checkpoint first: whoever freezes has the one or the other. `settle` goes on
-    where a killed process stopped.
+    Every file is replaced at once, the checkpoint first: whoever freezes has the one or the other. `finish_replacing`
+    goes on where a killed process stopped.
     """
     for name in (CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE):
         if (done / name).is_file():
@@ -45,17 +45,17 @@ def take_place(run: Path, done: Path) -> None:
     shutil.rmtree(run / NEXT_FOLDER, ignore_errors=True)
 
 
-def settle(run: Path) -> None:
-    """Goes on with a `take_place` that was killed halfway."""
+def finish_replacing(run: Path) -> None:
+    """Goes on with a `replace_run` that was killed halfway."""
     if is_link(run / NEXT_FOLDER):  # none of ours: a shot folder may come from anywhere
         remove_link(run / NEXT_FOLDER)
     for summary in sorted((run / NEXT_FOLDER).glob(f"*/{SUMMARY_FILE}")):
         if is_link(summary.parent):
             remove_link(summary.parent)
         else:
-            take_place(run, summary.parent)
+            replace_run(run, summary.parent)
 
 
-def forget(run: Path, key: str) -> None:
+def drop_begun(run: Path, key: str) -> None:
     """Drops what was begun of settings that the run itself is finished with: it could only come to the same."""
     shutil.rmtree(run / NEXT_FOLDER / key, ignore_errors=True)

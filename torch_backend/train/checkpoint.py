@@ -36,7 +36,7 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]
         try:
             save_file(contiguous, str(beside), metadata={"splannequin": text})
         except SafetensorError as error:  # it hands the system's reason on in words: "... (os error 28)"
-            code = int(told[1]) if (told := re.search(r"os error (\d+)", str(error))) else errno.EIO
+            code = int(number[1]) if (number := re.search(r"os error (\d+)", str(error))) else errno.EIO
             windows = (code,) if os.name == "nt" else ()
             raise OSError(code, f"checkpoint not written: {error}", str(path), *windows) from error
 

@@ -26,8 +26,8 @@ def cuda_refusal() -> str:
     if torch.version.hip is not None:
         return "This PyTorch is built for AMD GPUs, which the rasteriser has no body for."
     if not torch.cuda.is_available():
-        told = why_unused(torch.version.cuda)
-        return told[0] if told else "PyTorch sees no NVIDIA GPU."
+        reason = why_unused(torch.version.cuda)
+        return reason[0] if reason else "PyTorch sees no NVIDIA GPU."
     if not initialised_warp().is_cuda_available():
         return "PyTorch sees the NVIDIA GPU, but Warp does not: update the NVIDIA driver to version 580 or newer."
     if torch.cuda.get_device_capability() < (7, 5):

@@ -59,7 +59,9 @@ class FrameEvidence:
     """Of those that it calls moving."""
 
 
-def gather(trainer: Trainer, test: list[int], held_out: Tensor, mattes: Mattes | None = None) -> list[FrameEvidence]:
+def gather_evidence(
+    trainer: Trainer, test: list[int], held_out: Tensor, mattes: Mattes | None = None
+) -> list[FrameEvidence]:
     """Looks at up to `MOST` of a run's frames, held out or not; ascending.
 
     Args:
@@ -79,7 +81,7 @@ def gather(trainer: Trainer, test: list[int], held_out: Tensor, mattes: Mattes |
         trainer.report.check_cancelled()
         frame = trainer.scene.frames[index]
         matte = mattes(frame) if mattes is not None else None
-        found.append(_look(trainer, index, images[index], places, index in known, matte))
+        found.append(_inspect_frame(trainer, index, images[index], places, index in known, matte))
     return found
 
 
@@ -115,7 +117,7 @@ def travelled(places: Tensor, viewmat: Tensor, K: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _look(
+def _inspect_frame(
     trainer: Trainer, index: int, image: Tensor, places: Tensor, held_out: bool, matte: NDArray[np.uint8] | None
 ) -> FrameEvidence:
     model, rows, width = trainer.model, trainer.model.open_rows(), trainer.width
@@ -136,8 +138,8 @@ def _look(
     by_matte: list[float | None] = [None, None]
     if matte is not None:
         for n, value in enumerate((0, 255)):
-            there = _resized(matte == value, off.shape)
-            by_matte[n] = float(off[there].float().mean()) if there.any() else None
+            region = _resized(matte == value, off.shape)
+            by_matte[n] = float(off[region].float().mean()) if region.any() else None
     return FrameEvidence(
         trainer.scene.frames[index], held_out, psnr(shown, plate), shares(off.float()), _cells(travels, 0.97),
         moving.numpy(), *by_matte,
@@ -167,5 +169,5 @@ def _cells(values: Tensor, share: float) -> NDArray[np.float32]:
 
 def _resized(mask: NDArray[np.bool_], shape: torch.Size) -> Tensor:
     """bool [h, w] at another size, nearest."""
-    there = torch.from_numpy(mask.astype(np.float32))[None, None]
-    return F.interpolate(there, size=tuple(shape), mode="nearest")[0, 0] > 0.5
+    values = torch.from_numpy(mask.astype(np.float32))[None, None]
+    return F.interpolate(values, size=tuple(shape), mode="nearest")[0, 0] > 0.5

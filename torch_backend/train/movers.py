@@ -61,10 +61,10 @@ def moving_frames(run: RunView, share: float) -> Tensor:
         if n in run.frames_left_out or not bool(movers.any()):
             continue
         run.report.check_cancelled()
-        where = movers.to(model.device, torch.float32)
+        mask = movers.to(model.device, torch.float32)
         camera = run.viewmats[index], run.Ks[index], width, height
-        on_movers, painted_here = gathered(state, *camera, torch.stack([where, torch.ones_like(where)], -1)).unbind(1)
-        counts += (painted_here > SEEN_WEIGHT) & (on_movers > share * painted_here)
+        on_movers, painted_weight = gathered(state, *camera, torch.stack([mask, torch.ones_like(mask)], -1)).unbind(1)
+        counts += (painted_weight > SEEN_WEIGHT) & (on_movers > share * painted_weight)
     return counts
 
 
@@ -110,8 +110,8 @@ def _changes(model: DynamicModel, rows: Tensor, pixels: Tensor, config: GateConf
     count = len(model.centres)
     picked = np.unique(np.linspace(0, count - 1, min(MOMENTS, count)).round().astype(int)).tolist()
     moments = [model.deltas(rows, model.centres[n : n + 1]) for n in picked]
-    asked = [moment for moment in moments if moment is not None]
-    return change_of(model.gaussians, rows, asked, pixels, config, model.gaussians.support[rows][:, picked].T)
+    present = [moment for moment in moments if moment is not None]
+    return change_of(model.gaussians, rows, present, pixels, config, model.gaussians.support[rows][:, picked].T)
 
 
 def pixels_per_unit(run: RunView, rows: Tensor) -> Tensor:

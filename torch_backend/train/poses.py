@@ -50,7 +50,7 @@ class Poses:
         return torch.from_numpy(np.stack(columns, axis=1)).to(self.values)
 
     @torch.no_grad()
-    def settle(self, held: set[int]) -> None:
+    def fix_gauge(self, held: set[int]) -> None:
         """After a step: takes the mean correction out, and puts frames in `held` between their neighbours."""
         keep = [n for n in range(len(self._times)) if n not in held]
         self.values -= self.values[keep].mean(0)

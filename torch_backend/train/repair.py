@@ -103,25 +103,25 @@ def repair(
     """
     if _sound(model, optimizer):
         return ""
-    said = _repair_gaussians(model, optimizer, densifier, step)
+    messages = _repair_gaussians(model, optimizer, densifier, step)
     named = {} if model.field is None else dict(model.field.named_parameters())
     for name, p in named.items():
         bad, before = ~torch.isfinite(p), memory.of(name, p)
         if bool(bad.any()):
             sound = p[~bad]
-            said.append(f"mended {_counted(int(bad.sum()), 'number')} of {name}")
+            messages.append(f"mended {_counted(int(bad.sum()), 'number')} of {name}")
             _mend(p, bad, before if before is not None else sound.median() if len(sound) else 0.0, optimizer)
     known = {id(p) for p in (*model.gaussians.params.values(), *named.values())}
     for group in optimizer.param_groups:
         for p in (p for p in group["params"] if id(p) not in known and not bool(torch.isfinite(p).all())):
             bad = ~torch.isfinite(p)
             name = "exposure" if p is model.exposure.values else "the poses"
-            said.append(f"mended {_counted(int(bad.sum()), 'number')} of {name}")
+            messages.append(f"mended {_counted(int(bad.sum()), 'number')} of {name}")
             _mend(p, bad, 0.0, optimizer)
     count = sum(_clear_moments(optimizer, p) for group in optimizer.param_groups for p in group["params"])
     if count:
-        said.append(f"cleared {_counted(count, 'moment')} of Adam")
-    return ", ".join(said)
+        messages.append(f"cleared {_counted(count, 'moment')} of Adam")
+    return ", ".join(messages)
 
 
 @torch.no_grad()
@@ -133,9 +133,9 @@ def drop_offenders(model: DynamicModel, optimizer: torch.optim.Optimizer, densif
     dropped = torch.stack(list(names.values())).any(0)
     if not 0 < int(dropped.sum()) <= max(1, int(_FEW * len(dropped))):
         return ""
-    said = f"dropped {_counted(int(dropped.sum()), 'Gaussian')} (gradient of {_names(names)} not finite)"
+    message = f"dropped {_counted(int(dropped.sum()), 'Gaussian')} (gradient of {_names(names)} not finite)"
     _drop(model, optimizer, densifier, dropped)
-    return said
+    return message
 
 
 def _sound(model: DynamicModel, optimizer: torch.optim.Optimizer) -> bool:
@@ -150,27 +150,27 @@ def _sound(model: DynamicModel, optimizer: torch.optim.Optimizer) -> bool:
 def _repair_gaussians(
     model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, step: int
 ) -> list[str]:
-    said, params = [], model.gaussians.params
+    messages, params = [], model.gaussians.params
     names = {name: _bad_rows(params[name]) for name in PARAM_NAMES}
     dropped = torch.stack(list(names.values())).any(0)
     count = int(dropped.sum())
     if 2 * count > len(dropped):
         raise unstable(step)
     if count:
-        said.append(f"dropped {_counted(count, 'Gaussian')} ({_names(names)} not finite)")
+        messages.append(f"dropped {_counted(count, 'Gaussian')} ({_names(names)} not finite)")
         _drop(model, optimizer, densifier, dropped)
         params = model.gaussians.params
     flat = params["quats"].abs().amax(1) <= QUAT_MIN
     if bool(flat.any()):
-        said.append(f"mended {_counted(int(flat.sum()), 'Gaussian')} (quats without length)")
+        messages.append(f"mended {_counted(int(flat.sum()), 'Gaussian')} (quats without length)")
         identity = params["quats"].new_tensor([1.0, 0.0, 0.0, 0.0])
         _mend(params["quats"], flat[:, None].expand(-1, 4), identity.expand(len(flat), 4), optimizer)
     for name, owned in ({} if model.field is None else model.field.owned).items():
         rows = _bad_rows(params[name])
         if bool(rows.any()):
-            said.append(f"mended {_counted(int(rows.sum()), 'Gaussian')} ({name} not finite)")
+            messages.append(f"mended {_counted(int(rows.sum()), 'Gaussian')} ({name} not finite)")
             _mend(params[name], ~torch.isfinite(params[name]), owned.value, optimizer)
-    return said
+    return messages
 
 
 def _drop(model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, dropped: Tensor) -> None:

@@ -81,19 +81,19 @@ def correlation_frames(residual: Tensor, weight: Tensor) -> float | None:
     value = (residual.double() - mean) * seen
 
     def agreement(lag: int) -> float | None:
-        here, there = slice(lag, None), slice(None, len(value) - lag)
-        pairs = float((seen[here] * seen[there]).sum())
-        return float((value[here] * value[there]).sum()) / pairs if pairs else None
+        later, earlier = slice(lag, None), slice(None, len(value) - lag)
+        pairs = float((seen[later] * seen[earlier]).sum())
+        return float((value[later] * value[earlier]).sum()) / pairs if pairs else None
 
     alone, next_one = agreement(0), agreement(1)
     if not alone or next_one is None or next_one < 0.1 * alone:
         return None
     before = next_one
     for lag in range(2, max(3, len(value) // 2 + 1)):
-        here = agreement(lag)
-        if here is None:
+        agreed = agreement(lag)
+        if agreed is None:
             return float(lag - 1)
-        if here < 0.5 * next_one:
-            return lag - 1 + (before - 0.5 * next_one) / (before - here)
-        before = here
+        if agreed < 0.5 * next_one:
+            return lag - 1 + (before - 0.5 * next_one) / (before - agreed)
+        before = agreed
     return len(value) / 2

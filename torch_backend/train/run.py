@@ -22,17 +22,17 @@ from ..scene import Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
 from ..solve.motion import load_motion, motion_key
 from . import adam
-from .anew import SUMMARY_FILE, forget, place_for, settle, take_place
+from .anew import SUMMARY_FILE, drop_begun, finish_replacing, folder_for, replace_run
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .device import choose_device, unused_card
-from .evidence import gather
+from .evidence import gather_evidence
 from .extend import EXTENSION_FILE, pending
 from .model import DynamicModel, restore_model
 from .modelled import modelled
 from .movers import Mattes, load_movers
 from .trainer import Trainer
-from .verdict import figures_of, told, warn
+from .verdict import figures_of, verdict_fields, warn_if_poor
 
 _ATTEMPTS = 5
 """A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
@@ -77,7 +77,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     device = _prepared_device(config, params, report)
     run = shot.own(shot.run(params.run))
     shot.own(run / PREVIEWS_FOLDER)
-    settle(run)
+    finish_replacing(run)
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
@@ -89,10 +89,10 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         motion = None
     done = finished(run, key)
     if done is not None and params.resume:
-        forget(run, key)
+        drop_begun(run, key)
         report.progress("training", 1, 1, "already trained")
         return done
-    folder = shot.own(place_for(run, key, params.resume))
+    folder = shot.own(folder_for(run, key, params.resume))
     shot.own(folder / PREVIEWS_FOLDER)
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     if folder != run and params.resume:
@@ -119,9 +119,9 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     summary = summarise(trainer, params.run, test, held_out, key, functools.partial(load_motion, shot))
     write_json(folder / SUMMARY_FILE, summary)
     if folder != run:
-        take_place(run, folder)
+        replace_run(run, folder)
     report.metric("train", summary)
-    warn(summary, report)
+    warn_if_poor(summary, report)
     return summary
 
 
@@ -135,7 +135,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         raise ValueError(f"extend is {params.extend}: it is a number of steps to add")
     folder, again = shot.own(shot.run(params.run)), "Train it without --extend first."
     shot.own(folder / PREVIEWS_FOLDER)
-    settle(folder)
+    finish_replacing(folder)
     checkpoint, beside = folder / CHECKPOINT_FILE, folder / EXTENSION_FILE
     facts = read_meta(checkpoint) if checkpoint.is_file() else {}
     if not facts:
@@ -181,7 +181,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     write_json(folder / SUMMARY_FILE, summary)
     beside.unlink(missing_ok=True)
     report.metric("train", summary)
-    warn(summary, report)
+    warn_if_poor(summary, report)
     return summary
 
 
@@ -323,7 +323,7 @@ def summarise(
 ) -> dict[str, Any]:
     """The run's figures, units in the key names; what was modelled and what it cost."""
     value = trainer.heldout_psnr(test, held_out)
-    model, seen = trainer.model, gather(trainer, test, held_out, mattes)
+    model, seen = trainer.model, gather_evidence(trainer, test, held_out, mattes)
     return {
         "version": 1,
         "key": key,
@@ -340,7 +340,7 @@ def summarise(
         "train_frames": len(trainer.train_ids),
         "heldout_frames": len(test),
         "heldout_psnr_db": None if value is None else round(value, 3),
-        **told(figures_of(seen, trainer.scene.width, trainer.width * trainer.height)),
+        **verdict_fields(figures_of(seen, trainer.scene.width, trainer.width * trainer.height)),
         "gaussians": len(model.gaussians),
         "moving_gaussians": len(model.open_rows()),
         "moving_share": round(moving_share(model), 5),
@@ -382,7 +382,7 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
 def _stamp(checkpoint: Path) -> list[Any]:
     """[inode, name, bytes, time in ns] of a file, all None if it is gone. A replaced file has another inode."""
     try:
-        told = checkpoint.stat()
+        status = checkpoint.stat()
     except FileNotFoundError:
         return [None] * 4
-    return [told.st_ino, checkpoint.name, told.st_size, told.st_mtime_ns]
+    return [status.st_ino, checkpoint.name, status.st_size, status.st_mtime_ns]

@@ -34,7 +34,7 @@ from .repair import FieldMemory, drop_offenders, repair, unstable
 from .residual import correlation_of_movers
 
 _MAX_BAD_STEPS = 20
-_LOOK_EVERY = 10
+_INSPECT_EVERY = 10
 """Steps between two looks at what a GPU counted, and between two reports of progress."""
 
 
@@ -42,7 +42,7 @@ class Trainer:
     """Optimises one run on one device; images [I, H, W, 3] float16 display-referred, on the device or in host memory.
 
     Random numbers are drawn on the CPU whatever the device is: a run is the same experiment everywhere, and its
-    checkpoint goes on anywhere. On a GPU a step reads nothing back; `run` looks every `_LOOK_EVERY` steps.
+    checkpoint goes on anywhere. On a GPU a step reads nothing back; `run` looks every `_INSPECT_EVERY` steps.
 
     Args:
         scene: normalised scene, on the CPU.
@@ -72,7 +72,7 @@ class Trainer:
         self.viewmats = scene.viewmats.to(self.device)
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
         self.times = [float(scene.times[i]) for i in train]
-        self._when = torch.tensor(self.times, device=self.device)
+        self._time_tensor = torch.tensor(self.times, device=self.device)
         self.seconds = float(scene.seconds[train[-1]] - scene.seconds[train[0]])
         self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
         centres = bin_times(scene.times[train])
@@ -92,7 +92,7 @@ class Trainer:
         self.bad_steps = 0
         self.unusable: set[int] = set()
         self.order: list[int] = []
-        self._recent: deque[int] = deque(maxlen=2 * _LOOK_EVERY)
+        self._recent: deque[int] = deque(maxlen=2 * _INSPECT_EVERY)
         self._memory, self._shift = FieldMemory(), torch.zeros(0, 3, device=self.device)
         low, high = field_box(scene.points)
         self._extent = float((high - low).norm())
@@ -153,14 +153,14 @@ class Trainer:
         try:
             while self.iteration < self.end:
                 self.report.check_cancelled()
-                self._milestones()
+                self.schedule_events()
                 loss = self.step()
                 self.iteration += 1
                 self.trained_seconds = time.perf_counter() - since
                 if (self.iteration - begin) % every == 0:
                     evaluate(self)
-                if self.iteration % _LOOK_EVERY == 0 or self.iteration == self.end:
-                    self._look()
+                if self.iteration % _INSPECT_EVERY == 0 or self.iteration == self.end:
+                    self.inspect_nonfinite()
                     text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {float(loss):.4f}"
                     self.report.progress("training", self.iteration - begin, self.end - begin, text)
                 if time.perf_counter() - self._saved_at > self.config.checkpoint_seconds:
@@ -175,7 +175,7 @@ class Trainer:
     def step(self) -> Tensor:
         """One optimisation step on one training frame; returns its photometric loss (0-dim). Not finite: left out."""
         frame, supervision = self._next_frame(), self.config.supervision
-        self._schedule()
+        self._schedule_rates()
         rows = self.model.open_rows()
         pairs = self._pairs_to_anchor(rows)
         deltas, anchored = self._deltas(rows, frame, pairs)
@@ -208,10 +208,10 @@ class Trainer:
             self._recent.extend([] if other is None else [other])
         self.optimizer.step(guard=[total])
         if self._refines_poses():
-            self.poses.settle(self.frames_left_out)
+            self.poses.fix_gauge(self.frames_left_out)
         applied = self.optimizer.applied
         if self.device.type == "cpu" and not bool(applied):
-            self._left_out(frame)
+            self._skip_step(frame)
             return loss.detach()
         self.bad_steps = 0
         self._observe(frame, rows, state, out, applied)
@@ -235,7 +235,7 @@ class Trainer:
 
     def _deltas(self, rows: Tensor, frame: int, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
         """The field for the frame's Gaussians and for the pairs to anchor, in one call: (of `rows`, of `pairs`)."""
-        when, field = self._when[frame : frame + 1], self.model.field
+        when, field = self._time_tensor[frame : frame + 1], self.model.field
         if field is None:
             return None, None
         time = field.training_time(self.times[frame], self.progress, self.generator)
@@ -253,7 +253,7 @@ class Trainer:
         """[H, W, 3] float32, the trained frame at position `frame`, on the device."""
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
 
-    def _milestones(self) -> None:
+    def schedule_events(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
         if self.extensions:
             return
@@ -320,7 +320,7 @@ class Trainer:
 
     def _harden_gate(self) -> None:
         """Closes for good what did not move. While nothing moves at all, the trial goes on."""
-        self._look()  # one NaN would spoil the neighbours' verdicts
+        self.inspect_nonfinite()  # one NaN would spoil the neighbours' verdicts
         if self.model.field is None or not len(self.model.open_rows()):
             return
         if harden(self):
@@ -328,7 +328,7 @@ class Trainer:
             self._shift = self._shift[:0]
 
     def _create_field(self) -> None:
-        self._look()  # and every bound of the field
+        self.inspect_nonfinite()  # and every bound of the field
         model, c = self.model.gaussians, self.config
         means = model.params["means"].detach()[model.open].cpu()
         harmonics = model.params["shN"].shape[1]
@@ -403,14 +403,14 @@ class Trainer:
             return None
         return draw_anchored(self.model.gaussians, rows, s, self.generator)
 
-    def _support_loss(self, pairs: Anchored, here: Deltas) -> Tensor:
+    def _support_loss(self, pairs: Anchored, deltas: Deltas) -> Tensor:
         s, field = self.config.supervision, self.model.field
         if field is None:
             raise RuntimeError("pairs were drawn without a field")
-        loss = support_loss(self.model.gaussians, field, pairs, here, self.centres, self.seconds, s)
+        loss = support_loss(self.model.gaussians, field, pairs, deltas, self.centres, self.seconds, s)
         return s.support_every * loss
 
-    def _left_out(self, frame: int) -> None:
+    def _skip_step(self, frame: int) -> None:
         """After a step that was left out on the CPU: repairs; a run that keeps failing ends in words."""
         self.bad_steps += 1
         if self.bad_steps >= _MAX_BAD_STEPS:
@@ -419,7 +419,7 @@ class Trainer:
         text = f"Step {self.iteration} on frame {number} was skipped: its loss or gradient is not finite."
         self._recover(text if self.bad_steps == 1 else "", gradients=True)
 
-    def _look(self) -> None:
+    def inspect_nonfinite(self) -> None:
         """Repairs what is not finite; reads a GPU's counts of steps left out: since the last look, and in a row."""
         count, in_a_row = (0, 0) if self.device.type == "cpu" else self._bad.tolist()
         self._bad[0] = 0
@@ -460,7 +460,7 @@ class Trainer:
 
     # ------------------------------------------------------------------ optimiser
 
-    def _schedule(self) -> None:
+    def _schedule_rates(self) -> None:
         schedule = self.extensions[-1] if self.extensions else self.policy
         schedule_rates(self.optimizer, schedule.rate_progress(self.iteration, self.config.iterations))
 

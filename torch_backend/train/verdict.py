@@ -111,32 +111,32 @@ def judge(figures: RunFigures, limits: RunLimits | None = None) -> Verdict:
         walks, bad = spans_of(figures.frames, figures.travel, far, most=1), bad | far.any(axis=(1, 2))
     poor = dim or float(lost.any(axis=(1, 2)).mean()) > limits.poor_lost
     word = "poor" if poor else "fair" if places or walks else "good"
-    said = _sentences(figures, limits, dim, places, walks)
-    return Verdict(word, said, [*places, *walks], _advice(figures, dim, np.asarray(bad), places, walks, limits))
+    sentences = _sentences(figures, limits, dim, places, walks)
+    return Verdict(word, sentences, [*places, *walks], _advice(figures, dim, np.asarray(bad), places, walks, limits))
 
 
 def _sentences(
     figures: RunFigures, limits: RunLimits, dim: bool, places: list[dict[str, Any]], walks: list[dict[str, Any]]
 ) -> list[str]:
     """What is so: how well it fits, what moves and how far, where it does not hold."""
-    width, said = figures.width, []
+    width, sentences = figures.width, []
     if dim:
         on = "held-out frames" if figures.held_out else "training frames"
-        said.append(
+        sentences.append(
             f"It does not show the clip: {figures.median_db:.1f} dB on half of its {on}, "
             f"{figures.tenth_db:.1f} dB on the worst tenth."
         )
     elif not places:
-        said.append(EXPLAINED)
-    said += [f"It does not hold in {where_words(place)}." for place in places]
+        sentences.append(EXPLAINED)
+    sentences += [f"It does not hold in {where_words(place)}." for place in places]
     if figures.sway < limits.still:
-        said.append("Nothing moves in it.")
+        sentences.append("Nothing moves in it.")
     elif walks:
         farthest, place = round(figures.farthest * width), where_words(walks[0])
-        said.append(f"Something does not hold still: it travels up to {farthest} of {width} pixels in {place}.")
+        sentences.append(f"Something does not hold still: it travels up to {farthest} of {width} pixels in {place}.")
     else:
-        said.append(f"What moves sways by up to {max(1, round(figures.sway * width))} of {width} pixels.")
-    return said
+        sentences.append(f"What moves sways by up to {max(1, round(figures.sway * width))} of {width} pixels.")
+    return sentences
 
 
 def _advice(
@@ -232,7 +232,7 @@ def _longest_good(frames: Sequence[int], bad: NDArray[np.bool_], least: int = 4)
 # --------------------------------------------------------------------------------------------------- a summary's part
 
 
-def told(figures: RunFigures) -> dict[str, Any]:
+def verdict_fields(figures: RunFigures) -> dict[str, Any]:
     """A run's verdict and the figures behind it, for its summary."""
     verdict = judge(figures)
     return {
@@ -247,7 +247,7 @@ def told(figures: RunFigures) -> dict[str, Any]:
     }
 
 
-def warn(summary: dict[str, Any], report: Reporter) -> None:
+def warn_if_poor(summary: dict[str, Any], report: Reporter) -> None:
     """Warns of a poor run, from its summary."""
     verdict = Verdict(**summary["verdict"])
     if verdict.word == "poor":

@@ -94,7 +94,7 @@ def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
     config = config_from_params(TrainParams(iterations=60, max_gaussians=1500))
     trainer = Trainer(scene, images.cuda(), scene.solved, config, quiet(), {}, "cuda")
     for _ in range(30):
-        trainer._milestones()
+        trainer.schedule_events()
         trainer.step()
         trainer.iteration += 1
     path = world.shot.root / "gpu.safetensors"
@@ -104,7 +104,7 @@ def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
         other.restore(path)
         assert torch.equal(other.generator.get_state(), trainer.generator.get_state())
         for _ in range(10):
-            other._milestones()
+            other.schedule_events()
             loss = other.step()
             other.iteration += 1
         assert loss.device.type == device and bool(torch.isfinite(loss))
@@ -131,10 +131,10 @@ def test_bad_frames_are_left_out_on_the_gpu_too(world, quiet):
     before = {name: p.detach().clone() for name, p in trainer.model.gaussians.params.items()}
     for _ in range(9):
         trainer.step()
-    trainer._look()
+    trainer.inspect_nonfinite()
     assert any(e[0] == "warning" and "not finite" in e[1] for e in report.events)
     assert all(torch.equal(before[name], p) for name, p in trainer.model.gaussians.params.items())
     for _ in range(12):
         trainer.step()
     with pytest.raises(JobError, match="unstable"):
-        trainer._look()
+        trainer.inspect_nonfinite()

@@ -40,7 +40,7 @@ def trainer_of(world, quiet, steps, movers=True, **changes):
     found = load_movers(lambda frame: load_motion(world.shot, frame), scene, scene.solved, WIDTH, HEIGHT)
     trainer = Trainer(scene, images, scene.solved, config, quiet(), movers=found if movers else None)
     for _ in range(steps):
-        trainer._milestones()
+        trainer.schedule_events()
         trainer.step()
         trainer.iteration += 1
     return trainer

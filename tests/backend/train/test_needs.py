@@ -137,7 +137,7 @@ def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     runs[1].images[probes] = 1.0  # as good as no picture at all
     for trainer in runs:
         while trainer.iteration < 60:
-            trainer._milestones()
+            trainer.schedule_events()
             trainer.step()
             trainer.iteration += 1
     assert bool(runs[0].model.gaussians.open.any())
@@ -146,7 +146,7 @@ def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     assert not runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
     for trainer in runs:
         while trainer.iteration < 99:
-            trainer._milestones()
+            trainer.schedule_events()
             trainer.step()
             trainer.iteration += 1
     assert runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
@@ -273,7 +273,7 @@ def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     assert trainer.policy.stopped == 80  # the first measurement after the gate has given up waiting for motion
     assert trainer.iteration == 90
     group = trainer.optimizer.param_groups[0]
-    trainer._schedule()
+    trainer._schedule_rates()
     assert group["lr"] == pytest.approx(group["lr_end"])
     assert trainer.report.events[-1][2:4] == (90, 90)
     end = modelled(trainer)[-1]
@@ -292,7 +292,7 @@ def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
     for stop in (45, 72):
         broken = trainer_of(long_world, quiet, **changes)
         while broken.iteration < stop:
-            broken._milestones()
+            broken.schedule_events()
             broken.step()
             broken.iteration += 1
         broken.save(tmp_path / "broken.safetensors")

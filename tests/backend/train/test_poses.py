@@ -46,7 +46,7 @@ def test_the_gauge_holds_and_held_frames_follow_their_neighbours():
     poses = Poses([0.0, 0.2, 0.4, 0.8, 1.0], PosesConfig(), CPU)
     with torch.no_grad():
         poses.values[:] = torch.tensor([3.0, 100.0, 1.0, 2.0, 4.0])[:, None]
-    poses.settle({1})
+    poses.fix_gauge({1})
     assert poses.values[[0, 2, 3, 4], 0].tolist() == pytest.approx([0.5, -1.5, -0.5, 1.5])  # their mean, 2.5, is out
     assert float(poses.values.detach()[1, 0]) == pytest.approx(-0.5)
     between = poses.at(np.array([0.0, 0.6, 1.0, 2.0]))
@@ -64,7 +64,7 @@ def wrong_cameras(world, quiet, on):
     config.poses.on = on
     trainer = Trainer(scene, load_images(scene, scene.solved, 64, 48), scene.solved, config, quiet())
     while trainer.iteration < 320:
-        trainer._milestones()
+        trainer.schedule_events()
         trainer.step()
         trainer.iteration += 1
     return trainer, truth

@@ -39,12 +39,12 @@ def go_on(trainer: Trainer, steps: int) -> list[float]:
     """The loop of `Trainer.run`, without its checkpoints; returns the losses of the steps that were applied."""
     losses = []
     for _ in range(steps):
-        trainer._milestones()
+        trainer.schedule_events()
         loss = float(trainer.step())
         losses += [loss] if bool(trainer.optimizer.applied) else []
         trainer.iteration += 1
         if trainer.iteration % 10 == 0:
-            trainer._look()
+            trainer.inspect_nonfinite()
     return losses
 
 
@@ -90,7 +90,7 @@ def of_a_moment(trainer):
     """Seen before the next step, which would make a NaN of it and cost the Gaussian."""
     p = trainer.model.gaussians.params["means"]
     trainer.optimizer.state[p]["exp_avg_sq"][7, 0] = math.inf
-    trainer._look()
+    trainer.inspect_nonfinite()
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_one_bad_number_is_named_and_the_run_goes_on(begin, poison, words):
     count = len(trainer.model.gaussians)
     poison(trainer)
     after = go_on(trainer, 9)  # densification, which drops some of these by itself, is due at 40
-    trainer._look()
+    trainer.inspect_nonfinite()
     said = warnings(trainer)
     assert len(said) == 1
     assert words in said[0]
@@ -199,7 +199,7 @@ def test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back(begin, host)
     trainer = begin(host, 30)
     before = {name: p.detach().clone() for name, p in trainer.model.field.named_parameters()}
     loss = float(torch.tensor(go_on(trainer, 9)).mean())
-    normal = trainer._schedule
+    normal = trainer._schedule_rates
     fields = {id(p) for p in trainer.model.field.parameters()}
     rates = [group["lr_start"] for group in trainer.optimizer.param_groups]
 
@@ -209,11 +209,11 @@ def test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back(begin, host)
             if any(id(p) in fields for p in group["params"]):
                 group["lr"] *= 1e4
 
-    trainer._schedule = hasty
+    trainer._schedule_rates = hasty
     trainer.step()
-    trainer._schedule = normal
+    trainer._schedule_rates = normal
     assert float(trainer.step()) > 1.3 * loss
-    trainer._look()
+    trainer.inspect_nonfinite()
     (said,) = warnings(trainer)
     assert "put the field back" in said
     for name, p in trainer.model.field.named_parameters():
@@ -231,15 +231,15 @@ def test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back(begin, host)
 def test_a_hasty_step_of_one_attribute_is_trained_away(begin, name):
     trainer = begin("static", 20)
     loss = float(torch.tensor(go_on(trainer, 10)).mean())
-    normal = trainer._schedule
+    normal = trainer._schedule_rates
 
     def hasty():
         normal()
         next(group for group in trainer.optimizer.param_groups if group.get("name") == name)["lr"] *= 1e2
 
-    trainer._schedule = hasty
+    trainer._schedule_rates = hasty
     trainer.step()
-    trainer._schedule = normal
+    trainer._schedule_rates = normal
     after = go_on(trainer, 25)
     assert len(after) == 25
     assert sum(after[-5:]) / 5 < 2.0 * loss
@@ -281,7 +281,7 @@ def test_too_much_to_repair_ends_in_words(begin):
     trainer.model.gaussians.params["means"].data[::2] = NAN
     trainer.model.gaussians.params["means"].data[1] = NAN
     with pytest.raises(JobError, match="unstable at step 5"):
-        trainer._look()
+        trainer.inspect_nonfinite()
 
 
 def test_whole_runs_of_every_host_stay_finite_and_alike(world):
