@@ -93,12 +93,9 @@ def _write(path: Path, pixels: np.ndarray) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width, _ = pixels.shape
-    out = oiio.ImageOutput.create(str(path))
-    if out is None:
-        raise OSError(f"{path}: {oiio.geterror()}")
-    if not (out.open(str(path), oiio.ImageSpec(width, height, 3, oiio.FLOAT)) and out.write_image(pixels)):
-        raise OSError(f"{path}: {out.geterror()}")
-    out.close()
+    picture = oiio.ImageBuf(oiio.ImageSpec(width, height, 3, oiio.FLOAT))
+    if not (picture.set_pixels(oiio.ROI(), pixels) and picture.write(str(path))):
+        raise OSError(f"{path}: {picture.geterror()}")
 
 
 def _compare(frames: list[int], work: Path) -> dict[str, float]:
@@ -127,8 +124,7 @@ def inside(ask: dict[str, Any]) -> None:
     spec.loader.exec_module(module)
     package = module.load_package()
     package.register()
-    import bpy  # pyright: ignore[reportMissingImports]
-
+    bpy = importlib.import_module("bpy")
     work = Path(ask["work"])
     for name in ("delivered", "graded"):
         bpy.ops.wm.read_homefile(use_factory_startup=True)
@@ -140,8 +136,7 @@ def inside(ask: dict[str, Any]) -> None:
 
 def _through_the_group(package: str, ask: dict[str, Any], folder: Path, frame: int) -> np.ndarray:
     """[H, W, 3] float32: a plate of `folder`, warped by the take, as it leaves the compositor."""
-    import bpy  # pyright: ignore[reportMissingImports]
-
+    bpy = importlib.import_module("bpy")
     compat, compositor, steps = (
         importlib.import_module(f"{package}.splannequin_addon.{name}") for name in ("compat", "compositor", "steps")
     )
