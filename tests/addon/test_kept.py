@@ -12,7 +12,8 @@ _listening = [False]
 
 
 def _note(event: str, arguments: tuple) -> None:
-    if _listening[0] and event == "open" and isinstance(arguments[0], str | bytes | os.PathLike):
+    # `open` with an opener is told twice: by itself, and by `os.open`, which has no mode.
+    if _listening[0] and event == "open" and arguments[1] is not None and isinstance(arguments[0], str | os.PathLike):
         _opened.append(os.fsdecode(arguments[0]))
 
 
