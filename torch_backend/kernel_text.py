@@ -21,4 +21,4 @@ def kernel_text(path: Path) -> str:
     head = _HEAD.match(text)
     if head is None:
         raise ValueError(f"{path}: a kernel file begins with // and what it is")
-    return _INCLUDE.sub(lambda include: kernel_text(path.with_name(include.group(1))), text[head.end():])
+    return _INCLUDE.sub(lambda include: kernel_text(path.with_name(include.group(1))), text[head.end() :])

@@ -14,7 +14,7 @@ BACKEND = Path(__file__).resolve().parents[2] / "torch_backend"
 def test_the_head_is_not_compiled_and_the_rest_is_to_the_letter(tmp_path):
     (tmp_path / "part.cpp").write_text("// A part.\n\nint part;\n")
     whole = tmp_path / "whole.cpp"
-    whole.write_text("// A whole,\n// in two lines.\n\n// Kept.\nint a;\n#include \"part.cpp\"\n\n  int b; @NAME@\n")
+    whole.write_text('// A whole,\n// in two lines.\n\n// Kept.\nint a;\n#include "part.cpp"\n\n  int b; @NAME@\n')
     assert kernel_text(whole) == "\n// Kept.\nint a;\n\nint part;\n\n  int b; @NAME@\n"
 
 

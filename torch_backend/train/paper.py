@@ -28,9 +28,7 @@ class RenderedRun(RunView, Protocol):
         ...
 
 
-def paper_step(
-    run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput
-) -> int | None:
+def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> int | None:
     """Adds the paper's terms for this frame and a random other one; their gradients join the step's.
 
     Args:
@@ -66,9 +64,7 @@ def paper_step(
     return other
 
 
-def _supervised(
-    run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput
-) -> Tensor:
+def _supervised(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> Tensor:
     """bool [M]: which of `rows` the frame supervises well; `out` and `state` after the frame's own backward pass."""
     index, pull = run.train_ids[frame], state["means"].grad
     if pull is None or out.weight_sum is None:
