@@ -493,11 +493,12 @@ def _finish(
     made_of = _made_of(folder, numbers, look, shares)
     asked = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
     verdict = judge_take({"t_star_frame": t_star, **asked, "detail": made_of.get("detail")}, run_verdict(run))
-    title = f"{shot.info().name}: t* = frame {t_star}, run {params.run}"
+    info = shot.info()
+    title = f"{info.name}, {Path(info.source).name}: t* = frame {t_star}, run {params.run}"
     sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
     report.check_cancelled()
     report.progress("finishing the take", 1, 3, "video")
-    note = write_video(folder / VIDEO_FILE, (read_png(p) for p in previews), shot.info().fps or 24.0)
+    note = write_video(folder / VIDEO_FILE, (read_png(p) for p in previews), info.fps or 24.0)
     if note:
         report.warning(note)
     report.progress("finishing the take", 2, 3, "PLY")
