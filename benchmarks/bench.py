@@ -28,7 +28,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main
 from benchmarks.sources import Log, child_environ, end_with_parent, load_source, make_scenes
 from benchmarks.synthetic.make import default_folder
 from benchmarks.synthetic.sizes import SIZES
-from torch_backend.contract import ExitCode, JobError, TrainParams, from_dict, read_json
+from torch_backend.contract import METHODS, SUPERVISIONS, ExitCode, JobError, TrainParams, from_dict, read_json
 from torch_backend.job import new_job, run_job
 from torch_backend.native import default_threads
 from torch_backend.report.records import RECORD_VERSION, RunRecord, finished, machine_facts, save_record
@@ -36,7 +36,7 @@ from torch_backend.report.truth import TruthScene
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.shot import content_key, locked, write_json
 from torch_backend.train import PRESETS, TrainConfig, config_from_params
-from torch_backend.train.config import METHODS, SUPERVISIONS, config_to_json
+from torch_backend.train.config import config_to_json
 from torch_backend.train.device import choose_device
 
 HOSTS = {"hexplane": "4DGaussians", "mlp": "Deformable 3DGS", "control_points": "SC-GS"}

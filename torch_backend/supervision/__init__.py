@@ -1,7 +1,6 @@
 """Who was seen when, and what holds a Gaussian at times at which nobody saw it."""
 
 from .anchors import (
-    DETECTORS,
     Anchored,
     PaperView,
     SupervisionConfig,
@@ -14,7 +13,6 @@ from .anchors import (
 from .support import bin_of, bin_times, mark_hidden, mark_seen, nearest_bin, nearest_supported, support_confidence
 
 __all__ = [
-    "DETECTORS",
     "Anchored",
     "PaperView",
     "SupervisionConfig",

@@ -14,11 +14,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..contract import DETECTORS
 from ..deformation import Deformation, Deltas
 from ..gaussians import Gaussians
 from .support import SEEN_WEIGHT, nearest_supported
-
-DETECTORS = ("weight", "grad_norm", "grad_signed")
 
 
 @dataclass

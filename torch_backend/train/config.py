@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..contract import TrainParams
+from ..contract import DETECTORS, METHODS, SUPERVISIONS, TrainParams
 from ..deformation import GateConfig, HexPlaneConfig, HostConfig, host, host_config, hosts
 from ..gaussians import DensifyConfig, InitConfig
-from ..supervision import DETECTORS, SupervisionConfig
+from ..supervision import SupervisionConfig
 from .exposure import ExposureConfig
 from .needs import NeedsConfig
 from .poses import PosesConfig
@@ -127,8 +127,6 @@ def _final() -> TrainConfig:
 
 PRESETS = {"preview": _preview, "standard": _standard, "final": _final}
 """Name -> a fresh configuration."""
-METHODS = ("auto", *hosts(), "static")
-SUPERVISIONS = ("support", "paper", "none")
 
 
 def config_from_params(params: TrainParams) -> TrainConfig:

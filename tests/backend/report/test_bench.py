@@ -12,14 +12,14 @@ import torch
 
 from benchmarks.bench import ABLATIONS, HOLDOUT, RunSpec, cores, override, plan, run_plan
 from benchmarks.sources import ROOT
-from torch_backend.contract import read_json
+from torch_backend.contract import METHODS, read_json
 from torch_backend.deformation import host_config, hosts
 from torch_backend.report.evaluate import last_third_step_ms
 from torch_backend.report.records import DELIVERED, DEVELOPED, WITHHELD, finished, load_record
 from torch_backend.report.truth import RealScene, TruthFolder
 from torch_backend.report.write import write_report
 from torch_backend.scene import load_scene, split_frames
-from torch_backend.train.config import METHODS, config_from_json
+from torch_backend.train.config import config_from_json
 
 SIZE = {"iterations": 60, "max_gaussians": 900}
 
