@@ -818,6 +818,7 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
     legs: list[Leg] = []
     if not pytest_args and not series:
         legs.append(Leg("ruff", [backend.python, "-P", "-m", "ruff", "check", str(ROOT)]))
+        legs.append(Leg("ruff format", [backend.python, "-P", "-m", "ruff", "format", "--check", str(ROOT)]))
         project = ["--project", str(ROOT), "--pythonpath", backend.python]
         legs.append(Leg("pyright", [backend.python, "-P", "-m", "pyright", *project]))
     if backend_paths:

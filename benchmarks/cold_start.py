@@ -39,8 +39,9 @@ print(json.dumps({"import": imported - start, "first": first, "second": second})
 def one(cache: pathlib.Path) -> dict[str, float]:
     """Seconds of a new process whose Warp cache is the folder `cache`."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(cache)}
-    run = subprocess.run([sys.executable, "-P", "-c", CHILD], cwd=ROOT, env=environment,
-                         capture_output=True, text=True, check=True)
+    run = subprocess.run(
+        [sys.executable, "-P", "-c", CHILD], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+    )
     return json.loads(run.stdout)
 
 
@@ -55,8 +56,12 @@ def main() -> None:
                 results[label].append(one(pathlib.Path(folder)))
     for label, runs in results.items():
         figures = {name: [run[name] for run in runs] for name in runs[0]}
-        print(f"{label:12s}" + "".join(f"  {name} {statistics.median(v):.3f} s [{min(v):.3f}, {max(v):.3f}]"
-                                       for name, v in figures.items()))
+        print(
+            f"{label:12s}"
+            + "".join(
+                f"  {name} {statistics.median(v):.3f} s [{min(v):.3f}, {max(v):.3f}]" for name, v in figures.items()
+            )
+        )
 
 
 if __name__ == "__main__":

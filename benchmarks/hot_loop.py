@@ -64,15 +64,24 @@ _RESET = r"""
     // T falls with every hit; it is set back before it reaches the stop.
     if (turn % 16 == 0) for (int i = 0; i < 16; i++) T[i] = (F)1.f;
 """
-_FORWARD_TEXT = _OPERANDS + r"""
+_FORWARD_TEXT = (
+    _OPERANDS
+    + r"""
 F C[NCH][16], totals[16], peaks[16];
 for (int c = 0; c < NCH; c++) for (int i = 0; i < 16; i++) C[c][i] = (F)0.f;
 for (long long turn = 0; turn < P.n; turn++) {
-""" + _RESET + r"""
+"""
+    + _RESET
+    + r"""
     for (int l = 0; l < 16; l++) {
-""" + source.HIT + r"""
+"""
+    + source.HIT
+    + r"""
         F total = (F)0.f, peak = (F)0.f;
-""" + source.ROWS + source.FORWARD_ROW + r"""
+"""
+    + source.ROWS
+    + source.FORWARD_ROW
+    + r"""
         }
         totals[l] = total; peaks[l] = peak;
     }
@@ -81,15 +90,25 @@ F all = (F)0.f;
 for (int i = 0; i < 16; i++) { all += T[i] + totals[i] + peaks[i]; for (int c = 0; c < NCH; c++) all += C[c][i]; }
 store(P.image, all);
 """
-_BACKWARD_TEXT = _OPERANDS + r"""
+)
+_BACKWARD_TEXT = (
+    _OPERANDS
+    + r"""
 F left[16], G[NCH][16], all = (F)0.f;
 const bool want_abs = P.want_abs != 0;
 for (int i = 0; i < 16; i++) {
     left[i] = (F)P.background[0]; for (int c = 0; c < NCH; c++) G[c][i] = LANE * P.background[c]; }
 for (long long turn = 0; turn < P.n; turn++) {
-""" + _RESET + r"""
+"""
+    + _RESET
+    + r"""
     for (int l = 0; l < 16; l++) {
-""" + source.HIT + source.BACKWARD_SUMS + source.ROWS + source.BACKWARD_ROW + r"""
+"""
+    + source.HIT
+    + source.BACKWARD_SUMS
+    + source.ROWS
+    + source.BACKWARD_ROW
+    + r"""
         }
         all += s0 + s1 + s2 + s3 + s4 + s5 + ax + ay;
         for (int c = 0; c < NCH; c++) all += gc[c];
@@ -98,6 +117,7 @@ for (long long turn = 0; turn < P.n; turn++) {
 for (int i = 0; i < 16; i++) all += T[i] + left[i];
 store(P.image, all);
 """
+)
 
 
 @dataclass(frozen=True)
@@ -141,7 +161,7 @@ def limits(repeats: int = 60) -> HotLoop:
     # Wide, faint Gaussians about the tile: alpha between 0.006 and 0.008 everywhere.
     records[:, 0:2] = torch.linspace(4, 12, _HITS)[:, None]
     records[:, 2], records[:, 3], records[:, 4], records[:, 5] = -5e-4, 0.1, -5e-4, float(np.log2(0.008))
-    records[:, source.HEAD:source.HEAD + CHANNELS] = torch.linspace(0.1, 0.9, _HITS)[:, None]
+    records[:, source.HEAD : source.HEAD + CHANNELS] = torch.linspace(0.1, 0.9, _HITS)[:, None]
     sink, background = torch.zeros(64), torch.full((CHANNELS,), 1e-3)
     block.record, block.record_stride, block.image = records.data_ptr(), records.shape[1], sink.data_ptr()
     block.background, block.want_abs = background.data_ptr(), 1
@@ -169,12 +189,23 @@ class _Frames:
     """One workload as tensors; colours and their gradient, the outputs of a training step."""
 
     def __init__(self, work: "Workload", threads: int):
-        values = (work.means, work.quats, np.log(work.scales), np.log(work.opacities) - np.log1p(-work.opacities),
-                  work.colors)
+        values = (
+            work.means,
+            work.quats,
+            np.log(work.scales),
+            np.log(work.opacities) - np.log1p(-work.opacities),
+            work.colors,
+        )
         self.leaves = [torch.tensor(value, requires_grad=True) for value in values]
-        self.options = {"viewmats": torch.tensor(work.viewmat)[None], "Ks": torch.tensor(work.K)[None],
-                        "width": work.width, "height": work.height, "settings": RasterSettings(threads=threads),
-                        "backend": "cpu", "with_contributions": True}
+        self.options = {
+            "viewmats": torch.tensor(work.viewmat)[None],
+            "Ks": torch.tensor(work.K)[None],
+            "width": work.width,
+            "height": work.height,
+            "settings": RasterSettings(threads=threads),
+            "backend": "cpu",
+            "with_contributions": True,
+        }
         self.g = torch.tensor(work.g)[None]
 
     def run(self) -> None:
@@ -238,8 +269,13 @@ def blend_times(work: "Workload", threads: int, rounds: int = 15) -> BlendTimes:
             frames.run()
     finally:
         cpu.run_workers = own
-    return BlendTimes(float(np.median(times[source.BLEND])), float(np.median(times[source.BLEND_BACKWARD])),
-                      16 * rows, 16 * rows_back, threads)
+    return BlendTimes(
+        float(np.median(times[source.BLEND])),
+        float(np.median(times[source.BLEND_BACKWARD])),
+        16 * rows,
+        16 * rows_back,
+        threads,
+    )
 
 
 def main() -> None:
@@ -258,14 +294,24 @@ def main() -> None:
             # Beside each row: a machine shared with others has fast and slow minutes.
             limit, times = limits(), blend_times(work, threads, arguments.rounds)
             ahead, back = times.shares(limit)
-            results.append({"workload": name, "limit": asdict(limit), **asdict(times), "forward_share": ahead,
-                            "backward_share": back})
+            results.append(
+                {
+                    "workload": name,
+                    "limit": asdict(limit),
+                    **asdict(times),
+                    "forward_share": ahead,
+                    "backward_share": back,
+                }
+            )
             per = times.threads * limit.clock_hz
-            print(f"{name}  {threads} threads at {limit.clock_hz / 1e9:.2f} GHz; cycles per lane, of the limit's:  "
-                  f"forward {times.forward_s * 1e3:6.2f} ms, {times.forward_s * per / times.forward_lanes:.2f} of "
-                  f"{limit.forward_cycles_per_lane:.2f}, {ahead:.0%}   backward {times.backward_s * 1e3:6.2f} ms, "
-                  f"{times.backward_s * per / times.backward_lanes:.2f} of {limit.backward_cycles_per_lane:.2f}, "
-                  f"{back:.0%}", flush=True)
+            print(
+                f"{name}  {threads} threads at {limit.clock_hz / 1e9:.2f} GHz; cycles per lane, of the limit's:  "
+                f"forward {times.forward_s * 1e3:6.2f} ms, {times.forward_s * per / times.forward_lanes:.2f} of "
+                f"{limit.forward_cycles_per_lane:.2f}, {ahead:.0%}   backward {times.backward_s * 1e3:6.2f} ms, "
+                f"{times.backward_s * per / times.backward_lanes:.2f} of {limit.backward_cycles_per_lane:.2f}, "
+                f"{back:.0%}",
+                flush=True,
+            )
     if arguments.json:
         arguments.json.write_text(json.dumps(results, indent=1) + "\n")
 

@@ -76,8 +76,14 @@ class Scene:
         backend, dtype, device = BODIES.get(body, (body, torch.float32, "cpu"))
         leaves = self.leaves(dtype, device) if leaves is None else leaves
         options = {"settings": RasterSettings(threads=2)} | self.options | options
-        return rasterize(**leaves, Ks=self.Ks, width=self.width, height=self.height,  # type: ignore[arg-type]
-                         backend=backend, **options)
+        return rasterize(
+            **leaves,
+            Ks=self.Ks,
+            width=self.width,
+            height=self.height,  # type: ignore[arg-type]
+            backend=backend,
+            **options,
+        )
 
     def gradients(self, body: str, where: Any = 1.0, **options: Any) -> tuple[RasterOutput, dict[str, Tensor]]:
         """Output, and the gradients of a fixed random cotangent of all differentiable images, at pixels `where`."""
@@ -161,8 +167,9 @@ def compare(scene: Scene, body: str, **options: Any) -> Errors:
     same = gap < SAME_SIDE
     for images in (out, oracle):
         scalar(images, same.to(images.alphas.device)).backward()
-    grads, oracle_grads = ({n: leaf.grad for n, leaf in tensors.items() if leaf.grad is not None}
-                           for tensors in (leaves, truth))
+    grads, oracle_grads = (
+        {n: leaf.grad for n, leaf in tensors.items() if leaf.grad is not None} for tensors in (leaves, truth)
+    )
     brightest = max(1.0, float(oracle.colors.detach().abs().amax())) if oracle.colors.numel() else 1.0
     error = (out.colors.detach().cpu().double() - oracle.colors.detach()).abs() / brightest
     clean = error[same]
@@ -176,9 +183,17 @@ def compare(scene: Scene, body: str, **options: Any) -> Errors:
             floor = 0.01 * float(empty.grad.sum((0, 1, 2)).norm())  # type: ignore[union-attr]
         difference = (grads[name].cpu().double() - value).norm()
         gradients[name] = float(difference / value.norm().clamp_min(max(floor, 1e-6)))
-    return Errors(flips=float((~same).double().mean()) if same.numel() else 0.0,
-                  image=float(clean.amax()) if clean.numel() else 0.0, psnr=_decibels(clean), psnr_all=_decibels(error),
-                  gradients=gradients, out=out, grads=grads, oracle=oracle, oracle_grads=oracle_grads)
+    return Errors(
+        flips=float((~same).double().mean()) if same.numel() else 0.0,
+        image=float(clean.amax()) if clean.numel() else 0.0,
+        psnr=_decibels(clean),
+        psnr_all=_decibels(error),
+        gradients=gradients,
+        out=out,
+        grads=grads,
+        oracle=oracle,
+        oracle_grads=oracle_grads,
+    )
 
 
 def camera(width: int, height: int, focal: float, cx: float | None = None, cy: float | None = None) -> Tensor:
@@ -187,8 +202,9 @@ def camera(width: int, height: int, focal: float, cx: float | None = None, cy: f
     return torch.tensor([[[focal, 0, cx], [0, focal, cy], [0, 0, 1]]], dtype=torch.float64)
 
 
-def cloud(n: int, width: int, height: int, seed: int = 0, channels: int = 3, degree: int | None = None,
-          **options: Any) -> Scene:
+def cloud(
+    n: int, width: int, height: int, seed: int = 0, channels: int = 3, degree: int | None = None, **options: Any
+) -> Scene:
     """Random Gaussians before a camera that is turned a little; harmonics instead of colours if degree is given."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -200,9 +216,14 @@ def cloud(n: int, width: int, height: int, seed: int = 0, channels: int = 3, deg
     a = 0.1
     viewmat[:3, :3] = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
     viewmat[:3, 3] = torch.tensor([0.05, -0.02, 0.1])
-    tensors = {"means": means, "quats": normal(n, 4), "log_scales": normal(n, 3) * 0.5 - 2.3,
-               "opacity_logits": normal(n) * 1.5, "viewmats": viewmat[None],
-               "background": torch.linspace(0.1, 0.9, channels, dtype=torch.float64)}
+    tensors = {
+        "means": means,
+        "quats": normal(n, 4),
+        "log_scales": normal(n, 3) * 0.5 - 2.3,
+        "opacity_logits": normal(n) * 1.5,
+        "viewmats": viewmat[None],
+        "background": torch.linspace(0.1, 0.9, channels, dtype=torch.float64),
+    }
     if degree is None:
         tensors["colors"] = normal(n, channels)
     else:
@@ -212,12 +233,24 @@ def cloud(n: int, width: int, height: int, seed: int = 0, channels: int = 3, deg
     return Scene(tensors, camera(width, height, 0.9 * max(width, height)), width, height, options)
 
 
-def single(width: int = 16, height: int = 16, focal: float = 16.0, mean: tuple[float, float, float] = (0.0, 0.0, 2.0),
-           quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0), scale: float = 0.2,
-           logit: float = 2.0) -> Scene:
+def single(
+    width: int = 16,
+    height: int = 16,
+    focal: float = 16.0,
+    mean: tuple[float, float, float] = (0.0, 0.0, 2.0),
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+    scale: float = 0.2,
+    logit: float = 2.0,
+) -> Scene:
     """One grey-red Gaussian before a camera at the origin."""
-    values = {"means": [mean], "quats": [quat], "log_scales": [(math.log(scale),) * 3], "opacity_logits": [logit],
-              "colors": [(0.8, 0.4, 0.2)], "background": (0.0, 0.0, 0.0)}
+    values = {
+        "means": [mean],
+        "quats": [quat],
+        "log_scales": [(math.log(scale),) * 3],
+        "opacity_logits": [logit],
+        "colors": [(0.8, 0.4, 0.2)],
+        "background": (0.0, 0.0, 0.0),
+    }
     tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
     tensors["viewmats"] = torch.eye(4, dtype=torch.float64)[None]
     return Scene(tensors, camera(width, height, focal), width, height)
@@ -230,8 +263,11 @@ def workload(name: str) -> Scene:
     opacity = torch.tensor(work.opacities).double()
     arrays = {"means": work.means, "quats": work.quats, "colors": work.colors, "viewmats": work.viewmat[None]}
     tensors = {name: torch.tensor(value).double() for name, value in arrays.items()}
-    tensors |= {"log_scales": torch.tensor(work.scales).double().log(), "opacity_logits": torch.logit(opacity),
-                "background": torch.tensor([0.1, 0.2, 0.3]).double()}
+    tensors |= {
+        "log_scales": torch.tensor(work.scales).double().log(),
+        "opacity_logits": torch.logit(opacity),
+        "background": torch.tensor([0.1, 0.2, 0.3]).double(),
+    }
     return Scene(tensors, torch.tensor(work.K)[None].double(), width, height)
 
 
@@ -271,8 +307,12 @@ def _poisoned(small: bool) -> Scene:
     return scene
 
 
-def _scales(*log_scales: float, axes: tuple[tuple[int, ...], ...] = ((0,), (0, 1), (0, 1, 2)), near: float = 0.01,
-            antialiased: bool = False) -> Callable[[bool], Scene]:
+def _scales(
+    *log_scales: float,
+    axes: tuple[tuple[int, ...], ...] = ((0,), (0, 1), (0, 1, 2)),
+    near: float = 0.01,
+    antialiased: bool = False,
+) -> Callable[[bool], Scene]:
     """A cloud in which some Gaussians have the given log-scales on one, two or three axes."""
 
     def build(small: bool) -> Scene:
@@ -447,8 +487,15 @@ def _equal_depths(small: bool) -> Scene:
 
 
 def _antialiased(small: bool) -> Scene:
-    return cloud(60 if small else 200, 40, 30, seed=16, degree=2, with_depth=True,
-                 settings=RasterSettings(threads=2, antialiased=True))
+    return cloud(
+        60 if small else 200,
+        40,
+        30,
+        seed=16,
+        degree=2,
+        with_depth=True,
+        settings=RasterSettings(threads=2, antialiased=True),
+    )
 
 
 CASES: dict[str, Case] = {
@@ -456,11 +503,15 @@ CASES: dict[str, Case] = {
     "antialiased, harmonics of degree 2": Case(_antialiased),
     "NaN and infinities in every input": Case(_poisoned),
     "log-scales inf, 40, 30, 29, 20": Case(
-        _scales(math.inf, 40.0, 30.0, 29.0, 20.0), gradient=None,
-        note="what float32 cannot invert is culled in all bodies; the cut itself is subject to rounding"),
+        _scales(math.inf, 40.0, 30.0, 29.0, 20.0),
+        gradient=None,
+        note="what float32 cannot invert is culled in all bodies; the cut itself is subject to rounding",
+    ),
     "scales up to e^6 units": Case(
-        _scales(1.0, 3.0, 6.0), gradient=5e-3,
-        note="gradients of sheets that look flat from edge to edge are small differences of large numbers"),
+        _scales(1.0, 3.0, 6.0),
+        gradient=5e-3,
+        note="gradients of sheets that look flat from edge to edge are small differences of large numbers",
+    ),
     "scales of e^-20, e^-50, 0": Case(_scales(-20.0, -50.0, -math.inf)),
     "the same, antialiased": Case(_scales(-20.0, -50.0, -math.inf, antialiased=True)),
     "behind, on, just beyond, through the near plane": Case(_near_plane, gradient=5e-3),
@@ -470,27 +521,38 @@ CASES: dict[str, Case] = {
     "points, lines, discs from the side": Case(_edge_on),
     "quaternions of length 0, 1e-38 ... 1e37": Case(_quaternions),
     "opacity 1 (logits 15, 100, inf)": Case(
-        _opacities(15.0, 100.0, math.inf), plain=0.5, note="torch's float32 sigmoid is 1 beyond 17: its gradients, of "
-        "3e-7, are gone"),
+        _opacities(15.0, 100.0, math.inf),
+        plain=0.5,
+        note="torch's float32 sigmoid is 1 beyond 17: its gradients, of 3e-7, are gone",
+    ),
     "opacity 0 (logits -100, -inf), some not": Case(_opacities(-100.0, -math.inf, 0.0)),
     "opacity 0.01 everywhere": Case(_opacities(-4.6), flips=0.05),
     "forty opaque layers": Case(_opaque_stack),
-    "10,000 Gaussians in one pixel": Case(_crowd, psnr=80, gradient=5e-3, flips=0.2,
-                                          note="ten thousand alphas at the cut; 35 pixels"),
+    "10,000 Gaussians in one pixel": Case(
+        _crowd, psnr=80, gradient=5e-3, flips=0.2, note="ten thousand alphas at the cut; 35 pixels"
+    ),
     "one Gaussian over all pixels": Case(_giant),
-    "image of 1 x 1": Case(_image(1, 1)), "image of 7 x 5": Case(_image(7, 5)),
-    "image of 17 x 1": Case(_image(17, 1)), "image of 1 x 40": Case(_image(1, 40)),
+    "image of 1 x 1": Case(_image(1, 1)),
+    "image of 7 x 5": Case(_image(7, 5)),
+    "image of 17 x 1": Case(_image(17, 1)),
+    "image of 1 x 40": Case(_image(1, 40)),
     "no Gaussians": Case(lambda small: cloud(0, 20, 12, with_depth=True)),
     "nothing in view": Case(_nowhere),
-    "no cameras": Case(_cameras(0)), "three cameras": Case(_cameras(3)),
+    "no cameras": Case(_cameras(0)),
+    "three cameras": Case(_cameras(3)),
     "principal point at a corner": Case(_principal_point(3.0, 20.0)),
     "principal point outside, left": Case(_principal_point(-15.0, 9.0)),
     "principal point outside, right": Case(_principal_point(40.0, 30.0)),
     "black harmonics": Case(_black_harmonics),
-    "world scaled by 17462": Case(scaled_world(17462.0)), "world scaled by 1e-4": Case(scaled_world(1e-4)),
+    "world scaled by 17462": Case(scaled_world(17462.0)),
+    "world scaled by 1e-4": Case(scaled_world(1e-4)),
     "world 1400 units from the origin": Case(
-        _far_from_the_origin, psnr=55, gradient=5e-2, flips=0.1,
-        note="positions themselves are exact float32 numbers; their transform to the camera cancels 1400 against 1400"),
+        _far_from_the_origin,
+        psnr=55,
+        gradient=5e-2,
+        flips=0.1,
+        note="positions themselves are exact float32 numbers; their transform to the camera cancels 1400 against 1400",
+    ),
     "equal depths": Case(_equal_depths),
 }
 
@@ -499,117 +561,245 @@ def size(case: str, body: str) -> Scene:
     """The scene of a case, at the size for a body."""
     return CASES[case].build(body == "cuda")
 
+
 _H, _P = "test_hard_cases.py::", "test_properties.py::"
 ROWS: list[tuple[str, list[str], str]] = [
-    ("NaN loss, everything dies in 1 to 2 steps",
-     [_H + "test_non_finite_gaussian_is_culled_and_the_others_stay", _H + "test_non_finite_harmonics_are_culled",
-      _P + "test_any_numbers_give_sane_images_and_gradients"],
-     "skipping a step whose loss is not finite is the trainer's"),
-    ("NaN hidden by culling; ratio of determinants underflows",
-     [_H + "test_poisoned_gaussians_show_in_their_radii_though_not_in_the_image",
-      _H + "test_a_point_keeps_half_a_percent_of_its_opacity_when_antialiased"], ""),
+    (
+        "NaN loss, everything dies in 1 to 2 steps",
+        [
+            _H + "test_non_finite_gaussian_is_culled_and_the_others_stay",
+            _H + "test_non_finite_harmonics_are_culled",
+            _P + "test_any_numbers_give_sane_images_and_gradients",
+        ],
+        "skipping a step whose loss is not finite is the trainer's",
+    ),
+    (
+        "NaN hidden by culling; ratio of determinants underflows",
+        [
+            _H + "test_poisoned_gaussians_show_in_their_radii_though_not_in_the_image",
+            _H + "test_a_point_keeps_half_a_percent_of_its_opacity_when_antialiased",
+        ],
+        "",
+    ),
     ("NaN spreads in squares", [_H + "test_ssim_sees_no_nan_of_a_poisoned_scene"], ""),
-    ("Inf scale, NaN radius, uninitialised keys",
-     [_H + "test_infinite_and_enormous_scales_are_culled", _H + "test_extreme_scales",
-      _H + "test_what_overflows_and_is_culled_gets_zero_gradients",
-      _H + "test_a_tall_image_needs_more_tile_spans_than_are_kept"], "same predicate when counting and emitting"),
-    ("Near plane",
-     [_H + "test_near_plane", _H + "test_gaussian_on_the_near_plane_is_culled",
-      _H + "test_scale_of_the_world_does_not_matter"], "which near plane suits a scene is the trainer's"),
-    ("Frustum-edge Jacobian blow-up",
-     [_H + "test_frustum_edge_jacobian_is_clamped_about_the_principal_point",
-      _H + "test_footprint_beyond_the_frustum_is_bounded_by_the_clamp",
-      _H + "test_no_gradient_passes_the_frustum_clamp", _H + "test_principal_point_off_centre_and_outside",
-      _H + "test_a_crop_with_the_principal_point_aside_is_the_crop_of_the_image",
-      _P + "test_footprints_at_the_frustum_edge_are_bounded"],
-     "the clamp still turns long splats beyond the edge; their size is bounded"),
-    ("Degenerate 2D covariance",
-     [_H + "test_a_point_is_as_wide_as_the_low_pass", _H + "test_degenerate_covariances",
-      _H + "test_long_thin_gaussians_keep_their_precision",
-      _H + "test_a_point_keeps_half_a_percent_of_its_opacity_when_antialiased"], ""),
-    ("Zero or non-unit quaternion",
-     [_H + "test_zero_quaternion_is_culled", _H + "test_length_of_a_quaternion_does_not_matter"], ""),
-    ("Zero scale, log-scale explosion",
-     [_H + "test_extreme_scales", _H + "test_infinite_and_enormous_scales_are_culled",
-      _H + "test_a_point_is_as_wide_as_the_low_pass"], "pruning by size is the trainer's"),
-    ("Alpha clamp and saturated opacity",
-     [_H + "test_opacity_at_its_ends", _H + "test_no_gradient_passes_the_alpha_clamp",
-      _H + "test_pixel_stops_once_it_is_opaque"], ""),
-    ("Opacity reset kills Gaussians",
-     [_H + "test_faint_gaussians_lose_their_gradient_where_they_can_be_counted"],
-     "the rasteriser's part: such Gaussians have no radius and no weight, so they can be counted"),
-    ("Hard 1/255 cut-off breaks gradcheck",
-     ["test_reference.py::test_gradients_are_those_of_finite_differences"], "a scene kept clear of the cut-offs"),
-    ("SH clamp at 0 traps black Gaussians",
-     [_H + "test_black_harmonics_can_become_brighter_but_not_darker", _H + "test_colours_have_no_ceiling"], ""),
-    ("Huge screen radius",
-     [_H + "test_opaque_gaussians_reach_beyond_three_sigma", _H + "test_one_gaussian_over_all_pixels",
-      _H + "test_one_gaussian_over_millions_of_pixels_takes_memory_by_the_pixel",
-      _H + "test_ten_thousand_gaussians_in_one_pixel",
-      _H + "test_ten_thousand_gaussians_in_one_pixel_take_memory_by_the_gaussian"], ""),
-    ("Tile-key overflow",
-     [_H + "test_more_hits_than_an_index_holds_are_refused_before_memory_is_taken",
-      _H + "test_images_wider_than_a_tile_column_can_say_are_refused"], ""),
-    ("Empty frustum, zero Gaussians",
-     [_H + "test_no_gaussians", _H + "test_nothing_in_view", _H + "test_no_cameras"], ""),
-    ("More than 2^24 samples",
-     [_H + "test_one_gaussian_over_millions_of_pixels_takes_memory_by_the_pixel"],
-     "the rasteriser's part: sums over more pixels than float32 can count"),
-    ("SSIM",
-     [_H + "test_images_smaller_than_the_window_of_ssim_are_compared_by_l1_alone",
-      _H + "test_ssim_takes_one_as_the_range_of_the_data", "test_ssim.py::test_refuses_what_it_cannot_do"], ""),
-    ("Wrong poses or scene scale",
-     [_H + "test_scale_of_the_world_does_not_matter", _P + "test_scaling_the_world_scales_the_depth"],
-     "the rasteriser's part: a world of any scale renders the same"),
+    (
+        "Inf scale, NaN radius, uninitialised keys",
+        [
+            _H + "test_infinite_and_enormous_scales_are_culled",
+            _H + "test_extreme_scales",
+            _H + "test_what_overflows_and_is_culled_gets_zero_gradients",
+            _H + "test_a_tall_image_needs_more_tile_spans_than_are_kept",
+        ],
+        "same predicate when counting and emitting",
+    ),
+    (
+        "Near plane",
+        [
+            _H + "test_near_plane",
+            _H + "test_gaussian_on_the_near_plane_is_culled",
+            _H + "test_scale_of_the_world_does_not_matter",
+        ],
+        "which near plane suits a scene is the trainer's",
+    ),
+    (
+        "Frustum-edge Jacobian blow-up",
+        [
+            _H + "test_frustum_edge_jacobian_is_clamped_about_the_principal_point",
+            _H + "test_footprint_beyond_the_frustum_is_bounded_by_the_clamp",
+            _H + "test_no_gradient_passes_the_frustum_clamp",
+            _H + "test_principal_point_off_centre_and_outside",
+            _H + "test_a_crop_with_the_principal_point_aside_is_the_crop_of_the_image",
+            _P + "test_footprints_at_the_frustum_edge_are_bounded",
+        ],
+        "the clamp still turns long splats beyond the edge; their size is bounded",
+    ),
+    (
+        "Degenerate 2D covariance",
+        [
+            _H + "test_a_point_is_as_wide_as_the_low_pass",
+            _H + "test_degenerate_covariances",
+            _H + "test_long_thin_gaussians_keep_their_precision",
+            _H + "test_a_point_keeps_half_a_percent_of_its_opacity_when_antialiased",
+        ],
+        "",
+    ),
+    (
+        "Zero or non-unit quaternion",
+        [_H + "test_zero_quaternion_is_culled", _H + "test_length_of_a_quaternion_does_not_matter"],
+        "",
+    ),
+    (
+        "Zero scale, log-scale explosion",
+        [
+            _H + "test_extreme_scales",
+            _H + "test_infinite_and_enormous_scales_are_culled",
+            _H + "test_a_point_is_as_wide_as_the_low_pass",
+        ],
+        "pruning by size is the trainer's",
+    ),
+    (
+        "Alpha clamp and saturated opacity",
+        [
+            _H + "test_opacity_at_its_ends",
+            _H + "test_no_gradient_passes_the_alpha_clamp",
+            _H + "test_pixel_stops_once_it_is_opaque",
+        ],
+        "",
+    ),
+    (
+        "Opacity reset kills Gaussians",
+        [_H + "test_faint_gaussians_lose_their_gradient_where_they_can_be_counted"],
+        "the rasteriser's part: such Gaussians have no radius and no weight, so they can be counted",
+    ),
+    (
+        "Hard 1/255 cut-off breaks gradcheck",
+        ["test_reference.py::test_gradients_are_those_of_finite_differences"],
+        "a scene kept clear of the cut-offs",
+    ),
+    (
+        "SH clamp at 0 traps black Gaussians",
+        [_H + "test_black_harmonics_can_become_brighter_but_not_darker", _H + "test_colours_have_no_ceiling"],
+        "",
+    ),
+    (
+        "Huge screen radius",
+        [
+            _H + "test_opaque_gaussians_reach_beyond_three_sigma",
+            _H + "test_one_gaussian_over_all_pixels",
+            _H + "test_one_gaussian_over_millions_of_pixels_takes_memory_by_the_pixel",
+            _H + "test_ten_thousand_gaussians_in_one_pixel",
+            _H + "test_ten_thousand_gaussians_in_one_pixel_take_memory_by_the_gaussian",
+        ],
+        "",
+    ),
+    (
+        "Tile-key overflow",
+        [
+            _H + "test_more_hits_than_an_index_holds_are_refused_before_memory_is_taken",
+            _H + "test_images_wider_than_a_tile_column_can_say_are_refused",
+        ],
+        "",
+    ),
+    (
+        "Empty frustum, zero Gaussians",
+        [_H + "test_no_gaussians", _H + "test_nothing_in_view", _H + "test_no_cameras"],
+        "",
+    ),
+    (
+        "More than 2^24 samples",
+        [_H + "test_one_gaussian_over_millions_of_pixels_takes_memory_by_the_pixel"],
+        "the rasteriser's part: sums over more pixels than float32 can count",
+    ),
+    (
+        "SSIM",
+        [
+            _H + "test_images_smaller_than_the_window_of_ssim_are_compared_by_l1_alone",
+            _H + "test_ssim_takes_one_as_the_range_of_the_data",
+            "test_ssim.py::test_refuses_what_it_cannot_do",
+        ],
+        "",
+    ),
+    (
+        "Wrong poses or scene scale",
+        [_H + "test_scale_of_the_world_does_not_matter", _P + "test_scaling_the_world_scales_the_depth"],
+        "the rasteriser's part: a world of any scale renders the same",
+    ),
 ]
 """Rows of the list of known failures that concern rendering: (row, tests, remark)."""
 _S, _D, _T = "train/test_stability.py::", "deformation/", "train/"
 TRAINING: list[tuple[str, list[str], str]] = [
-    ("NaN loss, everything dies in 1 to 2 steps",
-     [_S + "test_one_bad_number_is_named_and_the_run_goes_on",
-      _S + "test_a_gradient_of_its_own_costs_a_gaussian_and_no_more",
-      _S + "test_too_much_to_repair_ends_in_words", _T + "test_adam.py::test_a_step_that_is_not_finite_changes_nothing",
-      _T + "test_train.py::test_a_run_that_keeps_failing_ends_in_words"],
-     "the step is left out, the offender dropped or mended and named; no restart"),
-    ("NaN hidden by culling",
-     [_S + "test_one_bad_number_is_named_and_the_run_goes_on", _S + "test_what_was_in_order_stays_as_it_was_row_by_row",
-      "gaussians/test_model.py::test_budget_is_never_exceeded_and_nan_is_pruned"],
-     "parameters and moments are looked over every 10 steps, whatever the loss says"),
-    ("NaN spreads in squares",
-     [_S + "test_a_frame_with_bad_pixels_is_left_out_from_then_on",
-      _S + "test_a_bad_frame_does_not_keep_the_gate_shut"], "from an image"),
-    ("Zero scale, log-scale explosion",
-     [_T + "test_adam.py::test_range_is_kept", _S + "test_a_gaussian_too_large_for_its_place_is_dropped"], ""),
+    (
+        "NaN loss, everything dies in 1 to 2 steps",
+        [
+            _S + "test_one_bad_number_is_named_and_the_run_goes_on",
+            _S + "test_a_gradient_of_its_own_costs_a_gaussian_and_no_more",
+            _S + "test_too_much_to_repair_ends_in_words",
+            _T + "test_adam.py::test_a_step_that_is_not_finite_changes_nothing",
+            _T + "test_train.py::test_a_run_that_keeps_failing_ends_in_words",
+        ],
+        "the step is left out, the offender dropped or mended and named; no restart",
+    ),
+    (
+        "NaN hidden by culling",
+        [
+            _S + "test_one_bad_number_is_named_and_the_run_goes_on",
+            _S + "test_what_was_in_order_stays_as_it_was_row_by_row",
+            "gaussians/test_model.py::test_budget_is_never_exceeded_and_nan_is_pruned",
+        ],
+        "parameters and moments are looked over every 10 steps, whatever the loss says",
+    ),
+    (
+        "NaN spreads in squares",
+        [
+            _S + "test_a_frame_with_bad_pixels_is_left_out_from_then_on",
+            _S + "test_a_bad_frame_does_not_keep_the_gate_shut",
+        ],
+        "from an image",
+    ),
+    (
+        "Zero scale, log-scale explosion",
+        [_T + "test_adam.py::test_range_is_kept", _S + "test_a_gaussian_too_large_for_its_place_is_dropped"],
+        "",
+    ),
     ("Opacity reset kills Gaussians", [], "opacities are never reset"),
     ("More than 2^24 samples", [], "nothing is drawn by `torch.multinomial`"),
-    ("Wrong poses or scene scale",
-     ["test_scene.py::test_normalisation_keeps_every_pixel_and_leads_back",
-      "test_scene.py::test_a_camera_that_stands_still_is_refused", "solve/test_solving.py::test_points_are_filtered",
-      "solve/test_solving.py::test_models_that_nothing_could_be_trained_on_are_refused"], ""),
-    ("Divergence without NaN",
-     [_S + "test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back",
-      _S + "test_a_hasty_step_of_one_attribute_is_trained_away",
-      _S + "test_whole_runs_of_every_host_stay_finite_and_alike"], "docs/benchmarks.md, \"Stability\""),
+    (
+        "Wrong poses or scene scale",
+        [
+            "test_scene.py::test_normalisation_keeps_every_pixel_and_leads_back",
+            "test_scene.py::test_a_camera_that_stands_still_is_refused",
+            "solve/test_solving.py::test_points_are_filtered",
+            "solve/test_solving.py::test_models_that_nothing_could_be_trained_on_are_refused",
+        ],
+        "",
+    ),
+    (
+        "Divergence without NaN",
+        [
+            _S + "test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back",
+            _S + "test_a_hasty_step_of_one_attribute_is_trained_away",
+            _S + "test_whole_runs_of_every_host_stay_finite_and_alike",
+        ],
+        'docs/benchmarks.md, "Stability"',
+    ),
     ("Floaters in front of the camera", [], "no remedy of its own and no test; held-out views are shown"),
     ("Exposure drift", [_T + "test_exposure.py::test_finds_a_drift"], "fitted from the first step, before the gate"),
     ("Rolling shutter", [], "neither detected nor tested; there is a synthetic scene to measure it on"),
     ("Moving shadows, light", [], "no test; there is a synthetic scene to measure them on"),
     ("Time-plane half range", [_D + "test_hexplane.py::test_ends_of_time_hit_the_end_nodes"], ""),
-    ("HexPlane out of bounds",
-     [_D + "test_planes.py::test_the_published_lookup_pulls_points_as_float64_does",
-      _D + "test_planes.py::test_a_gaussian_at_nan_stays_inside_the_planes"],
-     "the rim's feature holds, and pulls nobody; the box is that of the Gaussians that open, and a margin"),
-    ("Single or duplicate timestamps",
-     [_D + "test_planes.py::test_planes_of_two_nodes_do_not_bend",
-      "supervision/test_supervision.py::test_paper_needs_a_well_supervised_reference_and_two_times"],
-     "with one pose the camera stands still: refused (`test_scene.py`)"),
-    ("ARAP SVD",
-     [_D + "test_geometry.py::test_collapsed_flat_and_bad_edges",
-      _D + "test_control_points.py::test_penalties_are_finite_at_collapsed_nodes",
-      _S + "test_control_points_on_one_spot_stay_finite"], ""),
-    ("6-DoF rotation of angle 0",
-     [_D + "test_geometry.py::test_screw_has_gradients_at_angle_zero",
-      _D + "test_mlp.py::test_six_dof_is_still_at_the_start_and_has_gradients_there"], ""),
+    (
+        "HexPlane out of bounds",
+        [
+            _D + "test_planes.py::test_the_published_lookup_pulls_points_as_float64_does",
+            _D + "test_planes.py::test_a_gaussian_at_nan_stays_inside_the_planes",
+        ],
+        "the rim's feature holds, and pulls nobody; the box is that of the Gaussians that open, and a margin",
+    ),
+    (
+        "Single or duplicate timestamps",
+        [
+            _D + "test_planes.py::test_planes_of_two_nodes_do_not_bend",
+            "supervision/test_supervision.py::test_paper_needs_a_well_supervised_reference_and_two_times",
+        ],
+        "with one pose the camera stands still: refused (`test_scene.py`)",
+    ),
+    (
+        "ARAP SVD",
+        [
+            _D + "test_geometry.py::test_collapsed_flat_and_bad_edges",
+            _D + "test_control_points.py::test_penalties_are_finite_at_collapsed_nodes",
+            _S + "test_control_points_on_one_spot_stay_finite",
+        ],
+        "",
+    ),
+    (
+        "6-DoF rotation of angle 0",
+        [
+            _D + "test_geometry.py::test_screw_has_gradients_at_angle_zero",
+            _D + "test_mlp.py::test_six_dof_is_still_at_the_start_and_has_gradients_there",
+        ],
+        "",
+    ),
 ]
 """Rows that concern training: (row, tests in tests/backend, remark)."""
 
@@ -631,9 +821,12 @@ def test_names() -> set[str]:
 
 BARS = {"W0": (0.0, 1e-4), "W1": (100.0, 4e-4)}
 """Workload: least PSNR in dB over all pixels, largest relative L2 gradient error of any input."""
-_TITLES = {"cpu": "cpu: compiled, float32", "reference32": "reference32: the torch reference in float32",
-           "cuda": "cuda: the CUDA kernels, here on CPU fibers (smaller scenes)",
-           "gpu": "gpu: the CUDA kernels on a GPU"}
+_TITLES = {
+    "cpu": "cpu: compiled, float32",
+    "reference32": "reference32: the torch reference in float32",
+    "cuda": "cuda: the CUDA kernels, here on CPU fibers (smaller scenes)",
+    "gpu": "gpu: the CUDA kernels on a GPU",
+}
 _NOTES = """\
 - **Flips.** Alpha below 1/255 is dropped, so a pixel within rounding of the cut moves by up to 4e-3 with the last bit
   of an input. No body is wrong there and no two need agree: such pixels are left out of errors and gradients, and
@@ -683,8 +876,12 @@ def _generated(asked: int) -> str:
         raise SystemExit(f"the property tests did not run:\n{run.stdout[-2000:]}{run.stderr[-1000:]}")
     total, _, parts = counts[0].removeprefix("rasteriser: ").partition(" generated cases ")
     verdict = run.stdout.splitlines()[-1].strip("= ")
-    lines = [f"{int(total):,} cases, {verdict} (one test per property and body):", "", "| property | cases |",
-             "|---|---|"]
+    lines = [
+        f"{int(total):,} cases, {verdict} (one test per property and body):",
+        "",
+        "| property | cases |",
+        "|---|---|",
+    ]
     for part in parts.strip("()").split(", "):
         name, count = part.rsplit(" ", 1)
         lines.append(f"| {name.removeprefix('test_').replace('_', ' ')} | {count} |")
@@ -704,8 +901,10 @@ def _machine() -> str:
 
 def _workloads(bodies: list[str]) -> list[str]:
     """The rooms of benchmarks/raster.py: errors over all pixels and per input, against the bars."""
-    lines = ["| workload, body | flips | dB, all pixels | dB | " + " | ".join(i for i in INPUTS if i != "sh")
-             + " | bars |", "|---" * (len(INPUTS) + 4) + "|"]
+    lines = [
+        "| workload, body | flips | dB, all pixels | dB | " + " | ".join(i for i in INPUTS if i != "sh") + " | bars |",
+        "|---" * (len(INPUTS) + 4) + "|",
+    ]
     for name, (least, most) in BARS.items():
         scene = workload(name)
         for body in bodies:
@@ -715,35 +914,63 @@ def _workloads(bodies: list[str]) -> list[str]:
             held = e.psnr_all >= least and e.gradient <= most
             asked = (f">= {least:.0f} dB, " if least else "") + f"<= {_cell(most)}"
             cells = " | ".join(f"{e.gradients[i]:.1e}" for i in INPUTS if i in e.gradients)
-            lines.append(f"| {name}, {body} | {100 * e.flips:.2g} % | {e.psnr_all:.1f} | {e.psnr:.1f} | {cells} | "
-                         f"{asked}: {'held' if held else 'MISSED'} |")
+            lines.append(
+                f"| {name}, {body} | {100 * e.flips:.2g} % | {e.psnr_all:.1f} | {e.psnr:.1f} | {cells} | "
+                f"{asked}: {'held' if held else 'MISSED'} |"
+            )
     return lines
 
 
 def report(bodies: list[str], names: list[str], asked: int) -> str:
     """The whole of docs/numerics.md."""
     text = [
-        "# Numerics of the rasteriser", "",
+        "# Numerics of the rasteriser",
+        "",
         "Written by `python benchmarks/numerics.py`; do not edit. Errors of each body against the float64 oracle "
-        "(torch, autograd) on inputs rounded to float32.", "",
-        f"{datetime.date.today().isoformat()}; {_machine()}.", "",
+        "(torch, autograd) on inputs rounded to float32.",
+        "",
+        f"{datetime.date.today().isoformat()}; {_machine()}.",
+        "",
         "`max` is the largest colour error, `dB` the PSNR, both at pixels without flips and for a peak of 1 (or the "
         "brightest channel); `flips` is the share of the other pixels; the columns after that are relative L2 errors "
-        "of gradients. Empty: no such input.", "", "## Two rooms", "",
+        "of gradients. Empty: no such input.",
+        "",
+        "## Two rooms",
+        "",
         "W0: 400 Gaussians, 64 x 48. W1: 20,000 Gaussians, 320 x 180. Gradients are of a random weighting of colours "
-        "and alphas, at pixels without flips.", "", *_workloads(bodies), "",
-        "## Notes on conditioning", "", _NOTES.rstrip()]
+        "and alphas, at pixels without flips.",
+        "",
+        *_workloads(bodies),
+        "",
+        "## Notes on conditioning",
+        "",
+        _NOTES.rstrip(),
+    ]
     notes = {name: CASES[name].note for name in names if CASES[name].note}
     text += [f"- **{name}.** {note[0].upper()}{note[1:]}." for name, note in notes.items()]
     text += [
-        "", "## Generated cases", "",
-        "Properties that hold for every input (`tests/backend/raster/test_properties.py`): " + _generated(asked), "",
+        "",
+        "## Generated cases",
+        "",
+        "Properties that hold for every input (`tests/backend/raster/test_properties.py`): " + _generated(asked),
+        "",
         "`SPLANNEQUIN_CASES=20000 python -m pytest tests/backend/raster/test_properties.py` tries that many of each.",
         "",
-        "## Known failures, and the tests that stand for them", "",
+        "## Known failures, and the tests that stand for them",
+        "",
         "`tests/backend/raster/remedies.py` takes the remedies out, one at a time, and checks that these tests fail.",
-        "", *_known(ROWS), "", "## The same, of training", "", "Tests in `tests/backend`.", "", *_known(TRAINING), "",
-        "## Hard cases, body by body", ""]
+        "",
+        *_known(ROWS),
+        "",
+        "## The same, of training",
+        "",
+        "Tests in `tests/backend`.",
+        "",
+        *_known(TRAINING),
+        "",
+        "## Hard cases, body by body",
+        "",
+    ]
     for body in bodies:
         rows = [(name, compare(size(name, body), body)) for name in names]
         text += [f"### {_TITLES[body]}", "", *_table(rows), ""]

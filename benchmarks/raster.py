@@ -56,14 +56,21 @@ class Workload:
 
 # Rectangles: corner, edge u, edge v, density. The room is x in [-3, 3], y (down) in [-1.4, 1.4], z in [0, 5].
 _WALLS = [
-    ((-3, -1.4, 0), (6, 0, 0), (0, 0, 5), 1.0), ((-3, 1.4, 0), (6, 0, 0), (0, 0, 5), 1.5),
-    ((-3, -1.4, 0), (0, 2.8, 0), (0, 0, 5), 1.0), ((3, -1.4, 0), (0, 2.8, 0), (0, 0, 5), 1.0),
-    ((-3, -1.4, 5), (6, 0, 0), (0, 2.8, 0), 1.5), ((-3, -1.4, 0), (6, 0, 0), (0, 2.8, 0), 0.5),
+    ((-3, -1.4, 0), (6, 0, 0), (0, 0, 5), 1.0),
+    ((-3, 1.4, 0), (6, 0, 0), (0, 0, 5), 1.5),
+    ((-3, -1.4, 0), (0, 2.8, 0), (0, 0, 5), 1.0),
+    ((3, -1.4, 0), (0, 2.8, 0), (0, 0, 5), 1.0),
+    ((-3, -1.4, 5), (6, 0, 0), (0, 2.8, 0), 1.5),
+    ((-3, -1.4, 0), (6, 0, 0), (0, 2.8, 0), 0.5),
 ]
 # Boxes: centre, size, density. Spheres: centre, radius, density.
-_BOXES = [((0.2, 0.9, 2.6), (1.4, 0.08, 0.8), 4.0), ((-1.6, 0.8, 3.6), (0.9, 1.2, 0.9), 4.0),
-          ((1.9, 0.3, 4.2), (1.0, 2.2, 0.5), 4.0), ((0.1, 0.2, 2.5), (0.3, 0.5, 0.3), 8.0),
-          ((-0.6, 0.5, 1.9), (0.25, 0.7, 0.25), 8.0)]
+_BOXES = [
+    ((0.2, 0.9, 2.6), (1.4, 0.08, 0.8), 4.0),
+    ((-1.6, 0.8, 3.6), (0.9, 1.2, 0.9), 4.0),
+    ((1.9, 0.3, 4.2), (1.0, 2.2, 0.5), 4.0),
+    ((0.1, 0.2, 2.5), (0.3, 0.5, 0.3), 8.0),
+    ((-0.6, 0.5, 1.9), (0.25, 0.7, 0.25), 8.0),
+]
 _SPHERES = [((0.7, 0.55, 2.4), 0.25, 8.0), ((-1.5, 0.0, 3.4), 0.35, 8.0), ((-0.3, -0.1, 2.0), 0.2, 10.0)]
 
 
@@ -82,8 +89,10 @@ def _rectangles() -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
 def _surface_points(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals [count, 3] on the room's surfaces, as many on each as its area times its density asks."""
     faces = _rectangles()
-    share = np.array([float(np.linalg.norm(np.cross(u, v))) * d for _, u, v, d in faces]
-                     + [4 * np.pi * r * r * d for _, r, d in _SPHERES])
+    share = np.array(
+        [float(np.linalg.norm(np.cross(u, v))) * d for _, u, v, d in faces]
+        + [4 * np.pi * r * r * d for _, r, d in _SPHERES]
+    )
     points, normals = [], []
     for i, n in enumerate(rng.multinomial(count, share / share.sum())):
         if i < len(faces):
@@ -144,8 +153,16 @@ def room(count: int, width: int, height: int, seed: int = 1234) -> Workload:
     order = rng.permutation(count)
     K, viewmat = _camera(width, height)
     g = rng.normal(size=(height, width, 3)) / (height * width)
-    arrays = {"means": means[order], "quats": quats[order], "scales": scales[order], "opacities": opacities[order],
-              "colors": colors[order], "K": K, "viewmat": viewmat, "g": g}
+    arrays = {
+        "means": means[order],
+        "quats": quats[order],
+        "scales": scales[order],
+        "opacities": opacities[order],
+        "colors": colors[order],
+        "K": K,
+        "viewmat": viewmat,
+        "g": g,
+    }
     arrays = {name: np.ascontiguousarray(a, dtype=np.float32) for name, a in arrays.items()}
     return Workload(**arrays, width=width, height=height)
 
@@ -153,8 +170,10 @@ def room(count: int, width: int, height: int, seed: int = 1234) -> Workload:
 SLOW_MS = 1000.0
 """A body whose first frame takes longer is given SLOW_ROUNDS rounds at most."""
 SLOW_ROUNDS = 5
-SCALING = {"N": [(n, 640, 360) for n in (5_000, 20_000, 50_000, 100_000, 200_000)],
-           "pixels": [(50_000, 160 * s, 90 * s) for s in (1, 2, 4, 8)]}
+SCALING = {
+    "N": [(n, 640, 360) for n in (5_000, 20_000, 50_000, 100_000, 200_000)],
+    "pixels": [(50_000, 160 * s, 90 * s) for s in (1, 2, 4, 8)],
+}
 """Gaussians, width, height along which `--scaling` goes."""
 
 
@@ -179,9 +198,13 @@ class Body:
         def put(array: np.ndarray) -> torch.Tensor:
             return torch.tensor(array).to(self.device, self.dtype)
 
-        leaves = {"means": put(work.means), "quats": put(work.quats), "log_scales": put(np.log(work.scales)),
-                  "opacity_logits": put(np.log(work.opacities) - np.log1p(-work.opacities)),
-                  "viewmats": put(work.viewmat[None])}
+        leaves = {
+            "means": put(work.means),
+            "quats": put(work.quats),
+            "log_scales": put(np.log(work.scales)),
+            "opacity_logits": put(np.log(work.opacities) - np.log1p(-work.opacities)),
+            "viewmats": put(work.viewmat[None]),
+        }
         if self.degree is None:
             leaves["colors"] = put(work.colors)
         else:
@@ -194,9 +217,20 @@ class Body:
 
         def forward() -> torch.Tensor:
             return rasterize(
-                leaves["means"], leaves["quats"], leaves["log_scales"], leaves["opacity_logits"], leaves.get("colors"),
-                leaves.get("sh"), viewmats=leaves["viewmats"], Ks=Ks, width=work.width, height=work.height,
-                backend=self.backend, settings=settings, with_contributions=True).colors[0]
+                leaves["means"],
+                leaves["quats"],
+                leaves["log_scales"],
+                leaves["opacity_logits"],
+                leaves.get("colors"),
+                leaves.get("sh"),
+                viewmats=leaves["viewmats"],
+                Ks=Ks,
+                width=work.width,
+                height=work.height,
+                backend=self.backend,
+                settings=settings,
+                with_contributions=True,
+            ).colors[0]
 
         return Prepared(forward, leaves)
 
@@ -273,7 +307,8 @@ def measure(size: tuple[int, int, int], bodies: dict[str, Body], rivals: list[st
                 pairs = list(zip(times[rival], times[label], strict=False))  # the same round for both
                 result["ratios"][f"{rival} / {label}"] = {
                     name: _figures([theirs[i] / ours[i] for theirs, ours in pairs])
-                    for i, name in enumerate(("forward", "forward_backward"))}
+                    for i, name in enumerate(("forward", "forward_backward"))
+                }
     return result
 
 
@@ -286,9 +321,16 @@ def limit(name: str, threads: list[int], rounds: int) -> list[dict[str, Any]]:
         blend = hot_loop.blend_times(work, count, rounds)
         ahead, back = blend.shares(hot)
         cycles = count * hot.clock_hz
-        rows.append({"threads": count, "limit": asdict(hot), "forward_share": ahead, "backward_share": back,
-                     "forward_cycles_per_lane": blend.forward_s * cycles / blend.forward_lanes,
-                     "backward_cycles_per_lane": blend.backward_s * cycles / blend.backward_lanes})
+        rows.append(
+            {
+                "threads": count,
+                "limit": asdict(hot),
+                "forward_share": ahead,
+                "backward_share": back,
+                "forward_cycles_per_lane": blend.forward_s * cycles / blend.forward_lanes,
+                "backward_cycles_per_lane": blend.backward_s * cycles / blend.backward_lanes,
+            }
+        )
     return rows
 
 
@@ -300,12 +342,18 @@ def errors(name: str, bodies: dict[str, Body]) -> dict[str, Any]:
     for label, body in bodies.items():
         case = _Case(work, body)
         error = case.image().cpu().double() - truth
-        gradients = {key: leaf.grad.cpu().double() for key, leaf in case.prepared.leaves.items()
-                     if leaf.grad is not None}
+        gradients = {
+            key: leaf.grad.cpu().double() for key, leaf in case.prepared.leaves.items() if leaf.grad is not None
+        }
         expected = {key: leaf.grad for key, leaf in oracle.prepared.leaves.items() if leaf.grad is not None}
-        result[label] = {"psnr_db": float(-10 * error.square().mean().log10()), "gradient_relative_l2": {
-            key: float((value - expected[key]).norm() / expected[key].norm())
-            for key, value in gradients.items() if key in expected}}
+        result[label] = {
+            "psnr_db": float(-10 * error.square().mean().log10()),
+            "gradient_relative_l2": {
+                key: float((value - expected[key]).norm() / expected[key].norm())
+                for key, value in gradients.items()
+                if key in expected
+            },
+        }
     return result
 
 
@@ -346,35 +394,59 @@ def machine(device: str) -> dict[str, Any]:
         model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
     packages = ("torch", "warp-lang", "numpy", "gsplat")
     versions = {d.name: d.version for d in metadata.distributions() if d.name in packages}
-    return {"date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"), "system": platform.platform(),
-            "cpu": model, "cores": os.cpu_count(), "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
-            "python": platform.python_version(), "versions": versions}
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "system": platform.platform(),
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
+        "python": platform.python_version(),
+        "versions": versions,
+    }
 
 
 def _print_times(title: str, result: dict[str, Any]) -> None:
     for label, figures in result["bodies"].items():
         f, b = figures["forward_ms"], figures["forward_backward_ms"]
-        print(f"{title}  {label:24s} forward {f['median']:8.2f} [{f['low']:.2f}, {f['high']:.2f}] ms   "
-              f"forward+backward {b['median']:8.2f} [{b['low']:.2f}, {b['high']:.2f}] ms   {b['rounds']} rounds")
+        print(
+            f"{title}  {label:24s} forward {f['median']:8.2f} [{f['low']:.2f}, {f['high']:.2f}] ms   "
+            f"forward+backward {b['median']:8.2f} [{b['low']:.2f}, {b['high']:.2f}] ms   {b['rounds']} rounds"
+        )
     for label, ratio in result["ratios"].items():
         f, b = ratio["forward"], ratio["forward_backward"]
-        print(f"{title}  {label}: forward {f['median']:.1f} [{f['low']:.1f}, {f['high']:.1f}]   "
-              f"forward+backward {b['median']:.1f} [{b['low']:.1f}, {b['high']:.1f}] times")
+        print(
+            f"{title}  {label}: forward {f['median']:.1f} [{f['low']:.1f}, {f['high']:.1f}]   "
+            f"forward+backward {b['median']:.1f} [{b['low']:.1f}, {b['high']:.1f}] times"
+        )
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("workloads", nargs="*", default=["W0", "W1", "W2"], metavar="W",
-                        help="W0 to W3 (default: W0 W1 W2)")
+    parser.add_argument(
+        "workloads", nargs="*", default=["W0", "W1", "W2"], metavar="W", help="W0 to W3 (default: W0 W1 W2)"
+    )
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, os.cpu_count() or 1}),
-                        help="of the CPU body; torch (reference, peers) gets the most of them")
+    parser.add_argument(
+        "--threads",
+        type=int,
+        nargs="+",
+        default=sorted({1, os.cpu_count() or 1}),
+        help="of the CPU body; torch (reference, peers) gets the most of them",
+    )
     parser.add_argument("--reference", action="store_true", help="time the torch reference in float32 too (slow)")
-    parser.add_argument("--peer", action="append", default=[], metavar="MODULE",
-                        help="time this peer too, e.g. benchmarks.peers.gsplat; may be given again")
-    parser.add_argument("--limit", action="store_true",
-                        help="also measure blending's cycles per lane against benchmarks/hot_loop.py (CPU only)")
+    parser.add_argument(
+        "--peer",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="time this peer too, e.g. benchmarks.peers.gsplat; may be given again",
+    )
+    parser.add_argument(
+        "--limit",
+        action="store_true",
+        help="also measure blending's cycles per lane against benchmarks/hot_loop.py (CPU only)",
+    )
     parser.add_argument("--scaling", action="store_true", help="also time along N, pixels and threads")
     parser.add_argument("--memory", action="store_true", help="also measure each body's peak memory (Linux, or CUDA)")
     parser.add_argument("--errors", action="store_true", help="also compare with the float64 oracle on W0 and W1")
@@ -417,17 +489,21 @@ def main() -> None:
         if arguments.limit:
             result["limit"] = limit(name, arguments.threads, arguments.rounds)
             for row in result["limit"]:
-                print(f"{name}  blending, {row['threads']} threads, cycles per lane and share of the hot-loop limit: "
-                      f"forward {row['forward_cycles_per_lane']:.2f}, {row['forward_share']:.0%}; "
-                      f"backward {row['backward_cycles_per_lane']:.2f}, {row['backward_share']:.0%}")
+                print(
+                    f"{name}  blending, {row['threads']} threads, cycles per lane and share of the hot-loop limit: "
+                    f"forward {row['forward_cycles_per_lane']:.2f}, {row['forward_share']:.0%}; "
+                    f"backward {row['backward_cycles_per_lane']:.2f}, {row['backward_share']:.0%}"
+                )
         if arguments.memory:
             result["peak_mib"] = memory(WORKLOADS[name], ours | rivals)
             for label, peak in result["peak_mib"].items():
                 print(f"{name}  {label:24s} peak memory {peak:8.1f} MiB")
     if arguments.scaling:
         fastest = list(plain)[-1]
-        report["scaling"] = {axis: [measure(size, {fastest: plain[fastest]}, [], arguments.rounds) for size in sizes]
-                             for axis, sizes in SCALING.items()}
+        report["scaling"] = {
+            axis: [measure(size, {fastest: plain[fastest]}, [], arguments.rounds) for size in sizes]
+            for axis, sizes in SCALING.items()
+        }
         if device == "cpu":
             every = {f"cpu, {t} threads": Body("cpu", threads=t) for t in range(1, (os.cpu_count() or 1) + 1)}
             report["scaling"]["threads"] = [measure(WORKLOADS["W2"], every, [], arguments.rounds)]

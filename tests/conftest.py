@@ -42,7 +42,7 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Pa
     return plant
 
 
-NVIDIA_SMI = '''#!/bin/sh
+NVIDIA_SMI = """#!/bin/sh
 # Stands in for NVIDIA's own tool on a machine without a card: prints what that prints.
 case "$*" in
 *compute_cap*) {old} cat <<'END'
@@ -54,7 +54,7 @@ exit {code};;
 END
 exit {code};;
 esac
-'''
+"""
 
 
 @pytest.fixture

@@ -136,5 +136,3 @@ class Shot(ShotFolder):
         info = dataclasses.replace(self.info(), **changes)
         self.save(info)
         return info
-
-

@@ -28,18 +28,34 @@ def prepare(work: "Workload", device: str) -> Prepared:
     def put(array) -> torch.Tensor:
         return torch.tensor(array, device=device)
 
-    leaves = {"means": put(work.means), "quats": put(work.quats), "log_scales": put(work.scales).log(),
-              "opacity_logits": torch.logit(put(work.opacities)), "colors": put(work.colors),
-              "viewmats": put(work.viewmat[None])}
+    leaves = {
+        "means": put(work.means),
+        "quats": put(work.quats),
+        "log_scales": put(work.scales).log(),
+        "opacity_logits": torch.logit(put(work.opacities)),
+        "colors": put(work.colors),
+        "viewmats": put(work.viewmat[None]),
+    }
     for leaf in leaves.values():
         leaf.requires_grad_()
     Ks = put(work.K[None])
 
     def forward() -> torch.Tensor:
         images, _, _ = rasterization(
-            leaves["means"], leaves["quats"], leaves["log_scales"].exp(), leaves["opacity_logits"].sigmoid(),
-            leaves["colors"], leaves["viewmats"], Ks, work.width, work.height, near_plane=0.01, eps2d=0.3,
-            packed=False, absgrad=True)
+            leaves["means"],
+            leaves["quats"],
+            leaves["log_scales"].exp(),
+            leaves["opacity_logits"].sigmoid(),
+            leaves["colors"],
+            leaves["viewmats"],
+            Ks,
+            work.width,
+            work.height,
+            near_plane=0.01,
+            eps2d=0.3,
+            packed=False,
+            absgrad=True,
+        )
         return images[0]
 
     return Prepared(forward, leaves)

@@ -192,7 +192,7 @@ ANSWERS = (
         "the environment's path is short",
         f"{ADDON}environment.py",
         '    return Path.home() / ".splannequin"\n',
-        "    return Path.home() / \"x\" * 200\n",
+        '    return Path.home() / "x" * 200\n',
         f"{TEST}environment.py::test_the_folder_is_short",
     ),
     Answer(

@@ -204,9 +204,7 @@ def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tm
     train = asked("train", tmp_path, "--method", "mlp", "--host", "mlp", "--host-config", "reference",
                   "--detector", "weight")["train"]  # fmt: skip
     assert (train.method, train.host, train.host_config, train.detector) == ("mlp", "mlp", "reference", "weight")
-    assert (
-        train.device == "cpu" and asked("train", tmp_path, "--device", "cuda")["train"].device == "cuda"
-    )
+    assert train.device == "cpu" and asked("train", tmp_path, "--device", "cuda")["train"].device == "cuda"
     frozen = asked("freeze", "a.mp4", "--no-grain", "--camera-path", tmp_path / "p.json")["freeze"]
     assert (frozen.grain, frozen.camera_path, frozen.device) == (False, str(tmp_path / "p.json"), "cpu")
     assert frozen.only_missing, "frames that are finished are not rendered again"

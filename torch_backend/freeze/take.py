@@ -95,9 +95,7 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     try:
         shares = _render_all(folder, frames, done, scene, look, keys, report)
         there = done | {f.frame for f in frames}
-        facts = _finish(
-            shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, shares, report
-        )
+        facts = _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, shares, report)
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
     if run.stale:

@@ -39,8 +39,17 @@ def test_room_matches_the_oracle(small_room, tools):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_harmonics_depth_and_pose(tools, degree, antialiased):
-    scene = tools.cloud(300, 50, 41, seed=degree, channels=5, degree=degree, with_depth=True, with_contributions=True,
-                        settings=RasterSettings(threads=2, antialiased=antialiased))
+    scene = tools.cloud(
+        300,
+        50,
+        41,
+        seed=degree,
+        channels=5,
+        degree=degree,
+        with_depth=True,
+        with_contributions=True,
+        settings=RasterSettings(threads=2, antialiased=antialiased),
+    )
     cpu, cpu_grads = scene.gradients("cpu")
     ref, ref_grads = scene.gradients("reference")
     assert tools.psnr(cpu.colors, ref.colors) >= 90
@@ -75,7 +84,9 @@ def test_cameras_of_a_batch_are_independent_and_their_gradients_add(tools):
     assert_gradients(grads, ref_grads, tools.relative, 1e-3)
     assert tools.relative(out.means2d_grad, ref.means2d_grad) < 1e-3
     for c in range(2):
-        alone = tools.Scene(scene.tensors | {"viewmats": views[c:c + 1]}, Ks[c:c + 1], 30, 22, scene.options).run("cpu")
+        alone = tools.Scene(scene.tensors | {"viewmats": views[c : c + 1]}, Ks[c : c + 1], 30, 22, scene.options).run(
+            "cpu"
+        )
         for name in ("colors", "alphas", "radii", "weight_sum", "weight_max"):
             assert torch.equal(getattr(out, name)[c], getattr(alone, name)[0]), name
 
@@ -108,7 +119,7 @@ def test_top_contributor_is_the_largest_weight(tools):
     alphas = []
     for i in range(n):
         names = ("means", "quats", "log_scales", "opacity_logits", "colors")
-        one = {name: value[i:i + 1] if name in names else value for name, value in scene.tensors.items()}
+        one = {name: value[i : i + 1] if name in names else value for name, value in scene.tensors.items()}
         alphas.append(tools.Scene(one, scene.Ks, width, height, scene.options).run("reference").alphas[0].detach())
     rotation, shift = scene.tensors["viewmats"][0, 2, :3], scene.tensors["viewmats"][0, 2, 3]
     order = torch.argsort(scene.tensors["means"] @ rotation + shift, stable=True)
@@ -134,8 +145,12 @@ def test_top_contributor_is_the_largest_weight(tools):
 
 def test_of_twins_the_front_one_is_top(tools):
     scene = tools.single(logit=0.0)
-    twice = {name: torch.cat((value, value)) if name in ("means", "quats", "log_scales", "opacity_logits", "colors")
-             else value for name, value in scene.tensors.items()}
+    twice = {
+        name: torch.cat((value, value))
+        if name in ("means", "quats", "log_scales", "opacity_logits", "colors")
+        else value
+        for name, value in scene.tensors.items()
+    }
     out = tools.Scene(twice, scene.Ks, 16, 16).run("cpu", with_top=True)
     assert set(out.top_ids.unique().tolist()) <= {-1, 0}
     assert (out.top_ids == 0).any()
@@ -220,9 +235,11 @@ assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 
 
 def test_nothing_is_written_to_the_terminal(tmp_path):
-    code = ("import torch; from torch_backend.raster import rasterize as r; e=torch.eye(4)[None]; "
-            "r(torch.tensor([[0.,0.,2.]]), torch.ones(1,4), torch.zeros(1,3), torch.zeros(1), torch.ones(1,1), "
-            "viewmats=e, Ks=e[:,:3,:3], width=3, height=2)")
+    code = (
+        "import torch; from torch_backend.raster import rasterize as r; e=torch.eye(4)[None]; "
+        "r(torch.tensor([[0.,0.,2.]]), torch.ones(1,4), torch.zeros(1,3), torch.zeros(1), torch.ones(1,1), "
+        "viewmats=e, Ks=e[:,:3,:3], width=3, height=2)"
+    )
     env = {**os.environ, "WARP_CACHE_PATH": str(tmp_path)}
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, timeout=300, check=True)
     assert run.stdout == ""

@@ -22,8 +22,14 @@ def device(request) -> torch.device:
 
 def run(scene, device, leaves=None, **options) -> Any:
     leaves = scene.leaves() if leaves is None else leaves
-    return rasterize(**{name: leaf.to(device) for name, leaf in leaves.items()}, Ks=scene.Ks.to(device),
-                     width=scene.width, height=scene.height, backend="cuda", **(scene.options | options))
+    return rasterize(
+        **{name: leaf.to(device) for name, leaf in leaves.items()},
+        Ks=scene.Ks.to(device),
+        width=scene.width,
+        height=scene.height,
+        backend="cuda",
+        **(scene.options | options),
+    )
 
 
 def on_host(out: RasterOutput) -> Any:
@@ -90,8 +96,16 @@ def test_room_matches_the_oracle(small_room, tools, device):
 
 @pytest.mark.parametrize(("degree", "antialiased"), [(0, True), (1, False), (2, True), (3, False), (3, True)])
 def test_harmonics_depth_and_pose(tools, device, degree, antialiased):
-    scene = tools.cloud(150, 37, 29, seed=degree, channels=5, degree=degree, with_depth=True,
-                        settings=RasterSettings(antialiased=antialiased))
+    scene = tools.cloud(
+        150,
+        37,
+        29,
+        seed=degree,
+        channels=5,
+        degree=degree,
+        with_depth=True,
+        settings=RasterSettings(antialiased=antialiased),
+    )
     out, grads = gradients(scene, device)
     ref, ref_grads = scene.gradients("reference")
     assert tools.psnr(out.colors, ref.colors) >= 90
@@ -128,7 +142,7 @@ def test_cameras_of_a_batch_are_independent_and_their_gradients_add(tools, devic
     assert_gradients(grads, ref_grads, tools.relative, 1e-3)
     assert tools.relative(out.means2d_grad, ref.means2d_grad) < 1e-3
     for c in range(3):
-        one = tools.Scene(scene.tensors | {"viewmats": views[c:c + 1]}, Ks[c:c + 1], 30, 22, scene.options)
+        one = tools.Scene(scene.tensors | {"viewmats": views[c : c + 1]}, Ks[c : c + 1], 30, 22, scene.options)
         alone = on_host(run(one, device))
         for name in ("colors", "alphas", "radii", "means2d", "weight_sum", "weight_max", "top_ids", "top_weights"):
             assert torch.equal(getattr(out, name)[c], getattr(alone, name)[0]), name
@@ -204,16 +218,26 @@ def test_nothing_to_see(tools, device, cameras, n):
 def test_invalid_gaussians_and_cameras_leave_no_trace(tools, device):
     scene = tools.cloud(40, 30, 22, seed=3, channels=6, degree=1)
     truth = on_host(run(scene, device))
-    for name, value in (("means", math.nan), ("quats", math.inf), ("quats", 0.0), ("log_scales", math.inf),
-                        ("opacity_logits", math.nan), ("colors", math.inf), ("sh", math.nan)):
+    for name, value in (
+        ("means", math.nan),
+        ("quats", math.inf),
+        ("quats", 0.0),
+        ("log_scales", math.inf),
+        ("opacity_logits", math.nan),
+        ("colors", math.inf),
+        ("sh", math.nan),
+    ):
         bad = torch.full_like(scene.tensors[name][:1], value)
         for key, tensor in scene.tensors.items():
             if key not in ("viewmats", "background"):
                 scene.tensors[key] = torch.cat([tensor, bad if key == name else tensor[:1]])
     out, grads = gradients(scene, device)
     assert torch.equal(out.colors, truth.colors)
-    assert all(torch.isfinite(grad).all() and (grad[40:] == 0).all() for name, grad in grads.items()
-               if name not in ("viewmats", "background"))
+    assert all(
+        torch.isfinite(grad).all() and (grad[40:] == 0).all()
+        for name, grad in grads.items()
+        if name not in ("viewmats", "background")
+    )
     # Values on a GPU are not checked; there a broken camera sees nothing.
     if device.type == "cuda":
         scene.Ks = scene.Ks * math.nan
@@ -315,8 +339,10 @@ def test_a_training_step_is_captured_as_a_cuda_graph(tools):
     scene = tools.cloud(300, 64, 48, degree=1)
 
     def setup():
-        leaves = {name: leaf.detach().cuda().requires_grad_(name not in ("viewmats", "background"))
-                  for name, leaf in scene.leaves().items()}
+        leaves = {
+            name: leaf.detach().cuda().requires_grad_(name not in ("viewmats", "background"))
+            for name, leaf in scene.leaves().items()
+        }
         return leaves, torch.optim.Adam([leaf for leaf in leaves.values() if leaf.requires_grad], 1e-2, capturable=True)
 
     Ks, target = scene.Ks.float().cuda(), torch.full((1, 48, 64, 3), 0.5, device="cuda")

@@ -33,8 +33,9 @@ def test_kernels_compile_for_every_architecture(module, tmp_path, capfd):
 def test_machine_code_is_made_too(arch, tmp_path):
     name = "raster_blend_backward"
     cuda.build(name, 3)
-    (path,) = initialised_warp().compile_aot_module(cuda.module_name(name, 3), arch=arch, module_dir=tmp_path,
-                                                     use_ptx=False)
+    (path,) = initialised_warp().compile_aot_module(
+        cuda.module_name(name, 3), arch=arch, module_dir=tmp_path, use_ptx=False
+    )
     code = path.read_bytes()
     assert code[:4] == b"\x7fELF"
     assert name.encode() in code

@@ -385,7 +385,8 @@ def test_opaque_gaussians_reach_beyond_three_sigma(tools, body):
     out = scene.run(body)
     sigma = math.sqrt(6.0**2 + 0.3)
     assert out.alphas[0, 4, 20 + math.floor(3.25 * sigma)].item() == pytest.approx(
-        math.exp(-0.5 * (math.floor(3.25 * sigma) / sigma) ** 2), rel=1e-3)
+        math.exp(-0.5 * (math.floor(3.25 * sigma) / sigma) ** 2), rel=1e-3
+    )
     assert out.radii[0, 0] == math.ceil(math.sqrt(2 * math.log(255.0)) * sigma)
 
 
@@ -526,8 +527,14 @@ def in_a_child(code, body, timeout=240):
         pytest.skip("ru_maxrss has other units here")
     # Without it glibc learns to keep blocks that were freed, and peaks vary twofold.
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MALLOC_MMAP_THRESHOLD_": "65536"}
-    run = subprocess.run([sys.executable, "-c", CHILD + code, body], capture_output=True, text=True, timeout=timeout,
-                         env=environment, cwd=ROOT)
+    run = subprocess.run(
+        [sys.executable, "-c", CHILD + code, body],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        env=environment,
+        cwd=ROOT,
+    )
     assert run.returncode == 0, run.stderr[-2000:]
     return [float(v) for v in run.stdout.split()[-3:]]
 
@@ -536,14 +543,17 @@ def in_a_child(code, body, timeout=240):
 def test_one_gaussian_over_millions_of_pixels_takes_memory_by_the_pixel(body):
     # More than 2^24 pixels on the CPU, beyond which float32 cannot count: its weights and gradients still add up.
     side = {"cpu": 4128, "gpu": 4128, "cuda": 64}.get(body, 256)
-    grown, weight, gradient = in_a_child(f"""
+    grown, weight, gradient = in_a_child(
+        f"""
 scene = single({side}, {side}, focal={side}.0, scale=8.0, logit=1.0)
 leaves = scene.leaves(dtype, device)
 out = scene.run(body, leaves, with_contributions=True)
 out.colors.sum().backward()
 alpha = out.alphas.detach().double().sum().item()
 print(peak() - start, out.weight_sum.item() / alpha, leaves["colors"].grad[0, 0].item() / alpha)
-""", body)
+""",
+        body,
+    )
     assert weight == pytest.approx(1, abs=1e-3)
     assert gradient == pytest.approx(1, abs=1e-3)
     # Image, alpha and their gradients: 32 bytes. The oracle keeps tens of tensors per (pixel, Gaussian) for autograd.
@@ -556,13 +566,16 @@ def test_ten_thousand_gaussians_in_one_pixel_take_memory_by_the_gaussian(body):
     count = 500 if body == "cuda" else 10_000
     oracle = body not in COMPILED
     count *= 4 if oracle else 1
-    grown, _, _ = in_a_child(f"""
+    grown, _, _ = in_a_child(
+        f"""
 scene = size("10,000 Gaussians in one pixel", body)
 for name in scene.tensors.keys() - {{"viewmats", "background"}}:
     scene.tensors[name] = torch.cat([scene.tensors[name]] * {4 if oracle else 1})
 out, grads = scene.gradients(body)
 print(peak() - start, 0, 0)
-""", body)
+""",
+        body,
+    )
     # The oracle blends 2^20 (pixel, Gaussian) pairs at once, whose forty tensors are large beside ten thousand.
     step = 40 * 2**20 * BODIES[body][1].itemsize if oracle else 64e6
     assert grown <= 4096 * count + step
@@ -573,7 +586,8 @@ def test_more_hits_than_an_index_holds_are_refused_before_memory_is_taken(body):
     # 200,000 Gaussians over 11,236 tiles each: 2.2e9 pairs, above 2^31. Nobody has that memory.
     if body == "cuda":
         pytest.skip("on fibers this would take hours; its list has a fixed capacity, see test_cuda.py")
-    grown, refused, _ = in_a_child("""
+    grown, refused, _ = in_a_child(
+        """
 scene = stack(single(1696, 1696, focal=1000.0, scale=20.0, logit=-4.0), 200_000)
 try:
     scene.run(body)
@@ -582,7 +596,9 @@ except RuntimeError as error:
     assert "200000 Gaussians cover 2247200000 tiles of a 1696x1696 image" in str(error), error
     refused = 1
 print(peak() - start, refused, 0)
-""", body)
+""",
+        body,
+    )
     assert refused
     assert grown <= 512e6
 
@@ -605,9 +621,12 @@ def test_images_wider_than_a_tile_column_can_say_are_refused(tools, body):
 def test_wrong_arguments_are_named(tools, body):
     scene = tools.cloud(5, 8, 8)
     wrong = {
-        "quats": scene.tensors["quats"][:, :3], "means": scene.tensors["means"][:, :2],
-        "log_scales": scene.tensors["log_scales"][:4], "colors": scene.tensors["colors"][0],
-        "background": torch.zeros(4), "viewmats": torch.eye(3)[None],
+        "quats": scene.tensors["quats"][:, :3],
+        "means": scene.tensors["means"][:, :2],
+        "log_scales": scene.tensors["log_scales"][:4],
+        "colors": scene.tensors["colors"][0],
+        "background": torch.zeros(4),
+        "viewmats": torch.eye(3)[None],
     }
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=name):

@@ -28,8 +28,11 @@ on_every_body = pytest.mark.parametrize("body", BODIES)
 def for_all(strategy, body, usual, generated, holds):
     """Assert `holds(example)` for `usual` examples (or as many as asked for), times the body's share."""
 
-    @settings(max_examples=max(5, round(SHARE[body] * (ASKED or usual))), suppress_health_check=list(HealthCheck),
-              phases=PHASES)
+    @settings(
+        max_examples=max(5, round(SHARE[body] * (ASKED or usual))),
+        suppress_health_check=list(HealthCheck),
+        phases=PHASES,
+    )
     @given(strategy)
     def each(example):
         generated()
@@ -39,11 +42,43 @@ def for_all(strategy, body, usual, generated, holds):
 
 
 EXTREMES = [0.0, -0.0, 1e-45, -1e-45, 1e-38, 1e-8, 1e8, -1e8, 1e30, -1e30, 3e38, -3e38, math.inf, -math.inf, math.nan]
-ANY = st.one_of(st.floats(width=32), st.sampled_from(EXTREMES), st.floats(-3, 3, width=32),
-                st.sampled_from([math.nan, math.inf, -math.inf]))
+ANY = st.one_of(
+    st.floats(width=32),
+    st.sampled_from(EXTREMES),
+    st.floats(-3, 3, width=32),
+    st.sampled_from([math.nan, math.inf, -math.inf]),
+)
 UNIT = st.floats(-1, 1, width=32)
-IN_VIEW = [0.0, 0.0, 2.0, 0.3, 0.2, 3.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.2, 0.1, 0.3, -1.0, -1.0, -1.0, -1.0, -1.5, -1.0,
-           1.0, 0.0, 0.8, 0.4, 0.2, 0.1, 0.5, 0.9]
+IN_VIEW = [
+    0.0,
+    0.0,
+    2.0,
+    0.3,
+    0.2,
+    3.0,
+    1.0,
+    0.0,
+    0.0,
+    0.0,
+    1.0,
+    0.2,
+    0.1,
+    0.3,
+    -1.0,
+    -1.0,
+    -1.0,
+    -1.0,
+    -1.5,
+    -1.0,
+    1.0,
+    0.0,
+    0.8,
+    0.4,
+    0.2,
+    0.1,
+    0.5,
+    0.9,
+]
 """Means, quaternions, log-scales, opacity logits and colours of two Gaussians."""
 SIZES = st.sampled_from([(1, 1), (7, 5), (16, 16), (17, 3), (20, 18), (1, 33)])
 NEAR = 0.0625
@@ -58,13 +93,23 @@ def gaussians(draw):
     u = [draw(UNIT) for _ in range(3)]
     place = draw(st.sampled_from(["view", "view", "view", "behind", "plane", "through", "edge", "far", "pixel"]))
     depth = 2.5 + 1.5 * u[2]
-    mean = {"view": (0.5 * u[0] * depth, 0.5 * u[1] * depth, depth), "behind": (u[0], u[1], -depth),
-            "plane": (0.1 * u[0], 0.1 * u[1], NEAR * (1 + draw(st.sampled_from([-1e-6, 0.0, 1e-6, 0.1])))),
-            "through": (0.3 * u[0], 0.3 * u[1], NEAR + 0.1 * (1 + u[2])),
-            "edge": (draw(st.sampled_from([-1.0, 1.0])) * depth * (0.6 + 0.6 * abs(u[0])), u[1] * depth, depth),
-            "far": (1e4 * u[0], 1e4 * u[1], 1e5), "pixel": (1e-3 * u[0], 1e-3 * u[1], 2.5)}[place]
-    quat = draw(st.one_of(st.tuples(UNIT, UNIT, UNIT, UNIT), st.sampled_from(
-        [(0.0,) * 4, (1.0, 0.0, 0.0, 0.0), (1e-7,) * 4, (0.0, 0.0, 1e-5, 0.0), (0.0, -3e18, 1e18, 0.0)])))
+    mean = {
+        "view": (0.5 * u[0] * depth, 0.5 * u[1] * depth, depth),
+        "behind": (u[0], u[1], -depth),
+        "plane": (0.1 * u[0], 0.1 * u[1], NEAR * (1 + draw(st.sampled_from([-1e-6, 0.0, 1e-6, 0.1])))),
+        "through": (0.3 * u[0], 0.3 * u[1], NEAR + 0.1 * (1 + u[2])),
+        "edge": (draw(st.sampled_from([-1.0, 1.0])) * depth * (0.6 + 0.6 * abs(u[0])), u[1] * depth, depth),
+        "far": (1e4 * u[0], 1e4 * u[1], 1e5),
+        "pixel": (1e-3 * u[0], 1e-3 * u[1], 2.5),
+    }[place]
+    quat = draw(
+        st.one_of(
+            st.tuples(UNIT, UNIT, UNIT, UNIT),
+            st.sampled_from(
+                [(0.0,) * 4, (1.0, 0.0, 0.0, 0.0), (1e-7,) * 4, (0.0, 0.0, 1e-5, 0.0), (0.0, -3e18, 1e18, 0.0)]
+            ),
+        )
+    )
     scale = st.one_of(st.floats(-4, -0.5, width=32), st.sampled_from([math.log(1e-8), -6.0, 1.0, 3.0, math.log(1e8)]))
     extreme = st.sampled_from([-100.0, -5.6, -5.5, 100.0, math.inf, -math.inf])
     logit = draw(st.one_of(st.floats(-3, 6, width=32), extreme))
@@ -89,8 +134,12 @@ def scenes(draw, least=0, most=6, kind=KINDS, views=VIEWS, sizes=SIZES, points=P
     def normal(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    tensors = {name: torch.tensor([row[i] for row in rows], dtype=torch.float64).reshape(n, *shape) for i, (name, shape)
-               in enumerate((("means", (3,)), ("quats", (4,)), ("log_scales", (3,)), ("opacity_logits", ())))}
+    tensors = {
+        name: torch.tensor([row[i] for row in rows], dtype=torch.float64).reshape(n, *shape)
+        for i, (name, shape) in enumerate(
+            (("means", (3,)), ("quats", (4,)), ("log_scales", (3,)), ("opacity_logits", ()))
+        )
+    }
     if degree is not None:
         tensors["sh"] = 0.5 * normal(n, (degree + 1) ** 2, 3)
     if degree is None or channels > 3:
@@ -101,9 +150,11 @@ def scenes(draw, least=0, most=6, kind=KINDS, views=VIEWS, sizes=SIZES, points=P
     tensors["viewmats"] = viewmats
     px, py = draw(points)
     Ks = camera(width, height, 0.9 * max(width, height), px * width, py * height).repeat(count, 1, 1)
-    options = {"settings": RasterSettings(threads=draw(st.sampled_from([1, 2])), near=NEAR,
-                                          antialiased=draw(st.booleans())),
-               "with_depth": draw(st.booleans()), "with_contributions": True}
+    options = {
+        "settings": RasterSettings(threads=draw(st.sampled_from([1, 2])), near=NEAR, antialiased=draw(st.booleans())),
+        "with_depth": draw(st.booleans()),
+        "with_contributions": True,
+    }
     return Scene(tensors, Ks, width, height, options).rounded()
 
 
@@ -114,8 +165,12 @@ def good_gaussians(draw):
     depth = 2.5 + u[2]
     quat = draw(st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT))
     scale = st.floats(-3.5, -0.5, width=32)
-    return ((0.3 * u[0] * depth, 0.3 * u[1] * depth, depth), quat, (draw(scale), draw(scale), draw(scale)),
-            draw(st.floats(-3, 4, width=32)))
+    return (
+        (0.3 * u[0] * depth, 0.3 * u[1] * depth, depth),
+        quat,
+        (draw(scale), draw(scale), draw(scale)),
+        draw(st.floats(-3, 4, width=32)),
+    )
 
 
 @st.composite
@@ -184,13 +239,23 @@ def test_any_numbers_give_sane_images_and_gradients(body, generated):
         values, degree, antialiased = example
         flat = torch.tensor(values, dtype=torch.float64)
         color = flat[22:28].reshape(2, 3)
-        tensors = {"means": flat[:6].reshape(2, 3), "quats": flat[6:14].reshape(2, 4),
-                   "log_scales": flat[14:20].reshape(2, 3), "opacity_logits": flat[20:22],
-                   "viewmats": torch.eye(4, dtype=torch.float64)[None]}
+        tensors = {
+            "means": flat[:6].reshape(2, 3),
+            "quats": flat[6:14].reshape(2, 4),
+            "log_scales": flat[14:20].reshape(2, 3),
+            "opacity_logits": flat[20:22],
+            "viewmats": torch.eye(4, dtype=torch.float64)[None],
+        }
         tensors["colors" if degree is None else "sh"] = (
-            color if degree is None else color[:, None].repeat(1, (degree + 1) ** 2, 1))
-        scene = Scene(tensors, camera(7, 5, 9.0, 3.0, 2.0), 7, 5,
-                      {"settings": RasterSettings(threads=1, antialiased=antialiased), "with_contributions": True})
+            color if degree is None else color[:, None].repeat(1, (degree + 1) ** 2, 1)
+        )
+        scene = Scene(
+            tensors,
+            camera(7, 5, 9.0, 3.0, 2.0),
+            7,
+            5,
+            {"settings": RasterSettings(threads=1, antialiased=antialiased), "with_contributions": True},
+        )
         _, dtype, device = BODIES[body]
         leaves = scene.leaves(dtype, device)
         out = scene.run(body, leaves)
@@ -258,13 +323,28 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(body, generate
     def holds(example):
         scene, turn, shift = example
         w, x, y, z = turn = torch.tensor(turn, dtype=torch.float64) / torch.tensor(turn).double().norm()
-        R = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-                         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-                         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]).reshape(3, 3)
+        R = torch.stack(
+            [
+                1 - 2 * (y * y + z * z),
+                2 * (x * y - w * z),
+                2 * (x * z + w * y),
+                2 * (x * y + w * z),
+                1 - 2 * (x * x + z * z),
+                2 * (y * z - w * x),
+                2 * (x * z - w * y),
+                2 * (y * z + w * x),
+                1 - 2 * (x * x + y * y),
+            ]
+        ).reshape(3, 3)
         t = torch.tensor(shift, dtype=torch.float64)
         a, v = scene.tensors["quats"][:, 0], scene.tensors["quats"][:, 1:]
-        quats = torch.cat([(w * a - v @ turn[1:])[:, None],
-                           w * v + a[:, None] * turn[1:] + torch.linalg.cross(turn[1:].expand_as(v), v)], 1)
+        quats = torch.cat(
+            [
+                (w * a - v @ turn[1:])[:, None],
+                w * v + a[:, None] * turn[1:] + torch.linalg.cross(turn[1:].expand_as(v), v),
+            ],
+            1,
+        )
         view = scene.tensors["viewmats"].clone()
         view[:, :3, :3] = view[:, :3, :3] @ R.T
         view[:, :3, 3] -= view[:, :3, :3] @ t
@@ -284,8 +364,11 @@ def test_scaling_the_world_scales_the_depth(body, generated):
         factor = 10.0**exponent
         view = scene.tensors["viewmats"].clone()
         view[:, :3, 3] *= factor
-        scaled = scene.tensors | {"means": scene.tensors["means"] * factor, "viewmats": view,
-                                  "log_scales": scene.tensors["log_scales"] + math.log(factor)}
+        scaled = scene.tensors | {
+            "means": scene.tensors["means"] * factor,
+            "viewmats": view,
+            "log_scales": scene.tensors["log_scales"] + math.log(factor),
+        }
         near = [dataclasses.replace(scene.options["settings"], near=NEAR * f) for f in (1, factor)]
         options = [scene.options | {"with_depth": True, "settings": value} for value in near]
         one = Scene(scene.tensors, scene.Ks, scene.width, scene.height, options[0]).run(body)
@@ -353,12 +436,12 @@ def test_a_camera_of_a_batch_sees_what_it_sees_alone(body, generated):
         both, grads = squared(scene)
         totals = {name: torch.zeros_like(grad) for name, grad in grads.items()}
         for c in range(2):
-            tensors = scene.tensors | {"viewmats": scene.tensors["viewmats"][c:c + 1]}
-            alone, part = squared(Scene(tensors, scene.Ks[c:c + 1], scene.width, scene.height, scene.options))
+            tensors = scene.tensors | {"viewmats": scene.tensors["viewmats"][c : c + 1]}
+            alone, part = squared(Scene(tensors, scene.Ks[c : c + 1], scene.width, scene.height, scene.options))
             assert torch.equal(both.colors[c], alone.colors[0])
             assert torch.equal(both.radii[c], alone.radii[0])
             for name, total in totals.items():
-                (total[c:c + 1] if name == "viewmats" else total).add_(part[name])
+                (total[c : c + 1] if name == "viewmats" else total).add_(part[name])
         for name, total in totals.items():
             assert (grads[name] - total).norm() <= 1e-4 * (1 + total.norm()), name
 

@@ -14,14 +14,17 @@ from torch_backend.raster.reference import rotation_matrices, sh_basis
 def pixel_alphas(scene, antialiased=False):
     """Alphas [H, W, N] before cut and clamp, and camera depths [N], by the textbook, one Gaussian after the other."""
     tensors, K, viewmat = scene.tensors, scene.Ks[0].numpy(), scene.tensors["viewmats"][0].numpy()
-    ys, xs = np.mgrid[:scene.height, :scene.width] + 0.5
+    ys, xs = np.mgrid[: scene.height, : scene.width] + 0.5
     alphas, depths = [], []
-    for mean, quat, log_scale, logit in zip(*(tensors[name].numpy() for name in (
-            "means", "quats", "log_scales", "opacity_logits")), strict=True):
+    for mean, quat, log_scale, logit in zip(
+        *(tensors[name].numpy() for name in ("means", "quats", "log_scales", "opacity_logits")), strict=True
+    ):
         x, y, z = viewmat[:3, :3] @ mean + viewmat[:3, 3]
         centre = (K @ (x / z, y / z, 1))[:2]
-        u, v = (np.clip(at / z, (-0.15 * size - c) / f, (1.15 * size - c) / f)
-                for at, size, f, c in ((x, scene.width, K[0, 0], K[0, 2]), (y, scene.height, K[1, 1], K[1, 2])))
+        u, v = (
+            np.clip(at / z, (-0.15 * size - c) / f, (1.15 * size - c) / f)
+            for at, size, f, c in ((x, scene.width, K[0, 0], K[0, 2]), (y, scene.height, K[1, 1], K[1, 2]))
+        )
         J = np.array([[K[0, 0] / z, 0, -K[0, 0] * u / z], [0, K[1, 1] / z, -K[1, 1] * v / z]])
         R = viewmat[:3, :3] @ Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
         raw = J @ R @ np.diag(np.exp(2 * log_scale)) @ R.T @ J.T
@@ -40,9 +43,15 @@ def blended(scene):
     alphas, depths = pixel_alphas(scene)
     height, width, n = alphas.shape
     colors, background = scene.tensors["colors"].numpy(), scene.tensors["background"].numpy()
-    out = {"colors": np.zeros((height, width, len(background))), "alphas": np.zeros((height, width)),
-           "depth_median": np.zeros((height, width)), "top_ids": np.zeros((height, width)),
-           "top_weights": np.zeros((height, width)), "weight_sum": np.zeros(n), "weight_max": np.zeros(n)}
+    out = {
+        "colors": np.zeros((height, width, len(background))),
+        "alphas": np.zeros((height, width)),
+        "depth_median": np.zeros((height, width)),
+        "top_ids": np.zeros((height, width)),
+        "top_weights": np.zeros((height, width)),
+        "weight_sum": np.zeros(n),
+        "weight_max": np.zeros(n),
+    }
     for pixel in np.ndindex(height, width):
         left, median, top, top_weight = 1.0, None, -1, 0.0
         for i in np.argsort(depths, kind="stable"):
@@ -165,15 +174,29 @@ def test_gradients_are_those_of_finite_differences(tools, antialiased):
     settings = RasterSettings(antialiased=antialiased)
 
     def images(*values):
-        out = rasterize(**dict(zip(names, values, strict=True)), Ks=scene.Ks, width=4, height=3, with_depth=True,
-                        backend="reference", settings=settings)
+        out = rasterize(
+            **dict(zip(names, values, strict=True)),
+            Ks=scene.Ks,
+            width=4,
+            height=3,
+            with_depth=True,
+            backend="reference",
+            settings=settings,
+        )
         return out.colors, out.alphas, out.depth_expected
 
     alphas, _ = pixel_alphas(scene, antialiased)
     assert alphas.min() > 0.01
     assert alphas.max() < 0.9
-    assert torch.autograd.gradcheck(images, tuple(scene.leaves(torch.float64).values()), eps=1e-6, atol=1e-7, rtol=1e-5,
-                                    check_undefined_grad=False, check_batched_grad=False)
+    assert torch.autograd.gradcheck(
+        images,
+        tuple(scene.leaves(torch.float64).values()),
+        eps=1e-6,
+        atol=1e-7,
+        rtol=1e-5,
+        check_undefined_grad=False,
+        check_batched_grad=False,
+    )
 
 
 def test_absgrad_sums_magnitudes_over_pixels(tools):
