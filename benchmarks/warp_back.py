@@ -138,7 +138,8 @@ def _through_the_group(package: str, ask: dict[str, Any], folder: Path, frame: i
     """[H, W, 3] float32: a plate of `folder`, warped by the take, as it leaves the compositor."""
     bpy = importlib.import_module("bpy")
     compat, compositor, steps = (
-        importlib.import_module(f"{package}.splannequin_addon.{name}") for name in ("compat", "compositor", "steps")
+        importlib.import_module(f"{package}.splannequin_addon.{name}")
+        for name in ("compat", "bake.compositor", "process.steps")
     )
     scene = bpy.context.scene
     tree = compat.compositor_tree(scene) or compat.new_compositor_tree(scene, "Artist")

@@ -71,7 +71,12 @@ def make(shot: Path, take: str, output: Path) -> None:
     def ours(name: str):
         return importlib.import_module(f"{_package().__name__}.splannequin_addon.{name}")
 
-    bake, compositor, shots, steps = ours("bake"), ours("compositor"), ours("shots"), ours("steps")
+    bake, compositor, shots, steps = (
+        ours("bake.insertion"),
+        ours("bake.compositor"),
+        ours("shot.contents"),
+        ours("process.steps"),
+    )
     shot, output = shot.absolute(), output.absolute()
     state = shots.read(shot)
     if not state.solve or take not in state.takes:

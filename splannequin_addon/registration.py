@@ -4,39 +4,27 @@ from __future__ import annotations
 
 import bpy
 
-from . import (
-    cli,
-    mattes,
-    menu,
-    ops_align,
-    ops_clip,
-    ops_jobs,
-    ops_runs,
-    ops_shots,
-    ops_solves,
-    ops_steps,
-    panel,
-    pictures,
-    places,
-    points,
-    preferences,
-    props,
-    stmaps,
-    supervisor,
-    translations,
-)
+from . import settings, translations
+from .command_line import command
+from .footage import operators as footage_operators
+from .process import supervisor
+from .shot import places
+from .solve import align_operators, mattes, points, stmaps
+from .solve import operators as solve_operators
+from .train import pictures
+from .ui import job_operators, menu, pick_operators, preferences, shots_panel, step_operator, step_panel
 
 _CLASSES = (
-    *ops_steps.CLASSES,
-    *ops_jobs.CLASSES,
-    *ops_clip.CLASSES,
-    *ops_runs.CLASSES,
-    *ops_align.CLASSES,
-    *ops_shots.CLASSES,
-    *ops_solves.CLASSES,
+    *step_operator.CLASSES,
+    *job_operators.CLASSES,
+    *footage_operators.CLASSES,
+    *pick_operators.CLASSES,
+    *align_operators.CLASSES,
+    *shots_panel.CLASSES,
+    *solve_operators.CLASSES,
     *stmaps.CLASSES,
     *mattes.CLASSES,
-    *panel.CLASSES,
+    *step_panel.CLASSES,
 )
 
 
@@ -51,7 +39,7 @@ def register() -> None:
         return
     _take_tooltips_from_docstrings()
     translations.register()
-    props.register()
+    settings.register()
     preferences.register()
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
@@ -60,15 +48,15 @@ def register() -> None:
     points.register()
     places.register()
     supervisor.register()
-    cli.register()
+    command.register()
 
 
 def unregister() -> None:
     """Undoes `register`, in reverse."""
     if not registered():
         return
-    ops_align.stop()
-    cli.unregister()
+    align_operators.stop()
+    command.unregister()
     stmaps.unregister()
     supervisor.unregister()
     places.unregister()
@@ -78,7 +66,7 @@ def unregister() -> None:
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)
     preferences.unregister()
-    props.unregister()
+    settings.unregister()
     translations.unregister()
 
 

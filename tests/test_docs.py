@@ -61,7 +61,7 @@ def test_the_forge_runs_the_commands_of_the_readme():
 
 
 def test_the_manual_has_a_page_per_step_with_its_picture_and_its_button():
-    tree = ast.parse(text_of(ROOT / "splannequin_addon" / "steps.py"))
+    tree = ast.parse(text_of(ROOT / "splannequin_addon" / "process" / "steps.py"))
     calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and ast.unparse(n.func) == "Step"]
     buttons = {c.args[0].value: c.args[3].value for c in calls}
     assert tuple(buttons) == STEPS
@@ -80,7 +80,7 @@ def test_all_pages_of_the_manual_are_in_its_index():
 
 def test_what_the_manual_sets_in_italics_is_on_the_screen_or_in_a_message():
     """Labels are written *so*: a button that is renamed does not stay in the manual under its old name."""
-    sources = "".join(text_of(p) for p in (ROOT / "splannequin_addon").glob("*.py"))
+    sources = "".join(text_of(p) for p in (ROOT / "splannequin_addon").rglob("*.py"))
     sources += "".join(text_of(p) for p in (ROOT / "torch_backend").rglob("*.py"))
     lost = []
     for page in MANUAL.glob("*.md"):

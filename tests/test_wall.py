@@ -75,8 +75,8 @@ LAYOUT = {
 }
 """Names in a shot folder, as the contract spells them."""
 OTHER_FOLDERS = {
-    ("splannequin_addon/environment.py", "summary.json"),  # of the launcher, in an environment
-    ("splannequin_addon/environment.py", ".splannequin"),
+    ("splannequin_addon/process/environment.py", "summary.json"),  # of the launcher, in an environment
+    ("splannequin_addon/process/environment.py", ".splannequin"),
     ("torch_backend/report/records.py", "summary.json"),  # of a benchmark
     ("torch_backend/solve/foreign.py", "colmap/sparse/0"),  # of another program
 }

@@ -10,7 +10,7 @@ from mathutils import Vector
 
 @pytest.fixture
 def take(addon, shot):
-    return addon("compositor").take_of(shot / "takes" / "freeze")
+    return addon("bake.compositor").take_of(shot / "takes" / "freeze")
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def _plain(value):
 
 
 def test_artists_nodes_and_links_stay_identical(addon, scene, artists_tree, take):
-    compositor = addon("compositor")
+    compositor = addon("bake.compositor")
     nodes, links = snapshot(artists_tree)
     compositor.insert(scene, take)
     after_nodes, after_links = snapshot(artists_tree, compositor.GROUP_NAME)
@@ -64,7 +64,7 @@ def test_artists_nodes_and_links_stay_identical(addon, scene, artists_tree, take
 
 
 def test_second_bake_updates_the_group(addon, scene, artists_tree, take, shot, new_take):
-    compositor = addon("compositor")
+    compositor = addon("bake.compositor")
     compositor.insert(scene, take)
     group = compositor.group_node(artists_tree)
     group.inputs["Mix"].default_value = 0.25
@@ -83,15 +83,15 @@ def test_second_bake_updates_the_group(addon, scene, artists_tree, take, shot, n
 def test_removal_restores_the_tree(addon, scene, artists_tree, take):
     before = snapshot(artists_tree)
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
-    addon("compositor").insert(scene, take)
-    assert addon("compositor").remove(scene)
+    addon("bake.compositor").insert(scene, take)
+    assert addon("bake.compositor").remove(scene)
     assert snapshot(artists_tree) == before
     assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
-    assert not addon("compositor").remove(scene)
+    assert not addon("bake.compositor").remove(scene)
 
 
 def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene, take, shot):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     plate = shot / "frames" / "000005.png"
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     said = compositor.insert(scene, take, plate)
@@ -113,7 +113,7 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
 
 
 def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, shot):
-    bake = addon("bake")
+    bake = addon("bake.insertion")
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
     assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 1, "the artist's tree shows no plate of ours"
     assert set(bpy.data.node_groups.keys()) == groups
@@ -124,14 +124,14 @@ def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, 
 
 
 def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, shot, tmp_path, pictures):
-    bake, plate = addon("bake"), shot / "frames" / "000005.png"
+    bake, plate = addon("bake.insertion"), shot / "frames" / "000005.png"
     for value in (40, 200):  # the first bake ended without coming in
         pictures.write(plate, np.full((12, 16, 3), value, np.uint8))
         assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 2
     image = next(i for i in bpy.data.images if i.filepath.endswith(".png"))
     assert round(255 * image.pixels[0]) == 200
     bake.insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    node = addon("bake.compositor").group_node(addon("compat").compositor_tree(scene))
     node.inputs["Mix"].default_value = 0.0
     render(addon, scene, tmp_path / "out")
     assert np.abs(pictures.read(tmp_path / "out" / "000005.png") * 255 - 200).max() < 0.6
@@ -141,15 +141,15 @@ def test_compositor_that_was_off_is_said_and_put_back(addon, scene, artists_tree
     compat = addon("compat")
     switches = {name: False for name in compat.compositor_switches(scene)}
     compat.restore_compositor_switches(scene, switches)
-    said = addon("compositor").insert(scene, take)
+    said = addon("bake.compositor").insert(scene, take)
     assert compat.compositor_enabled(scene) and "The compositor was switched on." in said
-    addon("compositor").remove(scene)
+    addon("bake.compositor").remove(scene)
     assert not compat.compositor_enabled(scene)
     assert compat.compositor_switches(scene) == switches, "each switch, not just one of them"
 
 
 def test_removal_leaves_a_group_that_another_scene_shows(addon, scene, artists_tree, take):
-    compat, compositor = addon("compat"), addon("compositor")
+    compat, compositor = addon("compat"), addon("bake.compositor")
     compositor.insert(scene, take)
     group = compositor.group_node(compat.compositor_tree(scene)).node_tree
     other = bpy.data.scenes.new("other")
@@ -161,8 +161,8 @@ def test_removal_leaves_a_group_that_another_scene_shows(addon, scene, artists_t
 
 
 def test_group_offers_what_a_compositor_needs(addon, scene, take):
-    addon("compositor").insert(scene, take)
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    addon("bake.compositor").insert(scene, take)
+    node = addon("bake.compositor").group_node(addon("compat").compositor_tree(scene))
     assert [s.name for s in node.inputs] == [
         "Image", "Mix", "Wipe", "Only Supported", "Only Moving", "Splat", "Show What Is Invented", "Grain", "CG",
         "CG Depth",
@@ -174,11 +174,11 @@ def test_group_offers_what_a_compositor_needs(addon, scene, take):
 def test_take_without_frames_is_refused_in_words(addon, scene, shot, contract):
     (shot / "takes" / "empty").mkdir()
     with pytest.raises(contract.JobError, match=r"'empty' .* holds no frozen frames"):
-        addon("bake").insert(scene, shot, "empty")
+        addon("bake.insertion").insert(scene, shot, "empty")
 
 
 def test_size_comes_from_the_exr_header(addon, shot, tmp_path):
-    compositor = addon("compositor")
+    compositor = addon("bake.compositor")
     assert compositor.exr_size(shot / "takes" / "freeze" / "000006.exr") == (16, 12)
     wrong = tmp_path / "wrong.exr"
     wrong.write_bytes(b"no picture")
@@ -189,12 +189,12 @@ def test_size_comes_from_the_exr_header(addon, shot, tmp_path):
 def render(addon, scene, folder: Path) -> None:
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 16, 12, 100
     scene.frame_start, scene.frame_end = 5, 7
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("bake").render(scene, folder)
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.insertion").render(scene, folder)
 
 
 def test_rendered_frames_equal_the_exr_within_one_of_255(addon, scene, take, tmp_path, layers, pictures):
-    addon("compositor").insert(scene, take)
+    addon("bake.compositor").insert(scene, take)
     render(addon, scene, tmp_path / "out")
     render(addon, scene, tmp_path / "out")  # the second render finds files and settings of the first
     for frame in (5, 6, 7):
@@ -205,8 +205,8 @@ def test_rendered_frames_equal_the_exr_within_one_of_255(addon, scene, take, tmp
 
 def test_mix_fades_between_plate_and_freeze(addon, scene, take, shot, tmp_path, layers, pictures):
     plate = shot / "frames" / "000005.png"
-    addon("compositor").insert(scene, take, plate)
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    addon("bake.compositor").insert(scene, take, plate)
+    node = addon("bake.compositor").group_node(addon("compat").compositor_tree(scene))
     node.inputs["Mix"].default_value = 0.0
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     render(addon, scene, tmp_path / "plate")
@@ -218,7 +218,7 @@ def test_mix_fades_between_plate_and_freeze(addon, scene, take, shot, tmp_path, 
 
 @pytest.mark.parametrize("output", ["Depth", "Support", "Motion"])
 def test_data_layers_arrive_on_the_groups_outputs(addon, scene, take, tmp_path, layers, pictures, output):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     scaled = compositor.take_of(take.folder, depth_scale=1.0 / 32.0)
     compositor.insert(scene, scaled)
     tree = compat.compositor_tree(scene)
@@ -235,12 +235,12 @@ def test_data_layers_arrive_on_the_groups_outputs(addon, scene, take, tmp_path, 
 @pytest.mark.parametrize("mix", [0.0, 1.0])
 def test_frames_of_another_size_are_fitted(addon, scene, take, shot, tmp_path, layers, pictures, mix):
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 32, 24, 100
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.compositor").insert(scene, take, shot / "frames" / "000005.png")
     tree = addon("compat").compositor_tree(scene)
-    addon("compositor").group_node(tree).inputs["Mix"].default_value = mix
+    addon("bake.compositor").group_node(tree).inputs["Mix"].default_value = mix
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path)
+    addon("bake.insertion").render(scene, tmp_path)
     found = pictures.read(tmp_path / "000006.png")
     assert found.shape == (24, 32, 3)
     plate = pictures.read(shot / "frames" / "000006.png")
@@ -262,7 +262,7 @@ def graded(addon, scene, shot):
         if kind == "CompositorNodeImage":
             plate.image = bpy.data.images.load(str(file))
             plate.image.source = "SEQUENCE"
-            addon("compositor").show_sequence(plate, plate.image, 5, 7)
+            addon("bake.compositor").show_sequence(plate, plate.image, 5, 7)
         else:
             plate.clip = bpy.data.movieclips.load(str(file))
         brighter = tree.nodes.new("CompositorNodeExposure")
@@ -279,9 +279,9 @@ def graded(addon, scene, shot):
 def test_behind_a_plate_the_grade_goes_on_from_the_frozen_frame(addon, scene, shot, graded, tmp_path, layers, pictures):
     tree, plate = graded(shot / "frames" / "000005.png")
     before = snapshot(tree)
-    said = addon("bake").insert(scene, shot, "freeze")
+    said = addon("bake.insertion").insert(scene, shot, "freeze")
     assert "as the plate" in said[0]
-    compositor = addon("compositor")
+    compositor = addon("bake.compositor")
     node = compositor.group_node(tree)
     nodes, links = snapshot(tree, compositor.GROUP_NAME)
     assert nodes == before[0] and len(before[1] - links) == 2 and not links - before[1]
@@ -293,7 +293,7 @@ def test_behind_a_plate_the_grade_goes_on_from_the_frozen_frame(addon, scene, sh
     render(addon, scene, tmp_path / "out")
     found = pictures.read(tmp_path / "out" / "000006.png")
     assert np.abs(found - pictures.srgb(4.0 * layers(6)["rgba"][..., :3])).max() * 255 < 1.1
-    assert addon("bake").remove(scene) and snapshot(tree) == before, "the links too"
+    assert addon("bake.insertion").remove(scene) and snapshot(tree) == before, "the links too"
 
 
 @pytest.mark.parametrize(
@@ -309,8 +309,8 @@ def test_a_plate_is_known_by_the_clips_file(addon, scene, shot, graded, tmp_path
         pictures.write(tmp_path / name.replace("####", f"{n:04d}"), np.zeros((12, 16, 3), np.uint8))
     tree, plate = graded(tmp_path / name.replace("####", "0005"), kind)
     scene.splannequin.clip = str(tmp_path / "clip.####.png")
-    addon("bake").insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(tree)
+    addon("bake.insertion").insert(scene, shot, "freeze")
+    node = addon("bake.compositor").group_node(tree)
     assert (plate.outputs["Image"].links[0].to_node == node) == behind
     assert (addon("compat").output_socket(tree).links[0].from_node == node) != behind
 
@@ -318,7 +318,7 @@ def test_a_plate_is_known_by_the_clips_file(addon, scene, shot, graded, tmp_path
 def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene, shot, graded, tmp_path, pictures):
     pictures.write(tmp_path / "a 0005.png", np.zeros((12, 16, 3), np.uint8))
     tree, plate = graded(tmp_path / "a 0005.png")
-    before, bake, props = snapshot(tree), addon("bake"), scene.splannequin
+    before, bake, props = snapshot(tree), addon("bake.insertion"), scene.splannequin
     output = addon("compat").output_socket(tree)
     other = tree.nodes.new("CompositorNodeImage")
     over = tree.nodes.new("CompositorNodeAlphaOver")
@@ -327,11 +327,11 @@ def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene,
     tree.nodes.active = None
     props.insert_at = "PLATE"
     bake.insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(tree)
+    node = addon("bake.compositor").group_node(tree)
     assert plate.outputs["Image"].links[0].to_node == node, "the only one that gets to the output"
     props.insert_at, node.inputs["Mix"].default_value = "OUTPUT", 0.25
     assert any("was moved" in line for line in bake.insert(scene, shot, "freeze"))
-    node = addon("compositor").group_node(tree)
+    node = addon("bake.compositor").group_node(tree)
     assert output.links[0].from_node == node and node.inputs["Mix"].default_value == 0.25
     assert not [link for link in plate.outputs["Image"].links if link.to_node == node]
     bake.remove(scene)
@@ -343,7 +343,7 @@ def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene,
     props.insert_at, bare = "PLATE", snapshot(tree)
     with pytest.raises(contract.JobError, match="No node of this compositor shows the plate"):
         bake.insert(scene, shot, "freeze")
-    assert snapshot(tree) == bare and addon("compositor").group_node(tree) is None
+    assert snapshot(tree) == bare and addon("bake.compositor").group_node(tree) is None
 
 
 def test_a_plate_of_another_size_is_taken_where_it_has_the_renders(addon, scene, shot, graded):
@@ -356,14 +356,14 @@ def test_a_plate_of_another_size_is_taken_where_it_has_the_renders(addon, scene,
         tree.links.new(fit.outputs[0], target)
     before = snapshot(tree)
     scene.render.resolution_x, scene.render.resolution_y = 32, 24
-    addon("bake").insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(tree)
+    addon("bake.insertion").insert(scene, shot, "freeze")
+    node = addon("bake.compositor").group_node(tree)
     assert [link.to_node for link in fit.outputs[0].links] == [node] and len(node.outputs["Image"].links) == 2
-    addon("bake").remove(scene)
+    addon("bake.insertion").remove(scene)
     assert snapshot(tree) == before
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
-    addon("bake").insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(tree)
+    addon("bake.insertion").insert(scene, shot, "freeze")
+    node = addon("bake.compositor").group_node(tree)
     assert plate.outputs["Image"].links[0].to_node == node, "a scale that the artist wants, of the frozen frame too"
 
 
@@ -375,13 +375,13 @@ def test_a_take_fills_the_frame_at_any_percentage(
     """Inserted at one percentage, rendered at another: half of 32 x 24 pixel by pixel, all of it to the border."""
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = 32, 24, baked
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.compositor").insert(scene, take, shot / "frames" / "000005.png")
+    node = addon("bake.compositor").group_node(addon("compat").compositor_tree(scene))
     node.inputs["Mix"].default_value = mix
     render.resolution_percentage = rendered
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path)
+    addon("bake.insertion").render(scene, tmp_path)
     found = pictures.read(tmp_path / "000006.png")
     plate = pictures.read(shot / "frames" / "000006.png")
     expected = pictures.srgb(layers(6)["rgba"][..., :3]) if mix else plate
@@ -405,10 +405,10 @@ def test_a_take_of_another_shape_fits_the_width_as_the_camera_sees_it(
 ):
     """Cut above and below in a wider frame, bars in a higher one: against the nearest pixels."""
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.compositor").insert(scene, take, shot / "frames" / "000005.png")
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path)
+    addon("bake.insertion").render(scene, tmp_path)
     found = pictures.read(tmp_path / "000006.png")
     scale = width / 16.0
     y = (np.arange(height) + 0.5 - height / 2) / scale + 6.0
@@ -422,7 +422,7 @@ def test_a_take_of_another_shape_fits_the_width_as_the_camera_sees_it(
 
 
 def test_only_moving_leaves_cg_where_nothing_moves(addon, scene, take, shot, tmp_path, layers, pictures):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     compositor.insert(scene, take, shot / "frames" / "000005.png")
     node = compositor.group_node(compat.compositor_tree(scene))
@@ -457,7 +457,7 @@ def in_front(cg: float | np.ndarray, frozen: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("alpha", [1.0, 0.5])
 def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, layers, pictures, alpha):
     """A wall of CG at depth 12 among frames whose depth grows downwards: pixel by pixel the nearer is in front."""
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     compositor.insert(scene, compositor.take_of(take.folder, depth_scale=2.0))
     node = compositor.group_node(compat.compositor_tree(scene))
     wall = np.array([0.5, 0.25, 0.0, 1.0], np.float32) * alpha
@@ -474,7 +474,7 @@ def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, la
 
 
 def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_path, layers, pictures):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     compositor.insert(scene, take, shot / "frames" / "000005.png")
     node = compositor.group_node(compat.compositor_tree(scene))
@@ -500,7 +500,7 @@ def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_pat
 
 def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, scene, take, shot, tmp_path, pictures):
     """The scene's own render, through its own depth pass, from the solved camera."""
-    steps, compat = addon("steps"), addon("compat")
+    steps, compat = addon("process.steps"), addon("compat")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
     steps.load_camera(scene, shot)
@@ -532,7 +532,7 @@ def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, sce
     wall.rotation_quaternion = camera.to_quaternion()
     wall.location = camera @ Vector((0.0, 0.0, -12.0))  # facing the camera, 12 in front of it
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path / "out")
+    addon("bake.insertion").render(scene, tmp_path / "out")
     found = pictures.read(tmp_path / "out" / "000006.png")
     depth = make_depth(6)
     green = (found[..., 1] > 0.99) & (found[..., 0] < 0.01)
@@ -550,7 +550,7 @@ EDGE = 7.7
 @pytest.mark.parametrize("far", [3.0, 12.0, 60.0])
 def test_a_half_covered_edge_of_cg_is_blended_by_its_coverage(addon, scene, shot, tmp_path, pictures, layers, far):
     """A wall rendered in front of all that is frozen, within it and behind it, against the composite worked out."""
-    steps, cameras = addon("steps"), addon("cameras")
+    steps, cameras = addon("process.steps"), addon("solve.cameras")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
     steps.load_camera(scene, shot)
@@ -577,7 +577,7 @@ def test_a_half_covered_edge_of_cg_is_blended_by_its_coverage(addon, scene, shot
     wall.rotation_quaternion = camera.to_quaternion()
     wall.location = camera @ Vector(((EDGE - 9.0) / 20.0 * far + 200.0, 0.0, -far))  # K: f 20, middle 9
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path / "out")
+    addon("bake.insertion").render(scene, tmp_path / "out")
     covered = np.clip(np.arange(16) + 1.0 - EDGE, 0.0, 1.0)[None, :, None]
     frozen, nearer = layers(6)["rgba"], in_front(far, layers(6)["depth"])
     cg = np.broadcast_to(covered * np.array([0.0, 1.0, 0.0, 1.0]), frozen.shape)

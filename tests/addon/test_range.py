@@ -16,25 +16,25 @@ def with_shot(scene, shot):
 def test_a_bake_asks_for_the_scenes_range_and_step_of_the_take(addon, with_shot, shot):
     scene = with_shot
     scene.frame_start, scene.frame_end, scene.frame_step = 6, 7, 1
-    params = addon("steps").params_of(scene, "bake")
+    params = addon("process.steps").params_of(scene, "bake")
     assert (params.first, params.last, params.step, params.only_missing) == (6, 7, 1, True)
     assert (params.take, params.run, params.t_star, params.grain) == ("freeze", "main", 6, False)
     scene.frame_start, scene.frame_end, scene.frame_step = 1, 250, 3
-    params = addon("steps").params_of(scene, "bake")
+    params = addon("process.steps").params_of(scene, "bake")
     assert (params.first, params.last, params.step) == (1, 250, 3)
-    assert addon("steps").params_of(scene, "freeze").first is None, "the freeze is about all of the clip"
+    assert addon("process.steps").params_of(scene, "freeze").first is None, "the freeze is about all of the clip"
 
 
 def test_a_bake_keeps_the_grain_of_its_take(addon, with_shot, shot):
     path = shot / "takes" / "freeze" / "take.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"grain": {"softness_px": 0.5}}))
-    assert addon("steps").params_of(with_shot, "bake").grain is True
+    assert addon("process.steps").params_of(with_shot, "bake").grain is True
 
 
 def test_a_bake_follows_the_keys_of_t_star_as_they_are_now(addon, with_shot, shot):
     path = shot / "takes" / "freeze" / "take.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"t_star_per_frame": {"5": 5.0, "6": 5.5, "7": 6.0}}))
-    props, steps = with_shot.splannequin, addon("steps")
+    props, steps = with_shot.splannequin, addon("process.steps")
     with_shot.frame_start, with_shot.frame_end = 5, 7
     assert steps.params_of(with_shot, "bake").t_star_per_frame == {"5": 5.0, "6": 5.5, "7": 6.0}
     props.choose_t_star, props.t_star = True, 7
@@ -49,7 +49,7 @@ def test_a_bake_follows_the_keys_of_t_star_as_they_are_now(addon, with_shot, sho
 
 
 def test_complete_is_about_the_frames_that_are_asked_for(addon, shot):
-    steps = addon("steps")
+    steps = addon("process.steps")
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     assert not steps.complete(shot, "freeze")
     assert steps.complete(shot, "freeze", range(5, 8, 2)) and steps.complete(shot, "freeze", range(7, 100))
@@ -58,7 +58,7 @@ def test_complete_is_about_the_frames_that_are_asked_for(addon, shot):
 
 
 def test_a_run_that_was_trained_on_makes_a_take_suspect(addon, shot):
-    steps = addon("steps")
+    steps = addon("process.steps")
     checkpoint, take = shot / "runs" / "main" / "checkpoint.safetensors", shot / "takes" / "freeze" / "take.json"
     assert not steps.may_be_stale(shot, "freeze")
     checkpoint.write_bytes(b"")
@@ -71,17 +71,17 @@ def test_a_run_that_was_trained_on_makes_a_take_suspect(addon, shot):
 def test_frames_of_the_range_that_the_take_lacks_are_told(addon, with_shot, shot):
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     with_shot.frame_start, with_shot.frame_end = 5, 7
-    said = addon("bake").insert(with_shot, shot, "freeze")
+    said = addon("bake.insertion").insert(with_shot, shot, "freeze")
     assert "1 frames of the scene's range are not in the take, the first is 6." in said
     with_shot.frame_step = 2
-    assert not any("not in the take" in line for line in addon("bake").insert(with_shot, shot, "freeze"))
+    assert not any("not in the take" in line for line in addon("bake.insertion").insert(with_shot, shot, "freeze"))
 
 
 def test_headless_bakes_a_part_of_a_take_and_leaves_it_in_the_file(addon, shot, tmp_path, capfd):
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     out = tmp_path / "out"
     arguments = ["bake", "--shot", str(shot), "--output", str(out)]
-    assert addon("headless").main([*arguments, "--first", "5", "--step", "2"]) == 0
+    assert addon("command_line.headless").main([*arguments, "--first", "5", "--step", "2"]) == 0
     assert [p.name for p in sorted((out / "composited").iterdir())] == ["000005.png", "000007.png"]
     assert not list((shot / "jobs").iterdir()) if (shot / "jobs").is_dir() else True, "no backend was asked"
     bpy.ops.wm.open_mainfile(filepath=str(out / "shot.blend"))
@@ -89,7 +89,7 @@ def test_headless_bakes_a_part_of_a_take_and_leaves_it_in_the_file(addon, shot, 
     assert (scene.frame_start, scene.frame_end, scene.frame_step) == (5, 7, 2)
     assert (scene.render.resolution_x, scene.render.resolution_y) == (16, 12)
     capfd.readouterr()
-    assert addon("headless").main([*arguments, "--first", "9"]) == 2
+    assert addon("command_line.headless").main([*arguments, "--first", "9"]) == 2
     assert "The last frame, 7, comes before the first, 9." in capfd.readouterr().err
 
 
@@ -111,22 +111,22 @@ def test_a_new_scene_bakes_at_the_size_of_the_plate_however_small_the_take(addon
     larger_plate(shot, 4)
     out = tmp_path / "out"
     arguments = ["bake", "--shot", str(shot), "--output", str(out), "--first", "6", "--last", "6"]
-    assert addon("headless").main(arguments) == 0
+    assert addon("command_line.headless").main(arguments) == 0
     assert size_of(bpy.context.scene) == (64, 48, 100)
     assert pictures.read(out / "composited" / "000006.png").shape == (48, 64, 3)
 
 
 def test_a_bake_never_lowers_the_size_of_a_scene_nor_takes_back_what_the_artist_set(addon, with_shot, shot, tmp_path):
     larger_plate(shot, 80)
-    scene, steps = with_shot, addon("steps")
+    scene, steps = with_shot, addon("process.steps")
     steps.load_camera(scene, shot)
     assert size_of(scene) == (1280, 960, 100)
-    assert addon("bake").fit_take(scene, shot, "freeze") == [] and size_of(scene) == (1280, 960, 100)
+    assert addon("bake.insertion").fit_take(scene, shot, "freeze") == [] and size_of(scene) == (1280, 960, 100)
     scene.frame_start = 6
     blend = str(tmp_path / "mine.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend)
     arguments = ["bake", "--shot", str(shot), "--blend", blend, "--output", str(tmp_path / "out")]
-    assert addon("headless").main([*arguments, "--last", "6"]) == 0
+    assert addon("command_line.headless").main([*arguments, "--last", "6"]) == 0
     scene = bpy.context.scene
     assert size_of(scene) == (1280, 960, 100) and scene.frame_start == 6
     scene.render.resolution_x, scene.render.resolution_percentage = 2560, 50
@@ -139,7 +139,7 @@ def test_a_bake_never_lowers_the_size_of_a_scene_nor_takes_back_what_the_artist_
 
 
 def test_the_camera_is_looked_at_again_only_if_the_take_was_seen_from_one(addon, contract, with_shot, shot):
-    steps, jobs = addon("steps"), addon("jobs")
+    steps, jobs = addon("process.steps"), addon("process.jobs")
     assert not steps.follows_camera(with_shot)
     with_shot.splannequin.path_camera = with_shot.camera
     assert not steps.follows_camera(with_shot), "the take is of the clip's own move"

@@ -21,15 +21,15 @@ def two(addon, scene, shot, other):
     """Both in the scene with their cameras; the second is chosen."""
     props = scene.splannequin
     props.shot_path, props.run_name = str(shot), "first run"
-    addon("steps").load_camera(scene, shot)
+    addon("process.steps").load_camera(scene, shot)
     assert bpy.ops.splannequin.shot_add() == {"FINISHED"}
     props.shot_path = str(other)
-    addon("steps").load_camera(scene, other)
+    addon("process.steps").load_camera(scene, other)
     return scene
 
 
 def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
-    props, steps, shot_list = scene.splannequin, addon("steps"), addon("shot_list")
+    props, steps, shot_list = scene.splannequin, addon("process.steps"), addon("shot.chosen")
     assert not bpy.ops.splannequin.shot_add.poll(), "there is no first shot yet"
     props.shot_path, props.clip = str(shot), "//first.mov"
     own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
@@ -66,7 +66,7 @@ def keyed(addon, scene):
 
 
 def test_a_keyed_instant_goes_with_its_shot(addon, two):
-    props, steps = two.splannequin, addon("steps")
+    props, steps = two.splannequin, addon("process.steps")
     two["mine"] = 1.0
     two.keyframe_insert('["mine"]', frame=1)
     artists = set(keyed(addon, two))
@@ -102,7 +102,7 @@ def test_keys_move_up_when_a_shot_before_them_goes(addon, two, shot, tmp_path):
 
 
 def test_the_chosen_shots_camera_is_the_scenes(addon, two, shot, other):
-    cameras, props = addon("cameras"), two.splannequin
+    cameras, props = addon("solve.cameras"), two.splannequin
     assert two.camera == cameras.find(two, other, "CAMERA")
     props.active_shot = 0
     assert two.camera == cameras.find(two, shot, "CAMERA")
@@ -122,7 +122,7 @@ def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
     """Put back at switching, as the artist left them; the scene's own come back with the last shot."""
     first, second = ((16, 12, 100), 12.5, (5, 7)), ((32, 24, 100), 25.0, (5, 7))
     original = seen(scene)
-    props, steps = scene.splannequin, addon("steps")
+    props, steps = scene.splannequin, addon("process.steps")
     for name, change in (("shot.json", {"fps": 25.0}), ("solve/cameras.json", {})):
         told = json.loads((other / name).read_text()) | change | {"width": 32, "height": 24}
         (other / name).write_text(json.dumps(told))
@@ -142,7 +142,7 @@ def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
     props.active_shot = 0
     assert seen(scene) == ((16, 12, 50), 12.5, (6, 7))
     bpy.ops.splannequin.shot_remove(things=True)
-    assert seen(scene) == second and scene.camera == addon("cameras").find(scene, other, "CAMERA")
+    assert seen(scene) == second and scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
     steps.remove_all(scene, other)
     assert seen(scene) == original and scene.camera == scene.objects["Camera"]
 
@@ -155,13 +155,13 @@ def test_what_the_artist_set_for_a_shot_is_still_the_artists_after_switching(add
     props.active_shot = 1
     assert two.render.resolution_x == 4000
     for folder in (shot, other):
-        addon("steps").remove_all(two, folder)
+        addon("process.steps").remove_all(two, folder)
     assert two.render.resolution_x == 4000 and two.frame_end == 250
 
 
 def test_a_scene_that_was_left_alone_stays_so_at_switching(addon, scene, shot, other):
     scene.render.resolution_x, scene.frame_end = 640, 99
-    props, steps = scene.splannequin, addon("steps")
+    props, steps = scene.splannequin, addon("process.steps")
     props.shot_path = str(shot)
     steps.load_camera(scene, shot)
     bpy.ops.splannequin.shot_add()
@@ -178,20 +178,20 @@ def things(scene) -> set[str]:
 
 
 def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
-    props, steps, compositor = scene.splannequin, addon("steps"), addon("compositor")
+    props, steps, compositor = scene.splannequin, addon("process.steps"), addon("bake.compositor")
     props.shot_path = str(shot)
     steps.load_camera(scene, shot)
     steps.insert_freeze(scene, shot, "freeze")
     before = things(scene)
     bpy.context.view_layer.update()
-    pose = np.array(addon("cameras").find(scene, shot, "CAMERA").matrix_world)
+    pose = np.array(addon("solve.cameras").find(scene, shot, "CAMERA").matrix_world)
     bpy.ops.splannequin.shot_add()
     props.shot_path = str(other)
     steps.load_camera(scene, other)
     assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
     assert things(scene) == before
     assert not len(props.shots) and steps.shot_folder(scene) == shot
-    assert scene.camera == addon("cameras").find(scene, shot, "CAMERA")
+    assert scene.camera == addon("solve.cameras").find(scene, shot, "CAMERA")
     bpy.context.view_layer.update()
     np.testing.assert_array_equal(scene.camera.matrix_world, pose)
     assert compositor.shown(scene)[0] == shot / "takes" / "freeze"
@@ -203,15 +203,15 @@ def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
 
 
 def test_removing_the_baked_shot_takes_its_group_out(addon, two, shot, other):
-    steps, compositor = addon("steps"), addon("compositor")
+    steps, compositor = addon("process.steps"), addon("bake.compositor")
     steps.insert_freeze(two, other, "freeze")
     steps.remove_all(two, other)
-    assert compositor.shown(two) is None and addon("cameras").find(two, shot, "CAMERA")
+    assert compositor.shown(two) is None and addon("solve.cameras").find(two, shot, "CAMERA")
     assert two.render.resolution_x == 16, "the settings go with the last shot"
 
 
 def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other, new_take):
-    steps, panel, shots = addon("steps"), addon("panel"), addon("shots")
+    steps, panel, shots = addon("process.steps"), addon("ui.step_panel"), addon("shot.contents")
     steps.insert_freeze(two, other, "freeze")
     assert panel.view_bake(two, shots.read(other)).done
     two.splannequin.active_shot = 0
@@ -227,21 +227,21 @@ def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other,
 def test_undo_brings_a_shot_back(addon, two, shot, other):
     bpy.ops.ed.undo_push(message="two shots")
     assert bpy.ops.splannequin.shot_remove("EXEC_DEFAULT", True) == {"FINISHED"}
-    assert addon("shot_list").folders(bpy.context.scene) == [shot]
+    assert addon("shot.chosen").folders(bpy.context.scene) == [shot]
     bpy.ops.ed.undo()
     scene = bpy.context.scene
-    assert addon("shot_list").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
-    assert scene.camera == addon("cameras").find(scene, other, "CAMERA")
+    assert addon("shot.chosen").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
+    assert scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
     scene.splannequin.active_shot = 0
-    assert addon("steps").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
+    assert addon("process.steps").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
 
 
 def ended(addon, contract, folder, step, kind, params, result):
     """A job of a shot that the supervisor follows and that has just ended well."""
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(folder, kind, params)
     (job.folder / "step").write_text(step)
-    addon("supervisor").follow(step, job)
+    addon("process.supervisor").follow(step, job)
     event = contract.Event("done", 1, 1.0, {"result": result})
     (job.folder / contract.EVENTS_FILE).write_text(json.dumps(event.__dict__) + "\n")
     status = contract.Status(job.folder.name, "done", 1, 1.0, 2.0, 2.0, fraction=1.0)
@@ -250,7 +250,7 @@ def ended(addon, contract, folder, step, kind, params, result):
 
 
 def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene, shot, other):
-    props, supervisor, cameras = scene.splannequin, addon("supervisor"), addon("cameras")
+    props, supervisor, cameras = scene.splannequin, addon("process.supervisor"), addon("solve.cameras")
     props.shot_path, props.t_star = str(shot), 2
     bpy.ops.splannequin.shot_add()
     props.shot_path, props.t_star = str(other), 3
@@ -270,7 +270,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
     props.active_shot = 0
     supervisor.tick()
     assert props.t_star == 6 and cameras.find(scene, shot, "CAMERA") == scene.camera
-    assert addon("compositor").shown(scene) is None, "choosing a shot bakes nothing"
+    assert addon("bake.compositor").shown(scene) is None, "choosing a shot bakes nothing"
     assert "Bake again" in supervisor.watch_of(shot).notes["bake"][0]
     props.t_star = 7
     supervisor.tick()
@@ -279,7 +279,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
 
 
 def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, other):
-    supervisor = addon("supervisor")
+    supervisor = addon("process.supervisor")
     supervisor.sample(two, other, iter_path(contract))
     two.splannequin.active_shot = 0
     while supervisor.watch_of(other).sampling is not None:

@@ -50,20 +50,20 @@ def test_names_defaults_and_choices_of_saved_properties_are_what_they_were(scene
 def test_an_old_shot_is_shown_whole(addon, tmp_path):
     root = tmp_path / "old.splannequin"
     shutil.copytree(OLD / "shot", root)
-    state = addon("shots").read(root)
+    state = addon("shot.contents").read(root)
     assert (state.frames, state.frame_range, state.size) == (74, (1, 74), (640, 480))
     assert state.runs["tiny"]["gaussians"] == 100 and state.takes["freeze"]["frame_count"] == 2
     assert not state.damaged["run"] and not state.damaged["take"] and not state.unfinished
     assert not state.runs["tiny"]["other_cameras"]
-    assert {kind: job.state for kind, job in addon("jobs").latest(root).items()} == dict.fromkeys(
+    assert {kind: job.state for kind, job in addon("process.jobs").latest(root).items()} == dict.fromkeys(
         ("import", "solve", "train", "freeze"), "done"
     )
-    assert addon("steps").take_params(root, "freeze").width == 64
-    assert addon("steps").complete(root, "freeze") and not addon("steps").may_be_stale(root, "freeze")
+    assert addon("process.steps").take_params(root, "freeze").width == 64
+    assert addon("process.steps").complete(root, "freeze") and not addon("process.steps").may_be_stale(root, "freeze")
 
 
 def test_old_command_lines_ask_for_the_same(addon, contract):
-    headless = addon("headless")
+    headless = addon("command_line.headless")
     for line in LINES:
         args = headless.parser().parse_args(line["argv"])
         found = headless.asked(args)
@@ -82,7 +82,9 @@ def test_old_command_lines_ask_for_the_same(addon, contract):
 
 @pytest.mark.parametrize("command", OPTIONS)
 def test_an_old_option_is_still_taken_with_its_choices(addon, command):
-    commands = next(a for a in addon("headless").parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+    commands = next(
+        a for a in addon("command_line.headless").parser()._actions if isinstance(a, argparse._SubParsersAction)
+    ).choices
     known = {tuple(a.option_strings) or a.dest: a for a in commands[command]._actions}
     for old in OPTIONS[command]:
         option = known[tuple(old["flags"]) or old["dest"]]

@@ -20,7 +20,7 @@ def add(path, **more):
 
 
 def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_under_bake(addon, with_shot, shot):
-    panel, shots = addon("panel"), addon("shots")
+    panel, shots = addon("ui.step_panel"), addon("shot.contents")
     add(shot / "runs" / "main" / "summary.json", verdict=RUN)
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE, detail={"plate_share": 0.98})
     state = shots.read(shot)
@@ -29,7 +29,7 @@ def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_un
         "Choose t* in frames 34 to 73, or train on that range alone.",
     ]
     assert panel.view_freeze(with_shot, state).state[-1] == "Good. 98 % of the picture is plate, 2 % is a guess."
-    addon("steps").insert_freeze(with_shot, shot, "freeze")
+    addon("process.steps").insert_freeze(with_shot, shot, "freeze")
     assert not any("plate, 2 %" in line for line in panel.view_bake(with_shot, state).state)
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE | {"word": "poor"})
     state = shots.read(shot)
@@ -38,7 +38,7 @@ def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_un
 
 def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):
     add(shot / "runs" / "main" / "summary.json", quality="Poor")
-    lines = addon("panel").view_train(with_shot, addon("shots").read(shot)).state
+    lines = addon("ui.step_panel").view_train(with_shot, addon("shot.contents").read(shot)).state
     assert lines[2:] == ["It is poor: take a range in which nobody walks, or solve the camera again."]
 
 
@@ -46,13 +46,13 @@ def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):
 def test_a_damaged_verdict_is_left_out(addon, with_shot, shot, damaged):
     for path in (shot / "runs" / "main" / "summary.json", shot / "takes" / "freeze" / "take.json"):
         add(path, verdict=damaged)
-    state = addon("shots").read(shot)
-    assert len(addon("panel").view_train(with_shot, state).state) == 2
-    assert len(addon("panel").view_freeze(with_shot, state).state) == 2
+    state = addon("shot.contents").read(shot)
+    assert len(addon("ui.step_panel").view_train(with_shot, state).state) == 2
+    assert len(addon("ui.step_panel").view_freeze(with_shot, state).state) == 2
 
 
 def test_what_the_verdict_tells_is_not_told_twice(addon):
-    unsaid = addon("panel").unsaid
+    unsaid = addon("ui.step_panel").unsaid
     warnings = [("Poor. It does not hold.", "Solve again."), ("Something else.", "")]
     assert unsaid(warnings, ["Run main", "Poor. It does not hold."]) == ["Something else."]
     assert unsaid(warnings, []) == ["Poor. It does not hold. Solve again.", "Something else."]
@@ -74,7 +74,7 @@ def test_verdicts_are_told_in_german(addon):
 
 
 def test_detail_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
-    steps = addon("steps")
+    steps = addon("process.steps")
     assert steps.params_of(with_shot, "freeze").detail == "on"
     with_shot.splannequin.detail = False
     assert steps.params_of(with_shot, "freeze").detail == "off"
@@ -86,14 +86,14 @@ def test_detail_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon,
 
 
 def test_the_command_line_takes_detail(addon, tmp_path):
-    headless = addon("headless")
+    headless = addon("command_line.headless")
     for words, expected in (([], "on"), (["--detail", "off"], "off")):
         args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
         assert headless.asked(args)["freeze"].detail == expected
 
 
 def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
-    steps, props, take = addon("steps"), with_shot.splannequin, shot / "takes" / "freeze" / "take.json"
+    steps, props, take = addon("process.steps"), with_shot.splannequin, shot / "takes" / "freeze" / "take.json"
     asked = []
     for wanted in (True, False):
         props.develop = wanted
@@ -108,14 +108,14 @@ def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(ad
 
 
 def test_the_command_line_takes_develop(addon, tmp_path):
-    headless = addon("headless")
+    headless = addon("command_line.headless")
     for words, expected in (([], "on"), (["--develop", "off"], "off")):
         args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
         assert headless.asked(args)["freeze"].develop == expected
 
 
 def test_a_figure_stays_with_its_unit(addon):
-    lines = addon("sentences").lines
+    lines = addon("ui.sentences").lines
     assert lines("Good. 97 % of the picture is plate, 3 % is a guess.", 37) == [
         "Good. 97 % of the picture is plate,", "3 % is a guess.",
     ]  # fmt: skip

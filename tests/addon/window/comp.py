@@ -61,7 +61,7 @@ def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
     import cube
     import numpy as np
 
-    scene, compositor, compat = bpy.context.scene, press.addon_module("compositor"), press.addon_module("compat")
+    scene, compositor, compat = bpy.context.scene, press.addon_module("bake.compositor"), press.addon_module("compat")
     scene.render.resolution_percentage = 100
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.samples, scene.cycles.use_denoising = 1, False
@@ -111,7 +111,7 @@ def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
     import bpy
     import numpy as np
 
-    scene, compositor, compat = bpy.context.scene, press.addon_module("compositor"), press.addon_module("compat")
+    scene, compositor, compat = bpy.context.scene, press.addon_module("bake.compositor"), press.addon_module("compat")
     tree = compat.compositor_tree(scene)
     if tree is None or not len(tree.nodes):
         tree = compat.new_compositor_tree(scene, "Comp")

@@ -379,7 +379,7 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
 
 
 def _supervisor():
-    return addon_module("supervisor")
+    return addon_module("process.supervisor")
 
 
 def addon_module(name: str):
