@@ -2,7 +2,7 @@
 """Splannequin's launcher: makes the two environments the project needs, then runs it. Standard library only.
 
     python3 splannequin.py demo                     freeze the bundled clip
-    python3 splannequin.py freeze CLIP --t-star 40  freeze your own
+    python3 splannequin.py freeze CLIP --t-star 40  freeze your own; a shot folder in its place: freeze that anew
     python3 splannequin.py doctor                   what this machine can do
     python3 splannequin.py test                     all tests
     python3 splannequin.py bench --quick            the method against ground truth, with a report

@@ -9,7 +9,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_backend.contract import ExitCode
+from torch_backend.contract import (
+    BACKEND,
+    ExitCode,
+    ShotFolder,
+    TakeFolder,
+    command_line,
+    is_shot,
+    read_json,
+    verdict_lines,
+)
 from torch_backend.shot import write_json
 
 from .blender import get_blender, set_up_wheel
@@ -20,26 +29,31 @@ from .places import HERE, ROOT
 from .summary import read_summary
 
 
-def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
-    """Clip to frozen frames through the compositor: the backend's stations, then the bake in Blender's environment."""
+def freeze(given: str, output: Path, options: Sequence[str]) -> int:
+    """A clip, or a shot folder, to frozen frames through the compositor: the backend's stations, then the bake in
+    Blender's environment. Of a shot folder the frames alone are frozen anew; see `contract.freezes_a_shot`."""
     started = time.monotonic()
-    if "://" not in clip and not any(mark in clip for mark in "#%*@") and not os.path.exists(clip):
+    if "://" not in given and not any(mark in given for mark in "#%*@") and not os.path.exists(given):
         raise LauncherError(
-            f"There is no clip at {clip}: give the path of a video file or an image sequence.", ExitCode.USAGE
+            f"There is no clip at {given}: give the path of a video file, an image sequence or a shot folder.",
+            ExitCode.USAGE,
         )
     backend = backend_environment()
     setting_up = set_up(backend, sys.executable)
     blender, took = get_blender()
     setting_up += took
 
-    say(f"Freezing {clip} into {output}")
-    command = tied_command(backend.python, "torch_backend", "freeze", clip, "--output", str(output), *options)
-    code = run_child(command, cwd=HERE, tied=True)
+    say(f"Freezing {given} into {output}")
+    again = "://" not in given and is_shot(given)
+    command = tied_command(backend.python, "torch_backend", "freeze", given, *options)
+    freezing = time.monotonic()
+    code = run_child([*command, *([] if again else ["--output", str(output)])], cwd=HERE, tied=True)
     if code:
         return code
-    summary = read_summary(output)
+    summary = _of_a_shot(given, options, time.monotonic() - freezing) if again else read_summary(output)
     if "shot" not in summary or "take" not in summary:
         raise LauncherError(f"The backend left no figures in {output / 'summary.json'}: see the messages above.", 1)
+    write_json(output / "summary.json", summary)
     # The bake rewrites summary.json with what it adds; the wall time and the set-up are ours to add after it.
     say(f"Compositing in {blender.label}")
     baking = time.monotonic()
@@ -57,12 +71,31 @@ def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     return 0
 
 
+def _of_a_shot(shot: str, options: Sequence[str], seconds: float) -> dict[str, Any]:
+    """The figures of a shot folder that was frozen alone, in `seconds`: the take, and what it is worth."""
+    parser, _ = command_line("splannequin", BACKEND)
+    args, _ = parser.parse_known_args(["freeze", shot, *options])
+    folder = ShotFolder(shot)
+    facts = read_json(TakeFolder(folder.take(args.take)).facts)
+    return {
+        "version": 1,
+        "shot": str(folder.root),
+        "take": args.take,
+        "t_star_frame": facts.get("t_star_frame"),
+        "verdict": verdict_lines(facts),
+        "wall_seconds_by_stage": {"freeze": round(seconds, 2)},
+    }
+
+
 def closing_figures(summary: dict[str, Any], output: Path) -> None:
     """The last lines of a freeze: how good, how long, where to look."""
     stages = summary["wall_seconds_by_stage"]
-    psnr = summary.get("heldout_psnr_db")
     say(f"Figures:       {output / 'summary.json'}")
     say("Wall seconds:  " + ", ".join(f"{name} {seconds:.0f}" for name, seconds in stages.items()))
+    if "registered" not in summary:  # a shot that was there: the backend has said how good its take is
+        say(f"{summary['wall_seconds']:.0f} s in all.")
+        return
+    psnr = summary["heldout_psnr_db"]
     quality = f"Held-out PSNR {psnr:.2f} dB" if psnr is not None else "No held-out frames"
     say(
         f"{quality}; trained {summary.get('train_seconds', 0):.0f} s; {summary.get('registered')} of "

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from torch_backend.contract import ExitCode
+from torch_backend.contract import INPUT, ExitCode
 from torch_backend.shot import is_disk_full, write_json
 
 from .blender import BPY_WHEELS
@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     helps = {
         "demo": "freeze the bundled clip",
-        "freeze": "freeze your own clip; other options go to the backend (--t-star N, --preset NAME, ...)",
+        "freeze": "freeze your own clip, or a shot folder anew; other options go to the backend (--t-star N, ...)",
         "test": "run all tests; other arguments go to pytest",
         "bench": "the method against ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
         "doctor": "say what this machine can do",
@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     for name, text in helps.items():
         command = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
         if name == "freeze":
-            command.add_argument("clip", metavar="CLIP", help="video file, image sequence or pattern (shot.####.exr)")
+            command.add_argument("clip", metavar="INPUT", help=INPUT[1])
         if name in ("test", "setup"):
             command.add_argument("--bpy", choices=sorted(BPY_WHEELS), help="the bpy wheel (default: one that fits)")
         if name == "setup":

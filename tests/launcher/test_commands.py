@@ -131,6 +131,24 @@ def test_a_folder_that_is_gone_is_one_sentence(tmp_path: Path):
     assert ran.returncode == 2 and "change to another" in ran.stderr and "Traceback" not in ran.stderr
 
 
+def test_a_shot_that_is_frozen_anew_tells_of_the_take_that_was_named():
+    shot = ROOT / "tests" / "data" / "v0_2" / "shot"
+    for words in ([], ["--t-star", "8", "--take=freeze"]):
+        found = commands._of_a_shot(str(shot), words, 2.0)
+        assert (found["shot"], found["take"], found["t_star_frame"]) == (str(shot), "freeze", 8)
+        assert found["verdict"][0].startswith("Poor.") and found["wall_seconds_by_stage"] == {"freeze": 2.0}
+    with pytest.raises(OSError, match="other"):
+        commands._of_a_shot(str(shot), ["--take", "other"], 2.0)
+
+
+def test_what_only_a_clip_wants_is_refused_of_a_shot(tmp_path: Path):
+    if not environments.backend_environment().ready():
+        pytest.skip("the backend's environment is not set up by the launcher")
+    (tmp_path / "s.splannequin").mkdir()
+    ran = launch("freeze", tmp_path / "s.splannequin", "--preset", "final", "--output", tmp_path / "out")
+    assert ran.returncode == 2 and "--preset is for a clip" in ran.stderr and "Traceback" not in ran.stderr
+
+
 def test_a_broken_status_of_a_job_breaks_nothing(tmp_path: Path):
     for number, text in enumerate(("[", "[]", '{"state": "failed"}')):
         job = tmp_path / "shot.splannequin" / "jobs" / str(number)
