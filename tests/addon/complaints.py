@@ -54,7 +54,7 @@ ANSWERS = (
     Answer(
         2,
         "the artist's stream goes on through the group",
-        COMPOSITOR,
+        f"{ADDON}bake/placing.py",
         '        tree.links.new(source, node.inputs["Image"])\n',
         "        pass\n",
         f"{TEST}compositor.py::test_artists_nodes_and_links_stay_identical",
@@ -63,14 +63,14 @@ ANSWERS = (
         2,
         "a second bake updates the group",
         COMPOSITOR,
-        "    if node is None:\n        node = _insert_node(tree, before)",
-        "    if True:\n        node = _insert_node(tree, before)",
+        "    if node is None:\n        node = freeze_group.new_node(tree, before)",
+        "    if True:\n        node = freeze_group.new_node(tree, before)",
         f"{TEST}compositor.py::test_second_bake_updates_the_group",
     ),
     Answer(
         2,
         "removal leads the artist's link back",
-        COMPOSITOR,
+        f"{ADDON}bake/placing.py",
         "            tree.links.new(sources[0], target)",
         "            pass",
         f"{TEST}compositor.py::test_removal_restores_the_tree",
@@ -78,7 +78,7 @@ ANSWERS = (
     Answer(
         3,
         "a camera is read frame by frame",
-        CAMERAS,
+        f"{ADDON}freeze/own_camera.py",
         "    scene.frame_set(number)\n",
         "",
         f"{TEST}cameras.py::test_an_artists_camera_is_read_in_solve_units",
@@ -94,7 +94,7 @@ ANSWERS = (
     Answer(
         4,
         "the nearer of CG and frozen shows",
-        COMPOSITOR,
+        f"{ADDON}bake/group_inside.py",
         "    group.links.new(cg, ratio.inputs[0])\n    group.links.new(frozen, ratio.inputs[1])\n",
         "    group.links.new(frozen, ratio.inputs[0])\n    group.links.new(cg, ratio.inputs[1])\n",
         f"{TEST}compositor.py::test_cg_stands_in_front_and_behind_by_depth",
@@ -150,7 +150,7 @@ ANSWERS = (
     Answer(
         8,
         "frame n shows plate n",
-        COMPOSITOR,
+        f"{ADDON}scene/sequences.py",
         "    user.frame_offset = first - 1\n",
         "    user.frame_offset = 0\n",
         f"{TEST}cameras.py::test_plate_fits_the_sensor_and_follows_the_frame_numbers",
@@ -222,7 +222,7 @@ ANSWERS = (
     Answer(
         13,
         "a render can be stopped between frames",
-        f"{ADDON}bake/insertion.py",
+        f"{ADDON}bake/rendering.py",
         "                check_cancelled()\n",
         "                pass\n",
         f"{TEST}headless.py::test_ctrl_c_while_frames_render_ends_the_bake_with_130",
