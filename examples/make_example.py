@@ -71,12 +71,7 @@ def make(shot: Path, take: str, output: Path) -> None:
     def ours(name: str):
         return importlib.import_module(f"{_package().__name__}.splannequin_addon.{name}")
 
-    bake, compositor, shots, steps = (
-        ours("bake.insertion"),
-        ours("bake.compositor"),
-        ours("shot.contents"),
-        ours("process.steps"),
-    )
+    bake, shots, steps = ours("bake.insertion"), ours("shot.contents"), ours("process.steps")
     shot, output = shot.absolute(), output.absolute()
     state = shots.read(shot)
     if not state.solve or take not in state.takes:
@@ -89,15 +84,15 @@ def make(shot: Path, take: str, output: Path) -> None:
     steps.load_camera(scene, shot)
     steps.insert_freeze(scene, shot, take)
     bake.fit_take(scene, shot, take)
-    scene.render.filepath = f"//{output.stem}_frames/{bake.DIGITS}"
+    scene.render.filepath = f"//{output.stem}_frames/{ours('bake.rendering').DIGITS}"
     first, last = state.frame_range
     note = bpy.data.texts.new("Read me")
     note.write(
         NOTE.format(shot=state.info["name"], t_star=props.t_star, first=first, last=last, output=scene.render.filepath)
     )
     note.cursor_set(0)
-    compositor.relative_images()
-    props.shot_path = compositor.blend_path(shot)
+    ours("scene.sequences").relative_images()
+    props.shot_path = ours("scene.paths").blend_path(shot)
     scene.frame_set(first)
     before = bpy.context.preferences.filepaths.save_version
     bpy.context.preferences.filepaths.save_version = 0

@@ -17,7 +17,7 @@ from bpy.props import (
 
 from ..torch_backend import contract
 from . import compat
-from .shot import made
+from .shot import chosen, made
 from .translations import tr
 
 PRESETS: list[tuple[str, str, str]] = contract.panel(contract.TrainParams, "preset")["items"]
@@ -26,9 +26,9 @@ PRESETS: list[tuple[str, str, str]] = contract.panel(contract.TrainParams, "pres
 
 def names_of(props: Any, kind: str) -> list[tuple[str, str]]:
     """(name, what it is) of the runs or takes of the shot that `props` names, for the field's list."""
-    from .process import steps, supervisor
+    from .process import supervisor
 
-    folder = steps.shot_folder(props.id_data)
+    folder = chosen.shot_folder(props.id_data)
     state = supervisor.watch_of(folder).state if folder else None
     if state is None:
         return []

@@ -24,9 +24,9 @@ import bpy
 
 from ...torch_backend import contract
 from ...torch_backend.contract import ExitCode
-from ..bake import compositor, insertion
+from ..bake import insertion, rendering
 from ..process import backend, jobs, steps
-from ..scene import scene_setup
+from ..scene import paths, scene_setup, sequences
 from ..shot import contents
 from ..solve import cameras, exchange, stmaps
 
@@ -307,7 +307,7 @@ def _bake(
         console.say(f"  {change}")
     folder = output / "composited"
     blend = output / "shot.blend"
-    numbers = insertion.render(
+    numbers = rendering.render(
         scene, folder, fresh, lambda done, total: console.progress("baking", done, total), _stop_if_interrupted
     )
     _save(scene, blend, folder)
@@ -328,8 +328,8 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
         files.save_version = 0
         scene = bpy.context.scene
-        compositor.relative_images()
-        scene.render.filepath = compositor.blend_path(frames / insertion.DIGITS)
+        sequences.relative_images()
+        scene.render.filepath = paths.blend_path(frames / rendering.DIGITS)
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
     except RuntimeError as error:
         raise contract.JobError(

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..process import steps, supervisor
+from ..process import supervisor
 from ..shot import chosen
 from ..ui import icons
 
@@ -43,7 +43,7 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
         if known and len(props.shots):
             chosen.choose(context.scene, known[0])
         elif props.clip != self.filepath:
-            folder = steps.shot_folder(context.scene)
+            folder = chosen.shot_folder(context.scene)
             state = supervisor.watch_of(folder).state if folder is not None else None
             if state is not None and state.frames:
                 chosen.add(context.scene)

@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
-from ..bake import compositor
+from ..scene import sequences
 from ..shot import made
 
 _REACH = 1e-2
@@ -32,8 +32,8 @@ def show(scene: Any, shot: Path) -> Any | None:
     data = bpy.data.cameras.new(name)
     data.clip_start, data.clip_end = 0.1 * _REACH, _REACH
     background = data.background_images.new()
-    background.image = compositor.load_sequence(path, f"Clip {made.name_of(shot)}", "srgb")
-    compositor.show_sequence(background.image_user, background.image, first, last)
+    background.image = sequences.load_sequence(path, f"Clip {made.name_of(shot)}", "srgb")
+    sequences.show_sequence(background.image_user, background.image, first, last)
     background.frame_method, background.display_depth, background.alpha = "FIT", "BACK", 1.0
     data.show_background_images = True
     camera = made.new(scene, shot).plate = bpy.data.objects.new(name, data)

@@ -18,9 +18,10 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ...torch_backend import contract
-from ..process import backend, steps
+from ..process import backend
+from ..shot import chosen, made
 from ..solve import cameras
-from . import live
+from . import live, own_camera
 
 TICK_SECONDS = 1 / 60
 QUICK_PIXELS = 320 * 180
@@ -57,7 +58,7 @@ def begin(scene: Any) -> None:
     global _session, _handler, _told
     if bpy.app.background:
         raise contract.JobError("There is no view to draw in.", "Use Freeze.", contract.ExitCode.USAGE)
-    shot, run = steps.shot_folder(scene), scene.splannequin.run_name
+    shot, run = chosen.shot_folder(scene), scene.splannequin.run_name
     if shot is None or not contract.RunFolder(contract.ShotFolder(shot).runs / run).checkpoint.is_file():
         raise contract.JobError(f"There is no trained run {run!r}.", "Train first.", contract.ExitCode.USAGE)
     end()
@@ -156,7 +157,7 @@ def _tick() -> float | None:
         _told = _session.failure
         end()
         return None
-    scenes = [s for s in bpy.data.scenes if steps.shot_folder(s) == _session.shot]
+    scenes = [s for s in bpy.data.scenes if chosen.shot_folder(s) == _session.shot]
     if not any(s.splannequin.run_name == _session.run for s in scenes):
         end()  # another file, another shot or another run
         return None
@@ -206,7 +207,7 @@ def view_of(
         return None
     shrink = min(1.0, (pixels / max(1, size[0] * size[1])) ** 0.5)
     width, height = max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
-    viewmat, K = cameras.in_solve(scene, shot, matrices[0], matrices[1], width, height)
+    viewmat, K = own_camera.in_solve(scene, shot, matrices[0], matrices[1], width, height)
     return contract.LiveView(0, 0, viewmat, K, width, height, t_star, show=scene.splannequin.live_show)
 
 
@@ -223,7 +224,7 @@ def _draw() -> None:
     """One region's part: ask for what it shows, draw what has arrived."""
     context = bpy.context
     scene, region, view = context.scene, context.region, context.region_data
-    if _session is None or view is None or steps.shot_folder(scene) != _session.shot:
+    if _session is None or view is None or chosen.shot_folder(scene) != _session.shot:
         return
     t_star = instant(scene)
     if t_star is None:
@@ -242,7 +243,7 @@ def _draw() -> None:
     _ask(key, quick, sharp)
     frame = _session.frames.get(key)
     if frame is not None:
-        _paint(key, frame, view, cameras.depth_scale(scene, _session.shot))
+        _paint(key, frame, view, made.depth_scale(scene, _session.shot))
 
 
 def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:

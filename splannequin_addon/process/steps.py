@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import bpy
-
 from ...torch_backend import contract
 from .. import compat
-from ..bake import compositor, insertion
+from ..bake import compositor, freeze_group, insertion
 from ..footage import plate
-from ..scene import intact, scene_setup
-from ..shot import chosen, contents, made, markers, places
+from ..scene import intact, paths, scene_setup
+from ..shot import chosen, contents, made, markers
+from ..shot.shot_state import ShotState
 from ..solve import cameras, exchange
 from ..train import training
 from . import backend, jobs
@@ -58,21 +57,6 @@ STEPS = {
 """The steps in order."""
 
 
-def shot_folder(scene: Any) -> Path | None:
-    """Folder of the scene's shot, of several the chosen one; None while neither it nor a clip is chosen."""
-    return chosen.folder_of(scene.splannequin)
-
-
-def scenes_of(shot: Path) -> list[Any]:
-    """Scenes of the file that work on a shot: of several, it is the chosen one."""
-    return [s for s in bpy.data.scenes if shot_folder(s) == shot]
-
-
-def scenes_with(shot: Path) -> list[Any]:
-    """Scenes of the file that have a shot, chosen or not."""
-    return [s for s in bpy.data.scenes if shot in chosen.folders(s)]
-
-
 def params_of(scene: Any, step: str) -> Any:
     """The backend's parameters for a step, from what the artist set. JobError names what is missing."""
     props = scene.splannequin
@@ -80,11 +64,11 @@ def params_of(scene: Any, step: str) -> Any:
         if not props.clip:
             raise contract.JobError("No clip is chosen.", "Choose a video or image sequence.", contract.ExitCode.USAGE)
         span = (props.first, props.last) if props.use_range else (None, None)
-        return contract.ImportParams(places.absolute(props.clip), *span, step=props.solve_step, fps=props.fps)
+        return contract.ImportParams(paths.absolute(props.clip), *span, step=props.solve_step, fps=props.fps)
     if step == "camera":
-        return exchange.params(scene, shot_folder(scene))
+        return exchange.params(scene, chosen.shot_folder(scene))
     if step == "train":
-        folder = shot_folder(scene)
+        folder = chosen.shot_folder(scene)
         state = contents.read(folder) if folder is not None else None
         return training.params(state, props.run_name, props.preset, props.extend_steps, backend.device())
     t_star = props.t_star if props.choose_t_star else None
@@ -100,7 +84,7 @@ def params_of(scene: Any, step: str) -> Any:
         only_missing=True,
         device=backend.device(),
     )
-    folder = shot_folder(scene)
+    folder = chosen.shot_folder(scene)
     if step == "bake" and folder is not None:
         asked = take_params(folder, props.take_name, t_star)
         if asked is not None and props.choose_t_star:
@@ -116,7 +100,7 @@ def keyed_instants(scene: Any) -> dict[str, float]:
     curve = next((c for c in compat.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
     if curve is None or not scene.splannequin.choose_t_star:
         return {}
-    folder = shot_folder(scene)
+    folder = chosen.shot_folder(scene)
     first, last = contents.read(folder).frame_range if folder else (scene.frame_start, scene.frame_end)
     low, high = min(first, scene.frame_start), max(last, scene.frame_end)
     return {str(n): min(max(float(curve.evaluate(n)), first), last) for n in range(low, high + 1)}
@@ -124,7 +108,7 @@ def keyed_instants(scene: Any) -> dict[str, float]:
 
 def own_camera(scene: Any) -> str:
     """Name of the artist's camera to freeze from; empty for the clip's own move."""
-    camera, folder = scene.splannequin.path_camera, shot_folder(scene)
+    camera, folder = scene.splannequin.path_camera, chosen.shot_folder(scene)
     if camera is None or folder is None or camera == cameras.find(scene, folder, "CAMERA"):
         return ""
     return str(camera.name)
@@ -132,7 +116,7 @@ def own_camera(scene: Any) -> str:
 
 def follows_camera(scene: Any) -> bool:
     """True if a bake has to look at the artist's camera again: the take was seen from one, and one is chosen."""
-    folder = shot_folder(scene)
+    folder = chosen.shot_folder(scene)
     if folder is None or not own_camera(scene):
         return False
     return bool(contents.read(folder).takes.get(scene.splannequin.take_name, {}).get("camera_path"))
@@ -257,11 +241,11 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
 
 def _needed(scene: Any, step: str) -> Path:
     """The scene's shot folder, which a step needs to be there unless it makes it. JobError says what to do."""
-    folder = shot_folder(scene)
+    folder = chosen.shot_folder(scene)
     if folder is None:
         raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
     if step != "footage" and not os.path.isfile(contract.ShotFolder(folder).info_path):
-        if places.missing(scene, None):
+        if chosen.missing(scene, None):
             message, hint = f"The shot folder {folder} is not there any more.", "Press Locate and choose it."
             raise contract.JobError(message, hint, contract.ExitCode.USAGE)
         raise contract.JobError(f"{folder} is no shot folder.", STEPS[step].needs, contract.ExitCode.USAGE)
@@ -309,7 +293,7 @@ def imported(scene: Any, shot: Path) -> list[str]:
     """After the import: the scene takes the clip's size, rate and range if it is new or the artist consents."""
     state = contents.read(shot)
     props = scene.splannequin
-    places.see(scene, state)
+    chosen.see(scene, state)
     first, last = state.frame_range
     if not first <= props.t_star <= last:
         props.t_star = (first + last) // 2
@@ -322,7 +306,7 @@ def imported(scene: Any, shot: Path) -> list[str]:
 def load_camera(scene: Any, shot: Path) -> list[str]:
     """Brings the solve into the scene. FileNotFoundError if there is none."""
     state = contents.read(shot)
-    places.see(scene, state)
+    chosen.see(scene, state)
     with intact.scene_of(scene):
         camera = cameras.build(scene, shot)
         changes = _fit(scene, state, force_k=True)
@@ -351,7 +335,7 @@ def remove_all(scene: Any, shot: Path) -> list[str]:
     What another shot of the scene needs stays: its own things, and the settings of the scene.
     """
     done = []
-    there = compositor.shown(scene)
+    there = freeze_group.shown(scene)
     baked = there[0].parent.parent if there is not None else None
     others = [f for f in chosen.folders(scene) if f is not None and f != shot]
     others = [f for f in others if f == baked or made.of(scene, f) is not None]
@@ -390,7 +374,7 @@ def wait(job: jobs.Job, on_event: Callable[[contract.Event], None] | None = None
         raise
 
 
-def _fit(scene: Any, state: contents.ShotState, force_k: bool = False) -> list[str]:
+def _fit(scene: Any, state: ShotState, force_k: bool = False) -> list[str]:
     props = scene.splannequin
     if not (props.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
         return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]

@@ -18,10 +18,12 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
-from ..bake import compositor, insertion
+from ..bake import insertion, rendering
 from ..footage import plate
 from ..freeze import live, viewport
-from ..shot import contents, made, markers, places
+from ..scene import sequences
+from ..shot import chosen, contents, made, markers
+from ..shot.shot_state import ShotState
 from ..train import pictures
 from ..translations import tr
 from . import backend, jobs, steps
@@ -58,7 +60,7 @@ class Watch:
     """Shot folder."""
     jobs: dict[str, jobs.Job] = field(default_factory=dict)
     """Newest job of each step, by the step's name."""
-    state: contents.ShotState | None = None
+    state: ShotState | None = None
     """What the folder holds."""
     stamp: tuple[float, ...] = ()
     """Of the folder when `state` was read."""
@@ -134,7 +136,7 @@ def sample(scene: Any, shot: Path, turns: Generator[int, None, contract.CameraPa
     watch = watch_of(shot)
     watch.notes.clear()
     watch.failures.pop(step, None)
-    watch.sampling = Sampling(scene.name, turns, len(insertion.frames_of(scene)), step)
+    watch.sampling = Sampling(scene.name, turns, len(rendering.frames_of(scene)), step)
 
 
 def _read_on(watch: Watch) -> None:
@@ -149,7 +151,7 @@ def _read_on(watch: Watch) -> None:
     except StopIteration as end:
         scene = bpy.data.scenes.get(sampling.scene)
         try:
-            if scene is not None and steps.shot_folder(scene) != watch.shot:
+            if scene is not None and chosen.shot_folder(scene) != watch.shot:
                 watch.failures[sampling.step] = (
                     "Another shot was chosen while the camera was read.",
                     "Choose this one and freeze again.",
@@ -174,7 +176,7 @@ def refresh(watch: Watch) -> bool:
         watch.stamp = stamp
         watch.state = contents.read(watch.shot)
     except (OSError, ValueError, KeyError) as error:
-        watch.state = contents.ShotState(watch.shot)
+        watch.state = ShotState(watch.shot)
         why = getattr(error, "strerror", None) or error
         watch.failures["footage"] = (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one.")
     return True
@@ -202,10 +204,10 @@ def tick() -> float:
 def _turn(watch: Watch, until: float) -> bool:
     """One shot's part of a tick, `until` a time of `time.monotonic`; True if its panel should be drawn again."""
     changed, watch.redraw = watch.redraw or watch.sampling is not None, False
-    for scene in steps.scenes_of(watch.shot):
+    for scene in chosen.scenes_of(watch.shot):
         changed |= markers.follow(scene)
         made.tidy(scene)
-        places.see(scene, watch.state)
+        chosen.see(scene, watch.state)
     if watch.to_render:
         _render(watch)
         return True
@@ -227,20 +229,20 @@ def _turn(watch: Watch, until: float) -> bool:
         if job.ended:
             steps.give_up(job)
             refresh(watch)
-            there = steps.scenes_of(watch.shot)
+            there = chosen.scenes_of(watch.shot)
             if there and step == "bake" and job.state == "done":
                 bring_in(there[0], watch.shot, str(job.params["take"]), alone=False)
             elif there or job.state != "done":
                 _apply(watch, step, job)
             else:
                 watch.pending[step] = job
-    if watch.pending and steps.scenes_of(watch.shot):
+    if watch.pending and chosen.scenes_of(watch.shot):
         for step, job in watch.pending.items():
             _apply_late(watch, step, job)
         watch.pending.clear()
         changed = True
     if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
-        if watch.running() is None and not steps.scenes_with(watch.shot):
+        if watch.running() is None and not chosen.scenes_with(watch.shot):
             del _watches[watch.shot]  # a path that was typed and left again
             return changed
         changed |= refresh(watch)
@@ -310,7 +312,7 @@ def _window_of(scene: Any) -> Any | None:
 def _change(watch: Watch, step: str, change: Callable[[Any], list[str]], only: str = "") -> None:
     """Changes the scenes that work on a shot, or the one of them that is named `only`: as one undo step each in a
     window. Notes what was changed or why not."""
-    for scene in [s for s in steps.scenes_of(watch.shot) if only in ("", s.name)]:
+    for scene in [s for s in chosen.scenes_of(watch.shot) if only in ("", s.name)]:
         window = _window_of(scene)
         try:
             if window is None:
@@ -360,7 +362,7 @@ def _put_in(watch: Watch, scene: Any, take: str) -> list[str]:
     """Puts a take into a scene's compositor; the render of a scene that is seen begins with the next turn."""
     changes = steps.insert_freeze(scene, watch.shot, take)
     if _window_of(scene) is not None:
-        changes += insertion.choose_output(scene, watch.shot, take)  # here, for it belongs to the same undo step
+        changes += rendering.choose_output(scene, watch.shot, take)  # here, for it belongs to the same undo step
         watch.to_render = scene.name
     return changes
 
@@ -392,9 +394,9 @@ def _on_load(*_: Any) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
     viewport.end()
     markers.forget()
-    compositor.forget_ahead()
+    sequences.forget_ahead()
     for scene in bpy.data.scenes:
-        folder = steps.shot_folder(scene)
+        folder = chosen.shot_folder(scene)
         if folder is not None:
             made.adopt(scene, folder)
     for shot in [s for s, w in _watches.items() if w.running() is None]:

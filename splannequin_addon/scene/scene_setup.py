@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from ...torch_backend import contract
-from ..solve import cameras
+from . import axes
 
 _BEFORE = "splannequin_settings_before"
 _OURS = "splannequin_settings_ours"
@@ -61,7 +61,7 @@ def fit_clip(
     render = scene.render
     changes = []
     spared = set() if over else {name for names in _touched(scene).values() for name in names}
-    aspect = cameras.pixel_aspect(k) if k else (render.pixel_aspect_x, render.pixel_aspect_y)
+    aspect = axes.pixel_aspect(k) if k else (render.pixel_aspect_x, render.pixel_aspect_y)
     now = (render.resolution_x, render.resolution_y, render.resolution_percentage)
     if size is not None and now != (*size, 100) and "resolution_x" not in spared:
         _set(scene, "render", {"resolution_x": size[0], "resolution_y": size[1], "resolution_percentage": 100})
@@ -211,3 +211,10 @@ def _set(scene: Any, owner: str, values: dict[str, Any]) -> None:
         before.setdefault(owner, {}).setdefault(name, was[name])
         ours.setdefault(owner, {})[name] = getattr(target, name)
     scene[_BEFORE], scene[_OURS] = json.dumps(before), json.dumps(ours)
+
+
+def render_size(scene: Any) -> tuple[int, int]:
+    """Pixels that a render of the scene has."""
+    render = scene.render
+    share = render.resolution_percentage
+    return render.resolution_x * share // 100, render.resolution_y * share // 100

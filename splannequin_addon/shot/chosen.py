@@ -16,9 +16,10 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..scene import scene_setup
+from ..scene import paths, scene_setup
 from ..solve import cameras
-from . import made
+from . import chosen, made
+from .shot_state import ShotState
 
 _T_STAR = "splannequin.t_star"
 """Data path of the one setting that can be keyed."""
@@ -125,3 +126,34 @@ def _rename(scene: Any, paths: Mapping[str, str]) -> None:
     for curve in [*compat.fcurves(scene), *drivers]:
         if curve.data_path in paths:
             curve.data_path = paths[curve.data_path]
+
+
+def shot_folder(scene: Any) -> Path | None:
+    """Folder of the scene's shot, of several the chosen one; None while neither it nor a clip is chosen."""
+    return chosen.folder_of(scene.splannequin)
+
+
+def scenes_of(shot: Path) -> list[Any]:
+    """Scenes of the file that work on a shot: of several, it is the chosen one."""
+    return [s for s in bpy.data.scenes if shot_folder(s) == shot]
+
+
+def scenes_with(shot: Path) -> list[Any]:
+    """Scenes of the file that have a shot, chosen or not."""
+    return [s for s in bpy.data.scenes if shot in chosen.folders(s)]
+
+
+def missing(scene: Any, state: ShotState | None) -> bool:
+    """True if the scene's shot was there before, and its folder is gone now."""
+    folder = chosen.folder_of(scene.splannequin)
+    if folder is None or (state is not None and state.info):
+        return False
+    return paths.absolute(scene.splannequin.shot_seen) == str(folder) or made.of(scene, folder) is not None
+
+
+def see(scene: Any, state: ShotState | None) -> None:
+    """Remembers that the scene's shot is there, so that it can be missed."""
+    folder, held = chosen.folder_of(scene.splannequin), scene.splannequin
+    there = folder is not None and state is not None and state.frames and state.folder == folder
+    if folder is not None and there and paths.absolute(held.shot_seen) != str(folder):
+        held.shot_seen = paths.blend_path(folder)

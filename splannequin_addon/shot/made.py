@@ -14,7 +14,8 @@ import bpy
 from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
-from ..bake import compositor
+from ..scene import paths
+from ..solve import cameras
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""
@@ -57,7 +58,7 @@ def of(scene: Any, shot: Path) -> Any | None:
 def new(scene: Any, shot: Path) -> Any:
     """`of`, made if it is not there."""
     entry = of(scene, shot) or scene.splannequin.made.add()
-    entry.name, entry.folder = name_of(shot), compositor.blend_path(shot)
+    entry.name, entry.folder = name_of(shot), paths.blend_path(shot)
     return entry
 
 
@@ -120,3 +121,9 @@ def adopt(scene: Any, shot: Path) -> None:
     for collection in [c for c in scene.collection.children_recursive if c.get(_TAG) == name]:
         entry.collection = collection
         del collection[_TAG]
+
+
+def depth_scale(scene: Any, shot: Path) -> float:
+    """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
+    root = cameras.find(scene, shot, "EMPTY")
+    return float(sum(root.matrix_world.to_scale()) / 3.0) if root else 1.0

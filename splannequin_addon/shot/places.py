@@ -17,8 +17,9 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
-from ..bake import compositor
+from ..scene import paths
 from . import chosen, contents, made
+from .shot_state import ShotState
 
 _SETTINGS = ("clip", "shot_path", "cameras_path", "shot_seen")
 """Settings of a shot that hold a path."""
@@ -26,12 +27,7 @@ _saving: list[str] = []
 """What `_holders` held before the file that is being saved was given its own."""
 
 
-def absolute(path: str) -> str:
-    """A path of the settings, absolute; empty if there is none."""
-    return os.path.abspath(bpy.path.abspath(path)) if path else ""
-
-
-def source_of(state: contents.ShotState) -> str:
+def source_of(state: ShotState) -> str:
     """The footage that a shot was imported from, where it is now: as it was named, or beside the shot, with which it
     was moved. Empty if it is in neither place."""
     named, beside = str(state.info.get("source", "")), state.beside
@@ -39,22 +35,6 @@ def source_of(state: contents.ShotState) -> str:
     if beside:
         there.insert(1, state.folder / beside)
     return next((os.path.normpath(p) for p in there if named and _there(p)), "")
-
-
-def missing(scene: Any, state: contents.ShotState | None) -> bool:
-    """True if the scene's shot was there before, and its folder is gone now."""
-    folder = chosen.folder_of(scene.splannequin)
-    if folder is None or (state is not None and state.info):
-        return False
-    return absolute(scene.splannequin.shot_seen) == str(folder) or made.of(scene, folder) is not None
-
-
-def see(scene: Any, state: contents.ShotState | None) -> None:
-    """Remembers that the scene's shot is there, so that it can be missed."""
-    folder, held = chosen.folder_of(scene.splannequin), scene.splannequin
-    there = folder is not None and state is not None and state.frames and state.folder == folder
-    if folder is not None and there and absolute(held.shot_seen) != str(folder):
-        held.shot_seen = compositor.blend_path(folder)
 
 
 def locate(scene: Any, folder: Path) -> None:
@@ -73,15 +53,15 @@ def locate(scene: Any, folder: Path) -> None:
     held, before = scene.splannequin, chosen.folder_of(scene.splannequin)
     entry = made.of(scene, before) if before is not None else None
     if entry is not None and made.of(scene, folder) in (None, entry):
-        entry.name, entry.folder = made.name_of(folder), compositor.blend_path(folder)
+        entry.name, entry.folder = made.name_of(folder), paths.blend_path(folder)
     for image in bpy.data.images:
-        path = Path(absolute(image.filepath))
+        path = Path(paths.absolute(image.filepath))
         if before is not None and image.get("splannequin") and before in path.parents and not path.exists():
-            image.filepath = compositor.blend_path(folder / path.relative_to(before))
-    held.shot_path = held.shot_seen = compositor.blend_path(folder)
+            image.filepath = paths.blend_path(folder / path.relative_to(before))
+    held.shot_path = held.shot_seen = paths.blend_path(folder)
     source = source_of(state)
-    if source and not (held.clip and _there(Path(absolute(held.clip)))):
-        held.clip = compositor.blend_path(Path(source))
+    if source and not (held.clip and _there(Path(paths.absolute(held.clip)))):
+        held.clip = paths.blend_path(Path(source))
 
 
 def _there(path: Path) -> bool:
@@ -118,7 +98,7 @@ def _before_save(file: str = "", *_: Any) -> None:
         path = getattr(owner, name)
         _saving.append(path)
         if path and (all_of_them or path.startswith("//")):
-            setattr(owner, name, _relative(absolute(path), os.path.dirname(os.path.abspath(file))))
+            setattr(owner, name, _relative(paths.absolute(path), os.path.dirname(os.path.abspath(file))))
 
 
 @persistent
@@ -138,13 +118,13 @@ def _after_load(*_: Any) -> None:
     here = Path(bpy.data.filepath).parent
     for owner, name in _holders():
         path = getattr(owner, name)
-        if not path or path.startswith("//") or _known(Path(absolute(path)), name):
+        if not path or path.startswith("//") or _known(Path(paths.absolute(path)), name):
             continue
         words = re.split(r"[\\/]+", path)
         tails = [Path(*words[n:]) for n in range(1, len(words)) if words[n]]
         found = next((base / tail for tail in tails for base in (here, here.parent) if _known(base / tail, name)), None)
         if found is not None:
-            setattr(owner, name, compositor.blend_path(found))
+            setattr(owner, name, paths.blend_path(found))
 
 
 def _known(path: Path, name: str) -> bool:

@@ -19,9 +19,10 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..bake import insertion
-from ..process import steps, supervisor
-from ..shot import made
+from ..bake import shown_take
+from ..process import supervisor
+from ..scene import axes
+from ..shot import chosen, made
 from ..translations import tr
 from . import alignment, cameras, points
 
@@ -63,32 +64,32 @@ def move(scene: Any, shot: Path, change: np.ndarray) -> list[str]:
         shot: shot folder; its root is there.
         change: [4, 4], multiplied onto the root from the left.
     """
-    root, before = cameras.find(scene, shot, "EMPTY"), cameras.depth_scale(scene, shot)
+    root, before = cameras.find(scene, shot, "EMPTY"), made.depth_scale(scene, shot)
     uniform = max(root.scale) - min(root.scale) <= 1e-5 * max(root.scale)
     root.matrix_world = Matrix((change @ np.array(root.matrix_world, dtype=np.float64)).tolist())
     if uniform:  # to the last bit, whatever the decomposition left
         root.scale = [sum(root.scale) / 3.0] * 3
     bpy.context.view_layer.update()
-    grown = cameras.depth_scale(scene, shot) / before
+    grown = made.depth_scale(scene, shot) / before
     if abs(grown - 1.0) < 1e-6:
         return []
     camera = cameras.find(scene, shot, "CAMERA")
     if camera is not None:
         camera.data.clip_end *= grown
         camera.data.clip_start *= grown
-    return insertion.follow_scale(scene, shot)
+    return shown_take.follow_scale(scene, shot)
 
 
 def _shot_of(scene: Any) -> Path:
     """The scene's shot; `poll` has seen to it that there is one."""
-    shot = steps.shot_folder(scene)
+    shot = chosen.shot_folder(scene)
     assert shot is not None
     return shot
 
 
 def _centres(scene: Any, shot: Path) -> tuple[np.ndarray, np.ndarray]:
     """Where the camera was and its upward directions, [F, 3] each, world."""
-    poses = cameras.poses(contract.CameraPath.load(contract.ShotFolder(shot).cameras))
+    poses = axes.poses(contract.CameraPath.load(contract.ShotFolder(shot).cameras))
     poses = np.array(cameras.find(scene, shot, "EMPTY").matrix_world, dtype=np.float64) @ poses
     return poses[:, :3, 3], poses[:, :3, 1]
 
@@ -102,7 +103,7 @@ class _Aligns:
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Off without the solve in the scene."""
-        shot = steps.shot_folder(context.scene)
+        shot = chosen.shot_folder(context.scene)
         if shot is None or cameras.find(context.scene, shot, "EMPTY") is None:
             cls.poll_message_set(tr("Load the camera of this shot first"))  # type: ignore[attr-defined]
             return False
@@ -147,14 +148,14 @@ class _Aligns:
         if self.properties.is_property_set("places"):  # type: ignore[attr-defined]
             return np.array(self.places, dtype=np.float64).reshape(self.count, 3)  # type: ignore[attr-defined]
         ours = [cameras.find(context.scene, shot, kind) for kind in ("EMPTY", "CAMERA", "MESH")]
-        chosen = [o for o in context.selected_objects if o not in ours]
-        if len(chosen) != self.count:
+        picked = [o for o in context.selected_objects if o not in ours]
+        if len(picked) != self.count:
             raise contract.JobError(
-                f"{len(chosen)} objects are selected, {self.count} are needed.",
+                f"{len(picked)} objects are selected, {self.count} are needed.",
                 "Place empties where the points should be and select them.",
                 contract.ExitCode.USAGE,
             )
-        return np.array([o.matrix_world.translation for o in chosen], dtype=np.float64)
+        return np.array([o.matrix_world.translation for o in picked], dtype=np.float64)
 
     def _begin(self, context: Any) -> set[str]:
         global _picking
@@ -343,7 +344,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
 def scaled(scene: Any, shot: Path) -> bool:
     """True if somebody gave a shot its scale: by Set Scale, or by hand on its root."""
     entry = made.of(scene, shot)
-    return (entry is not None and entry.scaled) or abs(cameras.depth_scale(scene, shot) - 1.0) > 1e-5
+    return (entry is not None and entry.scaled) or abs(made.depth_scale(scene, shot) - 1.0) > 1e-5
 
 
 def view_under(window: Any, x: int, y: int) -> tuple[Any, Any] | None:
@@ -383,12 +384,12 @@ def _draw() -> None:
     matrix = np.array(context.region_data.perspective_matrix @ root.matrix_world, dtype=np.float64)
     size = (context.region.width, context.region.height)
     gpu.state.blend_set("ALPHA")
-    for chosen, colour in (([_picking.under], (1.0, 1.0, 1.0, 1.0)), (_picking.picked, (1.0, 0.6, 0.1, 1.0))):
-        at, before = alignment.seen(_picking.xyz[[i for i in chosen if i >= 0]], matrix, size)
+    for numbers, colour in (([_picking.under], (1.0, 1.0, 1.0, 1.0)), (_picking.picked, (1.0, 0.6, 0.1, 1.0))):
+        at, before = alignment.seen(_picking.xyz[[i for i in numbers if i >= 0]], matrix, size)
         for number, (x, y) in enumerate(at[before], start=1):
             _dot((float(x), float(y)), 6.0 * scale, (0.0, 0.0, 0.0, 0.8))
             _dot((float(x), float(y)), 4.5 * scale, colour)
-            if chosen is _picking.picked:
+            if numbers is _picking.picked:
                 blf.size(0, 14.0 * scale)
                 blf.color(0, *colour)
                 blf.position(0, float(x) + 9.0 * scale, float(y) + 5.0 * scale, 0.0)

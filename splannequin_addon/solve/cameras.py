@@ -8,7 +8,7 @@ together, and depth is brought to scene units through it.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,144 +18,12 @@ from mathutils import Matrix, Quaternion
 
 from ...torch_backend import contract
 from .. import compat
-from ..bake import compositor
-from ..scene import intact
+from ..scene import axes, intact, sequences
 from ..shot import contents, made
 from . import alignment, guesses
 
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 """Kind of our objects -> which of `made.PARTS` it is, and last word of the name it is made with."""
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenCV camera axes to Blender's, and back."""
-SENSOR_MM = 36.0
-"""Width given to the camera's sensor. Only its ratio to the focal length matters."""
-
-
-def camera_to_world(viewmat: np.ndarray) -> np.ndarray:
-    """Blender's camera matrices from rigid OpenCV ones.
-
-    Args:
-        viewmat: world-to-camera, OpenCV axes, [..., 4, 4] float64.
-
-    Returns:
-        Camera-to-world with Blender's camera axes, [..., 4, 4] float64, in the same world.
-    """
-    viewmat = np.asarray(viewmat, dtype=np.float64)
-    turned = np.swapaxes(viewmat[..., :3, :3], -1, -2)
-    result = np.zeros_like(viewmat)
-    # No LAPACK: on a busy machine its threads keep Blender's main thread waiting for milliseconds, once per frame.
-    result[..., :3, :3] = turned
-    result[..., :3, 3] = -(turned * viewmat[..., None, :3, 3]).sum(-1)
-    result[..., 3, 3] = 1.0
-    return result * np.diagonal(FLIP)
-
-
-def poses(path: contract.CameraPath) -> np.ndarray:
-    """`camera_to_world` of every frame of a path, [F, 4, 4]."""
-    return camera_to_world(np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4))
-
-
-def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -> tuple[float, float, float]:
-    """(focal length in mm, shift_x, shift_y) for a camera with horizontal sensor fit and a sensor of `SENSOR_MM`.
-
-    Args:
-        k: fx, fy, cx, cy in pixels, pixel centres at +0.5.
-        width: image width in pixels.
-        height: image height in pixels.
-    """
-    fx, fy, cx, cy = k
-    # Shift is counted in widths of the picture, also down, where a pixel that is not square is fx / fy high.
-    return fx * SENSOR_MM / width, (width / 2 - cx) / width, (cy - height / 2) * (fx / fy) / width
-
-
-def pixel_aspect(k: tuple[float, float, float, float]) -> tuple[float, float]:
-    """(pixel_aspect_x, pixel_aspect_y) of a render that shows fx and fy as they are; Blender wants both >= 1."""
-    fx, fy = k[0], k[1]
-    ratio = fx / fy
-    if abs(ratio - 1.0) < 5e-4:  # half a pixel over a thousand
-        return 1.0, 1.0
-    return (1.0, ratio) if ratio > 1.0 else (1.0 / ratio, 1.0)
-
-
-def in_solve(
-    scene: Any, shot: Path, view_matrix: Any, window_matrix: Any, width: int, height: int
-) -> tuple[list[float], list[float]]:
-    """(viewmat, K) in solve units of what a view of the scene shows.
-
-    Args:
-        scene: the scene, in which the shot's root says where the solve stands.
-        shot: shot folder.
-        view_matrix: world to view, Blender's axes, [4, 4].
-        window_matrix: perspective projection, [4, 4].
-        width: of the picture in pixels.
-        height: of the picture in pixels.
-
-    Returns:
-        viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
-        K: fx, fy, cx, cy in pixels.
-    """
-    root, window = find(scene, shot, "EMPTY"), np.array(window_matrix, dtype=np.float64)
-    placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
-    to_view = FLIP @ np.array(view_matrix, dtype=np.float64) @ placed
-    to_view[:3] /= depth_scale(scene, shot)
-    K = [
-        0.5 * width * window[0, 0],
-        0.5 * height * window[1, 1],
-        0.5 * width * (1.0 - window[0, 2]),
-        0.5 * height * (1.0 + window[1, 2]),
-    ]
-    return to_view.ravel().tolist(), K
-
-
-def sample_path(scene: Any, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:
-    """Reads an animated camera over the scene's range, a frame per turn; yields frames done, returns the CameraPath.
-
-    Nothing of bpy is kept between two turns. The scene's current frame is put back at the end.
-
-    Args:
-        scene: the scene, whose range, render size and pixel aspect say what the camera sees.
-        name: of the camera object.
-        shot: shot folder whose solve the path is to be in.
-        width: of the frames in pixels; 0: the scene's.
-
-    Raises:
-        contract.JobError: the camera is gone, or is no perspective camera.
-    """
-    named, before = scene.name, scene.frame_current
-    size = compositor.render_size(scene)
-    width = width or size[0]
-    height = max(1, round(size[1] * width / size[0]))
-    numbers = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
-    del scene
-    frames: list[contract.CameraFrame] = []
-    try:
-        for number in numbers:
-            frames.append(_sampled(named, name, shot, number, (width, height)))
-            yield len(frames)
-    finally:
-        back = bpy.data.scenes.get(named)
-        if back is not None:
-            back.frame_set(before)
-    return contract.CameraPath(width, height, frames)
-
-
-def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[int, int]) -> contract.CameraFrame:
-    """A camera at one frame, as `sample_path` reads it."""
-    scene = bpy.data.scenes[scene_name]
-    camera = scene.objects.get(name)
-    if camera is None or camera.type != "CAMERA" or camera.data.type != "PERSP":
-        raise contract.JobError(
-            f"{name} is not a perspective camera of this scene.",
-            "Choose another camera to freeze from.",
-            contract.ExitCode.USAGE,
-        )
-    scene.frame_set(number)
-    graph = bpy.context.evaluated_depsgraph_get()
-    seen = camera.evaluated_get(graph)
-    aspect = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
-    window = seen.calc_matrix_camera(graph, x=size[0], y=size[1], scale_x=aspect[0], scale_y=aspect[1])
-    view = seen.matrix_world.normalized().inverted()
-    return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size), "blender")
 
 
 def scene_from_solve(
@@ -173,7 +41,7 @@ def scene_from_solve(
     Returns:
         [4, 4] float64, rotation and translation, no scale.
     """
-    matrices = poses(path)
+    matrices = axes.poses(path)
     up = matrices[:, :3, 1].mean(axis=0)
     forward = -matrices[:, :3, 2].mean(axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
@@ -214,7 +82,7 @@ def build(scene: Any, shot: Path) -> Any:
         # All that can fail comes before what was there is taken away.
         camera, cloud = _new_camera(shot, path), _new_points(shot, xyz, rgb)
         _place(scene, shot, camera, cloud, scene_from_solve(path, xyz, floor), _extent(path))
-        camera.data.clip_start, camera.data.clip_end = (v * depth_scale(scene, shot) for v in _clip(path, xyz))
+        camera.data.clip_start, camera.data.clip_end = (v * made.depth_scale(scene, shot) for v in _clip(path, xyz))
         guesses.mark(scene, shot, unsolved)
         made.keep_camera(scene)
         scene.camera = camera
@@ -284,12 +152,6 @@ def find(scene: Any, shot: Path, kind: str) -> Any | None:
     return made.part(scene, shot, _PARTS[kind])
 
 
-def depth_scale(scene: Any, shot: Path) -> float:
-    """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
-    root = find(scene, shot, "EMPTY")
-    return float(sum(root.matrix_world.to_scale()) / 3.0) if root else 1.0
-
-
 def remove(scene: Any, shot: Path) -> bool:
     """Takes everything that `build` made out of the file. True if there was something.
 
@@ -339,16 +201,16 @@ def _clear(scene: Any, shot: Path, but: tuple[str, ...] = ()) -> None:
 def _animate(camera: Any, path: contract.CameraPath) -> None:
     """Keys the camera on the clip's own frame numbers, straight between keys."""
     data = camera.data
-    data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR_MM
-    data.sensor_height = SENSOR_MM * path.height / path.width
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", axes.SENSOR_MM
+    data.sensor_height = axes.SENSOR_MM * path.height / path.width
     camera.rotation_mode = "QUATERNION"
-    lenses = [lens_from_k((f.K[0], f.K[1], f.K[2], f.K[3]), path.width, path.height) for f in path.frames]
+    lenses = [axes.lens_from_k((f.K[0], f.K[1], f.K[2], f.K[3]), path.width, path.height) for f in path.frames]
     varies = max(map(max, zip(*lenses))) > 0 and any(
         max(column) - min(column) > 1e-6 * max(abs(max(column)), 1.0) for column in zip(*lenses)
     )
     before: Quaternion | None = None
     places, turns = [], []
-    for matrix in poses(path).tolist():
+    for matrix in axes.poses(path).tolist():
         location, rotation, _ = Matrix(matrix).decompose()
         if before is not None and before.dot(rotation) < 0:  # q and -q turn alike, but keys would go the long way
             rotation.negate()
@@ -375,8 +237,8 @@ def _show_plate(data: Any, shot: Path, name: str) -> None:
     if not path.is_file():
         return
     background = data.background_images.new()
-    background.image = compositor.load_sequence(path, f"Plate {name}", "srgb")
-    compositor.show_sequence(background.image_user, background.image, first, last)
+    background.image = sequences.load_sequence(path, f"Plate {name}", "srgb")
+    sequences.show_sequence(background.image_user, background.image, first, last)
     background.frame_method = "FIT"
     background.display_depth = "BACK"
     background.alpha = 1.0
@@ -414,7 +276,7 @@ def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> Any:
 
 def _extent(path: contract.CameraPath) -> float:
     """Length of the diagonal of the box around the camera's path, solve units; at least 0.1."""
-    centres = poses(path)[:, :3, 3]
+    centres = axes.poses(path)[:, :3, 3]
     return max(float(np.linalg.norm(centres.max(axis=0) - centres.min(axis=0))), 0.1)
 
 

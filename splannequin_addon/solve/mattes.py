@@ -16,9 +16,9 @@ import bpy
 import numpy as np
 
 from ...torch_backend import contract
-from ..bake import compositor
 from ..process import steps, supervisor
-from ..shot import made
+from ..scene import paths, sequences
+from ..shot import chosen, made
 from ..translations import tr
 from ..ui import icons
 
@@ -41,7 +41,7 @@ def load_sequence(shot: Path) -> tuple[Any, int, int]:
     frames = sorted(int(p.stem) for p in contract.ShotFolder(shot).motion.glob("*.png") if p.stem.isdecimal())
     if not frames:
         raise no_matte(shot)
-    image = compositor.load_sequence(found_file(shot, frames[0]), f"Motion {made.name_of(shot)}", "srgb")
+    image = sequences.load_sequence(found_file(shot, frames[0]), f"Motion {made.name_of(shot)}", "srgb")
     return image, frames[0], frames[-1]
 
 
@@ -76,7 +76,7 @@ def paint_image(shot: Path, frame: int) -> Any:
     image = bpy.data.images.new(f"Motion {made.name_of(shot)} {frame}", width, height)
     image.pixels.foreach_set(pixels.ravel())
     image.update()
-    image[_FRAME], image[_SHOT] = frame, compositor.blend_path(shot)
+    image[_FRAME], image[_SHOT] = frame, paths.blend_path(shot)
     return image
 
 
@@ -111,7 +111,7 @@ def save_paint(image: Any) -> Path:
         _write(path, data)
     except OSError as error:
         raise steps.unwritable(path, error, "Make room, or see to it that the shot's folder can be written.") from error
-    image.filepath_raw, image.file_format = compositor.blend_path(path), "PNG"
+    image.filepath_raw, image.file_format = paths.blend_path(path), "PNG"
     image.source = "FILE"
     image.reload()
     return path
@@ -198,7 +198,7 @@ class _Matte:
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Off without a solve."""
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         state = supervisor.watch_of(folder).state if folder else None
         if state is None or not state.solve:
             cls.poll_message_set(tr("Solve the camera first"))  # type: ignore[attr-defined]
@@ -207,7 +207,7 @@ class _Matte:
 
     def execute(self, context: Any) -> set[str]:
         """Does it; a refusal is reported."""
-        shot = steps.shot_folder(context.scene)
+        shot = chosen.shot_folder(context.scene)
         if shot is None:
             return {"CANCELLED"}
         try:
@@ -235,7 +235,7 @@ class SPLANNEQUIN_OT_show_motion(_Matte, bpy.types.Operator):
         image, first, last = load_sequence(shot)
         space = _in_editor(context, image, "VIEW")
         if space is not None:
-            compositor.show_sequence(space.image_user, image, first, last)
+            sequences.show_sequence(space.image_user, image, first, last)
         return f"The motion matte has frames {first} to {last}."
 
 

@@ -10,7 +10,8 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ...torch_backend import contract
-from ..process import steps, supervisor
+from ..process import supervisor
+from ..shot import chosen
 from ..translations import tr
 from . import exchange
 
@@ -39,7 +40,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Off without a solve."""
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         state = supervisor.watch_of(folder).state if folder else None
         if state is None or not state.solve:
             cls.poll_message_set(tr("Solve the camera first"))
@@ -53,7 +54,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Has the backend write; in a window the panel tells when it is done."""
-        shot = steps.shot_folder(context.scene)
+        shot = chosen.shot_folder(context.scene)
         if shot is None or not self.directory:
             self.report({"ERROR"}, "No folder was given")
             return {"CANCELLED"}

@@ -11,7 +11,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..process import steps
+from ..shot import chosen
 from . import cameras
 
 _SIZE = 3.0
@@ -40,7 +40,7 @@ def _draw() -> None:
     context = bpy.context
     if context.space_data is None or not context.space_data.overlay.show_overlays:
         return
-    shot = steps.shot_folder(context.scene)
+    shot = chosen.shot_folder(context.scene)
     cloud = cameras.find(context.scene, shot, "MESH") if shot is not None else None
     if cloud is None or cloud.display_type != "BOUNDS" or not cloud.visible_get() or not len(cloud.data.vertices):
         return

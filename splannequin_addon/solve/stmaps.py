@@ -11,7 +11,8 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
-from ..process import backend, jobs, steps, supervisor
+from ..process import backend, jobs, supervisor
+from ..shot import chosen
 from ..translations import tr
 
 _TICK_SECONDS = 0.2
@@ -113,7 +114,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Off without a solve, while a step runs, and while the maps are being written."""
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         watch = supervisor.watch_of(folder) if folder else None
         if watch is None or watch.state is None or not watch.state.solve:
             cls.poll_message_set(tr("Solve the camera first"))
@@ -128,7 +129,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Starts the backend; headless, waits for it."""
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         if folder is None:
             return {"CANCELLED"}
         try:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...torch_backend import contract
-from ..shot import contents
+from ..shot.shot_state import ShotState
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Cost:
     """A run of this preset was timed; else `seconds` goes by pixels and steps of another's."""
 
 
-def costs(state: contents.ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
+def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
     """The cost of every preset, and the run that it was told from, None if the shot has none that was timed."""
     timed = sorted((r for r in state.runs.values() if _per_step(r)), key=_size) if state is not None else []
     # Where nothing may move a step is several times as fast.

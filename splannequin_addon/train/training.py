@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...torch_backend import contract
-from ..shot import checkpoints, contents
+from ..shot import checkpoints
+from ..shot.shot_state import ShotState
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Plan:
     """What will happen, in a sentence; empty if that needs no saying."""
 
 
-def plan(state: contents.ShotState | None, run: str, preset: str) -> Plan:
+def plan(state: ShotState | None, run: str, preset: str) -> Plan:
     """What training the run of a name with a preset means, as the shot stands."""
     finished = state.runs.get(run) if state is not None else None
     paused = state.unfinished.get(run) if state is not None else None
@@ -54,7 +55,7 @@ def _goes_on(told: dict[str, Any], preset: str) -> bool:
     return anew is not None and anew["preset"] == preset and not anew["other_cameras"]
 
 
-def params(state: contents.ShotState | None, run: str, preset: str, steps: int, device: str) -> contract.TrainParams:
+def params(state: ShotState | None, run: str, preset: str, steps: int, device: str) -> contract.TrainParams:
     """What the backend is asked for; `steps` is how many are added if the run is finished."""
     kind = plan(state, run, preset).kind
     if state is not None and kind == "resume":

@@ -10,7 +10,8 @@ import bpy
 from bpy.props import StringProperty
 
 from ...torch_backend import contract
-from ..process import jobs, steps, supervisor
+from ..process import jobs, supervisor
+from ..shot import chosen
 from ..translations import tr
 
 
@@ -28,7 +29,7 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Asks the job to stop."""
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         watch = supervisor.watch_of(folder) if folder else None
         job = watch.jobs.get(self.step or watch.running() or "") if watch else None
         if job is None or job.ended:
@@ -53,7 +54,7 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Opens it."""
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         log = log_of(supervisor.watch_of(folder), self.step) if folder else None
         if log is None:
             self.report({"WARNING"}, "There is no log")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ...torch_backend import contract
-from ..shot import contents
+from ..shot.shot_state import ShotState
 from .sentences import cells as _cells
 
 _RUN_HEAD = ("Run", "dB", "Size", "Move", "Time")
@@ -20,7 +20,7 @@ _TAKE_HEAD = ("Take", "t*", "Frames", "Run")
 _TAKE_WIDTHS = (0.3, 0.18, 0.24, 0.28)
 
 
-def run_rows(state: contents.ShotState) -> list[tuple[str, ...]]:
+def run_rows(state: ShotState) -> list[tuple[str, ...]]:
     """(name, dB on frames kept out, Gaussians, share that moves, time trained) of every run, as shown.
 
     Of one that is not finished (name, how far it came), of one that cannot be read (name, that it is damaged).
@@ -44,7 +44,7 @@ def run_rows(state: contents.ShotState) -> list[tuple[str, ...]]:
     return rows
 
 
-def take_rows(state: contents.ShotState) -> list[tuple[str, ...]]:
+def take_rows(state: ShotState) -> list[tuple[str, ...]]:
     """(name, t*, frames on disk, run) of every take, as shown; of one that cannot be read (name, "damaged")."""
     rows = []
     for name in state.listed("take"):
@@ -66,7 +66,7 @@ def duration(seconds: float | None) -> str:
     return f"{seconds / 60:.0f}m" if seconds < 5400 else f"{seconds / 3600:.1f}h"
 
 
-def draw(layout: Any, kind: str, state: contents.ShotState, chosen: str) -> None:
+def draw(layout: Any, kind: str, state: ShotState, chosen: str) -> None:
     """Rows of the runs or takes (`kind` "run" or "take"), the `chosen` one marked; a click on a name picks it."""
     rows, head, widths = (
         (run_rows(state), _RUN_HEAD, _RUN_WIDTHS) if kind == "run" else (take_rows(state), _TAKE_HEAD, _TAKE_WIDTHS)

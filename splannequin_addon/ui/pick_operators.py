@@ -11,15 +11,16 @@ from bpy.props import StringProperty
 
 from ...torch_backend import contract
 from ..freeze import viewport
-from ..process import jobs, steps, supervisor
+from ..process import jobs, supervisor
 from ..settings import PRESETS
+from ..shot import chosen
 from ..translations import tr
 from . import listing
 
 
 def _known(context: Any) -> tuple[supervisor.Watch | None, Any]:
     """The shot's watch and what its folder holds."""
-    folder = steps.shot_folder(context.scene)
+    folder = chosen.shot_folder(context.scene)
     watch = supervisor.watch_of(folder) if folder else None
     return watch, watch.state if watch else None
 

@@ -10,6 +10,7 @@ from bpy.props import BoolProperty, StringProperty
 
 from ...torch_backend import contract
 from ..process import steps, supervisor
+from ..scene import paths
 from ..shot import chosen, places
 from ..translations import tr
 
@@ -39,7 +40,7 @@ class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Off while the chosen shot has no clip: it is a new one."""
-        if steps.shot_folder(context.scene) is None:
+        if chosen.shot_folder(context.scene) is None:
             cls.poll_message_set(tr("Choose a clip for this shot first"))
             return False
         return True
@@ -79,7 +80,7 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         """Removes it."""
         scene = context.scene
-        folder = steps.shot_folder(scene)
+        folder = chosen.shot_folder(scene)
         if self.things and folder is not None:
             for note in steps.remove_all(scene, folder):
                 self.report({"INFO"}, note)
@@ -101,7 +102,7 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         """Has the folder chosen, beginning where it was."""
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         if folder is not None:
             there = next((p for p in folder.parents if p.is_dir()), None)
             self.directory = f"{there}/" if there is not None else ""
@@ -111,7 +112,7 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         """Takes it, if there is a shot in it."""
         try:
-            places.locate(context.scene, Path(places.absolute(self.directory)))
+            places.locate(context.scene, Path(paths.absolute(self.directory)))
         except contract.JobError as error:
             self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}

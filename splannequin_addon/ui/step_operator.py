@@ -7,11 +7,10 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
-from ..bake import compositor, insertion
-from ..freeze import viewport
+from ..bake import freeze_group, rendering
+from ..freeze import own_camera, viewport
 from ..process import backend, steps, supervisor
-from ..shot import markers
-from ..solve import cameras
+from ..shot import chosen, markers
 from ..translations import tr
 
 
@@ -23,7 +22,7 @@ class _StepOperator:
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Off while a step of this shot runs."""
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         if folder is not None and supervisor.watch_of(folder).running():
             cls.poll_message_set(tr("A step of this shot is running"))  # type: ignore[attr-defined]
             return False
@@ -43,7 +42,7 @@ class _StepOperator:
             self.report({"WARNING"}, "Cancelled: finished work is kept")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         except (contract.JobError, ValueError, OSError, RuntimeError) as error:
-            folder = steps.shot_folder(scene)
+            folder = chosen.shot_folder(scene)
             sentence = getattr(error, "message", str(error))
             if folder is not None:
                 supervisor.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
@@ -74,7 +73,7 @@ def _read_camera(turns: Any, scene: Any, step: str) -> Any:
 def _turns(scene: Any, folder: Any) -> Any:
     """`cameras.sample_path` of the artist's camera, at the size of the take that is to be baked."""
     width = steps.params_of(scene, "bake").width
-    return cameras.sample_path(scene, steps.own_camera(scene), folder, width)
+    return own_camera.sample_path(scene, steps.own_camera(scene), folder, width)
 
 
 class SPLANNEQUIN_OT_import_clip(_StepOperator, bpy.types.Operator):
@@ -115,18 +114,20 @@ class SPLANNEQUIN_OT_freeze(_StepOperator, bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         """Runs the step. In a window a camera of the artist's is read a few frames per turn of the timer."""
         scene = context.scene
-        name, folder = steps.own_camera(scene), steps.shot_folder(scene)
+        name, folder = steps.own_camera(scene), chosen.shot_folder(scene)
         if not name or folder is None or bpy.app.background:
             return super().execute(context)
-        supervisor.sample(scene, folder, cameras.sample_path(scene, name, folder, scene.splannequin.freeze_width))
+        supervisor.sample(scene, folder, own_camera.sample_path(scene, name, folder, scene.splannequin.freeze_width))
         return {"FINISHED"}
 
     def params(self, scene: Any) -> Any:
         """Reads the artist's camera, if one is chosen, all at once."""
-        name, folder = steps.own_camera(scene), steps.shot_folder(scene)
+        name, folder = steps.own_camera(scene), chosen.shot_folder(scene)
         if not name or folder is None:
             return None
-        return _read_camera(cameras.sample_path(scene, name, folder, scene.splannequin.freeze_width), scene, "freeze")
+        return _read_camera(
+            own_camera.sample_path(scene, name, folder, scene.splannequin.freeze_width), scene, "freeze"
+        )
 
 
 class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
@@ -141,13 +142,13 @@ class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         """Bakes; a complete take needs no backend."""
         scene = context.scene
-        folder = steps.shot_folder(scene)
+        folder = chosen.shot_folder(scene)
         take = scene.splannequin.take_name
-        if folder is None or backend.available() or not steps.complete(folder, take, insertion.frames_of(scene)):
+        if folder is None or backend.available() or not steps.complete(folder, take, rendering.frames_of(scene)):
             if folder is not None and not bpy.app.background and steps.follows_camera(scene):
                 width = steps.params_of(scene, "bake").width
                 supervisor.sample(
-                    scene, folder, cameras.sample_path(scene, steps.own_camera(scene), folder, width), "bake"
+                    scene, folder, own_camera.sample_path(scene, steps.own_camera(scene), folder, width), "bake"
                 )
                 return {"FINISHED"}
             return super().execute(context)
@@ -165,7 +166,7 @@ class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
 
     def params(self, scene: Any) -> Any:
         """Reads the artist's camera again, if the take is seen from one: what moved since is stale."""
-        folder = steps.shot_folder(scene)
+        folder = chosen.shot_folder(scene)
         if folder is None or not steps.follows_camera(scene):
             return None
         return _read_camera(_turns(scene, folder), scene, "bake")
@@ -173,7 +174,7 @@ class SPLANNEQUIN_OT_bake(_StepOperator, bpy.types.Operator):
     def after(self, scene: Any, job: Any) -> list[str]:
         """Inserts the freeze, then renders."""
         notes = super().after(scene, job)
-        notes += insertion.choose_output(scene, job.shot, job.params["take"])
+        notes += rendering.choose_output(scene, job.shot, job.params["take"])
         bpy.ops.render.render(animation=True, scene=scene.name)
         return notes
 
@@ -195,11 +196,11 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
 
     def _render(self, context: Any, how: str) -> set[str]:
         scene = context.scene
-        folder = steps.shot_folder(scene)
+        folder = chosen.shot_folder(scene)
         if folder is None:
             self.report({"ERROR"}, "No shot is chosen: import a clip first")
             return {"CANCELLED"}
-        notes = insertion.choose_output(scene, folder, scene.splannequin.take_name)
+        notes = rendering.choose_output(scene, folder, scene.splannequin.take_name)
         if notes:
             supervisor.undo_step("bake")
         supervisor.render_began(folder, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
@@ -254,7 +255,7 @@ class SPLANNEQUIN_OT_freeze_as_warp(bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Inserts or updates the group, the other way."""
-        take, warp = context.scene.splannequin.take_name, not compositor.wants_warp(context.scene)
+        take, warp = context.scene.splannequin.take_name, not freeze_group.wants_warp(context.scene)
         return _edit(self, context, "bake", lambda scene, shot: steps.insert_freeze(scene, shot, take, warp))
 
 
@@ -300,7 +301,7 @@ class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         """Takes the current frame, held within the clip's range."""
         scene = context.scene
-        folder = steps.shot_folder(scene)
+        folder = chosen.shot_folder(scene)
         frame = scene.frame_current
         state = supervisor.watch_of(folder).state if folder else None
         if state is not None and state.frames:
@@ -339,7 +340,7 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
         if bpy.app.background:
             cls.poll_message_set(tr("There is no 3D view"))
             return False
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         state = supervisor.watch_of(folder).state if folder else None
         if state is None or context.scene.splannequin.run_name not in state.runs:
             cls.poll_message_set(tr("Train first"))
@@ -390,7 +391,7 @@ class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
 
 def _edit(operator: Any, context: Any, step: str, change: Any) -> set[str]:
     """Runs a change of the scene; says what was done or why not."""
-    folder = steps.shot_folder(context.scene)
+    folder = chosen.shot_folder(context.scene)
     if folder is None:
         operator.report({"ERROR"}, "No shot is chosen: import a clip first")
         return {"CANCELLED"}

@@ -13,12 +13,13 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..bake import compositor, insertion
+from ..bake import freeze_group, shown_take
 from ..freeze import viewport
 from ..process import backend, steps, supervisor
 from ..scene import scene_setup
 from ..settings import PRESETS
-from ..shot import contents, made, markers, places
+from ..shot import chosen, made, markers
+from ..shot.shot_state import ShotState
 from ..solve import align_operators, cameras, guesses, mattes
 from ..train import estimates, pictures, training
 from ..translations import tr
@@ -43,7 +44,7 @@ class View:
     """One sentence: what comes next."""
 
 
-def view_footage(scene: Any, state: contents.ShotState | None) -> View:
+def view_footage(scene: Any, state: ShotState | None) -> View:
     """Footage: what was imported."""
     if state is None or not state.frames:
         chosen = bool(scene.splannequin.clip)
@@ -53,7 +54,7 @@ def view_footage(scene: Any, state: contents.ShotState | None) -> View:
     return View(True, True, lines, "Next: solve the camera.")
 
 
-def view_camera(scene: Any, state: contents.ShotState | None) -> View:
+def view_camera(scene: Any, state: ShotState | None) -> View:
     """Camera: how good the solve is."""
     if state is None or not state.frames:
         return View(False, False, [], steps.STEPS["camera"].needs)
@@ -66,7 +67,7 @@ def view_camera(scene: Any, state: contents.ShotState | None) -> View:
     return View(True, True, lines, "Look through the camera, then train.")
 
 
-def view_train(scene: Any, state: contents.ShotState | None) -> View:
+def view_train(scene: Any, state: ShotState | None) -> View:
     """Train: how good the run is."""
     if state is None or not state.solve:
         return View(False, False, [], steps.STEPS["train"].needs)
@@ -85,7 +86,7 @@ def view_train(scene: Any, state: contents.ShotState | None) -> View:
     return View(True, True, lines, "Next: freeze an instant.")
 
 
-def view_freeze(scene: Any, state: contents.ShotState | None) -> View:
+def view_freeze(scene: Any, state: ShotState | None) -> View:
     """Freeze: which frames there are."""
     if state is None or scene.splannequin.run_name not in state.runs:
         return View(False, False, [], steps.STEPS["freeze"].needs)
@@ -100,20 +101,20 @@ def view_freeze(scene: Any, state: contents.ShotState | None) -> View:
     return View(True, True, lines, "Next: bake it into your compositor.")
 
 
-def view_bake(scene: Any, state: contents.ShotState | None) -> View:
+def view_bake(scene: Any, state: ShotState | None) -> View:
     """Bake: whether the freeze is in the scene's compositor."""
     if state is None or scene.splannequin.take_name not in state.takes:
         return View(False, False, [], steps.STEPS["bake"].needs)
     tree = compat.compositor_tree(scene)
-    if tree is None or compositor.group_node(tree) is None:
+    if tree is None or freeze_group.group_node(tree) is None:
         return View(False, True, [], "Put the freeze before your compositor's output and render.")
-    there, take = compositor.shown(scene), insertion.shown(scene, state.folder)
+    there, take = freeze_group.shown(scene), shown_take.shown(scene, state.folder)
     if there is not None and take != scene.splannequin.take_name:
         shown = f"take {take}" if take else f"another shot, {made.name_of(there[0].parent.parent)}"
         lines = [f"Your compositor shows {shown}: the one that was baked last."]
         return View(False, True, lines, "Baking puts this take in its place.")
     lines = ["The freeze is in your compositor.", *unsure(state.takes[scene.splannequin.take_name])]
-    if insertion.stale_scale(scene, state.folder):
+    if shown_take.stale_scale(scene, state.folder):
         lines.append("The shot was scaled since: its depth is stale until you bake again.")
     if not scene_setup.keeps_plate_colours(scene):
         lines.append(f"The view transform {scene.view_settings.view_transform} changes the plate's colours.")
@@ -139,12 +140,12 @@ class _StepPanel:
     operator = ""
 
     def _watch(self, context: Any) -> supervisor.Watch | None:
-        folder = steps.shot_folder(context.scene)
+        folder = chosen.shot_folder(context.scene)
         return supervisor.watch_of(folder) if folder else None
 
     def _view(self, context: Any) -> View:
         watch = self._watch(context)
-        if watch is not None and places.missing(context.scene, watch.state):
+        if watch is not None and chosen.missing(context.scene, watch.state):
             return View(False, self.step == "footage", [], "" if self.step == "footage" else "Locate the shot first.")
         return VIEWS[self.step](context.scene, watch.state if watch else None)
 
@@ -316,7 +317,7 @@ class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
         """No backend, no shot folder: what to do about it."""
         self._backend_trouble(context, layout)
         watch = self._watch(context)
-        if watch is not None and places.missing(context.scene, watch.state):
+        if watch is not None and chosen.missing(context.scene, watch.state):
             box = layout.box()
             column = box.column(align=True)
             column.alert = True
@@ -346,7 +347,7 @@ class SPLANNEQUIN_PT_footage(_StepPanel, bpy.types.Panel):
 
     def _label(self, context: Any, view: View) -> str:
         watch = self._watch(context)
-        gone = watch is not None and places.missing(context.scene, watch.state)
+        gone = watch is not None and chosen.missing(context.scene, watch.state)
         return "Import Anew" if gone else super()._label(context, view)
 
     def draw_advanced(self, context: Any, layout: Any) -> None:
@@ -425,7 +426,7 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
         if plan.words:
             wrap(layout, context, plan.words, "PAUSE" if self._paused(context) else "INFO")
 
-    def _presets(self, context: Any, layout: Any, state: contents.ShotState | None) -> None:
+    def _presets(self, context: Any, layout: Any, state: ShotState | None) -> None:
         """A button for each preset: how large, how many steps, how long on this machine."""
         props, (rows, told) = context.scene.splannequin, estimates.costs(state)
         column = layout.column(align=True)
@@ -485,7 +486,7 @@ class SPLANNEQUIN_PT_train(_StepPanel, bpy.types.Panel):
             (_, first), (seconds, last) = points[0], points[-1]
             wrap(body, context, f"{first:.1f} to {last:.1f} dB on frames kept out, in {minutes(seconds)}", "NONE")
 
-    def _runs(self, context: Any, state: contents.ShotState) -> None:
+    def _runs(self, context: Any, state: ShotState) -> None:
         """All runs of the shot, to compare and pick."""
         if not state.listed("run"):
             return

@@ -193,27 +193,33 @@ def test_no_solve_no_alignment(scene):
 
 
 def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, built, shot):
-    bake, compositor, cameras = addon("bake.insertion"), addon("bake.compositor"), addon("solve.cameras")
+    cameras = addon("solve.cameras")
     panel, state = addon("ui.step_panel"), addon("shot.contents").read(shot)
     addon("process.steps").insert_freeze(built, shot, "freeze")
-    assert compositor.shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
+    assert addon("bake.freeze_group").shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
     places = world(addon, built, shot)[[0, 1]]
     apart = float(np.linalg.norm(places[1] - places[0]))
     bpy.ops.splannequin.align_scale(places=places.ravel(), distance=3 * apart)
-    assert compositor.shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not bake.stale_scale(built, shot)
+    assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not addon(
+        "bake.shown_take"
+    ).stale_scale(built, shot)
     assert "compositor follows" in addon("process.supervisor").watch_of(shot).notes["camera"][0]
     root = cameras.find(built, shot, "EMPTY")
     root.scale = (5.0, 5.0, 5.0)  # by hand
     bpy.context.view_layer.update()
-    assert bake.stale_scale(built, shot)
+    assert addon("bake.shown_take").stale_scale(built, shot)
     assert any("stale" in line for line in panel.view_bake(built, state).state)
     addon("process.steps").insert_freeze(built, shot, "freeze")
-    assert compositor.shown(built)[1] == pytest.approx(5.0) and not bake.stale_scale(built, shot)
+    assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(5.0) and not addon(
+        "bake.shown_take"
+    ).stale_scale(built, shot)
     assert panel.view_bake(built, state).state[0] == "The freeze is in your compositor."
     built.frame_set(6)
     graph = bpy.context.evaluated_depsgraph_get()
     camera = built.camera.evaluated_get(graph)
     window = camera.calc_matrix_camera(graph, x=16, y=12)
-    viewmat, _ = cameras.in_solve(built, shot, camera.matrix_world.normalized().inverted(), window, 16, 12)
+    viewmat, _ = addon("freeze.own_camera").in_solve(
+        built, shot, camera.matrix_world.normalized().inverted(), window, 16, 12
+    )
     want = contract.CameraPath.load(shot / "solve" / "cameras.json").frames[1].viewmat
     np.testing.assert_allclose(viewmat, want, atol=1e-4)

@@ -22,7 +22,7 @@ def poses_of(shot: Path) -> tuple[list[dict], int, int]:
 
 
 def test_identity_camera_looks_along_z_with_y_down(addon):
-    matrix = addon("solve.cameras").camera_to_world(np.eye(4))
+    matrix = addon("scene.axes").camera_to_world(np.eye(4))
     # Blender's camera looks along its -z and has y up: in OpenCV's world that is +z and -y.
     np.testing.assert_allclose(matrix @ [0, 0, -1, 0], [0, 0, 1, 0])
     np.testing.assert_allclose(matrix @ [0, 1, 0, 0], [0, -1, 0, 0])
@@ -32,20 +32,20 @@ def test_identity_camera_looks_along_z_with_y_down(addon):
 def test_translation_moves_the_camera_the_other_way(addon):
     viewmat = np.eye(4)
     viewmat[:3, 3] = (1, 2, 3)
-    np.testing.assert_allclose(addon("solve.cameras").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
+    np.testing.assert_allclose(addon("scene.axes").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
 
 
 def test_blenders_axes_are_y_up_and_z_back(addon):
-    cameras = addon("solve.cameras")
+    addon("solve.cameras")
     turn = np.array([[0, 0, 1, 0.4], [1, 0, 0, -2.0], [0, 1, 0, 7.0], [0, 0, 0, 1]], dtype=np.float64)
-    matrix = cameras.camera_to_world(turn)
+    matrix = addon("scene.axes").camera_to_world(turn)
     np.testing.assert_allclose(np.linalg.inv(matrix @ np.diag([1.0, -1.0, -1.0, 1.0])), turn, atol=1e-12)
 
 
 def test_lens_of_a_centred_and_a_shifted_principal_point(addon):
-    cameras = addon("solve.cameras")
-    assert cameras.lens_from_k((640, 640, 320, 240), 640, 480) == (36.0, 0.0, 0.0)
-    lens, shift_x, shift_y = cameras.lens_from_k((1280, 1280, 330, 220), 640, 480)
+    addon("solve.cameras")
+    assert addon("scene.axes").lens_from_k((640, 640, 320, 240), 640, 480) == (36.0, 0.0, 0.0)
+    lens, shift_x, shift_y = addon("scene.axes").lens_from_k((1280, 1280, 330, 220), 640, 480)
     assert (lens, shift_x, shift_y) == (72.0, -10 / 640, -20 / 640)
 
 
@@ -53,7 +53,7 @@ def test_lens_of_a_centred_and_a_shifted_principal_point(addon):
     ("k", "aspect"), [((500, 500, 0, 0), (1, 1)), ((500, 400, 0, 0), (1, 1.25)), ((400, 500, 0, 0), (1.25, 1))]
 )
 def test_pixel_aspect_stays_above_one(addon, k, aspect):
-    np.testing.assert_allclose(addon("solve.cameras").pixel_aspect(k), aspect)
+    np.testing.assert_allclose(addon("scene.axes").pixel_aspect(k), aspect)
 
 
 @pytest.mark.parametrize("fy", [20.0, 16.0, 25.0])
@@ -153,7 +153,7 @@ def test_second_build_replaces_and_keeps_the_roots_place(addon, scene, shot):
     ]
     assert tuple(cameras.find(scene, shot, "EMPTY").location) == (1.0, 2.0, 3.0)
     bpy.context.view_layer.update()
-    assert cameras.depth_scale(scene, shot) == pytest.approx(2.0)
+    assert addon("shot.made").depth_scale(scene, shot) == pytest.approx(2.0)
 
 
 def test_remove_leaves_nothing(addon, scene, shot):
@@ -226,7 +226,7 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     assert addon("process.steps").own_camera(scene) == "mine"
     scene.frame_start, scene.frame_end, scene.frame_step = 5, 7, 1
     scene.frame_set(6)
-    path = run_out(cameras.sample_path(scene, "mine", shot, 0))
+    path = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
     want = contract.CameraPath.load(shot / "solve" / "cameras.json")
     assert scene.frame_current == 6
     assert (path.width, path.height) == (want.width, want.height)
@@ -235,7 +235,7 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
         np.testing.assert_allclose(found.viewmat, solved.viewmat, atol=5e-5)
         np.testing.assert_allclose(found.K, solved.K, rtol=1e-4)
     own.data.lens *= 2.0
-    wide = run_out(cameras.sample_path(scene, "mine", shot, 64))
+    wide = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 64))
     assert (wide.width, wide.height) == (64, 48)
     np.testing.assert_allclose(wide.frames[0].K[0], 8 * want.frames[0].K[0], rtol=1e-4)
     params = addon("process.steps").freeze_from(scene, wide)
@@ -243,7 +243,7 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     assert params.width == 64
     own.data.type = "ORTHO"
     with pytest.raises(contract.JobError, match="mine is not a perspective camera"):
-        run_out(cameras.sample_path(scene, "mine", shot, 0))
+        run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
     scene.splannequin.path_camera = scene.camera
     assert addon("process.steps").own_camera(scene) == "", "the clip's own camera is the clip's own move"
 

@@ -14,7 +14,7 @@ def costs(addon, tmp_path):
     """costs(runs, width) is {preset: cost} for a shot of that width, and the run that tells it."""
 
     def call(runs, width=1280):
-        state = addon("shot.contents").ShotState(tmp_path, {"width": width, "height": 720}, runs=runs)
+        state = addon("shot.shot_state").ShotState(tmp_path, {"width": width, "height": 720}, runs=runs)
         rows, told = addon("train.estimates").costs(state)
         return {row.preset: row for row in rows}, told
 

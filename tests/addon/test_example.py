@@ -67,5 +67,5 @@ def test_the_shipped_example_opens_and_names_its_frames_relative_to_itself(root,
             assert image.filepath.startswith("//") and demo in absolute(image.filepath).parents
     assert addon("solve.cameras").find(scene, demo, "CAMERA") == scene.camera
     assert len(addon("solve.cameras").find(scene, demo, "MESH").data.vertices) > 1000
-    assert addon("bake.compositor").group_node(addon("compat").compositor_tree(scene)) is not None
+    assert addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene)) is not None
     assert (scene.frame_start, scene.frame_end) == (1, 74)

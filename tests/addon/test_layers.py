@@ -40,7 +40,7 @@ def graded(addon, scene, detailed):
     plate.image = bpy.data.images.load(str(folder / "000005.exr"))
     plate.image.source = "SEQUENCE"
     compat.set_image_colour(plate.image, "linear")
-    addon("bake.compositor").show_sequence(plate, plate.image, 5, 6)
+    addon("scene.sequences").show_sequence(plate, plate.image, 5, 6)
     grade, _, first, second, result = compat.new_mix_node(tree, "MULTIPLY")
     grade.inputs[0].default_value = 1.0
     second.default_value = (2.0, 2.0, 0.5, 1.0)
@@ -72,7 +72,7 @@ def render(scene, folder: Path, frame: int = 6, size=SIZE) -> np.ndarray:
 
 
 def node_of(addon, scene):
-    return addon("bake.compositor").group_node(addon("compat").compositor_tree(scene))
+    return addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
 
 
 def relative(found: np.ndarray, expected: np.ndarray) -> float:
@@ -102,7 +102,7 @@ def test_st_map_matte_and_fill_give_the_delivered_frame_back(addon, scene, detai
 
 
 def test_the_grade_goes_on_behind_the_warped_plate_and_goes_before_it(addon, scene, detailed, graded, tmp_path):
-    compositor, compat = addon("bake.compositor"), addon("compat")
+    compat = addon("compat")
     addon("process.steps").insert_freeze(scene, detailed, "detail", warp=True)
     node = node_of(addon, scene)
     assert node.inputs["Image"].links[0].from_node.bl_idname == "CompositorNodeImage", "as the plate"
@@ -110,7 +110,7 @@ def test_the_grade_goes_on_behind_the_warped_plate_and_goes_before_it(addon, sce
     scene.splannequin.insert_at = "OUTPUT"
     addon("process.steps").insert_freeze(scene, detailed, "detail")
     node = node_of(addon, scene)
-    assert compat.output_socket(graded).links[0].from_node == node and compositor.wants_warp(scene)
+    assert compat.output_socket(graded).links[0].from_node == node and addon("bake.freeze_group").wants_warp(scene)
     moved = made.WIDTH * 2 // 3  # beyond, other things than the plate are in the picture, and they are not graded
     expected = made.moved(made.plate(6) * GRADE, 6)
     assert relative(render(scene, tmp_path)[:, :moved, :3], expected[:, :moved]) < 1e-3
@@ -134,7 +134,7 @@ def test_a_plate_of_another_size_is_brought_to_that_of_the_warp(addon, scene, de
 
 
 def test_the_warp_is_switched_and_removed_without_a_trace(addon, scene, detailed, graded):
-    compositor = addon("bake.compositor")
+    addon("bake.compositor")
     scene.splannequin.shot_path, scene.splannequin.take_name = str(detailed), "detail"
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
     links = {(k.from_socket.path_from_id(), k.to_socket.path_from_id()) for k in graded.links}
@@ -147,7 +147,7 @@ def test_the_warp_is_switched_and_removed_without_a_trace(addon, scene, detailed
     assert bpy.ops.splannequin.freeze_as_warp() == {"FINISHED"}
     node = node_of(addon, scene)
     assert "As Warp" not in node.inputs and "Warp detail" not in bpy.data.images
-    assert node.inputs["Mix"].default_value == 0.5 and not compositor.wants_warp(scene)
+    assert node.inputs["Mix"].default_value == 0.5 and not addon("bake.freeze_group").wants_warp(scene)
     bpy.ops.splannequin.freeze_as_warp()
     assert addon("bake.insertion").remove(scene)
     assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
@@ -188,7 +188,7 @@ def test_pictures_read_ahead_for_a_warp_are_those_that_come_in(addon, scene, det
     count = len(bpy.data.images)
     assert len(list(bake.read_ahead(scene, detailed, "detail"))) == 2
     bake.insert(scene, detailed, "detail")
-    assert len(bpy.data.images) == count and not addon("bake.compositor")._ahead
+    assert len(bpy.data.images) == count and not addon("scene.sequences")._ahead
 
 
 @pytest.mark.parametrize("show", [0.0, 0.5, 1.0])
@@ -236,7 +236,7 @@ def test_a_take_of_splats_alone_says_that_it_cannot_tell(addon, scene, shot, lay
 
 def test_a_group_of_an_older_file_gets_the_new_sockets_and_keeps_its_own(addon, scene, detailed, graded, tmp_path):
     """As 0.5 left it: without them, with links and values of the artist's."""
-    compositor, compat = addon("bake.compositor"), addon("compat")
+    compat = addon("compat")
     addon("process.steps").insert_freeze(scene, detailed, "freeze")
     node = node_of(addon, scene)
     face = node.node_tree.interface
@@ -252,7 +252,7 @@ def test_a_group_of_an_older_file_gets_the_new_sockets_and_keeps_its_own(addon, 
     assert (
         relative(render(scene, tmp_path)[..., :3], made.frozen(6).astype(np.float32).astype(np.float16) * GRADE) < 1e-3
     )
-    assert compositor.group_node(compat.compositor_tree(scene)) == node
+    assert addon("bake.freeze_group").group_node(compat.compositor_tree(scene)) == node
 
 
 def test_the_command_line_bakes_a_warp_into_the_artists_file(addon, scene, detailed, graded, tmp_path, capsys):

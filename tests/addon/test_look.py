@@ -50,8 +50,8 @@ def grainy(addon, scene, shot):
     compositor = addon("bake.compositor")
     scene.render.resolution_x, scene.render.resolution_y = grains.WIDTH, grains.HEIGHT
     scene.render.resolution_percentage = 100
-    compositor.insert(scene, compositor.take_of(folder))
-    node = compositor.group_node(addon("compat").compositor_tree(scene))
+    compositor.insert(scene, addon("bake.take_files").take_of(folder))
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     scene.frame_start, scene.frame_end = grains.FRAMES
     addon("scene.scene_setup").keep_plate_colours(scene)
     exr_output(scene)
@@ -59,7 +59,7 @@ def grainy(addon, scene, shot):
     def render(factor: float) -> np.ndarray:
         node.inputs["Grain"].default_value = factor
         out = shot / f"out{factor}"
-        addon("bake.insertion").render(scene, out, png=False)
+        addon("bake.rendering").render(scene, out, png=False)
         return np.stack([read_exr(out / f"{n:06d}.exr") for n in grains.FRAMES])
 
     return render
@@ -84,7 +84,7 @@ def test_grain_at_1_is_the_plates_and_another_one_on_every_frame(grainy):
 
 
 def test_grain_does_not_cover_what_stands_behind(addon, scene, grainy):
-    node = addon("bake.compositor").group_node(addon("compat").compositor_tree(scene))
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     node.inputs["CG"].default_value = (0.0, 1.0, 0.0, 1.0)  # far behind, seen where the frame covers half
     grey, half = linear_of(np.float64(grains.VALUE)), grains.WIDTH // 2
     mean = grainy(1.0)[:, :, half:, :3].mean(axis=(0, 1, 2))
@@ -94,7 +94,7 @@ def test_grain_does_not_cover_what_stands_behind(addon, scene, grainy):
 def test_grain_at_0_leaves_every_bit(addon, scene, grainy, shot):
     """Against the same group over frames that have no grain layer at all."""
     clean = grainy(0.0)
-    group = addon("bake.compositor").group_node(addon("compat").compositor_tree(scene)).node_tree
+    group = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene)).node_tree
     mix = group.nodes["Grain"]
     clean_picture, _ = [s for s in mix.inputs if s.is_linked and s.type == "RGBA"]
     socket = clean_picture.links[0].from_socket
@@ -106,14 +106,14 @@ def test_grain_at_0_leaves_every_bit(addon, scene, grainy, shot):
 
 def test_a_take_without_grain_still_bakes_and_one_with_it_takes_its_place(addon, scene, shot, tmp_path):
     compositor = addon("bake.compositor")
-    compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))
-    node = compositor.group_node(addon("compat").compositor_tree(scene))
+    compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "freeze"))
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     assert "Grain" not in node.node_tree.nodes and node.inputs["Grain"].default_value == 0.0
     node.inputs["Grain"].default_value = 0.7
-    said = compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))
+    said = compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "freeze"))
     assert any("no grain" in line for line in said)
     shutil.copytree(grains.FOLDER, shot / "takes" / "grain")
-    said = compositor.insert(scene, compositor.take_of(shot / "takes" / "grain"))
+    said = compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "grain"))
     assert not any("no grain" in line for line in said)
     assert "Grain" in node.node_tree.nodes and node.inputs["Grain"].default_value == pytest.approx(0.7)
 
@@ -144,8 +144,8 @@ def test_the_plate_passes_through_untouched(addon, scene, shot, pictures, settin
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 64, 48, 100
     take = shot / "takes" / "grain"
     shutil.copytree(grains.FOLDER, take)
-    compositor.insert(scene, compositor.take_of(take), shot / "frames" / "000005.png")
-    node = compositor.group_node(compat.compositor_tree(scene))
+    compositor.insert(scene, addon("bake.take_files").take_of(take), shot / "frames" / "000005.png")
+    node = addon("bake.freeze_group").group_node(compat.compositor_tree(scene))
     for name, value in SETTINGS[setting].items():
         node.inputs[name].default_value = value
     scene.frame_start = scene.frame_end = 6
@@ -153,7 +153,7 @@ def test_the_plate_passes_through_untouched(addon, scene, shot, pictures, settin
     if kind != "PNG":
         exr_output(scene, kind)
     out = shot / "out"
-    addon("bake.insertion").render(scene, out, png=kind == "PNG")
+    addon("bake.rendering").render(scene, out, png=kind == "PNG")
     expected = source / 255.0
     if kind == "PNG":
         assert np.abs(pictures.read(out / "000006.png") - expected).max() * 255 < 0.5, "the very levels"
@@ -176,7 +176,7 @@ def read_layers(addon, path: Path, folder: Path) -> np.ndarray:
     addon("scene.scene_setup").keep_plate_colours(scene)
     exr_output(scene)
     scene.frame_start = scene.frame_end = 1
-    addon("bake.insertion").render(scene, folder / "read", png=False)
+    addon("bake.rendering").render(scene, folder / "read", png=False)
     return read_exr(folder / "read" / "000001.exr")
 
 
@@ -184,7 +184,7 @@ def read_layers(addon, path: Path, folder: Path) -> np.ndarray:
 @pytest.mark.parametrize("movie", [True, False])
 def test_a_render_is_cancelled_between_frames_and_its_file_closed(addon, scene, shot, contract, movie, stop_at):
     compositor = addon("bake.compositor")
-    compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))
+    compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "freeze"))
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 64, 48, 100
     scene.frame_start, scene.frame_end = 5, 14
     scene.frame_step = 2
@@ -202,7 +202,7 @@ def test_a_render_is_cancelled_between_frames_and_its_file_closed(addon, scene, 
             raise contract.Cancelled
 
     with pytest.raises(contract.Cancelled):
-        addon("bake.insertion").render(
+        addon("bake.rendering").render(
             scene, shot / "out", not movie, lambda done, total: seen.append((done, total)), check
         )
     assert seen == [(n + 1, 5) for n in range(stop_at)]

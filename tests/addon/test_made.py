@@ -35,7 +35,7 @@ def test_copies_of_ours_are_the_artists(addon, built, shot):
     assert {kind: cameras.find(built, shot, kind) for kind in ours} == ours
     copies["aa renamed"].scale = (3.0, 3.0, 3.0)
     bpy.context.view_layer.update()
-    assert cameras.depth_scale(built, shot) == pytest.approx(1.0)
+    assert addon("shot.made").depth_scale(built, shot) == pytest.approx(1.0)
     names = sorted(c.name for c in copies.values())
     cameras.build(built, shot)
     assert sorted(c.name for c in copies.values()) == names, "a second build spares them"

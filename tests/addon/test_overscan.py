@@ -25,28 +25,28 @@ def take(addon, shot):
     facts = {"version": 1, "take": "over", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 1}
     facts |= {"width": 12, "height": 10, "first": 6, "last": 6, "overscan": -1.0, "margin": list(MARGIN)}
     (folder / "take.json").write_text(json.dumps(facts))
-    return addon("bake.compositor").take_of(folder)
+    return addon("bake.take_files").take_of(folder)
 
 
 def render(addon, scene, folder: Path, size=(12, 10)) -> Path:
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *size, 100
     scene.frame_start = scene.frame_end = 6
     addon("scene.scene_setup").keep_plate_colours(scene)
-    addon("bake.insertion").render(scene, folder)
+    addon("bake.rendering").render(scene, folder)
     return folder / "000006.png"
 
 
 def test_frame_and_margin_come_from_the_exr_header(addon, take, shot, tmp_path):
-    compositor = addon("bake.compositor")
+    addon("bake.compositor")
     assert (take.size, take.margin) == ((12, 10), MARGIN)
-    assert compositor.exr_windows(shot / "takes" / "freeze" / "000006.exr") == ((16, 12), (0, 0))
+    assert addon("bake.take_files").exr_windows(shot / "takes" / "freeze" / "000006.exr") == ((16, 12), (0, 0))
     file = tmp_path / "aside.exr"
     header = bytearray((DATA / "overscan" / "000006.exr").read_bytes())
     at = header.find(b"displayWindow\0box2i\0") + len(b"displayWindow\0box2i\0") + 4
     header[at + 8 : at + 12] = (12).to_bytes(4, "little")  # the frame ends one pixel farther right
     file.write_bytes(header)
     with pytest.raises(ValueError, match="equally far"):
-        compositor.exr_windows(file)
+        addon("bake.take_files").exr_windows(file)
 
 
 def test_the_scene_takes_the_size_of_the_frame(addon, scene, shot, take):
@@ -63,7 +63,7 @@ def test_every_layer_stands_over_the_plate_pixel_by_pixel(addon, scene, take, tm
     take.depth_scale = 1.0 / 32.0
     compositor.insert(scene, take)
     tree = compat.compositor_tree(scene)
-    tree.links.new(compositor.group_node(tree).outputs[output], compat.output_socket(tree))
+    tree.links.new(addon("bake.freeze_group").group_node(tree).outputs[output], compat.output_socket(tree))
     found = pictures.read(render(addon, scene, tmp_path))
     assert found.shape == (10, 12, 3)
     data = {"Image": layers(6)["rgba"][..., :3], "Depth": layers(6)["depth"] / 32.0}
@@ -82,7 +82,7 @@ def test_the_artists_stream_and_the_mattes_fall_on_the_same_pixels(addon, scene,
     stream.image.pixels.foreach_set(own[::-1].ravel())
     tree.links.new(stream.outputs["Image"], compat.output_socket(tree))
     compositor.insert(scene, take)
-    group = compositor.group_node(tree)
+    group = addon("bake.freeze_group").group_node(tree)
     group.inputs["Only Supported"].default_value = 1.0
     group.inputs["Wipe"].default_value = 0.5
     found = pictures.read(render(addon, scene, tmp_path))
@@ -221,7 +221,7 @@ def test_the_command_line_writes_maps_of_any_width(addon, lens_shot, tmp_path, c
     assert headless.main(["stmaps", str(lens_shot), "--json", "--width", "320"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["width"], facts["height"]) == (320, 240)
-    assert addon("bake.compositor").exr_size(Path(facts["redistort"])) == (320, 240)
+    assert addon("bake.take_files").exr_size(Path(facts["redistort"])) == (320, 240)
     assert headless.main(["stmaps", str(lens_shot), "--width", "7"]) == 2
     assert "cannot be 7 pixels wide" in capsys.readouterr().err
     assert headless.main(["stmaps", str(tmp_path)]) == 2

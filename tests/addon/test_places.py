@@ -42,8 +42,8 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     blend(project)
     there = moved(project)
     scene = opened(there)
-    assert addon("process.steps").shot_folder(scene) == there / "people.splannequin"
-    assert addon("shot.places").absolute(scene.splannequin.clip) == str(there / "people.mp4")
+    assert addon("shot.chosen").shot_folder(scene) == there / "people.splannequin"
+    assert addon("scene.paths").absolute(scene.splannequin.clip) == str(there / "people.mp4")
     assert addon("process.steps").params_of(scene, "footage").source == str(there / "people.mp4")
     assert addon("solve.cameras").find(scene, there / "people.splannequin", "CAMERA") == scene.camera
     assert plate_file() == there / "people.splannequin" / "frames" / "000005.png"
@@ -54,7 +54,7 @@ def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
     blend(project)
     copy = Path(shutil.copytree(project, project.with_name("copy")))
     scene = opened(copy)
-    assert addon("process.steps").shot_folder(scene) == copy / "people.splannequin"
+    assert addon("shot.chosen").shot_folder(scene) == copy / "people.splannequin"
     assert addon("solve.cameras").find(scene, copy / "people.splannequin", "CAMERA") == scene.camera
 
 
@@ -67,7 +67,7 @@ def test_an_older_file_that_holds_whole_paths_is_found_beside(addon, project):
         bpy.context.preferences.filepaths.use_relative_paths = True
     there = moved(project)
     scene = opened(there)
-    assert addon("process.steps").shot_folder(scene) == there / "people.splannequin"
+    assert addon("shot.chosen").shot_folder(scene) == there / "people.splannequin"
 
 
 def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_path):
@@ -75,24 +75,22 @@ def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_pa
     (tmp_path / "other").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "copy.blend"), copy=True)
     scene = bpy.context.scene
-    assert addon("process.steps").shot_folder(scene) == project / "people.splannequin", (
-        "the open file stays where it is"
-    )
+    assert addon("shot.chosen").shot_folder(scene) == project / "people.splannequin", "the open file stays where it is"
     assert scene.splannequin.clip == "//people.mp4"
     blend(tmp_path / "other")
-    assert addon("process.steps").shot_folder(bpy.context.scene) == project / "people.splannequin"
+    assert addon("shot.chosen").shot_folder(bpy.context.scene) == project / "people.splannequin"
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "other" / "copy.blend"))
-    assert addon("process.steps").shot_folder(bpy.context.scene) == project / "people.splannequin"
+    assert addon("shot.chosen").shot_folder(bpy.context.scene) == project / "people.splannequin"
 
 
 def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     blend(project)
-    places, steps = addon("shot.places"), addon("process.steps")
+    steps = addon("process.steps")
     before, there = project / "people.splannequin", project / "renamed.splannequin"
     before.rename(there)
     scene = opened(project)
     watch = addon("process.supervisor").watch_of(before)
-    assert places.missing(scene, watch.state)
+    assert addon("shot.chosen").missing(scene, watch.state)
     for step in ("camera", "train", "freeze", "bake"):
         with pytest.raises(contract.JobError, match="is not there any more") as told:
             steps.begin(scene, step)
@@ -103,17 +101,17 @@ def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     with pytest.raises(RuntimeError, match="is no shot folder"):
         bpy.ops.splannequin.locate_shot(directory=str(project))
     assert bpy.ops.splannequin.locate_shot(directory=f"{there}/") == {"FINISHED"}
-    assert steps.shot_folder(scene) == there and scene.splannequin.shot_path == "//renamed.splannequin"
+    assert addon("shot.chosen").shot_folder(scene) == there and scene.splannequin.shot_path == "//renamed.splannequin"
     assert addon("solve.cameras").find(scene, there, "CAMERA") == scene.camera
     assert plate_file() == there / "frames" / "000005.png"
-    assert addon("bake.insertion").shown(scene, there) == "freeze", "the compositor's frames followed"
-    assert not places.missing(scene, addon("shot.contents").read(there))
+    assert addon("bake.shown_take").shown(scene, there) == "freeze", "the compositor's frames followed"
+    assert not addon("shot.chosen").missing(scene, addon("shot.contents").read(there))
 
 
 def test_a_shot_that_is_yet_to_be_made_is_not_missed(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "new.mp4")
-    folder = addon("process.steps").shot_folder(scene)
-    assert not addon("shot.places").missing(scene, addon("shot.contents").read(folder))
+    folder = addon("shot.chosen").shot_folder(scene)
+    assert not addon("shot.chosen").missing(scene, addon("shot.contents").read(folder))
 
 
 def test_the_timer_remembers_a_shot_that_was_chosen(addon, scene, shot):
@@ -121,7 +119,7 @@ def test_the_timer_remembers_a_shot_that_was_chosen(addon, scene, shot):
     addon("process.supervisor").watch_of(shot)
     addon("process.supervisor").tick()
     shot.rename(shot.with_name("gone"))
-    assert addon("shot.places").missing(scene, addon("shot.contents").read(shot))
+    assert addon("shot.chosen").missing(scene, addon("shot.contents").read(shot))
 
 
 def test_the_footage_of_a_moved_shot_is_found_beside_it(addon, scene, shot, clip, tmp_path):

@@ -37,7 +37,7 @@ def with_runs(scene, shot):
 
 
 def plan(addon, scene):
-    state = addon("shot.contents").read(addon("process.steps").shot_folder(scene))
+    state = addon("shot.contents").read(addon("shot.chosen").shot_folder(scene))
     return addon("train.training").plan(state, scene.splannequin.run_name, scene.splannequin.preset)
 
 

@@ -29,7 +29,7 @@ def two(addon, scene, shot, other):
 
 
 def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
-    props, steps, shot_list = scene.splannequin, addon("process.steps"), addon("shot.chosen")
+    props, shot_list = scene.splannequin, addon("shot.chosen")
     assert not bpy.ops.splannequin.shot_add.poll(), "there is no first shot yet"
     props.shot_path, props.clip = str(shot), "//first.mov"
     own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
@@ -49,10 +49,10 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     assert (props.clip, props.shot_path, props.run_name, props.path_camera) == ("", "", "main", None)
     assert props.set_up_scene, "what is the scene's own stays"
     props.shot_path, props.t_star = str(other), 7
-    assert shot_list.folders(scene) == [shot, other] and steps.shot_folder(scene) == other
+    assert shot_list.folders(scene) == [shot, other] and addon("shot.chosen").shot_folder(scene) == other
     assert [shot_list.label(one) for one in shot_list.settings(scene)] == ["my shot é", "second"]
     props.active_shot = 0
-    assert steps.shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
+    assert addon("shot.chosen").shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
     assert shot_list.folders(scene) == [shot, other]
     props.active_shot = 1
     assert (props.shot_path, props.t_star, props.run_name) == (str(other), 7, "main")
@@ -178,7 +178,7 @@ def things(scene) -> set[str]:
 
 
 def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
-    props, steps, compositor = scene.splannequin, addon("process.steps"), addon("bake.compositor")
+    props, steps = scene.splannequin, addon("process.steps")
     props.shot_path = str(shot)
     steps.load_camera(scene, shot)
     steps.insert_freeze(scene, shot, "freeze")
@@ -190,23 +190,23 @@ def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
     steps.load_camera(scene, other)
     assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
     assert things(scene) == before
-    assert not len(props.shots) and steps.shot_folder(scene) == shot
+    assert not len(props.shots) and addon("shot.chosen").shot_folder(scene) == shot
     assert scene.camera == addon("solve.cameras").find(scene, shot, "CAMERA")
     bpy.context.view_layer.update()
     np.testing.assert_array_equal(scene.camera.matrix_world, pose)
-    assert compositor.shown(scene)[0] == shot / "takes" / "freeze"
+    assert addon("bake.freeze_group").shown(scene)[0] == shot / "takes" / "freeze"
     assert scene.view_settings.view_transform == "Standard", "the shot that stays needs its settings"
     assert not bpy.ops.splannequin.shot_remove.poll()
     steps.remove_all(scene, shot)
-    assert compositor.shown(scene) is None and scene.view_settings.view_transform == "AgX"
+    assert addon("bake.freeze_group").shown(scene) is None and scene.view_settings.view_transform == "AgX"
     assert scene.render.resolution_x == 1920
 
 
 def test_removing_the_baked_shot_takes_its_group_out(addon, two, shot, other):
-    steps, compositor = addon("process.steps"), addon("bake.compositor")
+    steps = addon("process.steps")
     steps.insert_freeze(two, other, "freeze")
     steps.remove_all(two, other)
-    assert compositor.shown(two) is None and addon("solve.cameras").find(two, shot, "CAMERA")
+    assert addon("bake.freeze_group").shown(two) is None and addon("solve.cameras").find(two, shot, "CAMERA")
     assert two.render.resolution_x == 16, "the settings go with the last shot"
 
 
@@ -233,7 +233,7 @@ def test_undo_brings_a_shot_back(addon, two, shot, other):
     assert addon("shot.chosen").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
     assert scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
     scene.splannequin.active_shot = 0
-    assert addon("process.steps").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
+    assert addon("shot.chosen").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
 
 
 def ended(addon, contract, folder, step, kind, params, result):
@@ -270,7 +270,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
     props.active_shot = 0
     supervisor.tick()
     assert props.t_star == 6 and cameras.find(scene, shot, "CAMERA") == scene.camera
-    assert addon("bake.compositor").shown(scene) is None, "choosing a shot bakes nothing"
+    assert addon("bake.freeze_group").shown(scene) is None, "choosing a shot bakes nothing"
     assert "Bake again" in supervisor.watch_of(shot).notes["bake"][0]
     props.t_star = 7
     supervisor.tick()

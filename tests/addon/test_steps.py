@@ -68,13 +68,13 @@ def test_a_folder_of_no_shot_is_refused(scene, tmp_path):
 
 def test_the_shot_folder_stands_beside_the_clip(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a clip.mov")
-    assert addon("process.steps").shot_folder(scene) == tmp_path / "a clip.splannequin"
+    assert addon("shot.chosen").shot_folder(scene) == tmp_path / "a clip.splannequin"
 
 
 def test_relative_paths_follow_the_blend(addon, scene, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.context.scene.splannequin.shot_path = "//x.splannequin"
-    assert addon("process.steps").shot_folder(bpy.context.scene) == tmp_path / "x.splannequin"
+    assert addon("shot.chosen").shot_folder(bpy.context.scene) == tmp_path / "x.splannequin"
 
 
 def test_load_camera_is_one_undo_step(with_shot, shot, addon):
@@ -125,7 +125,7 @@ def test_bake_without_a_backend_renders_a_complete_take(
 
 def test_the_artists_output_path_is_kept(addon, with_shot, shot, tmp_path):
     with_shot.render.filepath = str(tmp_path / "mine_")
-    assert addon("bake.insertion").choose_output(with_shot, shot, "freeze") == []
+    assert addon("bake.rendering").choose_output(with_shot, shot, "freeze") == []
     assert with_shot.render.filepath == str(tmp_path / "mine_")
 
 
@@ -211,7 +211,7 @@ def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_pat
         props.clip = str(shutil.copy(clip, tmp_path / name))
         steps.run(scene, "footage")
     assert {p.name for p in tmp_path.glob("*.splannequin")} == {"first.splannequin", "second.splannequin"}
-    assert steps.shot_folder(scene) == tmp_path / "second.splannequin"
+    assert addon("shot.chosen").shot_folder(scene) == tmp_path / "second.splannequin"
 
 
 def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, shot, tmp_path):

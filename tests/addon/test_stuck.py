@@ -98,7 +98,7 @@ def test_the_rate_of_a_sequence_is_the_one_that_was_set(addon, scene, tmp_path, 
         pictures.write(tmp_path / f"f.{n:04d}.png", np.ascontiguousarray(wide[:, 8 * n : 8 * n + 160]))
     scene.splannequin.clip, scene.splannequin.fps = str(tmp_path / "f.0001.png"), 30.0
     assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
-    assert addon("shot.contents").read(addon("process.steps").shot_folder(scene)).info["fps"] == 30.0
+    assert addon("shot.contents").read(addon("shot.chosen").shot_folder(scene)).info["fps"] == 30.0
 
 
 def test_after_the_import_the_clip_is_seen_and_nothing_else_is_touched(addon, with_shot, with_raw):

@@ -68,12 +68,12 @@ def main() -> None:
         told["as they come"] = tried(scene, lambda: steps.insert_freeze(scene, shot, "freeze"))
     else:
         told["combined"] = tried(scene, lambda: steps.combine_cg(scene, shot))
-        node = add_on("bake.compositor").group_node(compat.compositor_tree(scene))
+        node = add_on("bake.freeze_group").group_node(compat.compositor_tree(scene))
         node.inputs["CG"].links[0].from_node.mute = True
         scene.frame_start = scene.frame_end = 6
         for name, mix in (("plate", 0.0), ("frozen", 1.0)):
             node.inputs["Mix"].default_value = mix
-            add_on("bake.insertion").render(scene, out / name)
+            add_on("bake.rendering").render(scene, out / name)
     told["removed"] = tried(scene, lambda: steps.remove_all(scene, shot))
     told["end"] = there(scene)
     (out / "told.json").write_text(json.dumps(told))

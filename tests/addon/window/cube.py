@@ -71,7 +71,7 @@ def see(socket, folder: Path, name: str) -> np.ndarray:
     tree.links.new(socket, target)
     settings = scene.render.image_settings
     settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
-    add_on("bake.insertion").render(scene, folder / name, png=False)
+    add_on("bake.rendering").render(scene, folder / name, png=False)
     tree.links.new(kept, target)
     image = bpy.data.images.load(str(folder / name / f"{FRAME:06d}.exr"))
     image.colorspace_settings.name = "Non-Color"
@@ -154,7 +154,7 @@ def keep(picture: Path, folder: Path) -> None:
     settings = scene.render.image_settings
     for quality in (92, 85, 75, 60):
         settings.file_format, settings.quality, settings.color_mode = "JPEG", quality, "RGB"
-        add_on("bake.insertion").render(scene, folder / "jpeg", png=False)
+        add_on("bake.rendering").render(scene, folder / "jpeg", png=False)
         data = (folder / "jpeg" / f"{FRAME:06d}.jpg").read_bytes()
         if len(data) <= 150_000:
             break
@@ -172,9 +172,9 @@ def main() -> None:
     start()
     bake(args.shot.absolute())
     scene = bpy.context.scene
-    compat, compositor = add_on("compat"), add_on("bake.compositor")
+    compat = add_on("compat")
     tree = compat.compositor_tree(scene)
-    group = compositor.group_node(tree)
+    group = add_on("bake.freeze_group").group_node(tree)
     layers = next(n for n in tree.nodes if n.bl_idname == "CompositorNodeRLayers")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
