@@ -15,7 +15,6 @@ from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
 from ..scene import paths
-from ..solve import cameras
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""
@@ -125,5 +124,10 @@ def adopt(scene: Any, shot: Path) -> None:
 
 def depth_scale(scene: Any, shot: Path) -> float:
     """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
-    root = cameras.find(scene, shot, "EMPTY")
+    root = part(scene, shot, "root")
     return float(sum(root.matrix_world.to_scale()) / 3.0) if root else 1.0
+
+
+def is_plate(camera: Any) -> bool:
+    """True of a camera that shows a clip until it is solved, whichever shot's."""
+    return any(entry.plate == camera for scene in bpy.data.scenes for entry in scene.splannequin.made)

@@ -530,7 +530,6 @@ MESSAGES: dict[str, str] = {
     "Set it to Polynomial in the Movie Clip editor and solve its camera again.": "Im Movie-Clip-Editor auf Polynom stellen und die Kamera neu lösen.",
     "No file with cameras is chosen.": "Es ist keine Datei mit Kameras gewählt.",
     "Choose a COLMAP folder, a transforms.json or a camera path, or set Cameras From to Solve.": "Einen COLMAP-Ordner, eine transforms.json oder einen Kamerapfad wählen, oder Kameras aus auf Lösen stellen.",
-    "The backend did not start: {}.": "Das Backend ist nicht gestartet: {}.",
     "There is no shot yet.": "Es gibt noch keinen Shot.",
     "Export Cameras": "Kameras exportieren",
     "Write the solved cameras and points of the undistorted frames for other programs": "Die gelösten Kameras und Punkte der entzerrten Bilder für andere Programme schreiben",

@@ -86,7 +86,7 @@ ANSWERS = (
     Answer(
         3,
         "t* is read frame by frame",
-        f"{ADDON}process/steps.py",
+        f"{ADDON}freeze/takes.py",
         "float(curve.evaluate(n))",
         "float(curve.evaluate(low))",
         f"{TEST}cameras.py::test_a_keyed_instant_is_followed_frame_by_frame",
@@ -238,7 +238,7 @@ ANSWERS = (
     Answer(
         14,
         "jobs do not end with Blender",
-        f"{ADDON}process/jobs.py",
+        f"{ADDON}process/children.py",
         '    return {"start_new_session": True}\n',
         "    return {}\n",
         f"{TEST}jobs.py::test_a_child_runs_in_its_own_process_group",

@@ -58,8 +58,8 @@ def test_an_old_shot_is_shown_whole(addon, tmp_path):
     assert {kind: job.state for kind, job in addon("process.jobs").latest(root).items()} == dict.fromkeys(
         ("import", "solve", "train", "freeze"), "done"
     )
-    assert addon("process.steps").take_params(root, "freeze").width == 64
-    assert addon("process.steps").complete(root, "freeze") and not addon("process.steps").may_be_stale(root, "freeze")
+    assert addon("freeze.takes").take_params(root, "freeze").width == 64
+    assert addon("freeze.takes").complete(root, "freeze") and not addon("freeze.takes").may_be_stale(root, "freeze")
 
 
 def test_old_command_lines_ask_for_the_same(addon, contract):

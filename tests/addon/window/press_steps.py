@@ -355,7 +355,7 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
         status = job.status if job is not None else None
         share = 0.3 if name in ("2-camera", "3-train") else 0.05  # the others are over soon
         far = status is not None and status.fraction > share and status.stage.startswith(stage)
-        drawn = watch.rendered is not None and watch.rendered[0] > 0
+        drawn = watch.work is not None and watch.work.progress is not None and watch.work.progress.done > 0
         if not taken and (drawn if name == "5-bake" else far):
             yield from _shoot(work, f"{name}-running", settle=2)
             taken = True
