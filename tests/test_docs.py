@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "examples/README.md")]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 MANUAL = ROOT / "docs" / "manual"
-STEPS = ("footage", "camera", "train", "freeze", "bake")
+STEPS = ("import", "solve", "train", "freeze", "bake")
 ROOMS = ("footage", "solve", "train", "freeze", "bake")
 
 

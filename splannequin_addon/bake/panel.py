@@ -16,6 +16,7 @@ class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
     bl_idname = "SPLANNEQUIN_PT_bake"
     step = "bake"
     operator = "splannequin.bake"
+    folds = "bake"
 
     def draw_settings(self, context: Any, layout: Any) -> None:
         """Which take, and which of its frames: Blender's own range and step."""

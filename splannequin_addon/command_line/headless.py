@@ -121,12 +121,12 @@ def main(argv: Sequence[str]) -> int:
 
 def import_clip(args: argparse.Namespace, console: Console) -> int:
     """`import SHOT CLIP`."""
-    return _one_step(args, console, "footage")
+    return _one_step(args, console, "import")
 
 
 def solve(args: argparse.Namespace, console: Console) -> int:
     """`solve SHOT`."""
-    return _one_step(args, console, "camera")
+    return _one_step(args, console, "solve")
 
 
 def export(args: argparse.Namespace, console: Console) -> int:
@@ -152,7 +152,7 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
     requests = asked(args)
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
-    for step in ("footage", "camera", "train", "freeze"):
+    for step in ("import", "solve", "train", "freeze"):
         since = time.perf_counter()
         kind = steps.STEPS[step].kind
         params = requests[kind]

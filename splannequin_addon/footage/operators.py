@@ -104,7 +104,7 @@ class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator)
     bl_idname = "splannequin.import_clip"
     bl_label = "Import Clip"
     bl_options = {"REGISTER"}
-    step = "footage"
+    step = "import"
 
 
 CLASSES = (

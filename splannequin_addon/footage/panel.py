@@ -15,10 +15,11 @@ from ..ui.sentences import wrap
 class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
     """Step 1: footage into a shot folder"""
 
-    bl_label = "1  Footage"
+    bl_label = "1  Import"
     bl_idname = "SPLANNEQUIN_PT_footage"
-    step = "footage"
+    step = "import"
     operator = "splannequin.import_clip"
+    folds = "footage"
 
     def draw_settings(self, context: Any, layout: Any) -> None:
         """Clip, range, shot folder."""

@@ -16,8 +16,8 @@ from . import arrival, operators, panel, plate
 class Import(Step):
     """Footage into a shot folder."""
 
-    name = "footage"
-    label = "Footage"
+    name = "import"
+    label = "Import"
     kind = "import"
     button = "Import Clip"
     again = "Import Again"

@@ -32,17 +32,9 @@ def in_solve(
         viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
         K: fx, fy, cx, cy in pixels.
     """
-    root, window = made.part(scene, shot, "root"), np.array(window_matrix, dtype=np.float64)
+    root = made.part(scene, shot, "root")
     placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
-    to_view = axes.FLIP @ np.array(view_matrix, dtype=np.float64) @ placed
-    to_view[:3] /= made.depth_scale(scene, shot)
-    K = [
-        0.5 * width * window[0, 0],
-        0.5 * height * window[1, 1],
-        0.5 * width * (1.0 - window[0, 2]),
-        0.5 * height * (1.0 + window[1, 2]),
-    ]
-    return to_view.ravel().tolist(), K
+    return axes.in_solve(view_matrix, window_matrix, placed, made.depth_scale(scene, shot), (width, height))
 
 
 def sample_path(scene: Any, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:

@@ -26,6 +26,7 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
     bl_idname = "SPLANNEQUIN_PT_freeze"
     step = "freeze"
     operator = "splannequin.freeze"
+    folds = "freeze"
 
     def draw_settings(self, context: Any, layout: Any) -> None:
         """The instant."""

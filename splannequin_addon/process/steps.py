@@ -127,6 +127,10 @@ STEPS: dict[str, Step] = {}
 """The steps in order, by name. `registration.py` fills it."""
 
 
+OLD_NAMES = {"footage": "import", "camera": "solve"}
+"""What version 0.2.0 called steps, in job folders and in scripts that call our operators -> as they are called."""
+
+
 def add(step: Step) -> None:
     """Makes a step known, after those that are."""
     STEPS[step.name] = step
@@ -139,5 +143,11 @@ def step_of(job: jobs.Job) -> str:
             told = file.read(100).decode("utf-8", "replace")
     except (OSError, ValueError):
         told = ""  # started from the backend's command line
+    told = current(told)
     names = [s.name for s in STEPS.values() if s.kind == job.kind]
     return told if told in names else names[0]
+
+
+def current(name: str) -> str:
+    """The name of a step, of which `name` may be one that it had before."""
+    return OLD_NAMES.get(name, name)

@@ -15,10 +15,10 @@ from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
 from ..scene import paths
+from ..scene.mark import TAG
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""
-_TAG = "splannequin"
 _KINDS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 
 
@@ -109,17 +109,17 @@ def tidy(scene: Any) -> None:
 def adopt(scene: Any, shot: Path) -> None:
     """Takes over what 0.2.0 made, which marked objects instead: the one of each kind that kept its name."""
     name = name_of(shot)
-    if scene.splannequin.made or not any(o.get(_TAG) == name for o in scene.objects):
+    if scene.splannequin.made or not any(o.get(TAG) == name for o in scene.objects):
         return
     entry = new(scene, shot)
-    for item in [o for o in scene.objects if o.get(_TAG) == name]:
+    for item in [o for o in scene.objects if o.get(TAG) == name]:
         kind = _KINDS.get(item.type, "")
         if kind and item.name == f"{name} {kind}":
             setattr(entry, kind, item)
-        del item[_TAG]
-    for collection in [c for c in scene.collection.children_recursive if c.get(_TAG) == name]:
+        del item[TAG]
+    for collection in [c for c in scene.collection.children_recursive if c.get(TAG) == name]:
         entry.collection = collection
-        del collection[_TAG]
+        del collection[TAG]
 
 
 def depth_scale(scene: Any, shot: Path) -> float:

@@ -133,7 +133,7 @@ class _Aligns:
             told = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
             self.report({"ERROR"}, told)  # type: ignore[attr-defined]
             return {"CANCELLED"}
-        supervisor.watch_of(shot).notes["camera"] = notes
+        supervisor.watch_of(shot).notes["solve"] = notes
         for note in notes:
             self.report({"INFO"}, note)  # type: ignore[attr-defined]
         return {"FINISHED"}

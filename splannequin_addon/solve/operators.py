@@ -70,7 +70,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
         except contract.JobError as error:
             self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
             return {"CANCELLED"}
-        supervisor.watch_of(shot).failures.pop("camera", None)
+        supervisor.watch_of(shot).failures.pop("solve", None)
         supervisor.when_answered(asked, lambda: tell(shot, lambda: [exchange.exported(asked, folder)]))
         return {"FINISHED"}
 
@@ -81,7 +81,7 @@ class SPLANNEQUIN_OT_solve_camera(step_operator.StepOperator, bpy.types.Operator
     bl_idname = "splannequin.solve_camera"
     bl_label = "Solve Camera"
     bl_options = {"REGISTER"}
-    step = "camera"
+    step = "solve"
 
 
 class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
@@ -93,7 +93,7 @@ class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
 
     def execute(self, context: Any) -> set[str]:
         """Builds camera and points."""
-        outcome = step_operator.edit(self, context, "camera", arrival.load_camera)
+        outcome = step_operator.edit(self, context, "solve", arrival.load_camera)
         if outcome == {"FINISHED"} and context.window is not None:
             supervisor.look_through_camera(context.window)
         return outcome
@@ -138,17 +138,17 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
             self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
             return {"CANCELLED"}
         watch = supervisor.watch_of(folder)
-        watch.failures.pop("camera", None)
+        watch.failures.pop("solve", None)
         if not bpy.app.background:
-            watch.notes["camera"] = ["Writing the ST maps."]
+            watch.notes["solve"] = ["Writing the ST maps."]
             follow_stmaps(folder, asked)
             return {"FINISHED"}
         asked.wait()
         tell(folder, lambda: stmaps.sentences(stmaps.answer(asked)))
-        if "camera" in watch.failures:
-            self.report({"ERROR"}, watch.failures["camera"][0])
+        if "solve" in watch.failures:
+            self.report({"ERROR"}, watch.failures["solve"][0])
             return {"CANCELLED"}
-        for line in watch.notes["camera"]:
+        for line in watch.notes["solve"]:
             self.report({"INFO"}, line)
         return {"FINISHED"}
 
@@ -171,11 +171,11 @@ def follow_stmaps(shot: Path, asked: children.Question) -> None:
 def tell(shot: Path, say: Callable[[], list[str]]) -> None:
     """Puts what the backend answered, as `say` tells it or why it cannot, where the panel of the step shows it."""
     watch = supervisor.watch_of(shot)
-    watch.notes.pop("camera", None)
+    watch.notes.pop("solve", None)
     try:
-        watch.notes["camera"] = say()
+        watch.notes["solve"] = say()
     except (contract.JobError, ValueError, KeyError) as error:
-        watch.fail("camera", error)
+        watch.fail("solve", error)
 
 
 def register() -> None:

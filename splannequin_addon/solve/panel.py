@@ -14,16 +14,17 @@ from . import align_operators, cameras, mattes
 
 def can_load_camera(running: str | None) -> bool:
     """True unless a step runs that makes another solve; the others leave this one as it is."""
-    return running not in ("footage", "camera")
+    return running not in ("import", "solve")
 
 
 class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
-    """Step 2: the camera"""
+    """Step 2: where the camera was"""
 
-    bl_label = "2  Camera"
+    bl_label = "2  Solve"
     bl_idname = "SPLANNEQUIN_PT_camera"
-    step = "camera"
+    step = "solve"
     operator = "splannequin.solve_camera"
+    folds = "camera"
 
     def draw(self, context: Any) -> None:
         """The step's body, and where the solve stands in the scene."""

@@ -17,8 +17,8 @@ from . import align_operators, arrival, cameras, exchange, guesses, mattes, oper
 class Solve(Step):
     """Where the camera was, and what moves."""
 
-    name = "camera"
-    label = "Camera"
+    name = "solve"
+    label = "Solve"
     kind = "solve"
     button = "Solve Camera"
     again = "Solve Again"

@@ -24,6 +24,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
     bl_idname = "SPLANNEQUIN_PT_train"
     step = "train"
     operator = "splannequin.train"
+    folds = "train"
 
     def draw_settings(self, context: Any, layout: Any) -> None:
         """The preset; what the button will do to the run that is there."""

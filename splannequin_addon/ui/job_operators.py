@@ -29,7 +29,7 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         """Asks the job to stop."""
         folder = chosen.shot_folder(context.scene)
         watch = supervisor.watch_of(folder) if folder else None
-        job = watch.jobs.get(self.step or watch.running() or "") if watch else None
+        job = watch.jobs.get(steps.current(self.step) or watch.running() or "") if watch else None
         if job is None or job.ended:
             self.report({"WARNING"}, "Nothing is running")
             return {"CANCELLED"}
@@ -53,8 +53,8 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         """Opens it."""
         folder = chosen.shot_folder(context.scene)
-        job = supervisor.watch_of(folder).jobs.get(self.step) if folder else None
-        log = steps.STEPS[self.step].log(job) if job is not None else None
+        job = supervisor.watch_of(folder).jobs.get(steps.current(self.step)) if folder else None
+        log = steps.STEPS[steps.current(self.step)].log(job) if job is not None else None
         if log is None:
             self.report({"WARNING"}, "There is no log")
             return {"CANCELLED"}

@@ -24,6 +24,8 @@ class StepPanel:
     bl_category = CATEGORY
     step = ""
     operator = ""
+    folds = ""
+    """What its parts that can be folded are called in the files that keep how they stand."""
 
     def _watch(self, context: Any) -> supervisor.Watch | None:
         folder = chosen.shot_folder(context.scene)
@@ -81,7 +83,7 @@ class StepPanel:
             self._outcome(context, layout, watch, view.state)
             if running is None and view.advice and not (view.done and self._next_done(context)):
                 wrap(layout, context, view.advice, "INFO")
-        body = sub_panel(layout, f"{self.step}_more", "Advanced")
+        body = sub_panel(layout, f"{self.folds}_more", "Advanced")
         if body is not None:
             body.enabled = running is None
             self.draw_advanced(context, body)

@@ -286,7 +286,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     writer = contract.Writer(contract.host_name(), worker.pid, started, "train", "from a terminal", time.time() - 90000)
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
     with pytest.raises(contract.JobError) as told:
-        addon("process.begin").begin(scene, "footage")
+        addon("process.begin").begin(scene, "import")
     assert told.value.exit_code == contract.ExitCode.USAGE and told.value.hint == "Wait for it or cancel it."
     since = time.strftime("%Y-%m-%d %H:%M", time.localtime(writer.since))
     where = contract.host_name().partition(" (")[0]
@@ -296,7 +296,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     assert not (empty_shot / "jobs").exists(), "nothing was written"
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, host="elsewhere")))
     with pytest.raises(contract.JobError, match="on elsewhere since") as told:
-        addon("process.begin").begin(scene, "footage")
+        addon("process.begin").begin(scene, "import")
     assert str(empty_shot / "lock.json") in told.value.hint
     ending = jobs.new_job(empty_shot, "train", contract.TrainParams())
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name)))
@@ -306,7 +306,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     worker.kill()
     worker.wait()
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
-    jobs.wait(addon("process.begin").begin(scene, "footage", contract.ImportParams(str(clip), 1, 8)))
+    jobs.wait(addon("process.begin").begin(scene, "import", contract.ImportParams(str(clip), 1, 8)))
     assert not (empty_shot / "lock.json").exists()
 
 

@@ -44,12 +44,12 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     scene = opened(there)
     assert addon("shot.chosen").shot_folder(scene) == there / "people.splannequin"
     assert addon("scene.paths").absolute(scene.splannequin.clip) == str(there / "people.mp4")
-    assert addon("process.steps").STEPS["footage"].params(scene).source == str(there / "people.mp4")
+    assert addon("process.steps").STEPS["import"].params(scene).source == str(there / "people.mp4")
     assert addon("solve.cameras").find(scene, there / "people.splannequin", "CAMERA") == scene.camera
     assert plate_file() == there / "people.splannequin" / "frames" / "000005.png"
     assert (
         addon("process.steps")
-        .STEPS["camera"]
+        .STEPS["solve"]
         .view(scene, addon("shot.contents").read(there / "people.splannequin"))
         .done
     )
@@ -96,7 +96,7 @@ def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     scene = opened(project)
     watch = addon("process.supervisor").watch_of(before)
     assert addon("shot.chosen").missing(scene, watch.state)
-    for step in ("camera", "train", "freeze", "bake"):
+    for step in ("solve", "train", "freeze", "bake"):
         with pytest.raises(contract.JobError, match="is not there any more") as told:
             addon("process.begin").begin(scene, step)
         assert "Locate" in told.value.hint
@@ -161,14 +161,14 @@ def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, sc
     wrong.write_text("no video")
     scene.splannequin.clip = str(wrong)
     supervisor = addon("process.supervisor")
-    job = addon("process.begin").begin(scene, "footage")
-    supervisor.follow("footage", job)
+    job = addon("process.begin").begin(scene, "import")
+    supervisor.follow("import", job)
     job.process.wait()
     watch = supervisor.watch_of(job.shot)
     while watch.running():
         supervisor.tick()
     assert not job.shot.exists()
-    assert watch.jobs["footage"].state == "failed" and "text.mp4" in watch.jobs["footage"].status.message
+    assert watch.jobs["import"].state == "failed" and "text.mp4" in watch.jobs["import"].status.message
 
 
 def test_a_failed_import_takes_nothing_of_a_shot_that_has_frames(addon, shot, tmp_path):
@@ -199,7 +199,7 @@ def test_a_folder_that_cannot_be_is_one_sentence(addon, scene, clip, tmp_path, w
         bpy.ops.splannequin.import_clip()
     assert str(told.value).strip().count("\n") == 0
     watch = addon("process.supervisor").watch_of(folder)
-    assert "Cannot write to" in watch.failures["footage"][0]
+    assert "Cannot write to" in watch.failures["import"][0]
     addon("process.supervisor").tick()
     for step in addon("process.steps").STEPS.values():
         step.view(scene, watch.state)

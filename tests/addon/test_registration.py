@@ -35,7 +35,7 @@ def test_unregister_leaves_nothing_and_register_twice_registers_once(package):
 def test_the_panels_stand_in_order_in_one_tab(addon):
     steps = addon("process.steps").STEPS.values()
     panels = [c for step in steps for c in step.classes if hasattr(c, "step") and issubclass(c, bpy.types.Panel)]
-    assert [p.bl_label for p in panels] == ["1  Footage", "2  Camera", "3  Train", "4  Freeze", "5  Bake"]
+    assert [p.bl_label for p in panels] == ["1  Import", "2  Solve", "3  Train", "4  Freeze", "5  Bake"]
     assert {(p.bl_category, p.bl_space_type, p.bl_region_type) for p in panels} == {("Splannequin", "VIEW_3D", "UI")}
     for panel in panels:
         assert panel.operator.partition(".")[2] in dir(bpy.ops.splannequin)

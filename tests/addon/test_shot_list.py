@@ -255,7 +255,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
     bpy.ops.splannequin.shot_add()
     props.shot_path, props.t_star = str(other), 3
     frozen = ended(addon, contract, shot, "freeze", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
-    solved = ended(addon, contract, shot, "camera", "solve", contract.SolveParams(), {})
+    solved = ended(addon, contract, shot, "solve", "solve", contract.SolveParams(), {})
     baked = ended(addon, contract, shot, "bake", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
     for _ in range(100):  # a turn has a budget, and the machine may be busy
         supervisor.tick()
@@ -263,7 +263,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
             break
     assert solved.ended and baked.ended and props.t_star == 3 and props.shots[0].t_star == 2
     assert cameras.find(scene, shot, "CAMERA") is None and set(supervisor.watch_of(shot).pending) == {
-        "freeze", "camera", "bake",
+        "freeze", "solve", "bake",
     }  # fmt: skip
     supervisor.tick()
     assert supervisor.watch_of(shot).jobs, "a shot of the list is followed on"

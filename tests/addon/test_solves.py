@@ -90,7 +90,7 @@ def test_the_solve_is_asked_for_with_what_was_tracked(addon, tracked, scene, sho
     listing.write_text(json.dumps({**json.loads(listing.read_text()), "key": "imported"}))
     props = scene.splannequin
     props.shot_path, props.cameras_from, props.tracking_clip = str(shot), "TRACKING", tracked
-    params = addon("process.steps").STEPS["camera"].params(scene)
+    params = addon("process.steps").STEPS["solve"].params(scene)
     assert params.cameras == str(shot / "tracking" / "transforms.json")
     assert json.loads(Path(params.cameras).read_text(encoding="utf-8")) == addon("solve.exchange").transforms(tracked)
     # The backend understands it, and finds that it is of another clip: the test shot has frames 5 to 7 of 16 x 12.
@@ -125,17 +125,17 @@ def test_missing_cameras_are_said(addon, contract, scene, clip, shot):
     steps, props = addon("process.steps").STEPS, scene.splannequin
     props.shot_path, props.cameras_from = str(shot), "FILE"
     with pytest.raises(contract.JobError, match="No file with cameras is chosen"):
-        steps["camera"].params(scene)
+        steps["solve"].params(scene)
     props.cameras_path = str(shot / "x" / ".." / "model")
-    assert steps["camera"].params(scene).cameras == str(shot / "model")
+    assert steps["solve"].params(scene).cameras == str(shot / "model")
     props.cameras_from = "TRACKING"
     with pytest.raises(contract.JobError, match="No tracked clip is chosen"):
-        steps["camera"].params(scene)
+        steps["solve"].params(scene)
     props.tracking_clip = clip
     with pytest.raises(contract.JobError, match="is not solved"):
-        steps["camera"].params(scene)
+        steps["solve"].params(scene)
     props.cameras_from = "SOLVE"
-    assert steps["camera"].params(scene) == contract.SolveParams()
+    assert steps["solve"].params(scene) == contract.SolveParams()
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap_text", "nerfstudio"])
@@ -184,7 +184,7 @@ def test_an_export_in_a_window_is_followed_without_waiting(addon, shot, tmp_path
     asked.process.wait(60)
     supervisor.tick()
     supervisor.tick()
-    said = watch.notes["camera"][0] if well else watch.failures["camera"][0]
+    said = watch.notes["solve"][0] if well else watch.failures["solve"][0]
     assert (str(tmp_path / "out") if well else "is not a shot folder") in said
 
 

@@ -44,7 +44,7 @@ def test_a_button_says_what_is_wrong(addon, scene, tmp_path):
     with pytest.raises(RuntimeError, match=r"text\.mp4"):
         bpy.ops.splannequin.import_clip()
     watch = addon("process.supervisor").watch_of(tmp_path / "text.splannequin")
-    assert watch.jobs["footage"].state == "failed"
+    assert watch.jobs["import"].state == "failed"
 
 
 def test_no_clip_is_said_in_words(scene):
@@ -95,7 +95,7 @@ def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, sh
     bpy.ops.splannequin.insert_freeze()
     assert scene.view_settings.view_transform == "Standard" and scene.render.dither_intensity == 0.0
     notes = addon("process.supervisor").watch_of(shot).notes
-    assert notes["camera"] and notes["bake"]
+    assert notes["solve"] and notes["bake"]
     assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
     assert set(notes) == {"bake"}, "nothing says any more that the shot's camera is the scene's"
     assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == names
@@ -152,30 +152,30 @@ def test_the_timer_applies_a_job_that_ended_and_gives_each_step_its_words(addon,
     props = scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
     props.use_range, props.first, props.last = True, 1, 8
-    job = addon("process.begin").begin(scene, "footage")
+    job = addon("process.begin").begin(scene, "import")
     supervisor = addon("process.supervisor")
-    supervisor.follow("footage", job)
+    supervisor.follow("import", job)
     watch = supervisor.watch_of(job.shot)
-    assert watch.running() == "footage"
+    assert watch.running() == "import"
     job.process.wait()
     while watch.running():
         assert supervisor.tick() == supervisor.TICK_SECONDS
     assert watch.state.frames == 8
-    assert "Frame range set to 1 to 8." in watch.notes["footage"] and scene.frame_end == 8
+    assert "Frame range set to 1 to 8." in watch.notes["import"] and scene.frame_end == 8
 
 
-@pytest.mark.parametrize("step", ["footage", "camera", "train", "freeze", "bake"])
+@pytest.mark.parametrize("step", ["import", "solve", "train", "freeze", "bake"])
 def test_each_step_says_what_comes_next(addon, scene, step):
     view = addon("process.steps").STEPS[step].view(scene, None)
     assert view.advice.endswith(".") and not view.done
-    assert view.ready == (step == "footage")
+    assert view.ready == (step == "import")
 
 
 def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
     steps, state = addon("process.steps").STEPS, addon("shot.contents").read(shot)
     shown = {name: step.view(with_shot, state) for name, step in steps.items()}
-    assert shown["footage"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
-    assert shown["camera"].state == ["A good solve."] and "load it" in shown["camera"].advice
+    assert shown["import"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
+    assert shown["solve"].state == ["A good solve."] and "load it" in shown["solve"].advice
     assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % may move"]
     assert shown["freeze"].state == ["Take freeze: 3 frames, 16 x 12", "Time stands still at frame 6"]
     assert not shown["bake"].done and shown["bake"].ready
@@ -200,7 +200,7 @@ def test_a_newer_shot_is_refused_in_words(addon, contract, tmp_path: Path):
     with pytest.raises(ValueError, match="version 99"):
         addon("shot.contents").read(tmp_path)
     watch = addon("process.supervisor").watch_of(tmp_path)
-    assert "version 99" in watch.failures["footage"][0], "the panel shows it instead of breaking"
+    assert "version 99" in watch.failures["import"][0], "the panel shows it instead of breaking"
 
 
 def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_path):
@@ -208,7 +208,7 @@ def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_pat
     props.use_range, props.first, props.last = True, 1, 8
     for name in ("first.mp4", "second.mp4"):
         props.clip = str(shutil.copy(clip, tmp_path / name))
-        addon("process.begin").run(scene, "footage")
+        addon("process.begin").run(scene, "import")
     assert {p.name for p in tmp_path.glob("*.splannequin")} == {"first.splannequin", "second.splannequin"}
     assert addon("shot.chosen").shot_folder(scene) == tmp_path / "second.splannequin"
 
@@ -235,10 +235,10 @@ def test_bake_asks_for_a_ramp_or_a_path_as_it_was_made(addon, shot):
 def test_a_step_is_refused_while_another_of_the_shot_runs(addon, contract, scene, clip, tmp_path):
     jobs, props = addon("process.jobs"), scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
-    job = addon("process.begin").begin(scene, "footage")
+    job = addon("process.begin").begin(scene, "import")
     try:
         with pytest.raises(contract.JobError, match="is still running"):
-            addon("process.begin").begin(scene, "footage")
+            addon("process.begin").begin(scene, "import")
     finally:
         jobs.cancel(job)
         job.process.wait()

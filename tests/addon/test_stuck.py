@@ -53,7 +53,7 @@ def test_scrubbing_can_be_stopped_while_a_job_runs_and_when_the_shot_is_gone(add
 def test_the_solve_can_be_loaded_while_the_shot_trains(addon):
     can = addon("solve.panel").can_load_camera
     assert can(None) and can("train") and can("freeze") and can("bake")
-    assert not can("footage") and not can("camera")
+    assert not can("import") and not can("solve")
 
 
 def test_an_instant_that_nobody_chose_is_the_one_that_is_drawn(addon, with_shot, session):
@@ -70,21 +70,21 @@ def test_the_log_that_is_offered_has_something_in_it(addon, contract, shot, with
     steps = addon("process.steps").STEPS
     job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
     (job.folder / "log.txt").touch()
-    assert steps["camera"].log(job) is None, "an empty file helps nobody"
+    assert steps["solve"].log(job) is None, "an empty file helps nobody"
     (shot / "solve" / "colmap.log").write_text("what COLMAP said")
-    assert steps["camera"].log(job) == shot / "solve" / "colmap.log"
+    assert steps["solve"].log(job) == shot / "solve" / "colmap.log"
     (job.folder / "log.txt").write_text("what the backend said")
-    assert steps["camera"].log(job) == job.folder / "log.txt"
+    assert steps["solve"].log(job) == job.folder / "log.txt"
     other = addon("process.jobs").new_job(shot, "train", contract.TrainParams())
     assert steps["train"].log(other) is None
 
 
 def test_which_frames_are_solved_is_a_setting(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a.mp4")
-    asked = addon("process.steps").STEPS["footage"].params(scene)
+    asked = addon("process.steps").STEPS["import"].params(scene)
     assert (asked.step, asked.fps) == (0, 0.0)
     scene.splannequin.solve_step, scene.splannequin.fps = 3, 25.0
-    asked = addon("process.steps").STEPS["footage"].params(scene)
+    asked = addon("process.steps").STEPS["import"].params(scene)
     assert (asked.step, asked.fps) == (3, 25.0)
 
 
