@@ -15,10 +15,10 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 import warp as wp
@@ -42,7 +42,7 @@ def default_threads() -> int:
 
 
 @contextlib.contextmanager
-def _without_notice() -> Iterator[None]:
+def _without_notice() -> Generator[None]:
     """Hold back what C code writes to standard error meanwhile; pass on all but Warp's notice of a missing GPU."""
     try:
         saved = os.dup(2)
@@ -71,6 +71,11 @@ def initialised_warp() -> Any:
     return wp
 
 
+def func_native(text: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """`warp.func_native`: gives a function without a body, called as it says, the body `text`."""
+    return cast(Any, wp).func_native(text)
+
+
 def build(name: str, text: str) -> Launch:
     """Compile C++ `text` as a module of its own, or load it from Warp's cache."""
     initialised_warp()
@@ -78,7 +83,7 @@ def build(name: str, text: str) -> Launch:
     def run(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
 
     run.__name__ = run.__qualname__ = name
-    native = wp.func_native(text)(run)
+    native = func_native(text)(run)
 
     def entry(block: wp.uint64, stage: wp.int32, worker: wp.int32):
         native(block, stage, worker)
@@ -87,8 +92,10 @@ def build(name: str, text: str) -> Launch:
     kernel = wp.Kernel(entry, key=name, module=wp.get_module(module), options={"enable_backward": False})
     wp.load_module(module, device="cpu")
 
+    warp: Any = wp
+
     def launch(block: int, stage: int, worker: int) -> None:
-        wp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
+        warp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
 
     return launch
 
@@ -155,10 +162,10 @@ def warp_stream(device: torch.device) -> Any:
 
 def launch_on(kernel: Any, dim: Any, inputs: list[Any], device: torch.device) -> None:
     """Launches a Warp kernel where a torch tensor's `device` is; on CUDA behind torch's work, on its current stream."""
-    initialised_warp()
+    warp = initialised_warp()
     if device.type == "cpu":
-        wp.launch(kernel, dim=dim, inputs=inputs, device="cpu")
+        warp.launch(kernel, dim=dim, inputs=inputs, device="cpu")
         return
     # Warp leaves its device current; the caller's may be another one.
     with torch.cuda.device(device):
-        wp.launch(kernel, dim=dim, inputs=inputs, stream=warp_stream(device))
+        warp.launch(kernel, dim=dim, inputs=inputs, stream=warp_stream(device))

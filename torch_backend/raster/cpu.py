@@ -5,11 +5,13 @@
 
 import ctypes
 import threading
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from ..native import Launch, build, run_workers
+from ..torch_types import AutogradContext, applied, floats
 from . import cpu_source as source
 from .constants import FRUSTUM_MARGIN, TILE
 from .reference import expected_depth
@@ -93,7 +95,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.want_weights, block.want_top = int(scene.with_contributions), int(scene.with_top)
     block.want_abs = int(scene.settings.absgrad)
     block.workers = max(1, min(scene.settings.threads, block.chunks))
-    block.view[:] = scene.viewmats[camera, :3].reshape(-1).tolist()
+    block.view[:] = floats(scene.viewmats[camera, :3].reshape(-1))
     K = scene.Ks[camera]
     block.fx, block.fy, block.cx, block.cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     limits = camera_limits(K, scene.width, scene.height, FRUSTUM_MARGIN)
@@ -150,23 +152,64 @@ def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) ->
         run_workers(stages, block, source.WEIGHTS, by_chunk)
 
 
+class _Images(NamedTuple):
+    """What a call leaves: images of C cameras, figures of N Gaussians, as `RasterOutput` has them."""
+
+    image: Tensor
+    """[C, H, W, D]: channels of the scene, then with depth the sum of alpha T depth."""
+    alpha: Tensor
+    median: Tensor
+    """Empty without depth."""
+    radii: Tensor
+    means2d: Tensor
+    weights: Tensor
+    """[2, C, N]: sum and maximum of alpha T; N is 0 where nobody wants them."""
+    top_ids: Tensor
+    top_weights: Tensor
+
+
+class _Saved(NamedTuple):
+    """What the backward pass needs of the forward one: the differentiable inputs and the images."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    logits: Tensor
+    colors: Tensor | None
+    sh: Tensor | None
+    viewmats: Tensor
+    background: Tensor | None
+    image: Tensor
+    alpha: Tensor
+    behind: Tensor
+    """[D] the background of every channel, 0 for depth."""
+
+
+class _Context(AutogradContext, Protocol):
+    scene: Scene
+    norms: tuple[Tensor, Tensor]
+    """[C, N] each: where the backward pass writes `means2d_grad` and `means2d_absgrad`."""
+    leases: list[_Lease]
+    """One for each camera."""
+
+
 class _Rasterize(torch.autograd.Function):
     """Autograd's view of the CPU body. Tensors are float32, contiguous, on the CPU."""
 
     @staticmethod
     def forward(
-        ctx,
+        ctx: _Context,
         scene: Scene,
         norms: tuple[Tensor, Tensor],
-        means,
-        quats,
-        log_scales,
-        logits,
-        colors,
-        sh,
-        viewmats,
-        background,
-    ):
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        logits: Tensor,
+        colors: Tensor | None,
+        sh: Tensor | None,
+        viewmats: Tensor,
+        background: Tensor | None,
+    ) -> _Images:
         cameras, n = viewmats.shape[0], means.shape[0]
         channels = scene.channels + int(scene.with_depth)
         size = (cameras, scene.height, scene.width)
@@ -209,12 +252,12 @@ class _Rasterize(torch.autograd.Function):
             ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
         ctx.mark_non_differentiable(median, radii, means2d, weights, top_ids, top_weights)
         ctx.set_materialize_grads(False)
-        return image, alpha, median, radii, means2d, weights, top_ids, top_weights
+        return _Images(image, alpha, median, radii, means2d, weights, top_ids, top_weights)
 
     @staticmethod
-    def backward(ctx, *grads):
-        means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, behind = ctx.saved_tensors
-        scene: Scene = ctx.scene
+    def backward(ctx: _Context, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        saved, scene = _Saved(*ctx.saved_tensors), ctx.scene
+        means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, behind = saved
         grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
         grad_alpha = torch.zeros_like(alpha) if grads[1] is None else grads[1].contiguous()
         out = {
@@ -269,33 +312,23 @@ def rasterize(scene: Scene) -> RasterOutput:
         raise ValueError(f"{channels} channels, depth included; one call carries at most {source.MAX_CHANNELS}")
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
     norms = (torch.zeros(cameras, n), torch.zeros(cameras, n))
-    image, alphas, median, radii, means2d, weights, top_ids, top_weights = _Rasterize.apply(
-        scene,
-        norms,
-        scene.means,
-        scene.quats,
-        scene.log_scales,
-        scene.opacity_logits,
-        scene.colors,
-        scene.sh,
-        scene.viewmats,
-        scene.background,
-    )
-    colors, depth = image, None
+    inputs = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh)
+    out = _Images(*applied(_Rasterize, scene, norms, *inputs, scene.viewmats, scene.background))
+    colors, depth = out.image, None
     if scene.with_depth:
-        colors, depth_sum = image[..., :-1], image[..., -1]
-        depth = expected_depth(depth_sum, alphas)
+        colors, depth_sum = out.image[..., :-1], out.image[..., -1]
+        depth = expected_depth(depth_sum, out.alpha)
     return RasterOutput(
         colors=colors,
-        alphas=alphas,
+        alphas=out.alpha,
         depth_expected=depth,
-        depth_median=median if scene.with_depth else None,
-        radii=radii,
-        means2d=means2d,
-        weight_sum=weights[0] if scene.with_contributions else None,
-        weight_max=weights[1] if scene.with_contributions else None,
+        depth_median=out.median if scene.with_depth else None,
+        radii=out.radii,
+        means2d=out.means2d,
+        weight_sum=out.weights[0] if scene.with_contributions else None,
+        weight_max=out.weights[1] if scene.with_contributions else None,
         means2d_grad=norms[0],
         means2d_absgrad=norms[1],
-        top_ids=top_ids if scene.with_top else None,
-        top_weights=top_weights if scene.with_top else None,
+        top_ids=out.top_ids if scene.with_top else None,
+        top_weights=out.top_weights if scene.with_top else None,
     )

@@ -17,15 +17,16 @@ learns of it, and capture again.
 
 import threading
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from ..native import initialised_warp, warp_stream
+from ..torch_types import AutogradContext, applied, once_differentiable
 from . import cuda_source as source
 from .constants import TILE
+from .cuda_entry import warp_kernel
 from .reference import expected_depth
 from .settings import RasterOutput, Scene
 
@@ -38,7 +39,7 @@ _kernels: dict[tuple[str, int], Any] = {}
 _demands: dict[tuple[torch.device, int, int, int], "_Demand"] = {}
 
 
-def _structure(wp):
+def _structure(wp: Any) -> Any:
     """Warp type of the kernels' parameter structure; one for all modules."""
     if ("", 0) not in _kernels:
         types = {name: getattr(wp, kind) for name, kind in source.FIELDS.items()}
@@ -46,7 +47,7 @@ def _structure(wp):
     return _kernels["", 0]
 
 
-def build(name: str, channels: int = 0):
+def build(name: str, channels: int = 0) -> Any:
     """Warp kernel `name` of `cuda_source`, in module `module_name(name, channels)`; blending needs `channels`."""
     with _lock:
         if (name, channels) in _kernels:
@@ -55,31 +56,12 @@ def build(name: str, channels: int = 0):
         # code that CUDA graphs of the earlier ones still run.
         texts = {name: source.blending(channels)[name]} if channels else source.stages()
         for each, text in texts.items():
-            _kernels[each, channels] = _kernel(each, text, module_name(each, channels))
+            options = {"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK}
+            wp = initialised_warp()
+            _kernels[each, channels] = warp_kernel(
+                wp, each, text, wp.get_module(module_name(each, channels)), _structure(wp), options
+            )
         return _kernels[name, channels]
-
-
-def _kernel(name: str, text: str, module: str):
-    """Warp kernel `name` with the body `text`."""
-    wp = initialised_warp()
-    structure = _structure(wp)
-
-    def native(args, task): ...
-
-    native.__annotations__ = {"args": structure, "task": wp.int32}
-    native.__name__ = native.__qualname__ = f"{name}_native"
-    function = wp.func_native(text)(native)
-
-    def entry(args):
-        function(args, wp.tid())
-
-    entry.__annotations__ = {"args": structure}
-    return wp.Kernel(
-        entry,
-        key=name,
-        module=wp.get_module(module),
-        options={"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK},
-    )
 
 
 def module_name(name: str, channels: int = 0) -> str:
@@ -228,8 +210,25 @@ class _Maker:
         return torch.zeros(shape, dtype=dtype, device=self.device)
 
 
-def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_count: Tensor) -> tuple[Tensor, ...]:
-    """List the hits tile by tile, front to back. Returns (order, ends, sorted_slot, tile_start, tile_end, hits)."""
+class _Binned(NamedTuple):
+    """The hits of a call, listed tile by tile, front to back. S slots, T tiles."""
+
+    order: Tensor
+    """[S] int64: slots by depth."""
+    ends: Tensor
+    """[S] int64: hits up to and with each rank."""
+    sorted_slot: Tensor
+    """[capacity] int32: slot of each hit."""
+    tile_start: Tensor
+    """[T] int32: first hit of each tile."""
+    tile_end: Tensor
+    """[T] int32"""
+    hits: Tensor
+    """[2] int64: hits of the call, and how many the list holds."""
+
+
+def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_count: Tensor) -> _Binned:
+    """List the hits tile by tile, front to back."""
     make, capacity = _Maker(depth_key.device), demand.capacity
     slots, tiles = hit_count.shape[0], args.tiles_x * args.tiles_y * args.cameras
     tile_start, tile_end = make.zeros(tiles, dtype=torch.int32), make.zeros(tiles, dtype=torch.int32)
@@ -248,7 +247,56 @@ def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_c
         _point(args, sorted_key=sorted_key, permutation=permutation, hits=hits, demand=demand.most)
         launch("raster_ranges", args, capacity)
         demand.report()
-    return order, ends, sorted_slot, tile_start, tile_end, hits
+    return _Binned(order, ends, sorted_slot, tile_start, tile_end, hits)
+
+
+class _Images(NamedTuple):
+    """What a call leaves: images of C cameras, figures of N Gaussians, as `RasterOutput` has them."""
+
+    image: Tensor
+    """[C, H, W, D]: channels of the scene, then with depth the sum of alpha T depth."""
+    alpha: Tensor
+    median: Tensor
+    """This one and the last four but `hits` are empty where nobody wants them."""
+    radii: Tensor
+    means2d: Tensor
+    weight_sum: Tensor
+    weight_max: Tensor
+    top_id: Tensor
+    top_weight: Tensor
+    hits: Tensor
+
+
+class _Saved(NamedTuple):
+    """What the backward pass needs of the forward one: the differentiable inputs, the images, the records."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    logits: Tensor
+    colors: Tensor | None
+    sh: Tensor | None
+    viewmats: Tensor
+    background: Tensor | None
+    image: Tensor
+    alpha: Tensor
+    record: Tensor
+    aux: Tensor
+    hit_count: Tensor
+    order: Tensor
+    ends: Tensor
+    sorted_slot: Tensor
+    tile_start: Tensor
+    tile_end: Tensor
+    hits: Tensor
+
+
+class _Context(AutogradContext, Protocol):
+    scene: Scene
+    norms: tuple[Tensor, Tensor]
+    """[C, N] each: where the backward pass writes `means2d_grad` and `means2d_absgrad`."""
+    capacity: int
+    """Hits that the call's list holds."""
 
 
 class _Rasterize(torch.autograd.Function):
@@ -256,23 +304,23 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx,
+        ctx: _Context,
         scene: Scene,
         norms: tuple[Tensor, Tensor],
-        means,
-        quats,
-        log_scales,
-        logits,
-        colors,
-        sh,
-        viewmats,
-        background,
-    ):
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        logits: Tensor,
+        colors: Tensor | None,
+        sh: Tensor | None,
+        viewmats: Tensor,
+        background: Tensor | None,
+    ) -> _Images:
         make, launch = _Maker(means.device), _Launcher(means.device)
         cameras, n = viewmats.shape[0], means.shape[0]
         channels, slots = scene.channels + int(scene.with_depth), cameras * n
         size = (cameras, scene.height, scene.width)
-        none = (0,)
+        none: tuple[int, ...] = (0,)
         image, alpha = make.empty(*size, channels), make.empty(*size)
         median = make.empty(*(size if scene.with_depth else none))
         top = size if scene.with_top else none
@@ -319,54 +367,20 @@ class _Rasterize(torch.autograd.Function):
         )
         launch("raster_blend", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(
-                means,
-                quats,
-                log_scales,
-                logits,
-                colors,
-                sh,
-                viewmats,
-                background,
-                image,
-                alpha,
-                record,
-                aux,
-                hit_count,
-                *binned,
-            )
+            inputs = (means, quats, log_scales, logits, colors, sh, viewmats, background)
+            ctx.save_for_backward(*_Saved(*inputs, image, alpha, record, aux, hit_count, *binned))
             ctx.scene, ctx.norms, ctx.capacity = scene, norms, args.capacity
         weight_sum = (weight_parts.double() / source.WEIGHT_SCALE).float()
-        extras = (median, radii, means2d, weight_sum, weight_max, top_id, top_weight, binned[-1])
-        ctx.mark_non_differentiable(*extras)
+        out = _Images(image, alpha, median, radii, means2d, weight_sum, weight_max, top_id, top_weight, binned.hits)
+        ctx.mark_non_differentiable(*out[2:])
         ctx.set_materialize_grads(False)
-        return image, alpha, *extras
+        return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *grads):
-        (
-            means,
-            quats,
-            log_scales,
-            logits,
-            colors,
-            sh,
-            viewmats,
-            background,
-            image,
-            alpha,
-            record,
-            aux,
-            hit_count,
-            order,
-            ends,
-            sorted_slot,
-            tile_start,
-            tile_end,
-            _,
-        ) = ctx.saved_tensors
-        scene: Scene = ctx.scene
+    def backward(ctx: _Context, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        saved, scene = _Saved(*ctx.saved_tensors), ctx.scene
+        image, alpha, means, viewmats = saved.image, saved.alpha, saved.means, saved.viewmats
         make, launch = _Maker(means.device), _Launcher(means.device)
         channels, cameras, n = image.shape[-1], viewmats.shape[0], means.shape[0]
         grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
@@ -376,34 +390,20 @@ class _Rasterize(torch.autograd.Function):
         grad = make.zeros(cameras * n, args.grad_stride)
         inputs = {
             "grad_means": means,
-            "grad_quats": quats,
-            "grad_log_scales": log_scales,
-            "grad_logits": logits,
-            "grad_colors": colors,
-            "grad_sh": sh,
+            "grad_quats": saved.quats,
+            "grad_log_scales": saved.log_scales,
+            "grad_logits": saved.logits,
+            "grad_colors": saved.colors,
+            "grad_sh": saved.sh,
         }
         out = {name: None if value is None else torch.empty_like(value) for name, value in inputs.items()}
         grad_view = torch.zeros_like(viewmats)
+        # Of what was saved all but the background and the count of hits is an input here, under the same name.
+        kept = {name: value for name, value in saved._asdict().items() if name not in ("background", "hits")}
         _point(
             args,
-            means=means,
-            quats=quats,
-            log_scales=log_scales,
-            logits=logits,
-            colors=colors,
-            sh=sh,
-            viewmats=viewmats,
+            **kept,
             Ks=scene.Ks,
-            record=record,
-            aux=aux,
-            hit_count=hit_count,
-            order=order,
-            ends=ends,
-            sorted_slot=sorted_slot,
-            tile_start=tile_start,
-            tile_end=tile_end,
-            image=image,
-            alpha=alpha,
             grad_image=grad_image,
             grad_alpha=grad_alpha,
             grad=grad,
@@ -416,7 +416,7 @@ class _Rasterize(torch.autograd.Function):
             launch("raster_blend_backward", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
             launch("raster_project_backward", args, n)
         grad_background = None
-        if background is not None and ctx.needs_input_grad[9]:
+        if saved.background is not None and ctx.needs_input_grad[9]:
             grad_background = ((1 - alpha)[..., None] * grad_image[..., : scene.channels]).sum((0, 1, 2))
         return (None, None, *out.values(), grad_view, grad_background)
 
@@ -458,35 +458,25 @@ def rasterize(scene: Scene) -> RasterOutput:
     norms = (torch.zeros(cameras, n, device=device), torch.zeros(cameras, n, device=device))
     # Warp leaves its device current; a caller's may be another one.
     with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
-        image, alphas, median, radii, means2d, weight_sum, weight_max, top_ids, top_weights, hits = _Rasterize.apply(
-            scene,
-            norms,
-            scene.means,
-            scene.quats,
-            scene.log_scales,
-            scene.opacity_logits,
-            scene.colors,
-            scene.sh,
-            scene.viewmats,
-            scene.background,
-        )
-    colors, depth = image, None
+        inputs = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh)
+        out = _Images(*applied(_Rasterize, scene, norms, *inputs, scene.viewmats, scene.background))
+    colors, depth = out.image, None
     if scene.with_depth:
-        colors, depth_sum = image[..., :-1], image[..., -1]
-        depth = expected_depth(depth_sum, alphas)
+        colors, depth_sum = out.image[..., :-1], out.image[..., -1]
+        depth = expected_depth(depth_sum, out.alpha)
     weights, top = scene.with_contributions, scene.with_top
     return RasterOutput(
         colors=colors,
-        alphas=alphas,
+        alphas=out.alpha,
         depth_expected=depth,
-        depth_median=median if scene.with_depth else None,
-        radii=radii,
-        means2d=means2d,
-        weight_sum=weight_sum if weights else None,
-        weight_max=weight_max if weights else None,
+        depth_median=out.median if scene.with_depth else None,
+        radii=out.radii,
+        means2d=out.means2d,
+        weight_sum=out.weight_sum if weights else None,
+        weight_max=out.weight_max if weights else None,
         means2d_grad=norms[0],
         means2d_absgrad=norms[1],
-        top_ids=top_ids if top else None,
-        top_weights=top_weights if top else None,
-        hits=hits,
+        top_ids=out.top_id if top else None,
+        top_weights=out.top_weight if top else None,
+        hits=out.hits,
     )

@@ -6,12 +6,21 @@ Projection: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import cast
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
+from ..torch_types import (
+    AutogradContext,
+    applied,
+    checkpoint,
+    cross,
+    integers,
+    norm,
+    norm_1,
+    on_gradient,
+    unflatten,
+)
 from . import constants as k
 from .settings import RasterOutput, Scene, camera_limits
 
@@ -23,13 +32,14 @@ class _FloorAtZero(torch.autograd.Function):
     """max(x, 0) that lets a gradient through below 0 when descending it would raise x: black is no trap."""
 
     @staticmethod
-    def forward(ctx, x: Tensor) -> Tensor:
+    def forward(ctx: AutogradContext, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
         return x.clamp_min(0.0)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:
-        (x,) = ctx.saved_tensors
+    def backward(ctx: AutogradContext, *grads: Tensor) -> Tensor:
+        x: Tensor = ctx.saved_tensors[0]
+        (grad,) = grads
         return torch.where((x > 0) | (grad < 0), grad, torch.zeros_like(grad))
 
 
@@ -64,7 +74,7 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations [N, 3, 3] of quaternions [N, 4] wxyz of any non-zero norm."""
     quats = quats / quats.detach().abs().amax(-1, keepdim=True)  # the norm's squares neither vanish nor overflow
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    w, x, y, z = (quats / norm(quats, -1, keepdim=True)).unbind(-1)
     return torch.stack(
         (
             1 - 2 * (y * y + z * z),
@@ -111,13 +121,13 @@ def _finite_inputs(scene: Scene) -> Tensor:
 
 def _colors(scene: Scene, index: Tensor, means: Tensor, viewmat: Tensor) -> Tensor:
     """Channels [V, D] of the Gaussians `index` as this camera sees them."""
-    parts = []
+    parts: list[Tensor] = []
     if scene.sh is not None:
         position = -viewmat[:3, :3].T @ viewmat[:3, 3]
         dirs = means - position
-        basis = sh_basis(dirs / dirs.norm(dim=-1, keepdim=True), scene.sh_degree)
+        basis = sh_basis(dirs / norm(dirs, -1, keepdim=True), scene.sh_degree)
         coefficients = scene.sh[index][:, : basis.shape[1]]
-        parts.append(_FloorAtZero.apply(torch.einsum("nk,nkd->nd", basis, coefficients) + 0.5))
+        parts.append(applied(_FloorAtZero, torch.einsum("nk,nkd->nd", basis, coefficients) + 0.5))
     if scene.colors is not None:
         parts.append(scene.colors[index])
     return torch.cat(parts, -1)
@@ -152,7 +162,7 @@ def _footprint(scene: Scene, camera: int, index: Tensor) -> _Footprint:
     raw = B @ B.transpose(-1, -2)
     xx, xy, yy = raw[:, 0, 0] + k.LOW_PASS, raw[:, 0, 1], raw[:, 1, 1] + k.LOW_PASS
     # |b0 x b1|^2 is det(B B^T) without the cancellation of xx yy - xy^2.
-    det_raw = torch.linalg.cross(B[:, 0], B[:, 1]).square().sum(-1)
+    det_raw = cross(B[:, 0], B[:, 1]).square().sum(-1)
     det = det_raw + k.LOW_PASS * (raw[:, 0, 0] + raw[:, 1, 1]) + k.LOW_PASS**2
     opacity = torch.sigmoid(scene.opacity_logits[index])
     if scene.settings.antialiased:
@@ -266,9 +276,9 @@ def _blend(p: _Projected, batch: _Batch, left: Tensor) -> tuple[Tensor, Tensor, 
         def gather(grad: Tensor) -> None:
             for total, (s, dx, t, dy) in zip(totals, slopes, strict=True):
                 pixel = grad * (s.detach() * dx.detach() + t.detach() * dy.detach())
-                total.index_add_(0, members.flatten(), torch.linalg.vector_norm(pixel, 1, dim=(1, 2)).flatten())
+                total.index_add_(0, members.flatten(), norm_1(pixel, (1, 2)).flatten())
 
-        exponent.register_hook(gather)
+        on_gradient(exponent, gather)
     opacity = (p.opacity[members] * batch.valid)[:, None]
     alpha = opacity * torch.exp(exponent.flatten(1, 2))
     alpha = alpha.clamp_max(k.ALPHA_MAX).masked_fill(alpha < k.ALPHA_MIN, 0.0)
@@ -300,8 +310,9 @@ class _Camera:
 
     def __init__(self, scene: Scene, p: _Projected):
         self.scene, self.p = scene, p
-        self.like = {"dtype": scene.means.dtype, "device": scene.means.device}
-        self.weight_sum, self.weight_max = (torch.zeros(len(p.index), **self.like) for _ in range(2))
+        self.dtype, self.device = scene.means.dtype, scene.means.device
+        self.weight_sum = torch.zeros(len(p.index), dtype=self.dtype, device=self.device)
+        self.weight_max = torch.zeros_like(self.weight_sum)
         self.across, self.down = -(-scene.width // k.TILE), -(-scene.height // k.TILE)
         self.members, self.counts = _hits(p, self.across, self.down)
         self.starts = self.counts.cumsum(0) - self.counts
@@ -309,7 +320,7 @@ class _Camera:
     def _batches(self) -> Iterator[Tensor]:
         """All tiles, those with most hits first, as many at a time as _LANES allows."""
         order = self.counts.argsort(descending=True)
-        counts, first = self.counts[order].tolist(), 0
+        counts, first = integers(self.counts[order]), 0
         while first < len(counts):
             size = max(1, _LANES // (max(counts[first], 1) * k.TILE**2))
             yield order[first : first + size]
@@ -317,12 +328,12 @@ class _Camera:
 
     def _empty(self, tiles: Tensor) -> tuple[Tensor, Tensor, _Pixels]:
         """Pixel centres of columns and rows [B, TILE] of `tiles` [B], and the pixels before any Gaussian."""
-        centres = torch.arange(k.TILE, **self.like) + 0.5
+        centres = torch.arange(k.TILE, dtype=self.dtype, device=self.device) + 0.5
         xs, ys = (at[:, None] * k.TILE + centres for at in (tiles % self.across, tiles // self.across))
         inside = ((ys < self.scene.height)[:, :, None] & (xs < self.scene.width)[:, None, :]).flatten(1)
         # What overhangs the image is finished from the start.
-        left = torch.where(inside, 1.0, k.T_STOP).to(**self.like)
-        sums = torch.zeros(*left.shape, self.p.colors.shape[1] + 1, **self.like)
+        left = torch.where(inside, 1.0, k.T_STOP).to(dtype=self.dtype, device=self.device)
+        sums = left.new_zeros(*left.shape, self.p.colors.shape[1] + 1)
         top, top_weight = torch.full_like(left, -1, dtype=torch.int64), torch.zeros_like(left)
         return xs, ys, _Pixels(sums, left, top, top_weight, torch.full_like(left, k.DEPTH_EMPTY))
 
@@ -336,10 +347,7 @@ class _Camera:
             numbers = torch.arange(first, min(first + step, most), device=tiles.device)
             valid = numbers < counts
             batch = _Batch(self.members[torch.where(valid, starts + numbers, 0)], valid, xs, ys)
-            weights, after, sums, out.left = cast(
-                tuple[Tensor, ...],
-                checkpoint(_blend, self.p, batch, out.left, use_reentrant=False, preserve_rng_state=False),
-            )
+            weights, after, sums, out.left = checkpoint(_blend, self.p, batch, out.left)
             out.sums = out.sums + sums
             with torch.no_grad():
                 if self.scene.with_contributions:
@@ -374,24 +382,24 @@ class _Camera:
 
         def image(name: str) -> Tensor:
             value = torch.cat([getattr(batch, name) for batch in pixels])[place]
-            value = value.unflatten(1, (k.TILE, k.TILE)).unflatten(0, (self.down, self.across))
+            value = unflatten(unflatten(value, 1, (k.TILE, k.TILE)), 0, (self.down, self.across))
             return value.transpose(1, 2).flatten(2, 3).flatten(0, 1)[: self.scene.height, : self.scene.width]
 
         return _Pixels(*(image(field.name) for field in fields(_Pixels)))
 
 
-def _watch_gradients(p: _Projected, norm: Tensor, absnorm: Tensor) -> None:
-    """Have the backward pass write the densification figures of one camera into `norm` and `absnorm` [N]."""
+def _watch_gradients(p: _Projected, gradient: Tensor, absgradient: Tensor) -> None:
+    """Have the backward pass write the densification figures of one camera into `gradient` and `absgradient` [N]."""
     if not p.mean2d.requires_grad:
         return
 
     def write(grad: Tensor) -> None:
-        norm.zero_()[p.index] = grad.norm(dim=-1)
+        gradient.zero_()[p.index] = norm(grad, -1)
         if p.absgrad is not None:
-            absnorm.zero_()[p.index] = p.absgrad.norm(dim=-1)
+            absgradient.zero_()[p.index] = norm(p.absgrad, -1)
             p.absgrad.zero_()
 
-    p.mean2d.register_hook(write)
+    on_gradient(p.mean2d, write)
 
 
 def expected_depth(depth_sum: Tensor, alphas: Tensor) -> Tensor:
@@ -403,17 +411,17 @@ def expected_depth(depth_sum: Tensor, alphas: Tensor) -> Tensor:
 def rasterize(scene: Scene) -> RasterOutput:
     """All cameras of `scene`, one after the other."""
     n, cameras = scene.means.shape[0], scene.viewmats.shape[0]
-    like = {"dtype": scene.means.dtype, "device": scene.means.device}
-    norm, absnorm, weight_sum, weight_max = torch.zeros(4, cameras, n, **like)
+    zeros = scene.means.new_zeros
+    gradient, absgradient, weight_sum, weight_max = zeros(4, cameras, n)
     radii = torch.zeros(cameras, n, dtype=torch.int32, device=scene.means.device)
-    means2d = torch.zeros(cameras, n, 2, **like)
-    background = torch.zeros(scene.channels, **like) if scene.background is None else scene.background
+    means2d = zeros(cameras, n, 2)
+    background = zeros(scene.channels) if scene.background is None else scene.background
     candidates = _finite_inputs(scene).nonzero()[:, 0]
     size = (0, scene.height, scene.width)
     images: list[tuple[Tensor, ...]] = []
     for camera in range(cameras):
         p = _project(scene, camera, candidates)
-        _watch_gradients(p, norm[camera], absnorm[camera])
+        _watch_gradients(p, gradient[camera], absgradient[camera])
         radii[camera, p.index] = p.radius.clamp_max(2.0**30).to(torch.int32)
         means2d[camera, p.index] = p.mean2d.detach()
         blender = _Camera(scene, p)
@@ -433,8 +441,8 @@ def rasterize(scene: Scene) -> RasterOutput:
     if cameras:
         colors, alphas, depth_sum, median, top, top_weight = (torch.stack(i) for i in zip(*images, strict=True))
     else:
-        colors, top = torch.zeros(*size, scene.channels, **like), radii.new_zeros(size)
-        alphas = depth_sum = median = top_weight = torch.zeros(size, **like)
+        colors, top = zeros(*size, scene.channels), radii.new_zeros(size)
+        alphas = depth_sum = median = top_weight = zeros(size)
     return RasterOutput(
         colors=anchor(colors, scene),
         alphas=alphas,
@@ -444,8 +452,8 @@ def rasterize(scene: Scene) -> RasterOutput:
         means2d=means2d,
         weight_sum=weight_sum if scene.with_contributions else None,
         weight_max=weight_max if scene.with_contributions else None,
-        means2d_grad=norm,
-        means2d_absgrad=absnorm,
+        means2d_grad=gradient,
+        means2d_absgrad=absgradient,
         top_ids=top if scene.with_top else None,
         top_weights=top_weight if scene.with_top else None,
     )

@@ -14,14 +14,14 @@ import ctypes
 import functools
 import threading
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from ..kernel_text import kernel_text
 from ..native import Launch, build, default_threads, run_workers
+from ..torch_types import AutogradContext, applied, once_differentiable
 
 WINDOW, SIGMA = 11, 1.5
 _HALF = WINDOW // 2
@@ -59,14 +59,15 @@ class _Block(ctypes.Structure):
     _fields_ = [(name, kind) for name, kind, _ in _FIELDS]
 
 
-def _taps() -> list[float]:
+def window_taps() -> list[float]:
+    """[WINDOW] weights of the Gaussian window, of sum 1."""
     weights = torch.exp(-0.5 * (torch.arange(-_HALF, _HALF + 1, dtype=torch.float64) / SIGMA).square())
     return [float(weight) for weight in weights / weights.sum()]
 
 
 def _source() -> str:
     fields = " ".join(f"{text} {name};" for name, _, text in _FIELDS)
-    taps = ", ".join(f"{tap:.9g}f" for tap in _taps())
+    taps = ", ".join(f"{tap:.9g}f" for tap in window_taps())
     body = kernel_text(_SOURCE).replace("@ROWS@", str(_ROWS)).replace("@HALF@", str(_HALF)).replace("@TAPS@", taps)
     return f"struct Block {{ {fields} }};\nBlock& P = *(Block*)block;\n{body}"
 
@@ -95,7 +96,7 @@ def _inverse(size: int, repeat: int, total: int) -> Tensor:
     """[total] reciprocal weight sums of `size` positions, each `repeat` times, then zeros."""
     inside = torch.nn.functional.conv1d(
         torch.ones(1, 1, size, dtype=torch.float64),
-        torch.tensor(_taps(), dtype=torch.float64)[None, None],
+        torch.tensor(window_taps(), dtype=torch.float64)[None, None],
         padding=_HALF,
     )
     out = torch.zeros(total)
@@ -157,16 +158,16 @@ class _Ssim(torch.autograd.Function):
     """Autograd's view; only the first image has a gradient."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, threads: int) -> Tensor:  # type: ignore[override]
+    def forward(ctx: AutogradContext, image: Tensor, target: Tensor, threads: int) -> Tensor:
         value, gradient = _run(image.contiguous(), target.contiguous(), ctx.needs_input_grad[0], threads)
         ctx.save_for_backward(gradient)
         return value
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
-        (gradient,) = cast(tuple[Tensor, ...], ctx.saved_tensors)
-        return grad * gradient, None, None
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor, None, None]:
+        gradient: Tensor = ctx.saved_tensors[0]
+        return grads[0] * gradient, None, None
 
 
 def supports(image: Tensor, target: Tensor) -> bool:
@@ -196,4 +197,4 @@ def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
     workers = default_threads() if threads is None else threads
     if workers < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
-    return _Ssim.apply(image, target, workers)  # type: ignore[no-any-return]
+    return applied(_Ssim, image, target, workers)

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from ..kernel_text import kernel_text
-from ..native import initialised_warp, launch_on
-from .ssim import WINDOW, _taps
+from ..native import func_native, initialised_warp, launch_on
+from ..torch_types import AutogradContext, applied, once_differentiable
+from .ssim import WINDOW, window_taps
 
 _SOURCE = Path(__file__).with_name("kernels") / "ssim.cu"
 
@@ -25,8 +26,8 @@ _SOURCE = Path(__file__).with_name("kernels") / "ssim.cu"
 @functools.lru_cache(maxsize=1)
 def kernel() -> Any:
     """The Warp kernel of all passes; compiled for a device at its first launch there."""
-    wp = initialised_warp()
-    taps = ", ".join(f"{tap:.9g}f" for tap in _taps())
+    initialised_warp()
+    taps = ", ".join(f"{tap:.9g}f" for tap in window_taps())
     source = kernel_text(_SOURCE).replace("@HALF@", str(WINDOW // 2)).replace("@TAPS@", taps)
 
     def ssim_pass(
@@ -34,7 +35,7 @@ def kernel() -> Any:
         height: wp.int32, width: wp.int32, channels: wp.int32, stage: wp.int32, tid: wp.int32,
     ): ...  # fmt: skip
 
-    native = wp.func_native(source)(ssim_pass)
+    native = func_native(source)(ssim_pass)
 
     def entry(
         images: wp.uint64, targets: wp.uint64, blurreds: wp.uint64, backs: wp.uint64, scores: wp.uint64,
@@ -49,13 +50,13 @@ class _Ssim(torch.autograd.Function):
     """Autograd's view; the gradient is linear in the incoming one, so it is computed along with the value."""
 
     @staticmethod
-    def forward(ctx, image: Tensor, target: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: AutogradContext, image: Tensor, target: Tensor) -> Tensor:
         image, target = image.contiguous(), target.contiguous()
         height, width, channels = image.shape
-        wanted = ctx.needs_input_grad[0]
+        differentiable = ctx.needs_input_grad[0]
         blurred, score = image.new_empty(4, *image.shape), torch.empty_like(image)
-        back = image.new_empty(3, *image.shape) if wanted else None
-        for stage in range(4 if wanted else 2):
+        back = image.new_empty(3, *image.shape) if differentiable else None
+        for stage in range(4 if differentiable else 2):
             inputs = [
                 image.data_ptr(), target.data_ptr(), blurred.data_ptr(), 0 if back is None else back.data_ptr(),
                 score.data_ptr(), height, width, channels, stage,
@@ -66,9 +67,9 @@ class _Ssim(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        (gradient,) = ctx.saved_tensors
-        return grad * gradient, None
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor, None]:
+        gradient: Tensor = ctx.saved_tensors[0]
+        return grads[0] * gradient, None
 
 
 def supports(image: Tensor, target: Tensor) -> bool:
@@ -94,4 +95,4 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
             f"SSIM here takes float32 images of one device and a target without gradient, got "
             f"{image.dtype} on {image.device} and {target.dtype} on {target.device}"
         )
-    return _Ssim.apply(image, target)  # type: ignore[no-any-return]
+    return applied(_Ssim, image, target)

@@ -1,0 +1,122 @@
+"""Types for what torch itself leaves without any: each function is that call and one cast.
+
+torch's annotations end where its Python meets C++ (`linalg`, `Tensor.norm`, `Tensor.tolist`, an autograd context). A
+type checker that reads `x.norm(dim=1)` then knows nothing of the whole expression, and neither does an editor.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import function
+from torch.utils import checkpoint as _checkpoint
+
+_Backward = TypeVar("_Backward", bound=Callable[..., Any])
+_Result = TypeVar("_Result")
+
+
+class AutogradContext(Protocol):
+    """What autograd hands to `forward` and `backward` of a `torch.autograd.Function`; functions add what they keep."""
+
+    needs_input_grad: tuple[bool, ...]
+    """For each input of `forward` whether its gradient is wanted."""
+
+    @property
+    def saved_tensors(self) -> tuple[Any, ...]:
+        """What `save_for_backward` was given: tensors, and None where that was None."""
+        ...
+
+    def save_for_backward(self, *tensors: Tensor | None) -> None:
+        """Keeps inputs and outputs for `backward`."""
+        ...
+
+    def mark_non_differentiable(self, *tensors: Tensor) -> None:
+        """Says which outputs have no gradient."""
+        ...
+
+    def set_materialize_grads(self, value: bool) -> None:
+        """False: `backward` gets None for an output without gradient, not zeros."""
+        ...
+
+
+def applied(autograd_function: type[torch.autograd.Function], *inputs: Any) -> Any:
+    """Output of an autograd function; the caller says what that is."""
+    return cast(Any, autograd_function).apply(*inputs)
+
+
+def once_differentiable(backward: _Backward) -> _Backward:
+    """`torch.autograd.function.once_differentiable` that keeps the names of the arguments."""
+    return cast(_Backward, function.once_differentiable(backward))
+
+
+def checkpoint(body: Callable[..., _Result], *inputs: Any) -> _Result:
+    """body(*inputs), which the backward pass runs once more instead of keeping what is between. No random draws."""
+    run = cast(Callable[..., _Result], cast(Any, _checkpoint).checkpoint)
+    return run(body, *inputs, use_reentrant=False, preserve_rng_state=False)
+
+
+def backward(loss: Tensor, retain_graph: bool | None = None) -> None:
+    """Adds the gradients of `loss` (0-dim) to all leaves that it depends on."""
+    cast(Any, loss).backward(retain_graph=retain_graph)
+
+
+def on_gradient(values: Tensor, hook: Callable[[Tensor], None]) -> None:
+    """Calls `hook` with the gradient of `values` whenever a backward pass has it."""
+    cast(Any, values).register_hook(hook)
+
+
+def norm(values: Tensor, dim: int, keepdim: bool = False) -> Tensor:
+    """Euclidean norm along an axis."""
+    return cast(Any, values).norm(dim=dim, keepdim=keepdim)
+
+
+def norm_1(values: Tensor, dims: tuple[int, ...]) -> Tensor:
+    """Sum of magnitudes along axes."""
+    return cast(Any, torch.linalg).vector_norm(values, 1, dim=dims)
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product [..., 3]."""
+    return cast(Any, torch.linalg).cross(a, b)
+
+
+def determinant(matrices: Tensor) -> Tensor:
+    """Determinants [...] of [..., K, K]."""
+    return cast(Any, torch.linalg).det(matrices)
+
+
+def singular_values(matrices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(U, S, Vh) of [..., K, K]."""
+    return cast(Any, torch.linalg).svd(matrices)
+
+
+def split(values: Tensor, sizes: int | list[int], dim: int = 0) -> tuple[Tensor, ...]:
+    """Views of so many rows each (the last may have fewer), or of these sizes."""
+    return cast(Any, values).split(sizes, dim)
+
+
+def unflatten(values: Tensor, dim: int, sizes: tuple[int, ...]) -> Tensor:
+    """A view with the axis `dim` as several of these sizes."""
+    return cast(Any, values).unflatten(dim, sizes)
+
+
+def unique_with_inverse(values: Tensor) -> tuple[Tensor, Tensor]:
+    """(distinct values [U] ascending, index int64 into them in the shape of `values`)."""
+    return cast(Any, values).unique(return_inverse=True)
+
+
+def floats(values: Tensor) -> list[float]:
+    """Numbers of a tensor [K], read from its device."""
+    return cast(Any, values).tolist()
+
+
+def integers(values: Tensor) -> list[int]:
+    """Numbers of an integer tensor [K], read from its device."""
+    return cast(Any, values).tolist()
+
+
+def from_numpy(array: "np.ndarray[Any, Any]") -> Tensor:
+    """A CPU tensor that shares the array's memory."""
+    return cast(Any, torch).from_numpy(array)
