@@ -68,12 +68,7 @@ class FreezeSettings:
     live_show: EnumProperty(
         name="Show",
         description="What is drawn over the view while scrubbing",
-        items=[
-            ("color", "Picture", "The frozen people and place"),
-            ("guesses", "Guesses", "The picture, tinted where no frame near t* saw what is shown"),
-            ("support", "Support", "White where frames near t* saw what is shown, black where it is a guess"),
-            ("motion", "Motion", "White where something moves in the clip"),
-        ],
+        items=[(name, *words) for name, words in contract.LIVE_SHOWS.items()],
         options=set(),
     )
     take_name: StringProperty(
