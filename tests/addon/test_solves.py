@@ -173,8 +173,9 @@ def test_the_export_button_says_what_is_wrong(scene, shot, tmp_path):
 
 
 @pytest.mark.parametrize("well", [True, False])
-def test_an_export_in_a_window_is_followed_without_waiting(addon, shot, tmp_path, well):
-    solves, supervisor, watch = addon("solve.exchange"), addon("process.supervisor"), None
+def test_an_export_in_a_window_is_followed_without_waiting(addon, scene, shot, tmp_path, well):
+    solves, supervisor = addon("solve.exchange"), addon("process.supervisor")
+    scene.splannequin.shot_path = str(shot)
     asked = solves.begin_export(shot if well else tmp_path, "colmap", tmp_path / "out")
     told = addon("solve.operators").tell
     supervisor.when_answered(asked, lambda: told(shot, lambda: [solves.exported(asked, tmp_path / "out")]))
@@ -182,7 +183,6 @@ def test_an_export_in_a_window_is_followed_without_waiting(addon, shot, tmp_path
     watch = supervisor.watch_of(shot)
     assert not watch.notes and not watch.failures
     asked.process.wait(60)
-    supervisor.tick()
     supervisor.tick()
     said = watch.notes["solve"][0] if well else watch.failures["solve"][0]
     assert (str(tmp_path / "out") if well else "is not a shot folder") in said
