@@ -137,9 +137,9 @@ def inside(ask: dict[str, Any]) -> None:
 def _through_the_group(package: str, ask: dict[str, Any], folder: Path, frame: int) -> np.ndarray:
     """[H, W, 3] float32: a plate of `folder`, warped by the take, as it leaves the compositor."""
     bpy = importlib.import_module("bpy")
-    compat, numbered, freeze_group, steps = (
+    compat, numbered, freeze_group, insertion = (
         importlib.import_module(f"{package}.splannequin_addon.{name}")
-        for name in ("compat", "scene.numbered", "bake.freeze_group", "process.steps")
+        for name in ("compat", "scene.numbered", "bake.freeze_group", "bake.insertion")
     )
     scene = bpy.context.scene
     tree = compat.compositor_tree(scene) or compat.new_compositor_tree(scene, "Artist")
@@ -150,7 +150,7 @@ def _through_the_group(package: str, ask: dict[str, Any], folder: Path, frame: i
     tree.links.new(plate.outputs["Image"], compat.output_socket(tree) or compat.new_output_node(tree))
     scene.splannequin.clip = str(file)
     scene.frame_set(frame)
-    steps.insert_freeze(scene, Path(ask["shot"]), ask["take"], warp=True)
+    insertion.insert_freeze(scene, Path(ask["shot"]), ask["take"], warp=True)
     node = freeze_group.group_node(tree)
     tree.links.new(plate.outputs["Image"], node.inputs["Image"])
     tree.links.new(node.outputs["Image"], compat.output_socket(tree))

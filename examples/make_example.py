@@ -71,7 +71,7 @@ def make(shot: Path, take: str, output: Path) -> None:
     def ours(name: str):
         return importlib.import_module(f"{_package().__name__}.splannequin_addon.{name}")
 
-    bake, shots, steps = ours("bake.insertion"), ours("shot.contents"), ours("process.steps")
+    bake, shots = ours("bake.insertion"), ours("shot.contents")
     shot, output = shot.absolute(), output.absolute()
     state = shots.read(shot)
     if not state.solve or take not in state.takes:
@@ -81,8 +81,8 @@ def make(shot: Path, take: str, output: Path) -> None:
     scene = bpy.context.scene
     props = scene.splannequin
     props.shot_path, props.take_name, props.t_star = str(shot), take, int(state.takes[take]["t_star_frame"])
-    steps.load_camera(scene, shot)
-    steps.insert_freeze(scene, shot, take)
+    ours("solve.arrival").load_camera(scene, shot)
+    ours("bake.insertion").insert_freeze(scene, shot, take)
     bake.fit_take(scene, shot, take)
     scene.render.filepath = f"//{output.stem}_frames/{ours('bake.rendering').DIGITS}"
     first, last = state.frame_range

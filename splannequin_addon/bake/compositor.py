@@ -19,9 +19,10 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..scene import numbered, sequences
+from ..scene.mark import TAG
 from . import fitting, freeze_group, group_inside, placing, warp_nodes
-from .freeze_group import GAP
-from .take_files import Take
+from .node_names import GAP, GROUP_NAME
+from .take_files import WARP_FOLDER, Take
 
 _CG = "cg"
 _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
@@ -77,14 +78,14 @@ def insert(
         node = freeze_group.new_node(tree, before)
         placing.lead_through(tree, node, behind)
         place = "as the plate: what follows it goes on from there" if behind is not None else "before the output"
-        changes.append(f'The node group "{freeze_group.GROUP_NAME}" was inserted {place}.')
+        changes.append(f'The node group "{GROUP_NAME}" was inserted {place}.')
     else:
         if where != "AUTO" and placing.stands_in(node) != (behind is not None):
             placing.lead_past(tree, node)
             placing.lead_through(tree, node, behind)
-            changes.append(f'The node group "{freeze_group.GROUP_NAME}" was moved.')
+            changes.append(f'The node group "{GROUP_NAME}" was moved.')
         freeze_group.set_defaults(node, freeze_group.give_sockets(node.node_tree))
-        changes.append(f'The node group "{freeze_group.GROUP_NAME}" was updated.')
+        changes.append(f'The node group "{GROUP_NAME}" was updated.')
     changes += freeze_group.switch_warp(node, wanted, flow is not None)
     group_inside.fill(scene, node, take, frozen, flow)
     changes += freeze_group.lacking(node)
@@ -112,7 +113,7 @@ def _warp_image(take: Take) -> Any | None:
 
 def _with_layers(image: Any, take: Take, names: Sequence[str]) -> Any:
     """A sequence of the take, once it is known to have some layers. ValueError if not."""
-    group = bpy.data.node_groups.new(freeze_group.GROUP_NAME, "CompositorNodeTree")
+    group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
     try:
         node = group.nodes.new("CompositorNodeImage")
         sequences.show_sequence(node, image, take.first, take.last)
@@ -132,7 +133,7 @@ def may_combine_cg(scene: Any) -> Any:
         raise contract.JobError("The freeze is not in this compositor.", "Bake first.", contract.ExitCode.BAKE)
     if node.inputs["CG"].is_linked:
         raise contract.JobError(
-            f'Something is led into "CG" of {freeze_group.GROUP_NAME} already.',
+            f'Something is led into "CG" of {GROUP_NAME} already.',
             "Unlink it to have it done here.",
             contract.ExitCode.BAKE,
         )
@@ -146,7 +147,7 @@ def combine_cg(scene: Any) -> list[str]:
     """
     node, tree = may_combine_cg(scene), compat.compositor_tree(scene)
     layers = tree.nodes.new("CompositorNodeRLayers")
-    layers[sequences.TAG] = _CG
+    layers[TAG] = _CG
     layers.scene = scene
     layers.name = layers.label = "CG among the frozen"
     layers.location = (node.location.x - 2 * GAP, node.location.y - 300.0)
@@ -169,7 +170,7 @@ def remove(scene: Any) -> bool:
     tree.nodes.remove(node)
     if group.users == 0:  # another scene may show it
         bpy.data.node_groups.remove(group)
-    for ours in [n for n in tree.nodes if n.get(sequences.TAG)]:
+    for ours in [n for n in tree.nodes if n.get(TAG)]:
         images += [ours.image] if getattr(ours, "image", None) else []
         tree.nodes.remove(ours)
     if before.get("made_tree") and not [n for n in tree.nodes if n.bl_idname not in _OUTPUTS]:
@@ -198,7 +199,7 @@ def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Ite
 
 def _warp_picture(take: Take) -> tuple[Path, str, str]:
     """File, name and encoding of a take's warp."""
-    return numbered.frame_path(take.folder / warp_nodes.FOLDER, take.first), f"Warp {take.folder.name}", "linear"
+    return numbered.frame_path(take.folder / WARP_FOLDER, take.first), f"Warp {take.folder.name}", "linear"
 
 
 def _plate_name(plate: Path) -> str:
@@ -210,10 +211,10 @@ _OUTPUTS = ("CompositorNodeComposite", "NodeGroupOutput", "NodeGroupInput")
 
 def _show_plate(scene: Any, tree: Any, node: Any, image: Any, take: Take) -> None:
     """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
-    for old in [n for n in tree.nodes if n.get(sequences.TAG) and n.get(sequences.TAG) != _CG]:
+    for old in [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]:
         tree.nodes.remove(old)
     image_node = tree.nodes.new("CompositorNodeImage")
-    image_node[sequences.TAG] = True
+    image_node[TAG] = True
     image_node.name = image_node.label = "Plate"
     sequences.show_sequence(image_node, image, take.first, take.last)
     stream = image_node.outputs["Image"]
@@ -221,7 +222,7 @@ def _show_plate(scene: Any, tree: Any, node: Any, image: Any, take: Take) -> Non
     compat.output_socket(tree).node.location = (node.location.x + node.width + 60.0, node.location.y)
     image_node.location = (node.location.x - 2 * GAP, node.location.y)
     fit = compat.new_fit_node(tree, fitting.how_it_fits(scene, tuple(image.size)))
-    fit[sequences.TAG] = True
+    fit[TAG] = True
     fit.label = "Fit Plate"
     fit.location = (node.location.x - GAP, node.location.y)
     tree.links.new(stream, fit.inputs[0])

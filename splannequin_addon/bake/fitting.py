@@ -8,10 +8,8 @@ import bpy
 import numpy as np
 
 from .. import compat
-from ..scene import sequences
-from . import freeze_group
-from .freeze_group import GAP
-from .take_files import Take
+from ..scene.mark import TAG
+from .node_names import GAP, GRAIN
 
 
 def across(group: Any) -> Any:
@@ -43,20 +41,20 @@ _BEYOND = 1.1
 
 def _blend() -> Any:
     """A texture that rises from left to right. A scaled picture would do, but 4.3 leaves its lowest row unset."""
-    texture = next((t for t in bpy.data.textures if t.get(sequences.TAG) and t.type == "BLEND"), None)
+    texture = next((t for t in bpy.data.textures if t.get(TAG) and t.type == "BLEND"), None)
     if texture is None:
         texture = bpy.data.textures.new(RAMP, "BLEND")
-        texture[sequences.TAG] = True
+        texture[TAG] = True
     return texture
 
 
 def _ramp() -> Any:
     """A picture that rises from 0 at the frame's left to 1 at its right: 5.0 has no node that does."""
-    image = next((i for i in bpy.data.images if i.get(sequences.TAG) and i.name.startswith(RAMP)), None)
+    image = next((i for i in bpy.data.images if i.get(TAG) and i.name.startswith(RAMP)), None)
     if image is not None:
         return image
     image = bpy.data.images.new(RAMP, _STEPS, _ROWS, alpha=False, float_buffer=True, is_data=True)
-    image[sequences.TAG] = True
+    image[TAG] = True
     across = 0.5 + _BEYOND * ((np.arange(_STEPS, dtype=np.float32) + 0.5) / _STEPS - 0.5)
     row = np.repeat(across[:, None], 4, axis=1)
     row[:, 3] = 1.0
@@ -66,19 +64,21 @@ def _ramp() -> Any:
     return image
 
 
-def fitted(scene: Any, group: Any, take: Take, layers: dict[str, Any]) -> dict[str, Any]:
+def fitted(
+    scene: Any, group: Any, size: tuple[int, int], margin: tuple[int, int], layers: dict[str, Any]
+) -> dict[str, Any]:
     """The layers' sockets, by name: without overscan, and scaled to the render's size, whatever it is when it renders.
 
     Frames wider than the scene's picture are cut, as the camera sees it; flatter ones leave bars.
     """
     names, sockets = tuple(layers), dict(layers)
-    for row, name in enumerate(names if any(take.margin) else ()):
-        node = compat.new_crop_node(group, take.margin, take.size)
+    for row, name in enumerate(names if any(margin) else ()):
+        node = compat.new_crop_node(group, margin, size)
         node.label = f"{name} without overscan"
         node.location = (-2 * GAP, -50.0 - 170.0 * row)
         group.links.new(sockets[name], node.inputs[0])
         sockets[name] = node.outputs[0]
-    how, shown = how_it_fits(scene, take.size), _whole(group, sockets["Depth"])
+    how, shown = how_it_fits(scene, size), _whole(group, sockets["Depth"])
     coverage = None
     for row, name in enumerate(("", *names) if shown is not None else names):
         node = compat.new_fit_node(group, how)
@@ -88,7 +88,7 @@ def fitted(scene: Any, group: Any, take: Take, layers: dict[str, Any]) -> dict[s
         if not name:
             coverage = node.outputs[0]
         else:
-            sockets[name] = _unfaded(group, node.outputs[0], coverage, name in ("Combined", freeze_group.GRAIN))
+            sockets[name] = _unfaded(group, node.outputs[0], coverage, name in ("Combined", GRAIN))
     return sockets
 
 

@@ -11,20 +11,16 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..scene import sequences
-from . import warp_nodes
+from ..scene.mark import TAG
+from .node_names import AS_WARP, DEPTH, FROZEN, GRAIN, GROUP_NAME, INVENTED
 
-GROUP_NAME = "Splannequin Freeze"
 BEFORE = "splannequin_before"
 _WARPS = "splannequin_warps"
-FROZEN, DEPTH = "Frozen", "Depth in scene units"
-"""Nodes inside the group."""
-GAP = 200.0
 
 
 def switch_warp(node: Any, wanted: bool, possible: bool) -> list[str]:
     """Gives our node the factor of the warp, or takes it away; says what was changed. The inside is not touched."""
-    group, face, name = node.node_tree, node.node_tree.interface, warp_nodes.FACTOR
+    group, face, name = node.node_tree, node.node_tree.interface, AS_WARP
     there = [i for i in face.items_tree if i.item_type == "SOCKET" and i.in_out == "INPUT" and i.name == name]
     group[_WARPS] = wanted
     if wanted and possible and not there:
@@ -91,7 +87,7 @@ def set_depth_scale(scene: Any, scale: float) -> None:
 
 
 def _is_ours(group: Any) -> bool:
-    return group is not None and bool(group.get(sequences.TAG))
+    return group is not None and bool(group.get(TAG))
 
 
 _FACTORS = (
@@ -100,8 +96,6 @@ _FACTORS = (
     ("Only Supported", 0.0, "1: your stream shows through where the frozen frame is a guess"),
     ("Only Moving", 0.0, "1: your stream shows through where nothing moves in the footage"),
 )
-GRAIN = "Grain"
-INVENTED = "Show What Is Invented"
 _LOOKS = (
     ("Splat", 0.0, "1: the splats alone, as they were before the plates' pixels came in"),
     (INVENTED, 0.0, "1: what splats made up is tinted, what comes from a plate is not"),
@@ -163,7 +157,7 @@ def set_defaults(node: Any, names: set[str]) -> None:
 def new_node(tree: Any, before: dict[str, bool]) -> Any:
     """A node of a new group, with all its sockets and nothing inside; `before` says how the compositor was."""
     group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
-    group[sequences.TAG] = True
+    group[TAG] = True
     group[BEFORE] = json.dumps(before)
     give_sockets(group)
     node = tree.nodes.new("CompositorNodeGroup")

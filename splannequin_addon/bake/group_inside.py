@@ -9,8 +9,8 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..scene import sequences
-from . import fitting, freeze_group, warp_nodes
-from .freeze_group import GAP
+from . import fitting, warp_nodes
+from .node_names import AS_WARP, DEPTH, FROZEN, GAP, GRAIN, INVENTED
 from .take_files import Take
 
 _NOTHING = 0.1 * contract.NO_DEPTH
@@ -28,11 +28,11 @@ def fill(scene: Any, node: Any, take: Take, image: Any, warp: Any | None) -> Non
     enter = group.nodes.new("NodeGroupInput")
     leave = group.nodes.new("NodeGroupOutput")
     frozen = group.nodes.new("CompositorNodeImage")
-    frozen.name = frozen.label = freeze_group.FROZEN
+    frozen.name = frozen.label = FROZEN
     sequences.show_sequence(frozen, image, take.first, take.last)
     mix, factor, first, second, mixed = compat.new_mix_node(group)
     depth = compat.new_math_node(group)
-    depth.name = depth.label = freeze_group.DEPTH
+    depth.name = depth.label = DEPTH
     depth.inputs[1].default_value = take.depth_scale
     enter.location, frozen.location = (-2 * GAP, 150.0), (-3 * GAP, -100.0)
     mix.location, depth.location, leave.location = (3 * GAP, 150.0), (GAP, -100.0), (4 * GAP, 0.0)
@@ -43,7 +43,7 @@ def fill(scene: Any, node: Any, take: Take, image: Any, warp: Any | None) -> Non
     if "Plate" in layers:
         layers["Combined"] = _looked_at(group, enter, layers)
     layers.pop("Splat", None)
-    fitted = fitting.fitted(scene, group, take, layers)
+    fitted = fitting.fitted(scene, group, take.size, take.margin, layers)
     share = _share(group, enter, fitted)
     nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0])
     group.links.new(share, factor)
@@ -74,8 +74,8 @@ def _warped(group: Any, enter: Any, own: Any, image: Any, take: Take) -> Any:
     sequences.show_sequence(reader, image, take.first, take.last)
     frozen = warp_nodes.frozen(group, enter.outputs["Image"], reader.outputs, take.plate_size)
     node, factor, first, second, mixed = compat.new_mix_node(group)
-    node.label, node.location = warp_nodes.FACTOR, (-2 * GAP, 330.0)
-    group.links.new(enter.outputs[warp_nodes.FACTOR], factor)
+    node.label, node.location = AS_WARP, (-2 * GAP, 330.0)
+    group.links.new(enter.outputs[AS_WARP], factor)
     group.links.new(own, first)
     group.links.new(frozen, second)
     return mixed
@@ -96,9 +96,9 @@ def _looked_at(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     invented = compat.new_math_node(group, "MULTIPLY_ADD")
     invented.inputs[1].default_value, invented.inputs[2].default_value = -_TINTED, _TINTED
     group.links.new(layers["Plate"], invented.inputs[0])
-    amount = _product(group, enter.outputs[freeze_group.INVENTED], invented.outputs[0])
+    amount = _product(group, enter.outputs[INVENTED], invented.outputs[0])
     tint, factor, first, second, tinted = compat.new_mix_node(group)
-    tint.label, second.default_value = freeze_group.INVENTED, _TINT
+    tint.label, second.default_value = INVENTED, _TINT
     group.links.new(amount, factor)
     group.links.new(chosen, first)
     invented.location, tint.location = (-2 * GAP, 670.0), (-GAP, 500.0)
@@ -107,14 +107,14 @@ def _looked_at(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
 
 def _grainy(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     """Socket of the frozen picture with as much of its grain as is asked for; takes of before have none."""
-    if freeze_group.GRAIN not in layers:
+    if GRAIN not in layers:
         return layers["Combined"]
     node, factor, first, second, summed = compat.new_mix_node(group, "ADD")
-    node.name = node.label = freeze_group.GRAIN
+    node.name = node.label = GRAIN
     node.location = (0.0, -900.0)
-    group.links.new(enter.outputs[freeze_group.GRAIN], factor)
+    group.links.new(enter.outputs[GRAIN], factor)
     group.links.new(layers["Combined"], first)
-    group.links.new(layers[freeze_group.GRAIN], second)
+    group.links.new(layers[GRAIN], second)
     return summed
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...torch_backend import contract
-from ..scene import numbered, scene_setup
+from ..process import supervisor
+from ..scene import intact, scene_setup
 from ..shot import contents, made
 from ..shot.shot_state import ShotState
 from . import compositor, freeze_group, rendering, take_files
@@ -33,7 +35,7 @@ def insert(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[
         _need_warp(shot, frozen)
     footage = _footage(scene, shot, plate)
     changes = compositor.insert(scene, frozen, plate, footage, scene.splannequin.insert_at, warp)
-    lacking = missing_frames(shot, take, rendering.frames_of(scene))
+    lacking = contents.missing_frames(shot, take, rendering.frames_of(scene))
     if lacking:
         changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
     return changes
@@ -88,12 +90,6 @@ def remove(scene: Any) -> bool:
     return compositor.remove(scene)
 
 
-def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
-    """Those of some frames that a take lacks."""
-    there = set(numbered.frame_numbers(contract.ShotFolder(shot).takes / take))
-    return [n for n in frames if n not in there]
-
-
 def fit_take(scene: Any, shot: Path, take: str, new: bool = False) -> list[str]:
     """Gives the scene the rate and range of a take, and a size that loses no pixel of it; says what changed.
 
@@ -125,3 +121,56 @@ def _plate_size(state: ShotState) -> tuple[int, int]:
         return state.size
     path = contract.CameraPath.load(solved)
     return path.width, path.height
+
+
+def insert_freeze(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[str]:
+    """Puts a take into the scene's compositor, or its warp, and keeps the plate's colours if the artist consents."""
+    with intact.scene_of(scene):
+        changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
+        return insert(scene, shot, take, warp) + changes
+
+
+def combine_cg(scene: Any, shot: Path) -> list[str]:
+    """Has the scene's own objects stand among the frozen. JobError if the freeze is not in the compositor."""
+    compositor.may_combine_cg(scene)
+    with intact.scene_of(scene):
+        changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
+        return compositor.combine_cg(scene) + changes
+
+
+def bring_in(scene: Any, shot: Path, take: str, alone: bool = True) -> None:
+    """Has a take put into the compositor and rendered by the timer, in turns: Blender stands still in each.
+
+    Args:
+        scene: the scene; with `alone` no other one that works on the shot is changed.
+        shot: shot folder.
+        take: name of a take.
+        alone: see `scene`.
+    """
+    supervisor.work(shot, "bake", _turns(scene.name, shot, take, scene.name if alone else ""))
+
+
+def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
+    """A picture a turn; the compositor; the render, a turn after it, since Blender takes its time for both."""
+    with contextlib.suppress(
+        contract.JobError, OSError, RuntimeError, ValueError
+    ):  # inserting fails alike, and says so
+        yield from read_ahead(bpy.data.scenes[scene_name], shot, take)
+    seen = ""
+
+    def put_in(scene: Any) -> list[str]:
+        nonlocal seen
+        changes = insert_freeze(scene, shot, take)
+        if supervisor.window_of(scene) is not None:
+            changes += rendering.choose_output(scene, shot, take)  # here, for it belongs to the same undo step
+            seen = scene.name
+        return changes
+
+    supervisor.change(supervisor.watch_of(shot), "bake", put_in, only)
+    if not seen:
+        return
+    yield None
+    window = supervisor.window_of(bpy.data.scenes.get(seen))
+    if window is not None:
+        with bpy.context.temp_override(window=window, scene=window.scene):
+            bpy.ops.splannequin.render("INVOKE_DEFAULT")

@@ -15,7 +15,8 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..scene import scene_setup, sequences
+from ..scene import scene_setup
+from ..scene.mark import TAG
 
 _STANDS_IN = "splannequin_stands_in"
 _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
@@ -60,7 +61,7 @@ def place_of(scene: Any, footage: Sequence[Path], where: str) -> Any | None:
     tree = compat.compositor_tree(scene)
     if where == "OUTPUT" or tree is None:
         return None
-    led = [n for n in _upstream(tree) if n.bl_idname in _PICTURES and not n.get(sequences.TAG) and not n.mute]
+    led = [n for n in _upstream(tree) if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
     nodes = [n for n in tree.nodes if n in led and _picture(n).is_linked]
     found = [n for n in nodes if _shows(n, footage)]
     if where == "PLATE" and not found:  # by another name, then: the chosen one, or the only one

@@ -11,12 +11,8 @@ from typing import Any
 
 from .. import compat
 
-FOLDER = "warp"
-"""Folder of the warps in a take's."""
 LAYERS = ("Combined", "Alpha", "ST", "Matte")
 """Of a warp: the fill, how opaque the frozen frame is, coordinates, and how much the plate gives."""
-FACTOR = "As Warp"
-"""Name of the group's input that fades between the take's own frames and the warped plate."""
 _STEPS = 256.0
 _WIDE = 180.0
 

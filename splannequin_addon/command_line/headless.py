@@ -25,10 +25,11 @@ import bpy
 from ...torch_backend import contract
 from ...torch_backend.contract import ExitCode
 from ..bake import insertion, rendering
-from ..process import backend, jobs, steps
+from ..freeze import takes
+from ..process import backend, begin, jobs, steps
 from ..scene import paths, scene_setup, sequences
 from ..shot import contents
-from ..solve import cameras, exchange, stmaps
+from ..solve import arrival, cameras, exchange, stmaps
 
 
 class Console:
@@ -123,19 +124,19 @@ def main(argv: Sequence[str]) -> int:
 
 def import_clip(args: argparse.Namespace, console: Console) -> int:
     """`import SHOT CLIP`."""
-    return _one_step(args, console, "footage", args.shot)
+    return _one_step(args, console, "import", args.shot)
 
 
 def solve(args: argparse.Namespace, console: Console) -> int:
     """`solve SHOT`."""
-    return _one_step(args, console, "camera", args.shot)
+    return _one_step(args, console, "solve", args.shot)
 
 
 def export(args: argparse.Namespace, console: Console) -> int:
     """`export SHOT --output DIR`: cameras and points for other programs."""
     output = Path(args.output).absolute()
-    process = exchange.begin_export(Path(args.shot).absolute(), args.format, output, args.text)
-    console.say(exchange.finish_export(process, output))
+    asked = exchange.begin_export(Path(args.shot).absolute(), args.format, output, args.text)
+    console.say(exchange.exported(asked, output))
     return ExitCode.OK
 
 
@@ -161,11 +162,11 @@ def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
     requests = asked(args)
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
-    for step in ("footage", "camera", "train", "freeze"):
+    for step in ("import", "solve", "train", "freeze"):
         since = time.perf_counter()
         kind = steps.STEPS[step].kind
         params = requests[kind]
-        results[kind], notes = steps.run(scene, step, params, console)
+        results[kind], notes = begin.run(scene, step, params, console)
         stages[kind] = round(time.perf_counter() - since, 2)
         for note in notes:
             console.say(f"  {note}")
@@ -199,14 +200,14 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
             ExitCode.USAGE,
         )
     span = range(first, last + 1, args.step if args.step > 0 else scene.frame_step)
-    stale = backend.available() and steps.may_be_stale(shot, args.take)
-    if stale or not steps.complete(shot, args.take, span):
-        params = steps.take_params(shot, args.take) or contract.FreezeParams(take=args.take, only_missing=True)
+    stale = backend.available() and takes.may_be_stale(shot, args.take)
+    if stale or not takes.complete(shot, args.take, span):
+        params = takes.take_params(shot, args.take) or contract.FreezeParams(take=args.take, only_missing=True)
         params.first, params.last, params.step = span.start, span.stop - 1, span.step
         params.device = _device(args)
-        steps.run(scene, "freeze", params, console)
+        begin.run(scene, "freeze", params, console)
     if cameras.find(scene, shot, "CAMERA") is None and contract.ShotFolder(shot).cameras.is_file():
-        steps.load_camera(scene, shot)
+        arrival.load_camera(scene, shot)
     baked = _bake(scene, fresh, shot, args.take, output, console, span, args.as_warp or None)
     path = output / contract.SUMMARY_FILE
     summary = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
@@ -221,7 +222,7 @@ def write_stmaps(args: argparse.Namespace, console: Console) -> int:
     shot = _shot(args)
     asked = stmaps.begin(shot, args.width)
     asked.wait()
-    facts = asked.answer()
+    facts = stmaps.answer(asked)
     if console.as_json:
         print(json.dumps(facts))
     for line in stmaps.sentences(facts):
@@ -258,8 +259,8 @@ def _one_step(args: argparse.Namespace, console: Console, step: str, shot: str) 
     (params,) = asked(args).values()
     scene = bpy.context.scene
     scene.splannequin.shot_path = str(Path(shot).absolute())
-    job = steps.begin(scene, step, params)
-    result = steps.wait(job, console)
+    job = begin.begin(scene, step, params)
+    result = begin.wait(job, console)
     if console.as_json:
         print(json.dumps({"result": result}))
     elif isinstance(result, dict):
@@ -302,7 +303,7 @@ def _bake(
     changes = insertion.fit_take(scene, shot, take, fresh) if fresh or scene_setup.fitted(scene) else []
     if span is not None:
         scene.frame_start, scene.frame_end, scene.frame_step = span.start, span.stop - 1, span.step
-    changes += steps.insert_freeze(scene, shot, take, warp)
+    changes += insertion.insert_freeze(scene, shot, take, warp)
     for change in changes:
         console.say(f"  {change}")
     folder = output / "composited"
@@ -363,7 +364,7 @@ def _output(args: argparse.Namespace) -> Path:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise steps.unwritable(output, error, "Choose another --output folder.") from error
+        raise begin.unwritable(output, error, "Choose another --output folder.") from error
     return output
 
 

@@ -9,7 +9,7 @@ from bpy.props import BoolProperty, StringProperty
 
 from ..process import supervisor
 from ..shot import chosen
-from ..ui import icons
+from ..ui import icons, step_operator
 
 VIDEO = ".mp4;.mov;.m4v;.mkv;.avi;.mxf;.mts;.webm;.mpg;.mpeg"
 """Endings of what is taken for footage when it is dropped. Images stay Blender's: they are often references."""
@@ -98,9 +98,19 @@ class SPLANNEQUIN_FH_video(bpy.types.FileHandler):
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
+class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator):
+    """Take the clip's frames into the shot folder and check them"""
+
+    bl_idname = "splannequin.import_clip"
+    bl_label = "Import Clip"
+    bl_options = {"REGISTER"}
+    step = "import"
+
+
 CLASSES = (
     SPLANNEQUIN_OT_use_clip,
     SPLANNEQUIN_OT_use_movie_clip,
     SPLANNEQUIN_PT_movie_clip,
     SPLANNEQUIN_FH_video,
+    SPLANNEQUIN_OT_import_clip,
 )

@@ -46,11 +46,6 @@ def find(scene: Any, shot: Path) -> Any | None:
     return made.part(scene, shot, "plate")
 
 
-def is_one(camera: Any) -> bool:
-    """True of such a camera, whichever shot's."""
-    return any(entry.plate == camera for scene in bpy.data.scenes for entry in scene.splannequin.made)
-
-
 def remove(scene: Any, shot: Path) -> bool:
     """Takes the camera out of the file. True if it was there."""
     camera = find(scene, shot)

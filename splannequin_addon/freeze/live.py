@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
 import subprocess
-import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -20,7 +18,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 
 from ...torch_backend import contract
-from ..process import jobs
+from ..process import children
 
 _PATIENCE_SECONDS = 10.0
 """How long a closed child may take to end by itself."""
@@ -172,18 +170,12 @@ def open_session(shot: Path, run: str, python: str, package_root: Path) -> Sessi
     """
     session = Session(shot, run)
     log = contract.ShotFolder(shot).live_log
-    hidden: dict[str, Any] = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
     try:
         log.parent.mkdir(parents=True, exist_ok=True)
         with open(log, "wb") as errors:
-            session._process = subprocess.Popen(
-                **contract.python_child(python, "torch_backend", "live", str(shot.absolute()), "--run", run),
-                env=jobs.backend_environ(package_root),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                **hidden,
-            )
+            placed = contract.python_child(python, "torch_backend", "live", str(shot.absolute()), "--run", run)
+            piped = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors}
+            session._process = children.start(placed, package_root, outlives=False, **piped)
     except OSError as error:
         raise contract.JobError(
             f"The live session could not be started: {error.strerror or error}.",
@@ -202,8 +194,3 @@ def last_line(log: Path) -> str:
     except OSError:
         return ""
     return lines[-1].strip()[:200] if lines else ""
-
-
-def import_beside(name: str) -> None:
-    """Imports a module that the main thread will need, so that it does not wait for the disk then."""
-    threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()

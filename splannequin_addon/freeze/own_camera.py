@@ -12,8 +12,7 @@ from mathutils import Matrix
 
 from ...torch_backend import contract
 from ..scene import axes, scene_setup
-from ..shot import made
-from ..solve import cameras
+from ..shot import chosen, contents, made
 
 
 def in_solve(
@@ -33,17 +32,9 @@ def in_solve(
         viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
         K: fx, fy, cx, cy in pixels.
     """
-    root, window = cameras.find(scene, shot, "EMPTY"), np.array(window_matrix, dtype=np.float64)
+    root = made.part(scene, shot, "root")
     placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
-    to_view = axes.FLIP @ np.array(view_matrix, dtype=np.float64) @ placed
-    to_view[:3] /= made.depth_scale(scene, shot)
-    K = [
-        0.5 * width * window[0, 0],
-        0.5 * height * window[1, 1],
-        0.5 * width * (1.0 - window[0, 2]),
-        0.5 * height * (1.0 + window[1, 2]),
-    ]
-    return to_view.ravel().tolist(), K
+    return axes.in_solve(view_matrix, window_matrix, placed, made.depth_scale(scene, shot), (width, height))
 
 
 def sample_path(scene: Any, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:
@@ -95,3 +86,19 @@ def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[in
     window = seen.calc_matrix_camera(graph, x=size[0], y=size[1], scale_x=aspect[0], scale_y=aspect[1])
     view = seen.matrix_world.normalized().inverted()
     return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size), "blender")
+
+
+def name_of(scene: Any) -> str:
+    """Name of the artist's camera to freeze from; empty for the clip's own move."""
+    camera, folder = scene.splannequin.path_camera, chosen.shot_folder(scene)
+    if camera is None or folder is None or camera == made.part(scene, folder, "camera"):
+        return ""
+    return str(camera.name)
+
+
+def follows_camera(scene: Any) -> bool:
+    """True if a bake has to look at the artist's camera again: the take was seen from one, and one is chosen."""
+    folder = chosen.shot_folder(scene)
+    if folder is None or not name_of(scene):
+        return False
+    return bool(contents.read(folder).takes.get(scene.splannequin.take_name, {}).get("camera_path"))

@@ -15,12 +15,12 @@ from typing import Any
 import bpy
 import gpu
 import numpy as np
+from bpy.app.handlers import persistent
 from gpu_extras.batch import batch_for_shader
 
 from ...torch_backend import contract
 from ..process import backend
 from ..shot import chosen, made
-from ..solve import cameras
 from . import live, own_camera
 
 TICK_SECONDS = 1 / 60
@@ -90,7 +90,7 @@ def end() -> None:
 
 def _show_points(scene: Any, shot: Path, shown: bool) -> None:
     """Opens or closes the eye of our point cloud: its dots would cover the picture."""
-    cloud = cameras.find(scene, shot, "MESH")
+    cloud = made.part(scene, shot, "points")
     for layer in scene.view_layers if cloud is not None else ():
         if cloud.name in layer.objects:
             cloud.hide_set(not shown, view_layer=layer)
@@ -235,7 +235,7 @@ def _draw() -> None:
     if quick is None or sharp is None:
         return
     # Through the clip's camera the picture stands before the plate, and is exposed like it.
-    if view.view_perspective == "CAMERA" and scene.camera == cameras.find(scene, _session.shot, "CAMERA"):
+    if view.view_perspective == "CAMERA" and scene.camera == made.part(scene, _session.shot, "camera"):
         quick.exposed_like = sharp.exposed_like = float(scene.frame_current)
     quick.view = sharp.view = key
     sharp.detail = scene.splannequin.detail and sharp.show == "color"
@@ -328,3 +328,20 @@ def _shader_of() -> Any:
         )
         _shader = gpu.shader.create_from_info(info)
     return _shader
+
+
+@persistent
+def _on_load(*_: Any) -> None:
+    """Another file has other scenes."""
+    end()
+
+
+def register() -> None:
+    """Listens to file loads."""
+    bpy.app.handlers.load_post.append(_on_load)
+
+
+def unregister() -> None:
+    """Stops drawing."""
+    end()
+    bpy.app.handlers.load_post.remove(_on_load)

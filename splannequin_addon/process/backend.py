@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 
 from ...torch_backend import contract
-from . import environment, jobs
+from . import children, environment, jobs
 
 PACKAGE: str = __name__.partition(".splannequin_addon.")[0]
 """Name of the extension package, such as bl_ext.user_default.splannequin."""
@@ -91,59 +89,30 @@ def available() -> bool:
     return trouble() is None
 
 
-@dataclass
-class Doctor:
-    """A backend that is asked what it can do, beside Blender."""
-
-    process: subprocess.Popen[str]
-
-    @property
-    def ended(self) -> bool:
-        """True once it has answered, or failed to."""
-        return self.process.poll() is not None
-
-    def wait(self, seconds: float = 120.0) -> None:
-        """Waits for the answer; after `seconds` it is no longer waited for."""
-        try:
-            self._told = self.process.communicate(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self._told = self.process.communicate()
-
-    def answer(self) -> str:
-        """The JSON that `torch_backend doctor` prints. JobError if it failed."""
-        out, errors = getattr(self, "_told", None) or self.process.communicate()
-        if self.process.returncode:
-            last = (errors.strip().splitlines() or ["no reason given"])[-1]
-            raise contract.JobError(
-                f"The backend's environment is incomplete: {last}.",
-                "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
-                contract.ExitCode.ENVIRONMENT,
-            )
-        return out
+def ask(*words: str) -> children.Question:
+    """Asks the backend something, without waiting. JobError if there is none, or it cannot be started."""
+    return children.ask(python(), package_root(), *words)
 
 
-def begin_doctor() -> Doctor:
-    """Asks the backend what it can do, without waiting. JobError if there is none, or it cannot be started."""
-    root = package_root()
-    command = contract.python_child(python(), "torch_backend", "doctor")
-    try:
-        child = subprocess.Popen(
-            **command, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-    except OSError as error:
-        raise contract.JobError(
-            f"The backend did not answer: {error}.", "Set it up again.", contract.ExitCode.ENVIRONMENT
-        ) from error
-    return Doctor(child)
+def begin_doctor() -> children.Question:
+    """Asks the backend what it can do, without waiting. JobError as `ask`."""
+    return ask("doctor")
+
+
+def diagnosis(question: children.Question) -> str:
+    """What it can do, as the JSON that `torch_backend doctor` prints. JobError if it failed."""
+    return question.answer(
+        "The backend's environment is incomplete: {}.",
+        "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
+        contract.ExitCode.ENVIRONMENT,
+    )
 
 
 def doctor() -> str:
-    """What the backend's environment can do, as the JSON that `torch_backend doctor` prints. JobError if it fails."""
+    """`diagnosis`, waited for."""
     asked = begin_doctor()
-    asked.wait()
-    return asked.answer()
+    asked.wait(120.0)
+    return diagnosis(asked)
 
 
 def start(job: jobs.Job) -> None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...torch_backend import contract
-from . import jobs
+from . import children
 
 CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
 """Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
@@ -90,24 +90,17 @@ def start(folder: Path, python: str, package_root: Path) -> SetUp:
         contract.JobError: the folder cannot be written, or Python not started.
     """
     setup = SetUp(folder)
-    environ = {**jobs.backend_environ(package_root), "SPLANNEQUIN_HOME": str(folder.absolute())}
-    if torch_index():
-        environ.setdefault("SPLANNEQUIN_TORCH_INDEX", torch_index())
+    environ = {"SPLANNEQUIN_HOME": str(folder.absolute())}
+    if torch_index() and "SPLANNEQUIN_TORCH_INDEX" not in os.environ:
+        environ["SPLANNEQUIN_TORCH_INDEX"] = torch_index()
     python = os.path.abspath(python)
     launcher = str(package_root / "splannequin.py")
     command = [python, "-P", launcher, "setup", "--backend", "--output", str(setup.log.parent.absolute())]
     try:
         setup.log.parent.mkdir(parents=True, exist_ok=True)
         with open(setup.log, "wb") as log:
-            setup.process = subprocess.Popen(
-                command,
-                cwd=os.path.dirname(python),  # see contract.python_child
-                env=environ,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                **jobs.detached(),
-            )
+            placed = {"args": command, "cwd": os.path.dirname(python)}  # see contract.python_child
+            setup.process = children.start(placed, package_root, environ=environ, stdout=log, stderr=subprocess.STDOUT)
     except OSError as error:
         raise contract.JobError(
             f"The backend cannot be set up in {folder}: {error.strerror or error}.",

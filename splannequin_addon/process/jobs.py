@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from ...torch_backend import contract
+from . import children
 
-_SCRUBBED = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "PYTHONEXECUTABLE", "__PYVENV_LAUNCHER__", "VIRTUAL_ENV")
 _LAST_WORD_SECONDS = 10.0
 """How long a job's process is waited for after it told its end."""
 _START_SECONDS = 30.0
@@ -102,41 +102,13 @@ def start(job: Job, python: str, package_root: Path) -> None:
     command = contract.python_child(python, "torch_backend", "run-job", str(job.folder.absolute()))
     try:
         with open(job.folder / contract.LOG_FILE, "ab") as log:
-            job.process = subprocess.Popen(
-                **command,
-                env=backend_environ(package_root),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                **detached(),
-            )
+            job.process = children.start(command, package_root, stdout=log, stderr=subprocess.STDOUT)
     except OSError as error:
         raise contract.JobError(
             f"The backend's Python could not be started: {python}: {error.strerror or error}.",
             "Choose the Python of the backend's environment in the add-on's preferences.",
             contract.ExitCode.ENVIRONMENT,
         ) from error
-
-
-def detached() -> dict[str, Any]:
-    """What `Popen` needs for a child that outlives this Blender and shows no window."""
-    if sys.platform == "win32":
-        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
-    return {"start_new_session": True}
-
-
-def backend_environ(package_root: Path) -> dict[str, str]:
-    """Environment variables of a backend process: this package importable, nothing of Blender's Python."""
-    environ = {k: v for k, v in os.environ.items() if k not in _SCRUBBED}
-    environ.update(
-        PYTHONPATH=str(package_root),
-        PYTHONUTF8="1",
-        PYTHONUNBUFFERED="1",
-        PYTHONNOUSERSITE="1",
-        PYTHONSAFEPATH="1",  # what a child starts in turn takes no module from where it stands either
-        PYTHONDONTWRITEBYTECODE="1",  # the extension's folder may be read-only, and is not ours to fill
-    )
-    return environ
 
 
 def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:

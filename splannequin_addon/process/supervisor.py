@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,38 +18,43 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
-from ..bake import insertion, rendering
-from ..footage import plate
-from ..freeze import live, viewport
 from ..scene import sequences
 from ..shot import chosen, contents, made, markers
 from ..shot.shot_state import ShotState
-from ..train import pictures
 from ..translations import tr
-from . import backend, jobs, steps
+from . import backend, children, jobs, steps
 
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
-SAMPLING_SECONDS = 0.02
-"""Of a turn, spent on reading a camera; one frame of a heavy scene may take longer."""
+WORKING_SECONDS = 0.04
+"""Between two turns of work that Blender does itself."""
 _LOOK_SECONDS = 1.0
 """How often the shot folder is looked at for changes."""
 
 
-@dataclass
-class Sampling:
-    """A camera being read, a few frames per turn of the timer."""
+@dataclass(frozen=True)
+class Progress:
+    """How far work is that Blender does itself."""
 
-    scene: str
-    """Name of the scene."""
-    turns: Generator[int, None, contract.CameraPath]
-    """`cameras.sample_path`."""
+    text: str
+    """What is done, a few words with the figures."""
+    done: int
+    """Of `total`."""
     total: int
-    """Frames in all."""
+    hint: str = ""
+    """How it is stopped, a sentence."""
+
+
+@dataclass
+class Work:
+    """What Blender itself does for a step, beside the backend's jobs."""
+
     step: str
-    """Step that asks for the take: freeze or bake."""
-    done: int = 0
-    """Frames read."""
+    """Name of the step."""
+    turns: Iterator[Progress | None] | None = None
+    """It is done a turn of the timer at a time, by asking for the next; None if Blender goes on by itself."""
+    progress: Progress | None = None
+    """How far it is, once it tells."""
 
 
 @dataclass
@@ -70,15 +75,8 @@ class Watch:
     """What a finished step changed in the scene, or why it could not, by the step's name."""
     failures: dict[str, tuple[str, str]] = field(default_factory=dict)
     """(sentence, hint) of what failed on Blender's side, by the step's name."""
-    rendered: tuple[int, int] | None = None
-    """(frames done, frames in all) of a render that runs."""
-    ahead: tuple[Iterator[None], str, str] | None = None
-    """What Blender still has to read, a picture a turn, before a take comes into the compositor; the take's name; the
-    only scene's name, or empty for all that work on the shot."""
-    to_render: str = ""
-    """Name of the scene whose render begins with the next turn."""
-    sampling: Sampling | None = None
-    """An artist's camera that is being read, before its take is asked for."""
+    work: Work | None = None
+    """What Blender itself is doing for it."""
     pending: dict[str, jobs.Job] = field(default_factory=dict)
     """Jobs that ended well while another shot of the scene was chosen, by the step's name: they wait for this one."""
     redraw: bool = False
@@ -86,14 +84,18 @@ class Watch:
 
     def running(self) -> str | None:
         """Name of the step at work, if any."""
-        if self.rendered is not None or self.ahead is not None or self.to_render:
-            return "bake"
-        if self.sampling is not None:
-            return self.sampling.step
+        if self.work is not None:
+            return self.work.step
         return next((step for step, job in self.jobs.items() if not job.ended), None)
+
+    def fail(self, step: str, error: BaseException) -> None:
+        """Notes why a step failed."""
+        self.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
 
 
 _watches: dict[Path, Watch] = {}
+_meanwhile: list[Callable[[], bool]] = []
+"""What is looked after beside the shots, until it says that it is done."""
 _layout = (False, False)
 """Whether the empty panel of `lay_out` stands, and whether it is to be turned about."""
 _backend: tuple[contract.JobError | None, float] = (None, 0.0)
@@ -112,6 +114,11 @@ def watch_of(shot: Path) -> Watch:
     return watch
 
 
+def watches() -> list[Watch]:
+    """All shots that are watched."""
+    return list(_watches.values())
+
+
 def backend_trouble() -> contract.JobError | None:
     """Why there is no Python for the backend, None if there is; looked up every few seconds, as drawing asks all the
     time."""
@@ -127,43 +134,49 @@ def follow(step: str, job: jobs.Job) -> None:
     watch.jobs[step] = job
     watch.notes.clear()  # what earlier steps said has been read
     watch.failures.pop(step, None)
-    if step == "train":
-        pictures.forget()
+    steps.STEPS[step].began(job)
 
 
-def sample(scene: Any, shot: Path, turns: Generator[int, None, contract.CameraPath], step: str = "freeze") -> None:
-    """Has a camera read by the timer; then its take is begun, by the step freeze or bake."""
+def work(shot: Path, step: str, turns: Iterator[Progress | None]) -> None:
+    """Has the timer do work for a step, a turn at a time; what it raises is the step's failure.
+
+    Nothing of bpy may be kept between two turns.
+    """
     watch = watch_of(shot)
-    watch.notes.clear()
+    watch.notes.pop(step, None)
     watch.failures.pop(step, None)
-    watch.sampling = Sampling(scene.name, turns, len(rendering.frames_of(scene)), step)
+    watch.work = Work(step, turns)
 
 
-def _read_on(watch: Watch) -> None:
-    """Reads a camera on for part of a turn; begins its take when all of it is read."""
-    sampling, until = watch.sampling, time.monotonic() + SAMPLING_SECONDS
-    if sampling is None:
-        return
+def _work_on(watch: Watch, doing: Work) -> None:
+    """One more turn of what Blender itself does."""
     try:
-        while time.monotonic() < until:
-            sampling.done = next(sampling.turns)
+        doing.progress = next(doing.turns or iter(()))
         return
-    except StopIteration as end:
-        scene = bpy.data.scenes.get(sampling.scene)
-        try:
-            if scene is not None and chosen.shot_folder(scene) != watch.shot:
-                watch.failures[sampling.step] = (
-                    "Another shot was chosen while the camera was read.",
-                    "Choose this one and freeze again.",
-                )
-            elif scene is not None:
-                step = sampling.step
-                follow(step, steps.begin(scene, step, steps.freeze_from(scene, end.value, step)))
-        except (contract.JobError, OSError) as error:
-            watch.failures[sampling.step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
-    except (contract.JobError, KeyError) as error:
-        watch.failures[sampling.step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
-    watch.sampling = None
+    except StopIteration:
+        pass
+    except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
+        watch.fail(doing.step, error)
+    if watch.work is doing:  # its last turn may have begun something else
+        watch.work = None
+
+
+def meanwhile(turn: Callable[[], bool]) -> None:
+    """Has the timer call `turn` at each of its turns, until it returns False."""
+    _meanwhile.append(turn)
+
+
+def when_answered(question: children.Question, then: Callable[[], None]) -> None:
+    """Calls `then` from the timer once a backend that was asked something has ended."""
+
+    def look() -> bool:
+        if question.ended:
+            then()
+            redraw()
+            return False
+        return True
+
+    meanwhile(look)
 
 
 def refresh(watch: Watch) -> bool:
@@ -178,7 +191,8 @@ def refresh(watch: Watch) -> bool:
     except (OSError, ValueError, KeyError) as error:
         watch.state = ShotState(watch.shot)
         why = getattr(error, "strerror", None) or error
-        watch.failures["footage"] = (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one.")
+        first = next(iter(steps.STEPS))
+        watch.failures[first] = (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one.")
     return True
 
 
@@ -190,31 +204,35 @@ def tick() -> float:
         try:
             changed |= _turn(watch, until)
         except Exception as error:  # whatever it is: an exception would end the timer, and with it every shot's panel
-            step, told = watch.running() or "footage", f"{type(error).__name__}: {error}"
+            step, told = watch.running() or next(iter(steps.STEPS)), f"{type(error).__name__}: {error}"
             if watch.failures.get(step, ("",))[0] != told:  # once, not at every turn
                 traceback.print_exc()
             watch.failures[step] = (told, "The console has the details.")
             changed = True
+    for turn in list(_meanwhile):
+        try:
+            goes_on = turn()
+        except Exception:  # as above
+            traceback.print_exc()
+            goes_on = False
+        if not goes_on:
+            _meanwhile.remove(turn)
     if changed:
         redraw()
-    waits = any(w.sampling is not None or w.ahead is not None or w.to_render for w in _watches.values())
-    return 2 * SAMPLING_SECONDS if waits else TICK_SECONDS
+    works = any(w.work is not None and w.work.turns is not None for w in _watches.values())
+    return WORKING_SECONDS if works else TICK_SECONDS
 
 
 def _turn(watch: Watch, until: float) -> bool:
     """One shot's part of a tick, `until` a time of `time.monotonic`; True if its panel should be drawn again."""
-    changed, watch.redraw = watch.redraw or watch.sampling is not None, False
+    changed, watch.redraw = watch.redraw, False
     for scene in chosen.scenes_of(watch.shot):
         changed |= markers.follow(scene)
         made.tidy(scene)
         chosen.see(scene, watch.state)
-    if watch.to_render:
-        _render(watch)
+    if watch.work is not None and watch.work.turns is not None:
+        _work_on(watch, watch.work)
         return True
-    if watch.ahead is not None:
-        _read_ahead(watch, *watch.ahead)
-        return True
-    _read_on(watch)
     for step, job in list(watch.jobs.items()):
         if job.ended or time.monotonic() > until:
             continue
@@ -227,15 +245,7 @@ def _turn(watch: Watch, until: float) -> bool:
             del watch.jobs[step]
             continue
         if job.ended:
-            steps.give_up(job)
-            refresh(watch)
-            there = chosen.scenes_of(watch.shot)
-            if there and step == "bake" and job.state == "done":
-                bring_in(there[0], watch.shot, str(job.params["take"]), alone=False)
-            elif there or job.state != "done":
-                _apply(watch, step, job)
-            else:
-                watch.pending[step] = job
+            _ended(watch, step, job)
     if watch.pending and chosen.scenes_of(watch.shot):
         for step, job in watch.pending.items():
             _apply_late(watch, step, job)
@@ -247,6 +257,19 @@ def _turn(watch: Watch, until: float) -> bool:
             return changed
         changed |= refresh(watch)
     return changed
+
+
+def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
+    """A job has ended just now: its scenes are changed, at once, in turns, or when its shot is chosen."""
+    steps.STEPS[step].ended(job)
+    refresh(watch)
+    scenes = chosen.scenes_of(watch.shot)
+    if job.state != "done":
+        return
+    if not scenes:
+        watch.pending[step] = job
+    elif not steps.STEPS[step].arrive(scenes[0], job):
+        _apply(watch, step, job)
 
 
 def _told(job: jobs.Job) -> tuple[Any, ...]:
@@ -287,7 +310,7 @@ def look_through_camera(window: Any, camera: Any = None) -> None:
             space = area.spaces.active
             if camera is not None:
                 space.use_local_camera, space.camera = True, camera
-            elif space.use_local_camera and (space.camera is None or plate.is_one(space.camera)):  # or it is gone
+            elif space.use_local_camera and (space.camera is None or made.is_plate(space.camera)):  # or it is gone
                 space.use_local_camera = False
             space.region_3d.view_perspective = "CAMERA"
             return
@@ -301,90 +324,38 @@ def undo_step(step: str) -> None:
 
 def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
     """Lets a job that ended well change the scenes that work on its shot."""
-    if job.state == "done":
-        _change(watch, step, lambda scene: steps.finish(scene, step, job))
+    change(watch, step, lambda scene: steps.STEPS[step].finish(scene, job))
 
 
-def _window_of(scene: Any) -> Any | None:
+def window_of(scene: Any) -> Any | None:
+    """The window that shows a scene, if one does."""
     return next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
 
 
-def _change(watch: Watch, step: str, change: Callable[[Any], list[str]], only: str = "") -> None:
+def change(watch: Watch, step: str, how: Callable[[Any], list[str]], only: str = "") -> None:
     """Changes the scenes that work on a shot, or the one of them that is named `only`: as one undo step each in a
     window. Notes what was changed or why not."""
     for scene in [s for s in chosen.scenes_of(watch.shot) if only in ("", s.name)]:
-        window = _window_of(scene)
+        window = window_of(scene)
         try:
             if window is None:
-                watch.notes[step] = change(scene)
+                watch.notes[step] = how(scene)
                 continue
             with bpy.context.temp_override(window=window, scene=scene):
                 before = scene.splannequin.t_star
-                watch.notes[step] = change(scene)
-                camera = plate.find(scene, watch.shot) if step == "footage" else None
-                if step == "camera" or camera is not None:
-                    look_through_camera(window, camera)
+                watch.notes[step] = how(scene)
+                steps.STEPS[step].look(window, scene, watch.shot)
                 if watch.notes[step] or before != scene.splannequin.t_star:
                     undo_step(step)
         except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
-            watch.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
-
-
-def bring_in(scene: Any, shot: Path, take: str, alone: bool = True) -> None:
-    """Has a take put into the compositor and rendered by the timer, in turns: Blender stands still in each.
-
-    Args:
-        scene: the scene; with `alone` no other one that works on the shot is changed.
-        shot: shot folder.
-        take: name of a take.
-        alone: see `scene`.
-    """
-    watch, only = watch_of(shot), scene.name if alone else ""
-    watch.notes.pop("bake", None)
-    watch.failures.pop("bake", None)
-    try:
-        watch.ahead = insertion.read_ahead(scene, shot, take), take, only
-    except (contract.JobError, OSError):
-        watch.ahead = iter(()), take, only  # inserting it fails alike, and says so
-
-
-def _read_ahead(watch: Watch, turns: Iterator[None], take: str, only: str) -> None:
-    """Has one more picture read; after the last the take comes into the compositor."""
-    try:
-        next(turns)
-        return
-    except (StopIteration, OSError, RuntimeError, ValueError):
-        watch.ahead = None
-    _change(watch, "bake", lambda scene: _put_in(watch, scene, take), only)
-
-
-def _put_in(watch: Watch, scene: Any, take: str) -> list[str]:
-    """Puts a take into a scene's compositor; the render of a scene that is seen begins with the next turn."""
-    changes = steps.insert_freeze(scene, watch.shot, take)
-    if _window_of(scene) is not None:
-        changes += rendering.choose_output(scene, watch.shot, take)  # here, for it belongs to the same undo step
-        watch.to_render = scene.name
-    return changes
-
-
-def _render(watch: Watch) -> None:
-    """Starts the render of a bake: a turn after the compositor was changed, since Blender takes its time for both."""
-    name, watch.to_render = watch.to_render, ""
-    window = _window_of(bpy.data.scenes.get(name))
-    if window is None:
-        return
-    try:
-        with bpy.context.temp_override(window=window, scene=window.scene):
-            bpy.ops.splannequin.render("INVOKE_DEFAULT")
-    except RuntimeError as error:
-        watch.failures["bake"] = (str(error).strip(), "")
+            watch.fail(step, error)
 
 
 def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
-    """`_apply` for a job that had ended before its shot was chosen. Choosing a shot starts no render, and leaves the
-    other's take in the compositor."""
-    if step == "bake":
-        watch.notes[step] = ["Its frames were rendered meanwhile. Bake again to put them into your compositor."]
+    """`_apply` for a job that had ended before its shot was chosen."""
+    said = steps.STEPS[step].late(job)
+    if said:
+        watch.notes[step] = [said]
     else:
         _apply(watch, step, job)
 
@@ -392,7 +363,6 @@ def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
 @persistent
 def _on_load(*_: Any) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
-    viewport.end()
     markers.forget()
     sequences.forget_ahead()
     for scene in bpy.data.scenes:
@@ -403,57 +373,26 @@ def _on_load(*_: Any) -> None:
         del _watches[shot]
     redraw()
     for watch in _watches.values():
-        watch.rendered = watch.sampling = watch.ahead = None
-        watch.to_render = ""
+        watch.work = None
         watch.pending.clear()
-
-
-def render_began(shot: Path, frames: int) -> None:
-    """A render of a baked shot begins."""
-    watch_of(shot).rendered = (0, frames)
-
-
-@persistent
-def _on_frame(*_: Any) -> None:
-    for watch in list(_watches.values()):
-        if watch.rendered is not None:
-            watch.rendered = (watch.rendered[0] + 1, watch.rendered[1])
-            watch.redraw = True
-
-
-@persistent
-def _on_render_end(*_: Any) -> None:
-    for watch in list(_watches.values()):
-        if watch.rendered is not None:
-            done, total = watch.rendered
-            watch.rendered = None
-            watch.redraw = True
-            watch.notes.setdefault("bake", []).append(f"{done} of {total} frames rendered.")
 
 
 def forget() -> None:
     """Drops all that is known; the shots' folders tell it again when asked."""
     _watches.clear()
+    _meanwhile.clear()
 
 
 def register() -> None:
-    """Starts the timer (in a window: headless Blender has none) and listens to file loads and renders."""
+    """Starts the timer (in a window: headless Blender has none) and listens to file loads."""
     bpy.app.handlers.load_post.append(_on_load)
-    bpy.app.handlers.render_write.append(_on_frame)
-    bpy.app.handlers.render_complete.append(_on_render_end)
-    bpy.app.handlers.render_cancel.append(_on_render_end)
     if not bpy.app.background:
         bpy.app.timers.register(tick, first_interval=TICK_SECONDS, persistent=True)
-        live.import_beside("zipfile")  # numpy does to open a solve's points: 0.2 s from a cold disk
 
 
 def unregister() -> None:
     """Undoes `register`. Running jobs go on."""
-    viewport.end()
     if bpy.app.timers.is_registered(tick):
         bpy.app.timers.unregister(tick)
-    bpy.app.handlers.render_cancel.remove(_on_render_end)
-    bpy.app.handlers.render_complete.remove(_on_render_end)
-    bpy.app.handlers.render_write.remove(_on_frame)
     bpy.app.handlers.load_post.remove(_on_load)
     forget()

@@ -6,6 +6,8 @@ world).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ...torch_backend import contract
@@ -60,3 +62,31 @@ def pixel_aspect(k: tuple[float, float, float, float]) -> tuple[float, float]:
     if abs(ratio - 1.0) < 5e-4:  # half a pixel over a thousand
         return 1.0, 1.0
     return (1.0, ratio) if ratio > 1.0 else (1.0 / ratio, 1.0)
+
+
+def in_solve(
+    view_matrix: Any, window_matrix: Any, placed: np.ndarray, scale: float, size: tuple[int, int]
+) -> tuple[list[float], list[float]]:
+    """(viewmat, K) in solve units of what a view shows.
+
+    Args:
+        view_matrix: world to view, Blender's axes, [4, 4].
+        window_matrix: perspective projection, [4, 4].
+        placed: where the solve stands in the world, [4, 4] float64.
+        scale: scene units per solve unit.
+        size: width and height of the picture in pixels.
+
+    Returns:
+        viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
+        K: fx, fy, cx, cy in pixels.
+    """
+    (width, height), window = size, np.array(window_matrix, dtype=np.float64)
+    to_view = FLIP @ np.array(view_matrix, dtype=np.float64) @ placed
+    to_view[:3] /= scale
+    K = [
+        0.5 * width * window[0, 0],
+        0.5 * height * window[1, 1],
+        0.5 * width * (1.0 - window[0, 2]),
+        0.5 * height * (1.0 + window[1, 2]),
+    ]
+    return to_view.ravel().tolist(), K

@@ -10,8 +10,8 @@ import bpy
 
 from .. import compat
 from . import paths
+from .mark import TAG
 
-TAG = "splannequin"
 _ahead: set[str] = set()
 """Files that `read_ahead` has just had read: the next `load_sequence` takes them as they are."""
 

@@ -17,8 +17,7 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..scene import paths, scene_setup
-from ..solve import cameras
-from . import chosen, made
+from . import made
 from .shot_state import ShotState
 
 _T_STAR = "splannequin.t_star"
@@ -89,7 +88,7 @@ def choose(scene: Any, index: int) -> None:
         scene_setup.put_back(scene, held.shots[index].scene_settings)
         _rename(scene, {_T_STAR: _path(before), _path(index): _T_STAR})
         folder = folder_of(held)
-        camera = cameras.find(scene, folder, "CAMERA") if folder is not None else None
+        camera = made.part(scene, folder, "camera") if folder is not None else None
         if camera is not None:
             scene.camera = camera
     if held.active_shot != index:
@@ -130,7 +129,7 @@ def _rename(scene: Any, paths: Mapping[str, str]) -> None:
 
 def shot_folder(scene: Any) -> Path | None:
     """Folder of the scene's shot, of several the chosen one; None while neither it nor a clip is chosen."""
-    return chosen.folder_of(scene.splannequin)
+    return folder_of(scene.splannequin)
 
 
 def scenes_of(shot: Path) -> list[Any]:
@@ -140,12 +139,12 @@ def scenes_of(shot: Path) -> list[Any]:
 
 def scenes_with(shot: Path) -> list[Any]:
     """Scenes of the file that have a shot, chosen or not."""
-    return [s for s in bpy.data.scenes if shot in chosen.folders(s)]
+    return [s for s in bpy.data.scenes if shot in folders(s)]
 
 
 def missing(scene: Any, state: ShotState | None) -> bool:
     """True if the scene's shot was there before, and its folder is gone now."""
-    folder = chosen.folder_of(scene.splannequin)
+    folder = folder_of(scene.splannequin)
     if folder is None or (state is not None and state.info):
         return False
     return paths.absolute(scene.splannequin.shot_seen) == str(folder) or made.of(scene, folder) is not None
@@ -153,7 +152,7 @@ def missing(scene: Any, state: ShotState | None) -> bool:
 
 def see(scene: Any, state: ShotState | None) -> None:
     """Remembers that the scene's shot is there, so that it can be missed."""
-    folder, held = chosen.folder_of(scene.splannequin), scene.splannequin
+    folder, held = folder_of(scene.splannequin), scene.splannequin
     there = folder is not None and state is not None and state.frames and state.folder == folder
     if folder is not None and there and paths.absolute(held.shot_seen) != str(folder):
         held.shot_seen = paths.blend_path(folder)

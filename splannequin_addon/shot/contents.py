@@ -7,13 +7,14 @@ import dataclasses
 import json
 import os
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ...torch_backend import contract
 from ...torch_backend.contract import ShotFolder
-from ..process import jobs
+from ..scene import numbered
 from . import checkpoints, kept
 from .shot_state import ShotState
 
@@ -26,7 +27,7 @@ def create(folder: Path, name: str = "") -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     called = name or folder.name.removesuffix(contract.SHOT_SUFFIX)
-    jobs.write_json(path, {"version": 1, "name": called, "created": time.time()})
+    contract.write_json(path, {"version": 1, "name": called, "created": time.time()}, parents=False)
 
 
 def read(folder: Path) -> ShotState:
@@ -77,6 +78,12 @@ def plate_range(folder: Path) -> tuple[int, int] | None:
     found = (contract.frame_number(p.stem) for p in ShotFolder(folder).frames.glob(f"*{contract.PICTURE}"))
     numbers = [number for number in found if number is not None]
     return (min(numbers), max(numbers)) if numbers else None
+
+
+def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
+    """Those of some frames that a take lacks."""
+    there = set(numbered.frame_numbers(ShotFolder(shot).takes / take))
+    return [n for n in frames if n not in there]
 
 
 def _listed(path: Path) -> tuple[int, str]:

@@ -15,11 +15,10 @@ from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
 from ..scene import paths
-from ..solve import cameras
+from ..scene.mark import TAG
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""
-_TAG = "splannequin"
 _KINDS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 
 
@@ -110,20 +109,25 @@ def tidy(scene: Any) -> None:
 def adopt(scene: Any, shot: Path) -> None:
     """Takes over what 0.2.0 made, which marked objects instead: the one of each kind that kept its name."""
     name = name_of(shot)
-    if scene.splannequin.made or not any(o.get(_TAG) == name for o in scene.objects):
+    if scene.splannequin.made or not any(o.get(TAG) == name for o in scene.objects):
         return
     entry = new(scene, shot)
-    for item in [o for o in scene.objects if o.get(_TAG) == name]:
+    for item in [o for o in scene.objects if o.get(TAG) == name]:
         kind = _KINDS.get(item.type, "")
         if kind and item.name == f"{name} {kind}":
             setattr(entry, kind, item)
-        del item[_TAG]
-    for collection in [c for c in scene.collection.children_recursive if c.get(_TAG) == name]:
+        del item[TAG]
+    for collection in [c for c in scene.collection.children_recursive if c.get(TAG) == name]:
         entry.collection = collection
-        del collection[_TAG]
+        del collection[TAG]
 
 
 def depth_scale(scene: Any, shot: Path) -> float:
     """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
-    root = cameras.find(scene, shot, "EMPTY")
+    root = part(scene, shot, "root")
     return float(sum(root.matrix_world.to_scale()) / 3.0) if root else 1.0
+
+
+def is_plate(camera: Any) -> bool:
+    """True of a camera that shows a clip until it is solved, whichever shot's."""
+    return any(entry.plate == camera for scene in bpy.data.scenes for entry in scene.splannequin.made)

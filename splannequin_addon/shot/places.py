@@ -18,6 +18,7 @@ from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
 from ..scene import paths
+from ..scene.mark import TAG
 from . import chosen, contents, made
 from .shot_state import ShotState
 
@@ -56,7 +57,7 @@ def locate(scene: Any, folder: Path) -> None:
         entry.name, entry.folder = made.name_of(folder), paths.blend_path(folder)
     for image in bpy.data.images:
         path = Path(paths.absolute(image.filepath))
-        if before is not None and image.get("splannequin") and before in path.parents and not path.exists():
+        if before is not None and image.get(TAG) and before in path.parents and not path.exists():
             image.filepath = paths.blend_path(folder / path.relative_to(before))
     held.shot_path = held.shot_seen = paths.blend_path(folder)
     source = source_of(state)

@@ -19,8 +19,7 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..bake import shown_take
-from ..process import supervisor
+from ..process import steps, supervisor
 from ..scene import axes
 from ..shot import chosen, made
 from ..translations import tr
@@ -77,7 +76,7 @@ def move(scene: Any, shot: Path, change: np.ndarray) -> list[str]:
     if camera is not None:
         camera.data.clip_end *= grown
         camera.data.clip_start *= grown
-    return shown_take.follow_scale(scene, shot)
+    return [note for step in steps.STEPS.values() for note in step.scaled(scene, shot)]
 
 
 def _shot_of(scene: Any) -> Path:
@@ -134,7 +133,7 @@ class _Aligns:
             told = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
             self.report({"ERROR"}, told)  # type: ignore[attr-defined]
             return {"CANCELLED"}
-        supervisor.watch_of(shot).notes["camera"] = notes
+        supervisor.watch_of(shot).notes["solve"] = notes
         for note in notes:
             self.report({"INFO"}, note)  # type: ignore[attr-defined]
         return {"FINISHED"}
@@ -415,6 +414,15 @@ def draw(layout: Any) -> None:
         row = column.row(align=True)
         row.operator(f"splannequin.{operator}")
         row.operator(f"splannequin.{operator}", text="", icon="RESTRICT_SELECT_OFF").selected = True
+
+
+def register() -> None:
+    """Nothing is being clicked yet."""
+
+
+def unregister() -> None:
+    """Ends the clicking."""
+    stop()
 
 
 CLASSES = (SPLANNEQUIN_OT_align_floor, SPLANNEQUIN_OT_align_origin, SPLANNEQUIN_OT_align_scale)

@@ -1,8 +1,7 @@
-"""The solve in Blender, and the only place where camera axes are converted.
+"""The solve in Blender: an animated camera with the plate behind it, and points.
 
-OpenCV (x right, y down, z forward; viewmat world-to-camera) against Blender (x right, y up, looking along -z; camera to
-world). The solve arrives under one Empty that carries the solve-to-scene transform: moving it moves camera and points
-together, and depth is brought to scene units through it.
+They arrive under one Empty that carries the solve-to-scene transform: moving it moves camera and points together, and
+depth is brought to scene units through it.
 """
 
 from __future__ import annotations

@@ -1,28 +1,23 @@
 """Cameras from elsewhere and for elsewhere, on Blender's side.
 
 In: a file is handed on to the backend as it is; what Blender's own tracker solved is read here and written as a
-nerfstudio transforms.json, whose camera axes are Blender's. Out: the backend writes, in a process that is followed from
-a timer.
+nerfstudio transforms.json, whose camera axes are Blender's. Out: the backend writes.
 """
 
 from __future__ import annotations
 
-import functools
 import os
 import re
-import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...torch_backend import contract
-from ..process import backend, jobs
+from ..process import backend, children
 
-"""What was read of a clip's tracking, in the shot folder."""
 LEAST_TRACKED = 8
-_LOOK_SECONDS = 0.1
+"""Frames that a tracked camera has to be solved for."""
 
 
 def params(scene: Any, shot: Path | None) -> contract.SolveParams:
@@ -46,7 +41,7 @@ def params(scene: Any, shot: Path | None) -> contract.SolveParams:
             raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
         backend.python()  # before anything is written: without a backend nothing would read it
         file = contract.ShotFolder(shot).tracking
-        jobs.write_json(file, data)
+        contract.write_json(file, data, parents=False)
         asked.cameras = str(file)
     return asked
 
@@ -124,7 +119,7 @@ def lens(clip: Any) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------- out
 
 
-def begin_export(shot: Path, kind: str, folder: Path, text: bool = False) -> subprocess.Popen[str]:
+def begin_export(shot: Path, kind: str, folder: Path, text: bool = False) -> children.Question:
     """Has the backend write a shot's cameras for other programs, without waiting.
 
     Args:
@@ -136,43 +131,11 @@ def begin_export(shot: Path, kind: str, folder: Path, text: bool = False) -> sub
     Raises:
         contract.JobError: there is no backend, or it cannot be started.
     """
-    root = backend.package_root()
     words = ["export", str(shot.absolute()), "--format", kind, "--output", str(folder.absolute())]
-    if text:
-        words.append("--text")
-    command = contract.python_child(backend.python(), "torch_backend", *words)
-    try:
-        return subprocess.Popen(
-            **command, env=jobs.backend_environ(root), stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, encoding="utf-8",
-        )  # fmt: skip
-    except OSError as error:
-        raise contract.JobError(
-            f"The backend did not start: {error}.", "Set it up again.", contract.ExitCode.ENVIRONMENT
-        ) from error
+    return backend.ask(*words, *(["--text"] if text else []))
 
 
-def finish_export(process: subprocess.Popen[str], folder: Path) -> str:
-    """Waits for an export; returns what was done, in words. JobError with the backend's own sentence if it failed."""
-    errors = process.communicate()[1]
-    if process.returncode:
-        last = (errors.strip().splitlines() or ["the backend stopped without a word."])[-1].removeprefix("Error: ")
-        raise contract.JobError(last, "", process.returncode)
+def exported(asked: children.Question, folder: Path) -> str:
+    """What an export has done, in words. JobError with the backend's own sentence if it failed."""
+    asked.answer("{}")
     return f"Cameras written to {folder}"
-
-
-def look_after(process: subprocess.Popen[str], folder: Path, then: Callable[[str, bool], None]) -> float | None:
-    """A turn of the timer that follows an export: seconds to the next; None once it has ended and `then` was told."""
-    if process.poll() is None:
-        return _LOOK_SECONDS
-    try:
-        then(finish_export(process, folder), True)
-    except contract.JobError as error:
-        then(error.message, False)
-    return None
-
-
-def follow_export(process: subprocess.Popen[str], folder: Path, then: Callable[[str, bool], None]) -> None:
-    """Calls `then(sentence, whether it went well)` from a timer once an export has ended."""
-    turn = functools.partial(look_after, process, folder, then)
-    bpy.app.timers.register(turn, first_interval=_LOOK_SECONDS, persistent=True)

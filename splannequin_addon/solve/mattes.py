@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 
 from ...torch_backend import contract
-from ..process import steps, supervisor
+from ..process import begin, supervisor
 from ..scene import paths, sequences
 from ..shot import chosen, made
 from ..translations import tr
@@ -110,7 +110,7 @@ def save_paint(image: Any) -> Path:
     try:
         _write(path, data)
     except OSError as error:
-        raise steps.unwritable(path, error, "Make room, or see to it that the shot's folder can be written.") from error
+        raise begin.unwritable(path, error, "Make room, or see to it that the shot's folder can be written.") from error
     image.filepath_raw, image.file_format = paths.blend_path(path), "PNG"
     image.source = "FILE"
     image.reload()
@@ -293,7 +293,7 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
         try:
             gone = clear_paint(shot, frame)
         except OSError as error:
-            raise steps.unwritable(painted_file(shot, frame), error, "Close it elsewhere, then try again.") from error
+            raise begin.unwritable(painted_file(shot, frame), error, "Close it elsewhere, then try again.") from error
         if not gone:
             raise contract.JobError(f"Nothing is painted on frame {frame}.", "", contract.ExitCode.USAGE)
         return f"Frame {frame} of the motion matte is as the solve found it."

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import stat
-from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.props import StringProperty
 
 from ...torch_backend import contract
-from ..process import jobs, supervisor
+from ..process import jobs, steps, supervisor
 from ..shot import chosen
 from ..translations import tr
 
@@ -31,7 +29,7 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         """Asks the job to stop."""
         folder = chosen.shot_folder(context.scene)
         watch = supervisor.watch_of(folder) if folder else None
-        job = watch.jobs.get(self.step or watch.running() or "") if watch else None
+        job = watch.jobs.get(steps.current(self.step) or watch.running() or "") if watch else None
         if job is None or job.ended:
             self.report({"WARNING"}, "Nothing is running")
             return {"CANCELLED"}
@@ -55,28 +53,13 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         """Opens it."""
         folder = chosen.shot_folder(context.scene)
-        log = log_of(supervisor.watch_of(folder), self.step) if folder else None
+        job = supervisor.watch_of(folder).jobs.get(steps.current(self.step)) if folder else None
+        log = steps.STEPS[steps.current(self.step)].log(job) if job is not None else None
         if log is None:
             self.report({"WARNING"}, "There is no log")
             return {"CANCELLED"}
         bpy.ops.wm.path_open(filepath=str(log))
         return {"FINISHED"}
-
-
-def log_of(watch: supervisor.Watch, step: str) -> Path | None:
-    """The log of a step's newest job that has something in it: the job's own, else what COLMAP said; None without."""
-    job = watch.jobs.get(step)
-    if job is None:
-        return None
-    logs = [job.folder / contract.LOG_FILE, *([contract.ShotFolder(watch.shot).colmap_log] if step == "camera" else [])]
-    return next((log for log in logs if _written(log)), None)
-
-
-def _written(log: Path) -> bool:
-    try:
-        return stat.S_ISREG(log.stat().st_mode) and log.stat().st_size > 0
-    except OSError:
-        return False
 
 
 CLASSES = (SPLANNEQUIN_OT_cancel, SPLANNEQUIN_OT_open_log)

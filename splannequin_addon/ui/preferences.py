@@ -9,11 +9,10 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ...torch_backend import contract
-from ..process import backend, environment
+from ..process import backend, children, environment, supervisor
 from ..translations import tr
 from .sentences import wrap
 
-_TICK_SECONDS = 0.5
 _INSET = 150
 """Pixels beside a sentence in the preferences: the page's margins and the boxes that it stands in."""
 _DIALOG = 640
@@ -151,8 +150,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
             return {"CANCELLED"}
         _findings.clear()
         if not bpy.app.background:
-            if not bpy.app.timers.is_registered(_tick):
-                bpy.app.timers.register(_tick, first_interval=_TICK_SECONDS, persistent=True)
+            supervisor.meanwhile(_follow_setup)
             return {"FINISHED"}
         if _setup.process is not None:
             _setup.process.wait()
@@ -188,18 +186,19 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
         """Runs the backend's doctor beside Blender; headless, waits for it."""
         _findings[:] = ["Checking the backend."]
         try:
-            _checks.append(backend.begin_doctor())
+            asked = backend.begin_doctor()
         except contract.JobError as error:
             _findings.clear()
             self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
             return {"CANCELLED"}
         if bpy.app.background:
-            _checks[-1].wait()
-            _finish_checks()
+            asked.wait(120.0)
+            _take_in(asked)
             for line in _findings:
                 self.report({"INFO"}, tr(line))
-        elif not bpy.app.timers.is_registered(_tick):
-            bpy.app.timers.register(_tick, first_interval=_TICK_SECONDS, persistent=True)
+            return {"FINISHED"}
+        _checks.append(asked)
+        supervisor.when_answered(asked, lambda: _take_in(asked))
         return {"FINISHED"}
 
 
@@ -226,34 +225,37 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
         return {"FINISHED"}
 
 
-_checks: list[backend.Doctor] = []
+_checks: list[children.Question] = []
+"""Doctors that were asked and have not answered."""
 
 
-def _finish_checks() -> bool:
-    """Takes in the answers of checks that have ended. True if one had."""
-    ended = [check for check in _checks if check.ended]
-    for check in ended:
-        _checks.remove(check)
-        try:
-            _findings[:] = environment.findings(check.answer())
-        except (contract.JobError, ValueError, KeyError) as error:
-            _findings[:] = [f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()]
-    return bool(ended)
+def _take_in(asked: children.Question) -> None:
+    """What a doctor said is shown."""
+    if asked in _checks:
+        _checks.remove(asked)
+    try:
+        _findings[:] = environment.findings(backend.diagnosis(asked))
+    except (contract.JobError, ValueError, KeyError) as error:
+        _findings[:] = [f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()]
+    _redraw()
 
 
-def _tick() -> float | None:
-    """Follows the set-up and the checks; ends with them. A set-up that ended well is checked."""
-    changed = _finish_checks()
-    if _setup is not None and _setup.running:
-        changed |= environment.poll(_setup)
-        if not _setup.running and not _setup.failure:
-            bpy.ops.splannequin.check_backend()
-    if changed:
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type in ("PREFERENCES", "VIEW_3D"):
-                    area.tag_redraw()
-    return _TICK_SECONDS if busy() or _checks else None
+def _follow_setup() -> bool:
+    """A turn of the timer while a set-up runs; one that ended well is checked."""
+    if _setup is None:
+        return False
+    if environment.poll(_setup):
+        _redraw()
+    if not _setup.running and not _setup.failure:
+        bpy.ops.splannequin.check_backend()
+    return _setup.running
+
+
+def _redraw() -> None:
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in ("PREFERENCES", "VIEW_3D"):
+                area.tag_redraw()
 
 
 _CLASSES = (
@@ -273,7 +275,6 @@ def register() -> None:
 
 def unregister() -> None:
     """Undoes `register`. A set-up that runs goes on."""
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
+    _checks.clear()
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)

@@ -9,7 +9,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ...torch_backend import contract
-from ..process import steps, supervisor
+from ..process import begin, supervisor
 from ..scene import paths
 from ..shot import chosen, places
 from ..translations import tr
@@ -82,7 +82,7 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
         scene = context.scene
         folder = chosen.shot_folder(scene)
         if self.things and folder is not None:
-            for note in steps.remove_all(scene, folder):
+            for note in begin.remove_all(scene, folder):
                 self.report({"INFO"}, note)
         chosen.remove(scene, scene.splannequin.loaded_shot)
         return {"FINISHED"}

@@ -272,7 +272,7 @@ ANSWERS = (
         14,
         "jobs do not end with Blender",
         "splannequin_addon",
-        "detached",
+        "_detached",
         'return {"start_new_session": True}',
         "return {}",
         f"{TEST}jobs.py::test_a_child_runs_in_its_own_process_group",

@@ -111,7 +111,7 @@ def test_the_nearest_point_under_the_mouse(maths):
 @pytest.fixture
 def built(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
-    addon("process.steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     bpy.context.view_layer.update()
     return scene
 
@@ -194,8 +194,8 @@ def test_no_solve_no_alignment(scene):
 
 def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, built, shot):
     cameras = addon("solve.cameras")
-    panel, state = addon("ui.step_panel"), addon("shot.contents").read(shot)
-    addon("process.steps").insert_freeze(built, shot, "freeze")
+    state = addon("shot.contents").read(shot)
+    addon("bake.insertion").insert_freeze(built, shot, "freeze")
     assert addon("bake.freeze_group").shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
     places = world(addon, built, shot)[[0, 1]]
     apart = float(np.linalg.norm(places[1] - places[0]))
@@ -203,17 +203,17 @@ def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, 
     assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not addon(
         "bake.shown_take"
     ).stale_scale(built, shot)
-    assert "compositor follows" in addon("process.supervisor").watch_of(shot).notes["camera"][0]
+    assert "compositor follows" in addon("process.supervisor").watch_of(shot).notes["solve"][0]
     root = cameras.find(built, shot, "EMPTY")
     root.scale = (5.0, 5.0, 5.0)  # by hand
     bpy.context.view_layer.update()
     assert addon("bake.shown_take").stale_scale(built, shot)
-    assert any("stale" in line for line in panel.view_bake(built, state).state)
-    addon("process.steps").insert_freeze(built, shot, "freeze")
+    assert any("stale" in line for line in addon("process.steps").STEPS["bake"].view(built, state).state)
+    addon("bake.insertion").insert_freeze(built, shot, "freeze")
     assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(5.0) and not addon(
         "bake.shown_take"
     ).stale_scale(built, shot)
-    assert panel.view_bake(built, state).state[0] == "The freeze is in your compositor."
+    assert addon("process.steps").STEPS["bake"].view(built, state).state[0] == "The freeze is in your compositor."
     built.frame_set(6)
     graph = bpy.context.evaluated_depsgraph_get()
     camera = built.camera.evaluated_get(graph)

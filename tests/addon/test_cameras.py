@@ -63,7 +63,7 @@ def test_points_fall_where_the_solve_says(addon, scene, shot, fy):
         pose["K"][1] = fy
     path = {"version": 1, "width": width, "height": height, "frames": poses}
     (shot / "solve" / "cameras.json").write_text(json.dumps(path))
-    addon("process.steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     root = addon("solve.cameras").find(scene, shot, "EMPTY")
     points = np.load(shot / "solve" / "points.npz")["xyz"].astype(np.float64)
     for pose in poses:
@@ -180,7 +180,7 @@ def test_scene_is_upright(addon, scene, shot):
 def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_path, pictures):
     for item in list(scene.objects):
         bpy.data.objects.remove(item)
-    addon("process.steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     poses, width, height = poses_of(shot)
     scale = 6  # a picture of 96 x 72, so that a centroid is worth a tenth of a pixel
     scene.render.resolution_x, scene.render.resolution_y = width * scale, height * scale
@@ -215,7 +215,7 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     cameras = addon("solve.cameras")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
-    addon("process.steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     root = cameras.find(scene, shot, "EMPTY")
     root.scale = (2.0, 2.0, 2.0)
     own = bpy.data.objects.new("mine", scene.camera.data.copy())
@@ -223,7 +223,7 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     for kind in ("COPY_LOCATION", "COPY_ROTATION"):
         own.constraints.new(kind).target = scene.camera
     scene.splannequin.path_camera = own
-    assert addon("process.steps").own_camera(scene) == "mine"
+    assert addon("freeze.own_camera").name_of(scene) == "mine"
     scene.frame_start, scene.frame_end, scene.frame_step = 5, 7, 1
     scene.frame_set(6)
     path = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
@@ -238,14 +238,14 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     wide = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 64))
     assert (wide.width, wide.height) == (64, 48)
     np.testing.assert_allclose(wide.frames[0].K[0], 8 * want.frames[0].K[0], rtol=1e-4)
-    params = addon("process.steps").freeze_from(scene, wide)
+    params = addon("freeze.takes").freeze_from(scene, wide)
     assert contract.CameraPath.load(params.camera_path) == wide
     assert params.width == 64
     own.data.type = "ORTHO"
     with pytest.raises(contract.JobError, match="mine is not a perspective camera"):
         run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
     scene.splannequin.path_camera = scene.camera
-    assert addon("process.steps").own_camera(scene) == "", "the clip's own camera is the clip's own move"
+    assert addon("freeze.own_camera").name_of(scene) == "", "the clip's own camera is the clip's own move"
 
 
 def run_out(turns):
@@ -261,17 +261,17 @@ def test_a_keyed_instant_is_followed_frame_by_frame(addon, scene, shot):
     props = scene.splannequin
     props.shot_path, props.choose_t_star = str(shot), True
     scene.frame_start, scene.frame_end = 5, 9
-    assert steps.params_of(scene, "freeze").t_star_per_frame == {}
+    assert steps.STEPS["freeze"].params(scene).t_star_per_frame == {}
     for frame, value in ((5, 5), (7, 7)):
         props.t_star = value
         assert scene.keyframe_insert("splannequin.t_star", frame=frame)
     for curve in addon("compat").fcurves(scene):
         for key in curve.keyframe_points:
             key.interpolation = "LINEAR"
-    ramp = steps.params_of(scene, "freeze").t_star_per_frame
+    ramp = steps.STEPS["freeze"].params(scene).t_star_per_frame
     assert ramp == {"5": 5.0, "6": 6.0, "7": 7.0, "8": 7.0, "9": 7.0}
     props.choose_t_star = False
-    assert steps.params_of(scene, "freeze").t_star_per_frame == {}
+    assert steps.STEPS["freeze"].params(scene).t_star_per_frame == {}
 
 
 def test_points_keep_their_own_colours(addon, scene, shot):

@@ -53,7 +53,7 @@ def test_artists_nodes_and_links_stay_identical(addon, scene, artists_tree, take
     compositor = addon("bake.compositor")
     nodes, links = snapshot(artists_tree)
     compositor.insert(scene, take)
-    after_nodes, after_links = snapshot(artists_tree, addon("bake.freeze_group").GROUP_NAME)
+    after_nodes, after_links = snapshot(artists_tree, addon("bake.node_names").GROUP_NAME)
     output = addon("compat").output_socket(artists_tree)
     lost = {link for link in links if link[2:] == (output.node.name, output.identifier)}
     assert after_nodes == nodes
@@ -84,7 +84,7 @@ def test_second_bake_updates_the_group(addon, scene, artists_tree, take, shot, n
         .default_value
         == 3.0
     )
-    assert said == [f'The node group "{addon("bake.freeze_group").GROUP_NAME}" was updated.']
+    assert said == [f'The node group "{addon("bake.node_names").GROUP_NAME}" was updated.']
 
 
 def test_removal_restores_the_tree(addon, scene, artists_tree, take):
@@ -291,7 +291,7 @@ def test_behind_a_plate_the_grade_goes_on_from_the_frozen_frame(addon, scene, sh
     assert "as the plate" in said[0]
     compositor = addon("bake.compositor")
     node = addon("bake.freeze_group").group_node(tree)
-    nodes, links = snapshot(tree, addon("bake.freeze_group").GROUP_NAME)
+    nodes, links = snapshot(tree, addon("bake.node_names").GROUP_NAME)
     assert nodes == before[0] and len(before[1] - links) == 2 and not links - before[1]
     assert [link.to_node for link in plate.outputs["Image"].links] == [node]
     kinds = {link.to_node.bl_idname for link in node.outputs["Image"].links}
@@ -510,18 +510,18 @@ def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_pat
 
 def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, scene, take, shot, tmp_path, pictures):
     """The scene's own render, through its own depth pass, from the solved camera."""
-    steps, compat = addon("process.steps"), addon("compat")
+    compat = addon("compat")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
-    steps.load_camera(scene, shot)
-    steps.insert_freeze(scene, shot, "freeze")
+    addon("solve.arrival").load_camera(scene, shot)
+    addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     settings = scene.render.film_transparent, scene.view_layers[0].use_pass_z
     tree = compat.compositor_tree(scene)
     nodes = len(tree.nodes)
-    said = steps.combine_cg(scene, shot)
+    said = addon("bake.insertion").combine_cg(scene, shot)
     assert "by depth" in said[0] and len(tree.nodes) == nodes + 1
     with pytest.raises(Exception, match="already"):
-        steps.combine_cg(scene, shot)
+        addon("bake.insertion").combine_cg(scene, shot)
     scene.frame_set(6)
     for other in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
         bpy.data.objects.remove(other)
@@ -549,7 +549,7 @@ def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, sce
     sure = np.abs(depth - 12.0) > 0.05
     assert (green == (depth > 12.0))[sure & (np.arange(16) > 0)[None, :]].all()
     assert 10 < green.sum() < 150
-    steps.remove_all(scene, shot)
+    addon("process.begin").remove_all(scene, shot)
     assert (scene.render.film_transparent, scene.view_layers[0].use_pass_z) == settings
 
 
@@ -560,12 +560,12 @@ EDGE = 7.7
 @pytest.mark.parametrize("far", [3.0, 12.0, 60.0])
 def test_a_half_covered_edge_of_cg_is_blended_by_its_coverage(addon, scene, shot, tmp_path, pictures, layers, far):
     """A wall rendered in front of all that is frozen, within it and behind it, against the composite worked out."""
-    steps, cameras = addon("process.steps"), addon("solve.cameras")
+    cameras = addon("solve.cameras")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
-    steps.load_camera(scene, shot)
-    steps.insert_freeze(scene, shot, "freeze")
-    steps.combine_cg(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
+    addon("bake.insertion").insert_freeze(scene, shot, "freeze")
+    addon("bake.insertion").combine_cg(scene, shot)
     scene.frame_set(6)
     for other in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
         bpy.data.objects.remove(other)

@@ -47,10 +47,10 @@ def files_of(shot: Path) -> list[Path]:
 @pytest.fixture
 def look(addon, scene):
     """look(shot) does all that Blender does with a shot that is chosen, and returns every text that it would draw."""
-    supervisor, jobs, panel, listing = (
+    supervisor, jobs, steps, listing = (
         addon("process.supervisor"),
         addon("process.jobs"),
-        addon("ui.step_panel"),
+        addon("process.steps").STEPS,
         addon("ui.listing"),
     )
 
@@ -59,8 +59,8 @@ def look(addon, scene):
         scene.splannequin.shot_path = str(shot)
         watch = supervisor.watch_of(shot)
         texts = [words for failure in watch.failures.values() for words in failure]
-        for name, view in panel.VIEWS.items():
-            shown = view(scene, watch.state)
+        for name, step in steps.items():
+            shown = step.view(scene, watch.state)
             texts += [*shown.state, shown.advice, name]
         for row in listing.run_rows(watch.state) + listing.take_rows(watch.state):
             texts += row
@@ -76,8 +76,10 @@ def look(addon, scene):
             if job.status is not None:
                 texts += [job.status.message, job.status.stage, job.status.hint]
             texts += [words for warning in job.warnings for words in warning]
-        for kind in ("runs", "takes"):
-            texts += [words for pair in addon("settings").names_of(scene.splannequin, kind) for words in pair]
+        names = addon("train.settings").runs_of(scene.splannequin) + addon("freeze.settings").takes_of(
+            scene.splannequin
+        )
+        texts += [words for pair in names for words in pair]
         return texts
 
     return all_of

@@ -54,7 +54,7 @@ def test_a_small_clip_is_not_enlarged(costs):
 
 
 def test_a_tooltip_tells_what_the_preset_is(addon, contract):
-    for name, _, words in addon("settings").PRESETS:
+    for name, _, words in addon("train.settings").PRESETS:
         assert words.startswith(f"{contract.PRESET_WIDTHS[name]} pixels wide, {contract.PRESET_STEPS[name]} steps")
 
 

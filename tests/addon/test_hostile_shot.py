@@ -34,14 +34,14 @@ def test_st_maps(addon, contract, trap, shot):
     asked = addon("solve.stmaps").begin(shot)
     asked.wait()
     with pytest.raises(contract.JobError):  # the shot has no lens
-        asked.answer()
+        addon("solve.stmaps").answer(asked)
     assert not trap.exists(), trap.read_text()
 
 
 def test_exported_cameras(addon, trap, shot):
     solves = addon("solve.exchange")
-    process = solves.begin_export(shot, "nerfstudio", shot / "out")
-    assert str(shot / "out") in solves.finish_export(process, shot / "out")
+    asked = solves.begin_export(shot, "nerfstudio", shot / "out")
+    assert str(shot / "out") in solves.exported(asked, shot / "out")
     assert (shot / "out" / "transforms.json").is_file()
     assert not trap.exists(), trap.read_text()
 

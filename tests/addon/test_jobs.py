@@ -159,7 +159,7 @@ def test_poll_keeps_its_budget_and_loses_nothing(addon, contract, empty_shot):
 def test_the_childs_environment_is_free_of_blenders_python(addon, monkeypatch, root):
     monkeypatch.setenv("PYTHONHOME", "/of/blender")
     monkeypatch.setenv("PYTHONPATH", "/of/blender")
-    environ = addon("process.jobs").backend_environ(root)
+    environ = addon("process.children").backend_environ(root)
     assert "PYTHONHOME" not in environ and environ["PYTHONPATH"] == str(root)
 
 
@@ -280,13 +280,13 @@ def test_a_job_of_another_computer_is_neither_dead_nor_ended(addon, contract, em
 def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     addon, contract, empty_shot, scene, clip, sleeper
 ):
-    jobs, steps, worker = addon("process.jobs"), addon("process.steps"), sleeper()
+    jobs, worker = addon("process.jobs"), sleeper()
     scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(empty_shot)
     started = contract.process_start(worker.pid)
     writer = contract.Writer(contract.host_name(), worker.pid, started, "train", "from a terminal", time.time() - 90000)
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
     with pytest.raises(contract.JobError) as told:
-        steps.begin(scene, "footage")
+        addon("process.begin").begin(scene, "import")
     assert told.value.exit_code == contract.ExitCode.USAGE and told.value.hint == "Wait for it or cancel it."
     since = time.strftime("%Y-%m-%d %H:%M", time.localtime(writer.since))
     where = contract.host_name().partition(" (")[0]
@@ -296,7 +296,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     assert not (empty_shot / "jobs").exists(), "nothing was written"
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, host="elsewhere")))
     with pytest.raises(contract.JobError, match="on elsewhere since") as told:
-        steps.begin(scene, "footage")
+        addon("process.begin").begin(scene, "import")
     assert str(empty_shot / "lock.json") in told.value.hint
     ending = jobs.new_job(empty_shot, "train", contract.TrainParams())
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name)))
@@ -306,7 +306,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     worker.kill()
     worker.wait()
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
-    jobs.wait(steps.begin(scene, "footage", contract.ImportParams(str(clip), 1, 8)))
+    jobs.wait(addon("process.begin").begin(scene, "import", contract.ImportParams(str(clip), 1, 8)))
     assert not (empty_shot / "lock.json").exists()
 
 

@@ -16,7 +16,7 @@ VIEWMAT = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 def test_a_view_through_the_solved_camera_is_the_solved_camera(addon, contract, shot, scene, scale):
     cameras, viewport = addon("solve.cameras"), addon("freeze.viewport")
     scene.splannequin.shot_path = str(shot)
-    addon("process.steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     root = cameras.find(scene, shot, "EMPTY")
     root.matrix_world = Matrix.LocRotScale((1, 2, 3), Matrix.Rotation(0.7, 3, "Y"), (scale,) * 3) @ root.matrix_world
     path = contract.CameraPath.load(shot / "solve" / "cameras.json")

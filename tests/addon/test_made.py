@@ -22,7 +22,7 @@ def duplicate(*items):
 @pytest.fixture
 def built(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
-    addon("process.steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     return scene
 
 

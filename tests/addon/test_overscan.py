@@ -105,14 +105,17 @@ def test_at_another_render_size_the_frame_still_fills_the_picture(addon, scene, 
 def test_the_panels_choice_reaches_the_backend_and_a_bake_keeps_the_takes(addon, scene, shot, take):
     steps = addon("process.steps")
     scene.splannequin.shot_path = str(shot)
-    assert steps.params_of(scene, "freeze").overscan == 0.0
+    assert steps.STEPS["freeze"].params(scene).overscan == 0.0
     scene.splannequin.overscan = "LENS"
-    assert steps.params_of(scene, "freeze").overscan == -1.0
+    assert steps.STEPS["freeze"].params(scene).overscan == -1.0
     scene.splannequin.overscan = "OFF"
-    assert steps.take_params(shot, "over").overscan == -1.0 and steps.take_params(shot, "freeze").overscan == 0.0
+    assert (
+        addon("freeze.takes").take_params(shot, "over").overscan == -1.0
+        and addon("freeze.takes").take_params(shot, "freeze").overscan == 0.0
+    )
     scene.splannequin.take_name = "over"
-    assert steps.params_of(scene, "bake").overscan == -1.0
-    view = addon("ui.step_panel").view_freeze(scene, addon("shot.contents").read(shot))
+    assert steps.STEPS["bake"].params(scene).overscan == -1.0
+    view = addon("process.steps").STEPS["freeze"].view(scene, addon("shot.contents").read(shot))
     assert "Overscan: 2 pixels on each side, 1 above and below" in view.state
 
 
@@ -156,7 +159,7 @@ def mapped(tree, picture, path: Path):
 def test_blenders_map_uv_undistorts_and_gives_the_original_back(addon, scene, lens_shot, tmp_path, pictures):
     scene.splannequin.shot_path = str(lens_shot)
     assert bpy.ops.splannequin.write_stmaps() == {"FINISHED"}
-    notes = addon("process.supervisor").watch_of(lens_shot).notes["camera"]
+    notes = addon("process.supervisor").watch_of(lens_shot).notes["solve"]
     assert "stmap_undistort.exr and stmap_redistort.exr are in" in notes[0] and "overscan" in notes[1]
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     original = np.stack([0.5 + 0.4 * np.sin(x / 11.0), 0.5 + 0.4 * np.cos(y / 9.0), (x + y) / 300.0], axis=2)
@@ -195,19 +198,21 @@ def test_a_lens_that_folds_over_is_said_on_the_panel(addon, scene, lens_shot):
     scene.splannequin.shot_path = str(lens_shot)
     with pytest.raises(RuntimeError, match="folds over"):
         bpy.ops.splannequin.write_stmaps()
-    assert "folds over" in addon("process.supervisor").watch_of(lens_shot).failures["camera"][0]
+    assert "folds over" in addon("process.supervisor").watch_of(lens_shot).failures["solve"][0]
     assert not list((lens_shot / "solve").glob("*.exr"))
 
 
 def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_shot):
-    stmaps, watch = addon("solve.stmaps"), addon("process.supervisor").watch_of(lens_shot)
+    operators, supervisor = addon("solve.operators"), addon("process.supervisor")
+    watch = supervisor.watch_of(lens_shot)
     scene.splannequin.shot_path = str(lens_shot)
-    asked = stmaps.begin(lens_shot)
-    stmaps._asked.append(asked)
+    asked = addon("solve.stmaps").begin(lens_shot)
+    operators.follow_stmaps(lens_shot, asked)
     assert not bpy.ops.splannequin.write_stmaps.poll(), "one at a time"
     asked.process.wait(60)
-    assert stmaps._tick() is None and not stmaps._asked
-    assert "stmap_redistort.exr" in watch.notes["camera"][0]
+    supervisor.tick()
+    assert not operators.writing and not supervisor._meanwhile
+    assert "stmap_redistort.exr" in watch.notes["solve"][0]
     assert bpy.ops.splannequin.write_stmaps.poll()
 
 

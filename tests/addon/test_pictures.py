@@ -31,6 +31,5 @@ def test_without_a_window_there_are_no_icons(addon, tmp_path):
 
 def test_names_of_runs_and_takes_are_offered(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
-    names = addon("settings").names_of
-    assert names(scene.splannequin, "runs") == [("main", "24.0 dB, 12,345 Gaussians")]
-    assert names(scene.splannequin, "takes") == [("freeze", "t* 6, run main")]
+    assert addon("train.settings").runs_of(scene.splannequin) == [("main", "24.0 dB, 12,345 Gaussians")]
+    assert addon("freeze.settings").takes_of(scene.splannequin) == [("freeze", "t* 6, run main")]

@@ -44,10 +44,15 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     scene = opened(there)
     assert addon("shot.chosen").shot_folder(scene) == there / "people.splannequin"
     assert addon("scene.paths").absolute(scene.splannequin.clip) == str(there / "people.mp4")
-    assert addon("process.steps").params_of(scene, "footage").source == str(there / "people.mp4")
+    assert addon("process.steps").STEPS["import"].params(scene).source == str(there / "people.mp4")
     assert addon("solve.cameras").find(scene, there / "people.splannequin", "CAMERA") == scene.camera
     assert plate_file() == there / "people.splannequin" / "frames" / "000005.png"
-    assert addon("ui.step_panel").VIEWS["camera"](scene, addon("shot.contents").read(there / "people.splannequin")).done
+    assert (
+        addon("process.steps")
+        .STEPS["solve"]
+        .view(scene, addon("shot.contents").read(there / "people.splannequin"))
+        .done
+    )
 
 
 def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
@@ -85,18 +90,18 @@ def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_pa
 
 def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     blend(project)
-    steps = addon("process.steps")
+    addon("process.steps")
     before, there = project / "people.splannequin", project / "renamed.splannequin"
     before.rename(there)
     scene = opened(project)
     watch = addon("process.supervisor").watch_of(before)
     assert addon("shot.chosen").missing(scene, watch.state)
-    for step in ("camera", "train", "freeze", "bake"):
+    for step in ("solve", "train", "freeze", "bake"):
         with pytest.raises(contract.JobError, match="is not there any more") as told:
-            steps.begin(scene, step)
+            addon("process.begin").begin(scene, step)
         assert "Locate" in told.value.hint
     with pytest.raises(contract.JobError):
-        steps.freeze_from(scene, contract.CameraPath(4, 4, []))
+        addon("freeze.takes").freeze_from(scene, contract.CameraPath(4, 4, []))
     assert not before.exists()
     with pytest.raises(RuntimeError, match="is no shot folder"):
         bpy.ops.splannequin.locate_shot(directory=str(project))
@@ -156,14 +161,14 @@ def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, sc
     wrong.write_text("no video")
     scene.splannequin.clip = str(wrong)
     supervisor = addon("process.supervisor")
-    job = addon("process.steps").begin(scene, "footage")
-    supervisor.follow("footage", job)
+    job = addon("process.begin").begin(scene, "import")
+    supervisor.follow("import", job)
     job.process.wait()
     watch = supervisor.watch_of(job.shot)
     while watch.running():
         supervisor.tick()
     assert not job.shot.exists()
-    assert watch.jobs["footage"].state == "failed" and "text.mp4" in watch.jobs["footage"].status.message
+    assert watch.jobs["import"].state == "failed" and "text.mp4" in watch.jobs["import"].status.message
 
 
 def test_a_failed_import_takes_nothing_of_a_shot_that_has_frames(addon, shot, tmp_path):
@@ -194,10 +199,10 @@ def test_a_folder_that_cannot_be_is_one_sentence(addon, scene, clip, tmp_path, w
         bpy.ops.splannequin.import_clip()
     assert str(told.value).strip().count("\n") == 0
     watch = addon("process.supervisor").watch_of(folder)
-    assert "Cannot write to" in watch.failures["footage"][0]
+    assert "Cannot write to" in watch.failures["import"][0]
     addon("process.supervisor").tick()
-    for view in addon("ui.step_panel").VIEWS.values():
-        view(scene, watch.state)
+    for step in addon("process.steps").STEPS.values():
+        step.view(scene, watch.state)
     capfd.readouterr()
     assert addon("command_line.headless").main(["import", str(folder), str(clip)]) == 2
     said = capfd.readouterr().err
@@ -209,4 +214,4 @@ def test_a_keyed_camera_of_a_moved_shot_is_found(addon, shot):
     shutil.copy(shot / "solve" / "cameras.json", shot / "paths" / "freeze.json")
     told = shot / "takes" / "freeze" / "take.json"
     told.write_text(json.dumps(json.loads(told.read_text()) | {"camera_path": "/nowhere/paths/freeze.json"}))
-    assert addon("process.steps").take_params(shot, "freeze").camera_path == str(shot / "paths" / "freeze.json")
+    assert addon("freeze.takes").take_params(shot, "freeze").camera_path == str(shot / "paths" / "freeze.json")

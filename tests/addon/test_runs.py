@@ -76,29 +76,29 @@ def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, sh
     assert plan(addon, with_runs).button == "Train On", "the run that is there is of the preset that is chosen"
     props.preset = "final"
     assert plan(addon, with_runs).kind == "resume" and "as it was" in plan(addon, with_runs).words
-    asked = addon("process.steps").params_of(with_runs, "train")
+    asked = addon("process.steps").STEPS["train"].params(with_runs)
     assert (asked.run, asked.preset, asked.seed, asked.iterations, asked.extend) == ("main", "final", 9, 900, 0)
 
 
 def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
-    props, params_of = with_runs.splannequin, addon("process.steps").params_of
+    props, steps = with_runs.splannequin, addon("process.steps").STEPS
     props.extend_steps = 70
-    asked = params_of(with_runs, "train")
+    asked = steps["train"].params(with_runs)
     assert (asked.run, asked.extend, asked.iterations) == ("main", 70, 0)
     checkpoint(
         shot / "runs" / "main" / "extension.safetensors", iteration=1000,
         extensions=[{"from_iteration": 900, "steps": 300}],
     )  # fmt: skip
-    assert params_of(with_runs, "train").extend == 300, "the steps that were begun, not those in the field"
+    assert steps["train"].params(with_runs).extend == 300, "the steps that were begun, not those in the field"
     props.run_name = "better"
-    asked = params_of(with_runs, "train")
+    asked = steps["train"].params(with_runs)
     assert (asked.run, asked.extend, asked.iterations, asked.width) == ("better", 0, 900, 48)
     assert (asked.max_gaussians, asked.holdout, asked.seed) == (1234, 5, 7)
     assert (asked.host, asked.host_config, asked.supervision, asked.detector) == ("mlp", "reference", "paper", "weight")
     props.preset = "standard"
-    assert (params_of(with_runs, "train").preset, params_of(with_runs, "train").iterations) == ("standard", 0)
+    assert (steps["train"].params(with_runs).preset, steps["train"].params(with_runs).iterations) == ("standard", 0)
     props.run_name = "new"
-    assert params_of(with_runs, "train").extend == 0
+    assert steps["train"].params(with_runs).extend == 0
 
 
 def test_more_steps_are_a_third_of_the_presets_at_first(scene, contract):
@@ -197,7 +197,7 @@ def test_nothing_is_picked_or_removed_while_a_step_runs(addon, contract, with_ru
 
 
 def test_new_buttons_have_tooltips(addon):
-    for cls in addon("ui.pick_operators").CLASSES:
+    for cls in [*addon("train.operators").CLASSES, *addon("freeze.operators").CLASSES]:
         kind = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type()
         assert len(kind.description) > 10 and not kind.description.endswith("."), cls
         assert all(p.identifier == "rna_type" or p.description for p in kind.properties), cls
@@ -215,12 +215,7 @@ _WORLD = "import sys; from pathlib import Path; from tests.backend.conftest impo
 
 
 def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root, tmp_path, capfd):
-    steps, jobs, shots, python = (
-        addon("process.steps"),
-        addon("process.jobs"),
-        addon("shot.contents"),
-        addon("process.backend").python(),
-    )
+    jobs, shots, python = addon("process.jobs"), addon("shot.contents"), addon("process.backend").python()
     subprocess.run([python, "-c", _WORLD.format(str(tmp_path))], cwd=root, check=True)
     shot = tmp_path / "tiny.splannequin"
     (shot / "solve" / "solve.json").write_text('{"version": 1, "quality": "true"}')
@@ -230,7 +225,7 @@ def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root,
     assert plan(addon, scene).kind == "extend"
 
     scene.splannequin.extend_steps = 200
-    job = steps.begin(scene, "train")
+    job = addon("process.begin").begin(scene, "train")
     while "preview" not in job.images and not job.ended:
         jobs.poll(job, 0.05)
     assert job.images["preview"].endswith("000170.png")

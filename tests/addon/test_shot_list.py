@@ -21,10 +21,10 @@ def two(addon, scene, shot, other):
     """Both in the scene with their cameras; the second is chosen."""
     props = scene.splannequin
     props.shot_path, props.run_name = str(shot), "first run"
-    addon("process.steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     assert bpy.ops.splannequin.shot_add() == {"FINISHED"}
     props.shot_path = str(other)
-    addon("process.steps").load_camera(scene, other)
+    addon("solve.arrival").load_camera(scene, other)
     return scene
 
 
@@ -66,7 +66,7 @@ def keyed(addon, scene):
 
 
 def test_a_keyed_instant_goes_with_its_shot(addon, two):
-    props, steps = two.splannequin, addon("process.steps")
+    props = two.splannequin
     two["mine"] = 1.0
     two.keyframe_insert('["mine"]', frame=1)
     artists = set(keyed(addon, two))
@@ -76,9 +76,9 @@ def test_a_keyed_instant_goes_with_its_shot(addon, two):
         two.keyframe_insert("splannequin.t_star", frame=5)
     ours = {"splannequin.t_star": [5.0], "splannequin.shots[1].t_star": [7.0]}
     assert {k: v for k, v in keyed(addon, two).items() if k not in artists} == ours
-    assert steps.keyed_instants(two)["6"] == 5.0
+    assert addon("freeze.takes").keyed_instants(two)["6"] == 5.0
     props.active_shot = 1
-    assert steps.keyed_instants(two)["6"] == 7.0
+    assert addon("freeze.takes").keyed_instants(two)["6"] == 7.0
     two.frame_set(6)
     assert props.t_star == 7 and props.shots[0].t_star == 5
     assert set(keyed(addon, two)) == {*artists, "splannequin.t_star", "splannequin.shots[0].t_star"}
@@ -122,17 +122,17 @@ def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
     """Put back at switching, as the artist left them; the scene's own come back with the last shot."""
     first, second = ((16, 12, 100), 12.5, (5, 7)), ((32, 24, 100), 25.0, (5, 7))
     original = seen(scene)
-    props, steps = scene.splannequin, addon("process.steps")
+    props = scene.splannequin
     for name, change in (("shot.json", {"fps": 25.0}), ("solve/cameras.json", {})):
         told = json.loads((other / name).read_text()) | change | {"width": 32, "height": 24}
         (other / name).write_text(json.dumps(told))
     props.shot_path = str(shot)
-    steps.load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     assert seen(scene) == first
     bpy.ops.splannequin.shot_add()
     assert seen(scene) == first, "nothing of the new one is known"
     props.shot_path = str(other)
-    steps.load_camera(scene, other)
+    addon("solve.arrival").load_camera(scene, other)
     assert seen(scene) == second
     props.active_shot = 0
     assert seen(scene) == first
@@ -143,7 +143,7 @@ def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
     assert seen(scene) == ((16, 12, 50), 12.5, (6, 7))
     bpy.ops.splannequin.shot_remove(things=True)
     assert seen(scene) == second and scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
-    steps.remove_all(scene, other)
+    addon("process.begin").remove_all(scene, other)
     assert seen(scene) == original and scene.camera == scene.objects["Camera"]
 
 
@@ -155,18 +155,18 @@ def test_what_the_artist_set_for_a_shot_is_still_the_artists_after_switching(add
     props.active_shot = 1
     assert two.render.resolution_x == 4000
     for folder in (shot, other):
-        addon("process.steps").remove_all(two, folder)
+        addon("process.begin").remove_all(two, folder)
     assert two.render.resolution_x == 4000 and two.frame_end == 250
 
 
 def test_a_scene_that_was_left_alone_stays_so_at_switching(addon, scene, shot, other):
     scene.render.resolution_x, scene.frame_end = 640, 99
-    props, steps = scene.splannequin, addon("process.steps")
+    props = scene.splannequin
     props.shot_path = str(shot)
-    steps.load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     bpy.ops.splannequin.shot_add()
     props.shot_path = str(other)
-    steps.load_camera(scene, other)
+    addon("solve.arrival").load_camera(scene, other)
     scene.frame_end = 50
     props.active_shot = 0
     assert (scene.render.resolution_x, scene.frame_end) == (640, 50)
@@ -178,16 +178,16 @@ def things(scene) -> set[str]:
 
 
 def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
-    props, steps = scene.splannequin, addon("process.steps")
+    props = scene.splannequin
     props.shot_path = str(shot)
-    steps.load_camera(scene, shot)
-    steps.insert_freeze(scene, shot, "freeze")
+    addon("solve.arrival").load_camera(scene, shot)
+    addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     before = things(scene)
     bpy.context.view_layer.update()
     pose = np.array(addon("solve.cameras").find(scene, shot, "CAMERA").matrix_world)
     bpy.ops.splannequin.shot_add()
     props.shot_path = str(other)
-    steps.load_camera(scene, other)
+    addon("solve.arrival").load_camera(scene, other)
     assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
     assert things(scene) == before
     assert not len(props.shots) and addon("shot.chosen").shot_folder(scene) == shot
@@ -197,31 +197,31 @@ def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
     assert addon("bake.freeze_group").shown(scene)[0] == shot / "takes" / "freeze"
     assert scene.view_settings.view_transform == "Standard", "the shot that stays needs its settings"
     assert not bpy.ops.splannequin.shot_remove.poll()
-    steps.remove_all(scene, shot)
+    addon("process.begin").remove_all(scene, shot)
     assert addon("bake.freeze_group").shown(scene) is None and scene.view_settings.view_transform == "AgX"
     assert scene.render.resolution_x == 1920
 
 
 def test_removing_the_baked_shot_takes_its_group_out(addon, two, shot, other):
-    steps = addon("process.steps")
-    steps.insert_freeze(two, other, "freeze")
-    steps.remove_all(two, other)
+    addon("process.steps")
+    addon("bake.insertion").insert_freeze(two, other, "freeze")
+    addon("process.begin").remove_all(two, other)
     assert addon("bake.freeze_group").shown(two) is None and addon("solve.cameras").find(two, shot, "CAMERA")
     assert two.render.resolution_x == 16, "the settings go with the last shot"
 
 
 def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other, new_take):
-    steps, panel, shots = addon("process.steps"), addon("ui.step_panel"), addon("shot.contents")
-    steps.insert_freeze(two, other, "freeze")
-    assert panel.view_bake(two, shots.read(other)).done
+    shots = addon("shot.contents")
+    addon("bake.insertion").insert_freeze(two, other, "freeze")
+    assert addon("process.steps").STEPS["bake"].view(two, shots.read(other)).done
     two.splannequin.active_shot = 0
-    view = panel.view_bake(two, shots.read(shot))
+    view = addon("process.steps").STEPS["bake"].view(two, shots.read(shot))
     assert not view.done and "another shot, second" in view.state[0]
-    steps.insert_freeze(two, shot, "freeze")
-    assert panel.view_bake(two, shots.read(shot)).done
+    addon("bake.insertion").insert_freeze(two, shot, "freeze")
+    assert addon("process.steps").STEPS["bake"].view(two, shots.read(shot)).done
     new_take(shot, "later")
     two.splannequin.take_name = "later"
-    assert "take freeze" in panel.view_bake(two, shots.read(shot)).state[0]
+    assert "take freeze" in addon("process.steps").STEPS["bake"].view(two, shots.read(shot)).state[0]
 
 
 def test_undo_brings_a_shot_back(addon, two, shot, other):
@@ -255,7 +255,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
     bpy.ops.splannequin.shot_add()
     props.shot_path, props.t_star = str(other), 3
     frozen = ended(addon, contract, shot, "freeze", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
-    solved = ended(addon, contract, shot, "camera", "solve", contract.SolveParams(), {})
+    solved = ended(addon, contract, shot, "solve", "solve", contract.SolveParams(), {})
     baked = ended(addon, contract, shot, "bake", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
     for _ in range(100):  # a turn has a budget, and the machine may be busy
         supervisor.tick()
@@ -263,7 +263,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
             break
     assert solved.ended and baked.ended and props.t_star == 3 and props.shots[0].t_star == 2
     assert cameras.find(scene, shot, "CAMERA") is None and set(supervisor.watch_of(shot).pending) == {
-        "freeze", "camera", "bake",
+        "freeze", "solve", "bake",
     }  # fmt: skip
     supervisor.tick()
     assert supervisor.watch_of(shot).jobs, "a shot of the list is followed on"
@@ -280,9 +280,10 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
 
 def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, other):
     supervisor = addon("process.supervisor")
-    supervisor.sample(two, other, iter_path(contract))
+    read = addon("freeze.takes").reading(two.name, other, "freeze", iter_path(contract), 1)
+    supervisor.work(other, "freeze", read)
     two.splannequin.active_shot = 0
-    while supervisor.watch_of(other).sampling is not None:
+    while supervisor.watch_of(other).work is not None:
         supervisor.tick()
     assert "Another shot was chosen" in supervisor.watch_of(other).failures["freeze"][0]
     assert not (shot / "jobs").exists() and not (other / "jobs").exists()

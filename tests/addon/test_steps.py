@@ -30,10 +30,10 @@ def test_the_import_button_brings_the_clip_in(addon, scene, clip, tmp_path):
 
 def test_a_scene_in_use_is_left_alone_without_consent(addon, scene, shot):
     scene.render.resolution_x, scene.frame_end = 4096, 99
-    said = addon("process.steps").imported(scene, shot)
+    said = addon("footage.arrival").imported(scene, shot)
     assert (scene.render.resolution_x, scene.frame_end) == (4096, 99) and "left alone" in said[0]
     scene.splannequin.set_up_scene = True
-    addon("process.steps").imported(scene, shot)
+    addon("footage.arrival").imported(scene, shot)
     assert (scene.render.resolution_x, scene.frame_end) == (16, 7)
 
 
@@ -44,7 +44,7 @@ def test_a_button_says_what_is_wrong(addon, scene, tmp_path):
     with pytest.raises(RuntimeError, match=r"text\.mp4"):
         bpy.ops.splannequin.import_clip()
     watch = addon("process.supervisor").watch_of(tmp_path / "text.splannequin")
-    assert watch.jobs["footage"].state == "failed"
+    assert watch.jobs["import"].state == "failed"
 
 
 def test_no_clip_is_said_in_words(scene):
@@ -95,7 +95,7 @@ def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, sh
     bpy.ops.splannequin.insert_freeze()
     assert scene.view_settings.view_transform == "Standard" and scene.render.dither_intensity == 0.0
     notes = addon("process.supervisor").watch_of(shot).notes
-    assert notes["camera"] and notes["bake"]
+    assert notes["solve"] and notes["bake"]
     assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
     assert set(notes) == {"bake"}, "nothing says any more that the shot's camera is the scene's"
     assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == names
@@ -136,7 +136,7 @@ def test_t_star_is_held_within_the_clip(with_shot):
 
 
 def test_bake_asks_for_the_take_as_it_was_made(addon, with_shot):
-    params = addon("process.steps").params_of(with_shot, "bake")
+    params = addon("process.steps").STEPS["bake"].params(with_shot)
     assert (params.run, params.take, params.t_star, params.width, params.only_missing) == (
         "main",
         "freeze",
@@ -145,49 +145,48 @@ def test_bake_asks_for_the_take_as_it_was_made(addon, with_shot):
         True,
     )
     with_shot.splannequin.choose_t_star, with_shot.splannequin.t_star = True, 7
-    assert addon("process.steps").params_of(with_shot, "bake").t_star == 7
+    assert addon("process.steps").STEPS["bake"].params(with_shot).t_star == 7
 
 
 def test_the_timer_applies_a_job_that_ended_and_gives_each_step_its_words(addon, scene, clip, tmp_path):
     props = scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
     props.use_range, props.first, props.last = True, 1, 8
-    job = addon("process.steps").begin(scene, "footage")
+    job = addon("process.begin").begin(scene, "import")
     supervisor = addon("process.supervisor")
-    supervisor.follow("footage", job)
+    supervisor.follow("import", job)
     watch = supervisor.watch_of(job.shot)
-    assert watch.running() == "footage"
+    assert watch.running() == "import"
     job.process.wait()
     while watch.running():
         assert supervisor.tick() == supervisor.TICK_SECONDS
     assert watch.state.frames == 8
-    assert "Frame range set to 1 to 8." in watch.notes["footage"] and scene.frame_end == 8
+    assert "Frame range set to 1 to 8." in watch.notes["import"] and scene.frame_end == 8
 
 
-@pytest.mark.parametrize("step", ["footage", "camera", "train", "freeze", "bake"])
+@pytest.mark.parametrize("step", ["import", "solve", "train", "freeze", "bake"])
 def test_each_step_says_what_comes_next(addon, scene, step):
-    view = addon("ui.step_panel").VIEWS[step](scene, None)
+    view = addon("process.steps").STEPS[step].view(scene, None)
     assert view.advice.endswith(".") and not view.done
-    assert view.ready == (step == "footage")
+    assert view.ready == (step == "import")
 
 
 def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
-    panel, state = addon("ui.step_panel"), addon("shot.contents").read(shot)
-    shown = {step: view(with_shot, state) for step, view in panel.VIEWS.items()}
-    assert shown["footage"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
-    assert shown["camera"].state == ["A good solve."] and "load it" in shown["camera"].advice
+    steps, state = addon("process.steps").STEPS, addon("shot.contents").read(shot)
+    shown = {name: step.view(with_shot, state) for name, step in steps.items()}
+    assert shown["import"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
+    assert shown["solve"].state == ["A good solve."] and "load it" in shown["solve"].advice
     assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % may move"]
     assert shown["freeze"].state == ["Take freeze: 3 frames, 16 x 12", "Time stands still at frame 6"]
     assert not shown["bake"].done and shown["bake"].ready
 
 
 def test_every_button_and_setting_has_a_tooltip(addon):
-    operators = [
-        *addon("ui.step_operator").CLASSES,
-        *addon("ui.job_operators").CLASSES,
-        *addon("solve.align_operators").CLASSES,
-    ]
-    for cls in [*operators, *(c for c in addon("ui.shots_panel").CLASSES if issubclass(c, bpy.types.Operator))]:
+    classes = [*addon("ui.job_operators").CLASSES, *addon("ui.shots_panel").CLASSES]
+    classes += [cls for step in addon("process.steps").STEPS.values() for cls in step.classes]
+    operators = [cls for cls in classes if issubclass(cls, bpy.types.Operator)]
+    assert len(operators) > 25
+    for cls in operators:
         kind = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type()
         assert len(kind.description) > 10 and not kind.description.endswith("."), cls
         for prop in kind.properties:
@@ -201,15 +200,15 @@ def test_a_newer_shot_is_refused_in_words(addon, contract, tmp_path: Path):
     with pytest.raises(ValueError, match="version 99"):
         addon("shot.contents").read(tmp_path)
     watch = addon("process.supervisor").watch_of(tmp_path)
-    assert "version 99" in watch.failures["footage"][0], "the panel shows it instead of breaking"
+    assert "version 99" in watch.failures["import"][0], "the panel shows it instead of breaking"
 
 
 def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_path):
-    steps, props = addon("process.steps"), scene.splannequin
+    props = scene.splannequin
     props.use_range, props.first, props.last = True, 1, 8
     for name in ("first.mp4", "second.mp4"):
         props.clip = str(shutil.copy(clip, tmp_path / name))
-        steps.run(scene, "footage")
+        addon("process.begin").run(scene, "import")
     assert {p.name for p in tmp_path.glob("*.splannequin")} == {"first.splannequin", "second.splannequin"}
     assert addon("shot.chosen").shot_folder(scene) == tmp_path / "second.splannequin"
 
@@ -229,17 +228,17 @@ def test_bake_asks_for_a_ramp_or_a_path_as_it_was_made(addon, shot):
     facts = json.loads(path.read_text())
     ramp = {"5": 5.0, "6": 5.5}
     path.write_text(json.dumps({**facts, "last": 6, "t_star_per_frame": ramp, "camera_path": "/a/path.json"}))
-    params = addon("process.steps").take_params(shot, "freeze")
+    params = addon("freeze.takes").take_params(shot, "freeze")
     assert (params.first, params.last, params.t_star_per_frame, params.camera_path) == (5, 6, ramp, "/a/path.json")
 
 
 def test_a_step_is_refused_while_another_of_the_shot_runs(addon, contract, scene, clip, tmp_path):
-    steps, jobs, props = addon("process.steps"), addon("process.jobs"), scene.splannequin
+    jobs, props = addon("process.jobs"), scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
-    job = steps.begin(scene, "footage")
+    job = addon("process.begin").begin(scene, "import")
     try:
         with pytest.raises(contract.JobError, match="is still running"):
-            steps.begin(scene, "footage")
+            addon("process.begin").begin(scene, "import")
     finally:
         jobs.cancel(job)
         job.process.wait()
@@ -301,19 +300,19 @@ def test_marker_and_instant_follow_whichever_changed_last(addon, with_shot, shot
     markers.follow(scene)
     assert marker.frame == 5, "after a file load the setting in the file leads"
     other = scene.timeline_markers.new("mine", frame=3)
-    assert "The marker t* was removed." in addon("process.steps").remove_all(scene, shot)
+    assert "The marker t* was removed." in addon("process.begin").remove_all(scene, shot)
     assert list(scene.timeline_markers) == [other]
 
 
 def test_what_the_artist_changed_since_is_not_taken_back(addon, scene, shot):
-    setup, steps = addon("scene.scene_setup"), addon("process.steps")
+    setup = addon("scene.scene_setup")
     scene.splannequin.shot_path = str(shot)
     rate = scene.render.fps, scene.render.fps_base
     setup.fit_clip(scene, (16, 12), 12.5, (5, 7))
     setup.keep_plate_colours(scene)
     scene.render.resolution_x = 4000
     scene.view_settings.exposure = 1.5
-    steps.remove_all(scene, shot)
+    addon("process.begin").remove_all(scene, shot)
     assert (scene.render.resolution_x, scene.render.resolution_y) == (4000, 12), "a size belongs together"
     assert scene.view_settings.exposure == 1.5 and scene.view_settings.view_transform == "AgX"
     assert (scene.render.fps, scene.render.fps_base) == rate and (scene.frame_start, scene.frame_end) == (1, 250)

@@ -38,22 +38,22 @@ def session(addon, shot, monkeypatch):
 
 
 def test_scrubbing_can_be_stopped_while_a_job_runs_and_when_the_shot_is_gone(addon, with_shot, shot, session):
-    panel, viewport = addon("ui.step_panel"), addon("freeze.viewport")
+    viewport = addon("freeze.viewport")
     session.failure = None
     assert session.open and not bpy.ops.splannequin.suggested_instant.poll()
-    nothing = panel.View(False, False, [], "")
-    assert panel.can_scrub(nothing, "train")
+    nothing = addon("process.steps").View(False, False, [], "")
+    assert addon("freeze.panel").can_scrub(nothing, "train")
     shot.rename(shot.with_name("gone"))
     addon("process.supervisor").forget()
     assert bpy.ops.splannequin.live.poll()
     assert bpy.ops.splannequin.live() == {"FINISHED"} and viewport.session() is None
-    assert not panel.can_scrub(nothing, "train") and not panel.can_scrub(nothing, None)
+    assert not addon("freeze.panel").can_scrub(nothing, "train") and not addon("freeze.panel").can_scrub(nothing, None)
 
 
 def test_the_solve_can_be_loaded_while_the_shot_trains(addon):
-    can = addon("ui.step_panel").can_load_camera
+    can = addon("solve.panel").can_load_camera
     assert can(None) and can("train") and can("freeze") and can("bake")
-    assert not can("footage") and not can("camera")
+    assert not can("import") and not can("solve")
 
 
 def test_an_instant_that_nobody_chose_is_the_one_that_is_drawn(addon, with_shot, session):
@@ -67,25 +67,24 @@ def test_an_instant_that_nobody_chose_is_the_one_that_is_drawn(addon, with_shot,
 
 
 def test_the_log_that_is_offered_has_something_in_it(addon, contract, shot, with_shot):
-    log_of, watch = addon("ui.job_operators").log_of, addon("process.supervisor").watch_of(shot)
-    assert log_of(watch, "camera") is None
-    job = watch.jobs["camera"] = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
+    steps = addon("process.steps").STEPS
+    job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
     (job.folder / "log.txt").touch()
-    assert log_of(watch, "camera") is None, "an empty file helps nobody"
+    assert steps["solve"].log(job) is None, "an empty file helps nobody"
     (shot / "solve" / "colmap.log").write_text("what COLMAP said")
-    assert log_of(watch, "camera") == shot / "solve" / "colmap.log"
+    assert steps["solve"].log(job) == shot / "solve" / "colmap.log"
     (job.folder / "log.txt").write_text("what the backend said")
-    assert log_of(watch, "camera") == job.folder / "log.txt"
-    watch.jobs["train"] = addon("process.jobs").new_job(shot, "train", contract.TrainParams())
-    assert log_of(watch, "train") is None
+    assert steps["solve"].log(job) == job.folder / "log.txt"
+    other = addon("process.jobs").new_job(shot, "train", contract.TrainParams())
+    assert steps["train"].log(other) is None
 
 
 def test_which_frames_are_solved_is_a_setting(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a.mp4")
-    asked = addon("process.steps").params_of(scene, "footage")
+    asked = addon("process.steps").STEPS["import"].params(scene)
     assert (asked.step, asked.fps) == (0, 0.0)
     scene.splannequin.solve_step, scene.splannequin.fps = 3, 25.0
-    asked = addon("process.steps").params_of(scene, "footage")
+    asked = addon("process.steps").STEPS["import"].params(scene)
     assert (asked.step, asked.fps) == (3, 25.0)
 
 
@@ -104,7 +103,7 @@ def test_the_rate_of_a_sequence_is_the_one_that_was_set(addon, scene, tmp_path, 
 def test_after_the_import_the_clip_is_seen_and_nothing_else_is_touched(addon, with_shot, with_raw):
     scene, plate = with_shot, addon("footage.plate")
     mine, objects = scene.camera, set(scene.objects)
-    said = addon("process.steps").imported(scene, with_raw)
+    said = addon("footage.arrival").imported(scene, with_raw)
     camera = plate.find(scene, with_raw)
     assert f"{camera.name} shows the clip until the camera is solved." in said
     assert scene.camera == mine and set(scene.objects) - objects == {camera}
@@ -112,27 +111,27 @@ def test_after_the_import_the_clip_is_seen_and_nothing_else_is_touched(addon, wi
     assert Path(background.image.filepath) == with_raw / "frames" / "raw" / "000005.png"
     assert (background.image_user.frame_start, background.image_user.frame_duration) == (5, 3)
     assert camera.data.show_background_images
-    addon("process.steps").imported(scene, with_raw)
+    addon("footage.arrival").imported(scene, with_raw)
     assert set(scene.objects) - objects == {plate.find(scene, with_raw)}, "again: in place of the first"
 
 
 def test_the_solved_camera_takes_the_clips_place(addon, with_shot, with_raw):
     scene, plate = with_shot, addon("footage.plate")
     before = set(bpy.data.images), set(bpy.data.cameras)
-    addon("process.steps").imported(scene, with_raw)
+    addon("footage.arrival").imported(scene, with_raw)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
     assert plate.find(scene, with_raw) is None and scene.camera == addon("solve.cameras").find(
         scene, with_raw, "CAMERA"
     )
     assert not [c for c in bpy.data.cameras if "plate" in c.name]
-    addon("process.steps").remove_all(scene, with_raw)
+    addon("process.begin").remove_all(scene, with_raw)
     assert (set(bpy.data.images), set(bpy.data.cameras)) == before
 
 
 def test_removing_the_shot_before_the_solve_takes_the_clips_camera_along(addon, with_shot, with_raw):
     before = set(bpy.data.objects), set(bpy.data.images), set(bpy.data.cameras)
-    addon("process.steps").imported(with_shot, with_raw)
-    addon("process.steps").remove_all(with_shot, with_raw)
+    addon("footage.arrival").imported(with_shot, with_raw)
+    addon("process.begin").remove_all(with_shot, with_raw)
     assert (set(bpy.data.objects), set(bpy.data.images), set(bpy.data.cameras)) == before
 
 

@@ -58,8 +58,40 @@ def test_an_old_shot_is_shown_whole(addon, tmp_path):
     assert {kind: job.state for kind, job in addon("process.jobs").latest(root).items()} == dict.fromkeys(
         ("import", "solve", "train", "freeze"), "done"
     )
-    assert addon("process.steps").take_params(root, "freeze").width == 64
-    assert addon("process.steps").complete(root, "freeze") and not addon("process.steps").may_be_stale(root, "freeze")
+    assert addon("freeze.takes").take_params(root, "freeze").width == 64
+    assert addon("freeze.takes").complete(root, "freeze") and not addon("freeze.takes").may_be_stale(root, "freeze")
+
+
+@pytest.mark.parametrize(
+    ("kind", "told", "step"),
+    [
+        ("import", "footage", "import"),
+        ("solve", "camera", "solve"),
+        ("train", "train", "train"),
+        ("freeze", "bake", "bake"),
+        ("freeze", "freeze", "freeze"),
+        ("freeze", "", "freeze"),
+    ],
+)
+def test_a_job_of_an_old_shot_belongs_to_its_step(addon, contract, tmp_path, kind, told, step):
+    """What 0.2.0 wrote into job folders: its names of the steps."""
+    shot = tmp_path / "a.splannequin"
+    addon("shot.contents").create(shot)
+    params = contract.ImportParams("a.mp4") if kind == "import" else contract.PARAMS[kind]()
+    job = addon("process.jobs").new_job(shot, kind, params)
+    (job.folder / contract.STEP_FILE).write_text(told)
+    assert addon("process.steps").step_of(job) == step
+    assert set(addon("process.supervisor").watch_of(shot).jobs) == {step}
+
+
+def test_buttons_take_the_old_names_of_steps(addon, contract, scene, tmp_path):
+    shot = tmp_path / "a.splannequin"
+    addon("shot.contents").create(shot)
+    job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
+    scene.splannequin.shot_path = str(shot)
+    assert addon("process.supervisor").watch_of(shot).running() == "solve"
+    assert bpy.ops.splannequin.cancel(step="camera") == {"FINISHED"}
+    assert (job.folder / contract.CANCEL_FILE).exists()
 
 
 def test_old_command_lines_ask_for_the_same(addon, contract):

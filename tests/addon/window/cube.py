@@ -44,18 +44,21 @@ def start() -> None:
 def bake(shot: Path) -> None:
     """The frozen frame in the compositor of a new scene, behind the solved camera."""
     bpy.ops.wm.read_homefile(use_empty=True)
-    scene, steps = bpy.context.scene, add_on("process.steps")
+    scene = bpy.context.scene
     scene.splannequin.shot_path, scene.splannequin.set_up_scene = str(shot), True
-    for line in steps.load_camera(scene, shot):
+    for line in add_on("solve.arrival").load_camera(scene, shot):
         print(line)
     scene.frame_start = scene.frame_end = FRAME
     contract = importlib.import_module("bl_ext.user_default.splannequin.torch_backend.contract")
     params = contract.FreezeParams(
         take=TAKE, t_star=FRAME, width=scene.render.resolution_x, first=FRAME, last=FRAME, only_missing=True
     )
-    if not steps.complete(shot, TAKE, [FRAME]):
-        steps.run(scene, "freeze", params)
-    for line in [*steps.insert_freeze(scene, shot, TAKE), *steps.combine_cg(scene, shot)]:
+    if not add_on("freeze.takes").complete(shot, TAKE, [FRAME]):
+        add_on("process.begin").run(scene, "freeze", params)
+    for line in [
+        *add_on("bake.insertion").insert_freeze(scene, shot, TAKE),
+        *add_on("bake.insertion").combine_cg(scene, shot),
+    ]:
         print(line)
     scene.frame_set(FRAME)
     for item in scene.objects:
