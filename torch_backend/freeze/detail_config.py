@@ -30,6 +30,11 @@ class DetailConfig:
     believed there if it bears the motion out: sways too small for the flow."""
     borne_out: float = 0.03
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
+    carried: float = 2.0
+    """Travel in pixels from which on what the model moves belongs to what moves beside it: of a body that has turned,
+    a plain shirt looks the same in both plates."""
+    body: float = 64.0
+    """How far from what moves that may reach, pixels."""
     alike: float = 0.15
     """Low-passed difference of the frozen render and its own plate, display-referred, up to which they agree."""
     denied: float = 0.15

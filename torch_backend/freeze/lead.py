@@ -9,8 +9,8 @@ from .bands import bands
 from .detail_config import DetailConfig
 from .posed import PosedFrame, displacements, parallax
 from .query import OutputFrame
-from .regions import closed, opened
-from .reproject import blurred, pixel_centres, project, resized, unproject, widened
+from .regions import closed, grown, opened
+from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import Sighting, Sightings
 from .warp import snap
 
@@ -59,17 +59,7 @@ def leading_matte(
         return within, st, own
     wrong = torch.maximum(posed.motion, lead.moving) > 0.5
     if own:
-        off, gained = _off(sightings, posed, leading)
-        wrong = (
-            wrong
-            | _swayed(sightings, config, posed, leading, gained)
-            | _beside(sightings, config, posed, leading, usable, off)
-        )
-        # What the model lacks at the plate's own time, too, is its fault and no motion.
-        off = torch.where(gained > config.own_time * off, off, 0.0)
-        if truth is not None:
-            wrong = wrong | _denied(sightings, config, truth, off)
-        wrong = closed(sightings.whole(wrong, off), round(config.gap * sightings.unit))
+        wrong = _let_go(sightings, config, posed, leading, usable, wrong, truth)
     posed.doubt = widened(wrong.float(), round(config.margin * sightings.unit))
     let_go = blurred(posed.doubt, config.feather * sightings.unit)
     matte = 1.0 - let_go
@@ -79,6 +69,36 @@ def leading_matte(
         error = parallax(sightings, config, posed, leading, posed.depth)
         matte = matte * lead.visible * torch.exp(-error.square())
     return resized(matte, columns, rows) * within, st, own
+
+
+def _let_go(
+    sightings: Sightings,
+    config: DetailConfig,
+    posed: PosedFrame,
+    frame: int,
+    usable: list[int],
+    moving: Tensor,
+    truth: Sighting | None,
+) -> Tensor:
+    """[h, w] bool: where the frame's own plate shows another instant than t*.
+
+    Args:
+        moving: [h, w] bool, by the mattes.
+        truth: how plate t* sees what is seen; None if it may not be used.
+    """
+    off, gained = _off(sightings, posed, frame)
+    travel = _travel(sightings, config, posed, frame)
+    wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
+    contrary = None
+    if truth is not None:
+        contrary = torch.minimum(off, _contrary(sightings, posed, frame, truth))
+        wrong = wrong | _denied(sightings, config, truth, contrary)
+    # What the model lacks at the plate's own time, too, is its fault and no motion, unless plate t* lacks it as well.
+    wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
+    wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
+    if contrary is not None:
+        wrong = sightings.whole(wrong, contrary, config.denied_too)
+    return closed(wrong, round(config.gap * sightings.unit))
 
 
 def _off(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:
@@ -115,23 +135,36 @@ def _beside(
 
 
 def _denied(sightings: Sightings, config: DetailConfig, truth: Sighting, off: Tensor) -> Tensor:
-    """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate shows something else (`off`).
+    """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate differs from both, by `off`.
 
-    A hand that is held still where it was not at t* is still to the flow; a wrong depth explains edges only.
+    A hand that is held still where it was not at t* is still to the flow, and may be unknown to the model at any time.
+    What both plates show and the model lacks is no motion; a wrong depth explains edges only.
     """
     denied = (off > config.denied) & (truth.visible * truth.explained > 0.5)
     spots = opened(denied, round(config.thin * sightings.unit))
     return sightings.whole(spots, off, config.denied_too)
 
 
-def _swayed(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, gained: Tensor) -> Tensor:
-    """[h, w] bool: the model moves what is seen from t* to its own plate, and the plate bears it out.
+def _contrary(sightings: Sightings, posed: PosedFrame, frame: int, truth: Sighting) -> Tensor:
+    """[h, w] low-passed difference of its own plate and plate t*, where that sees the point (`truth`); 0 elsewhere."""
+    h, w = posed.depth.shape
+    picture = sightings.view(frame).picture.float()
+    inside = _middle(picture, posed.depth)
+    seen = truth.visible[inside][..., None]
+    told = look_up(sightings.view(posed.t).picture.float(), truth.pixels[inside])
+    out = torch.zeros(h, w, device="cpu")
+    out[inside] = sightings.difference(picture * seen, told * seen)
+    return out
+
+
+def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: Tensor) -> Tensor:
+    """[h, w] bool: the model moves what is seen from t* to its own plate (`travel`), and the plate bears it out.
 
     That is, the render of t* differs from the plate by more than the render of the plate's own time does (`gained`,
     as `_off`). A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
     that are.
     """
-    out = (gained > config.borne_out) & (_travel(sightings, config, posed, frame) > config.travel)
+    out = (gained > config.borne_out) & (travel > config.travel)
     # Outlines are errors of depth; what moves is a region.
     return opened(out, round(config.thin * sightings.unit))
 

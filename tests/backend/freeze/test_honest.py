@@ -15,7 +15,7 @@ from torch_backend.freeze.sightings import SightingConfig
 
 FRAME, T_STAR = 3, 11
 """The board stands wholly apart in these two."""
-BLIND = {"denied": 9.0, "travel": 1e9}
+BLIND = {"denied": 9.0, "denied_too": 9.0, "travel": 1e9, "carried": 1e9}
 """Of `DetailConfig`: what the model and plate t* say is not asked."""
 
 
@@ -73,6 +73,31 @@ def test_what_is_held_still_and_was_elsewhere_at_t_star_is_not_shown(world):
     assert shows_its_own_board(world, make(world, still, **BLIND)) > 0.9, "else there is nothing to mend"
     wall = ~widened(world.seen_at(FRAME)[1] | world.truth(world.output(FRAME, T_STAR))[1], 24)
     assert (made.matte.numpy()[wall] == 1.0).all(), "and nothing else is let go of"
+
+
+def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
+    """As before, but the model leaves the board where it was at t*: that plate and plate t* differ has to do."""
+    before = world.run.model
+    world.run.model = replace(before, field=Stays())
+    still = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
+    try:
+        made, alone = make(world, still), make(world, still, **BLIND)
+    finally:
+        world.run.model = before
+    assert shows_its_own_board(world, made) < 0.01
+    assert shows_its_own_board(world, alone) > 0.9, "else there is nothing to mend"
+
+
+def test_what_the_model_moves_goes_with_what_moves_beside_it(world):
+    """The matte has a corner of the board of t*; of the rest nothing is asked but how far the model moves it."""
+    there = world.truth(world.output(FRAME, T_STAR))[1]
+    rows, columns = np.nonzero(there)
+    corner = there & (np.arange(W) < columns.min() + 12) & (np.arange(H)[:, None] < rows.min() + 12)
+    mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14)} | {T_STAR: corner}
+    deaf = {**BLIND, "body": 640.0, "sightings": SightingConfig(contradicted=9.0)}
+    made = make(world, mattes, **{**deaf, "carried": DetailConfig().carried})
+    assert made.matte.numpy()[narrowed(there, 6)].max() < 0.01
+    assert make(world, mattes, **deaf).matte.numpy()[narrowed(there, 6)].mean() > 0.8, "else there is nothing to mend"
 
 
 def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(world):
