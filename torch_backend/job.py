@@ -15,8 +15,9 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from . import contract
@@ -219,7 +220,7 @@ def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack 
 
 
 @contextlib.contextmanager
-def _kept_in_place(shot: Shot, kind: str) -> Iterator[None]:
+def _kept_in_place(shot: Shot, kind: str) -> Generator[None]:
     """JobError, whatever else was wrong, if the shot's folder was moved or deleted in the meantime."""
     try:
         yield
@@ -259,15 +260,19 @@ def _log(folder: Path, text: str) -> None:
 
 
 @contextlib.contextmanager
-def _signals_cancel(reporter: JobReporter) -> Iterator[None]:
+def _signals_cancel(reporter: JobReporter) -> Generator[None]:
     """Ctrl-C, SIGTERM and CTRL_BREAK end the job with a checkpoint instead of a traceback."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     names = [name for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
     before = {name: signal.getsignal(getattr(signal, name)) for name in names}
+
+    def cancel(number: int, frame: FrameType | None) -> None:
+        reporter.cancel()
+
     for name in names:
-        signal.signal(getattr(signal, name), lambda *_: reporter.cancel())
+        signal.signal(getattr(signal, name), cancel)
     try:
         yield
     finally:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,7 +36,7 @@ class Staged:
 
 
 @contextlib.contextmanager
-def replacing_solve(shot: Shot) -> Iterator[Staged]:
+def replacing_solve(shot: Shot) -> Generator[Staged]:
     """Yields folders for the files of a whole new solve, which take the place of the old one's if the block ends well.
 
     If it fails or is killed, the old solve stays as it was. OSError if a file cannot be moved (on Windows: it is held

@@ -20,6 +20,7 @@ from .footage.images import read_frame
 from .footage.importing import load_frames
 from .shot import Shot
 from .solve.stored import damaged, load_cameras, load_points
+from .torch_types import from_numpy
 
 
 @dataclass
@@ -63,11 +64,17 @@ class Scene:
 
     def from_solve(self, viewmats: np.ndarray) -> Tensor:
         """World-to-camera matrices [..., 4, 4] of solve units, in scene units, float32."""
-        return torch.from_numpy(_in_scene(viewmats, self.scale, self.centre)).float()
+        return from_numpy(_in_scene(viewmats, self.scale, self.centre)).float()
 
     def camera_at(self, width: int, height: int) -> Tensor:
         """`Ks` rescaled to another image size, [F, 3, 3]."""
         return resize_intrinsics(self.Ks, self.width, self.height, width, height)
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """Up to `most` of the numbers 0 to count - 1, ascending, the first and the last among them."""
+    numbers = np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
+    return sorted({int(number) for number in numbers})
 
 
 def resize_intrinsics(Ks: Tensor, width: int, height: int, new_width: int, new_height: int) -> Tensor:
@@ -97,13 +104,13 @@ def load_scene(shot: Shot) -> Scene:
         frames=frames,
         seconds=seconds,
         times=np.clip((seconds - start) / (end - start), 0.0, 1.0),
-        viewmats=torch.from_numpy(_in_scene(viewmats, scale, centre)).float(),
+        viewmats=from_numpy(_in_scene(viewmats, scale, centre)).float(),
         Ks=torch.tensor([[[c.K[0], 0, c.K[2]], [0, c.K[1], c.K[3]], [0, 0, 1]] for c in path.frames]).float(),
         width=path.width,
         height=path.height,
         solved=solved,
-        points=torch.from_numpy((xyz - centre) * scale).float(),
-        colors=torch.from_numpy(rgb).float() / 255.0,
+        points=from_numpy((xyz - centre) * scale).float(),
+        colors=from_numpy(rgb).float() / 255.0,
         scale=scale,
         centre=centre,
         folder=shot.frames,
@@ -166,7 +173,7 @@ def read_image(path: Path, width: int, height: int) -> Tensor:
     """One display-referred image resized to [height, width, 3] float32 in [0, 1]. Raises what `read_frame` does."""
     pixels = read_frame(path)
     limit = 65535.0 if pixels.dtype == np.uint16 else 255.0
-    image = torch.from_numpy(pixels.astype(np.float32) / limit).permute(2, 0, 1)[None]
+    image = from_numpy(pixels.astype(np.float32) / limit).permute(2, 0, 1)[None]
     if image.shape[-2:] != (height, width):
         exact = image.shape[-2] % height == 0 and image.shape[-1] % width == 0
         mode, antialias = ("area", False) if exact else ("bicubic", True)

@@ -4,7 +4,7 @@ torch's annotations end where its Python meets C++ (`linalg`, `Tensor.norm`, `Te
 type checker that reads `x.norm(dim=1)` then knows nothing of the whole expression, and neither does an editor.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
@@ -92,7 +92,7 @@ def singular_values(matrices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return cast(Any, torch.linalg).svd(matrices)
 
 
-def split(values: Tensor, sizes: int | list[int], dim: int = 0) -> tuple[Tensor, ...]:
+def split(values: Tensor, sizes: int | Sequence[int], dim: int = 0) -> tuple[Tensor, ...]:
     """Views of so many rows each (the last may have fewer), or of these sizes."""
     return cast(Any, values).split(sizes, dim)
 
@@ -120,3 +120,13 @@ def integers(values: Tensor) -> list[int]:
 def from_numpy(array: "np.ndarray[Any, Any]") -> Tensor:
     """A CPU tensor that shares the array's memory."""
     return cast(Any, torch).from_numpy(array)
+
+
+def matrix_exp(matrices: Tensor) -> Tensor:
+    """Matrix exponentials [..., K, K]."""
+    return cast(Any, torch.linalg).matrix_exp(matrices)
+
+
+def norm_of_all(values: Tensor) -> Tensor:
+    """Euclidean norm (0-dim) of all numbers together."""
+    return cast(Any, values).norm()

@@ -13,7 +13,7 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 from . import contract
@@ -28,7 +28,7 @@ _BARE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os
 
 
 @contextlib.contextmanager
-def only_writer(root: Path, kind: str, job: str) -> Iterator[Writer]:
+def only_writer(root: Path, kind: str, job: str) -> Generator[Writer]:
     """Holds the shot in `root` for a job. JobError if another one does, or if the shot cannot be written."""
     pid = os.getpid()
     mine = Writer(contract.host_name(), pid, contract.process_start(pid), kind, job, time.time())

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ..gaussians.model import SH_C0
+from ..torch_types import backward, norm, split, unflatten, unique_with_inverse
 from .geometry import farthest_points, near_identity, nearest, rigid_rotations, rotation_matrices
 from .geometry import warm_up as warm_up_nearest
 from .mlp import Trunk, blurred, linear
@@ -191,8 +192,8 @@ class ControlPoints(Deformation):
         offset = motion.shift - (turned @ places[..., None])[..., 0]
         rows = torch.cat([turned.flatten(1), offset, motion.quats, motion.log_scales], dim=1)
         blend = F.embedding_bag(at, rows, per_sample_weights=share, mode="sum")
-        turned, offset, quats, log_scales = blend.split((9, 3, 4, 3), dim=1)
-        means = (turned.unflatten(1, (3, 3)) * x[:, None, :]).sum(2) + offset
+        turned, offset, quats, log_scales = split(blend, (9, 3, 4, 3), 1)
+        means = (unflatten(turned, 1, (3, 3)) * x[:, None, :]).sum(2) + offset
         return Deltas(means=means, quats=quats, log_scales=log_scales)
 
     def _skin(self, x: Tensor, hyper: Tensor) -> tuple[Tensor, Tensor]:
@@ -211,8 +212,8 @@ class ControlPoints(Deformation):
         """What index [M, K] needs at times [M] or [1], each once: (places [R, 3], motions, rows [M, K])."""
         if times.shape[0] == 1:
             return self.places, self.node_motion(self.places, times), index
-        instants, which = times.unique(return_inverse=True)
-        pairs, at = (index * len(instants) + which[:, None]).unique(return_inverse=True)
+        instants, which = unique_with_inverse(times)
+        pairs, at = unique_with_inverse(index * len(instants) + which[:, None])
         places = self.places[pairs // len(instants)]
         return places, self.node_motion(places, instants[pairs % len(instants)]), at
 
@@ -275,10 +276,10 @@ class ControlPoints(Deformation):
         share = min(max((progress - first) / max(last - first, 1e-9), 0.0), 1.0)
         return c.arap * (c.arap_end / c.arap) ** share if c.arap > 0 else 0.0
 
-    def _paths(self, places: Tensor) -> Tensor:
+    def paths(self, places: Tensor) -> Tensor:
         """[R, 3 * 16]: trajectories of places [R, 3] as features, in which distance is root mean square distance."""
         times = torch.linspace(0.0, 1.0, _INSTANTS, device=places.device)
-        paths = torch.cat([self.trajectories(chunk, times) for chunk in places.split(1024)], dim=1)
+        paths = torch.cat([self.trajectories(chunk, times) for chunk in split(places, 1024)], dim=1)
         return paths.transpose(0, 1).flatten(1) / math.sqrt(_INSTANTS)
 
     def rehearse(self, stage: Rehearsal) -> None:
@@ -334,7 +335,7 @@ def arap_energy(before: Tensor, after: Tensor) -> Tensor:
     count = min(_EDGES, len(before) - 1)
     index = nearest(before, before, count + 1)[:, 1:]
     old, new = before[index] - before[:, None], after[index] - after[:, None]
-    valid = old.detach().norm(dim=2) < _EDGE_RADIUS
+    valid = norm(old.detach(), 2) < _EDGE_RADIUS
     valid[:, :_SURE_EDGES] = True
     rotation, usable = rigid_rotations(old.detach(), new.detach(), valid)
     gap = (new - old @ rotation.transpose(1, 2)).square().sum(2)
@@ -367,7 +368,7 @@ def _radii(places: Tensor, published: bool) -> Tensor:
     if published or len(places) < 2:
         return torch.full_like(places[:, 0], max(0.1 * float(places.max() - places.min()), 1e-3))
     index = nearest(places, places, min(4, len(places)))[:, 1:]
-    return (places[index] - places[:, None]).norm(dim=2).mean(1).clamp_min(1e-3)
+    return norm(places[index] - places[:, None], 2).mean(1).clamp_min(1e-3)
 
 
 # ---------------------------------------------------------------------- stage one of the published host
@@ -390,7 +391,7 @@ class _Surrogates:
             points, colors = points[kept], colors[kept]
         # Mean spacing of the points: the common size of the balls.
         near = nearest(points, points, min(4, len(points)))[:, 1:]
-        spacing = (points[near] - points[:, None]).norm(dim=2).median().clamp_min(1e-3)
+        spacing = norm(points[near] - points[:, None], 2).median().clamp_min(1e-3)
         self.scale = nn.Parameter(spacing.log().reshape(1))
         self.params = {
             "means": nn.Parameter(points.clone()),
@@ -417,11 +418,11 @@ class _Surrogates:
             if step >= warm:
                 loss = loss + self._penalties()
             self.optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            backward(loss)
             if bool(torch.isfinite(loss)):
                 self.optimizer.step()
                 if state["means"].grad is not None:
-                    self.pull += state["means"].grad.norm(dim=1)
+                    self.pull += norm(state["means"].grad, 1)
         field.place(self.params["means"].detach())
 
     def _state(self, frame: int, moving: bool) -> dict[str, Tensor]:
@@ -472,12 +473,12 @@ class _Surrogates:
 
     @torch.no_grad()
     def _draw_nodes(self) -> None:
-        rows = farthest_points(self.field._paths(self.params["means"].detach()), self.field.config.nodes)
+        rows = farthest_points(self.field.paths(self.params["means"].detach()), self.field.config.nodes)
         self.params = {name: nn.Parameter(value.detach()[rows]) for name, value in self.params.items()}
         self.pull = torch.zeros_like(self.params["means"][:, 0])
         self.optimizer = self._optimiser()
 
-    def _optimiser(self) -> torch.optim.Adam:
+    def _optimiser(self) -> torch.optim.Optimizer:
         network = [p for group in self.field.parameter_groups() if group["name"] == "field" for p in group["params"]]
         groups = [
             {"params": network, "lr": self.field.config.lr},

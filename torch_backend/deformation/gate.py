@@ -18,11 +18,12 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..gaussians import Gaussians
 from ..gaussians.model import SH_C0
+from ..gaussians.neighbours import nearest as nearest_points
+from ..torch_types import from_numpy, norm
 from .protocol import Deltas
 
 
@@ -95,7 +96,7 @@ def change_of(
     opacity = model.params["opacity_logits"][rows]
     change = torch.zeros(len(rows), device=rows.device)
     for at, counted in zip(moments, counts, strict=True):
-        departure = (at.means - mean.means).norm(dim=1) * pixels / config.pixels
+        departure = norm(at.means - mean.means, 1) * pixels / config.pixels
         if at.sh0 is not None and mean.sh0 is not None:
             departure = torch.maximum(departure, SH_C0 * (at.sh0 - mean.sh0).abs().amax((1, 2)) / config.color)
         if at.opacity_logits is not None and mean.opacity_logits is not None:
@@ -122,8 +123,8 @@ def stays_open(
     if len(rows) <= config.neighbours:
         return change > 1.0
     means = model.params["means"].detach()[rows].cpu().numpy()
-    nearest = KDTree(means).query(means, k=config.neighbours + 1)[1].reshape(len(rows), -1)
-    nearest = torch.from_numpy(np.ascontiguousarray(nearest)).to(rows.device)
+    index = nearest_points(means, means, config.neighbours + 1)[1]
+    nearest = from_numpy(np.ascontiguousarray(index)).to(rows.device)
     smooth = change[nearest].median(1).values
     stays = smooth > max(1.0, noise * float(change.quantile(0.25)))
     room = int(config.max_share * len(model))

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet
+from ..torch_types import cross, determinant, norm, singular_values, split, unflatten
 
 _SERIES = 0.25
 """Below this squared angle sin and cos quotients are series: their closed forms cancel in float32."""
@@ -47,7 +48,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
-    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    return unflatten(torch.stack(entries, dim=-1), -1, (3, 3))
 
 
 def screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
@@ -56,12 +57,12 @@ def screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
     Deformable 3DGS divides by the angle and gives NaN at 0; here the quotients are series there.
     """
     a, b, c = _quotients(turn.square().sum(1, keepdim=True))
-    rotated = points + a * torch.linalg.cross(turn, points) + b * _twice(turn, points)
-    return rotated + shift + b * torch.linalg.cross(turn, shift) + c * _twice(turn, shift)
+    rotated = points + a * cross(turn, points) + b * _twice(turn, points)
+    return rotated + shift + b * cross(turn, shift) + c * _twice(turn, shift)
 
 
 def _twice(turn: Tensor, v: Tensor) -> Tensor:
-    return torch.linalg.cross(turn, torch.linalg.cross(turn, v))
+    return cross(turn, cross(turn, v))
 
 
 def _quotients(s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -92,7 +93,7 @@ def farthest_points(features: Tensor, count: int) -> Tensor:
         if not float(distance[index]) > 0.0:
             break
         picked.append(index)
-        distance = torch.minimum(distance, (features - features[index]).norm(dim=1))
+        distance = torch.minimum(distance, norm(features - features[index], 1))
     return torch.tensor(picked, dtype=torch.long, device=features.device)
 
 
@@ -133,7 +134,7 @@ def nearest(queries: Tensor, points: Tensor, count: int) -> Tensor:
     # Products of coordinates are twice as fast as differences, and exact enough near the origin.
     centre = points.mean(0)
     targets = points - centre
-    chunks = (queries - centre).split(4096)
+    chunks = split(queries - centre, 4096)
     found = [torch.cdist(chunk, targets).topk(count, dim=1, largest=False).indices for chunk in chunks]
     return torch.cat(found) if found else torch.zeros(0, count, dtype=torch.long, device=points.device)
 
@@ -149,7 +150,7 @@ def rigid_rotations(before: Tensor, after: Tensor, valid: Tensor) -> tuple[Tenso
         covariance = (after * kept).transpose(1, 2) @ (before * kept)
         usable = torch.isfinite(covariance).all(-1).all(-1) & (covariance.square().sum((1, 2)) > 1e-24)
         eye = torch.eye(3, dtype=before.dtype, device=before.device)
-        u, _, vh = torch.linalg.svd(torch.where(usable[:, None, None], covariance, eye))
+        u, _, vh = singular_values(torch.where(usable[:, None, None], covariance, eye))
         flip = torch.ones_like(u[:, 0])
-        flip[:, 2] = torch.linalg.det(u @ vh).sign()
+        flip[:, 2] = determinant(u @ vh).sign()
         return torch.where(usable[:, None, None], (u * flip[:, None, :]) @ vh, eye), usable

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ..torch_types import unflatten
 from . import planes as compiled
 from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_scale
 
@@ -159,7 +160,7 @@ class HexPlane(Deformation):
             log_scales=out["log_scales"],
             opacity_logits=out["opacity_logits"][:, 0],
             sh0=out["sh0"][:, None, :],
-            shN=out["shN"].unflatten(1, (-1, 3)) if "shN" in out else None,
+            shN=unflatten(out["shN"], 1, (-1, 3)) if "shN" in out else None,
         )
 
     def _by_level(self) -> list[Tensor]:

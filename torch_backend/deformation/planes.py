@@ -11,14 +11,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet
+from ..torch_types import AutogradContext, applied, once_differentiable
 
 LANES = 16
 """The number of features must be a multiple of this."""
@@ -70,15 +70,20 @@ def _sizes(planes: Sequence[Tensor]) -> Tensor:
     return torch.tensor([p.shape[2:] for p in planes], dtype=torch.int64, device="cpu")
 
 
+class _Sampling(AutogradContext, Protocol):
+    threads: int | None
+    """Workers that the backward pass runs on, too."""
+
+
 class _Product(torch.autograd.Function):
     """Features of points, with gradients for the planes and the points."""
 
     @staticmethod
-    def forward(ctx: Any, where: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: _Sampling, where: Tensor, threads: int | None, *planes: Tensor) -> Tensor:
         count, channels, levels = len(where), planes[0].shape[1], len(planes) // 6
         features = torch.empty(count, levels * channels, device="cpu")
-        wanted = any(ctx.needs_input_grad)
-        samples = torch.empty(len(planes), count, channels, device="cpu") if wanted else None
+        differentiable = any(ctx.needs_input_grad)
+        samples = torch.empty(len(planes), count, channels, device="cpu") if differentiable else None
         pointers, sizes = _table(planes), _sizes(planes)
         _sampler(channels).run(
             threads, planes=pointers.data_ptr(), grads=0, sizes=sizes.data_ptr(), where=where.data_ptr(),
@@ -91,10 +96,12 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        where, samples, *planes = cast(tuple[Tensor, ...], ctx.saved_tensors)
+    def backward(ctx: _Sampling, *grads_in: Tensor) -> tuple[Tensor | None, ...]:
+        where: Tensor = ctx.saved_tensors[0]
+        samples: Tensor = ctx.saved_tensors[1]
+        planes: list[Tensor] = list(ctx.saved_tensors[2:])
         out = [torch.empty_like(p) for p in planes]
-        grad = grad.contiguous()
+        grad = grads_in[0].contiguous()
         pulls = torch.empty_like(where) if ctx.needs_input_grad[0] else None
         pointers, grads, sizes = _table(planes), _table(out), _sizes(planes)
         for stage in (1,) if pulls is None else (1, 2):
@@ -115,14 +122,14 @@ def features(where: Tensor, planes: Sequence[Tensor], threads: int | None = None
     """
     if not supports(planes):
         raise ValueError("planes should be float32 on the CPU, channels last, with a multiple of 16 features")
-    return _Product.apply(where.float().contiguous(), threads, *planes)  # type: ignore[no-any-return]
+    return applied(_Product, where.float().contiguous(), threads, *planes)
 
 
 class _Bend(torch.autograd.Function):
     """The penalty's value; its gradient is computed along with it, being linear in the incoming one."""
 
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, threads: int | None, *planes: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: AutogradContext, weights: Tensor, threads: int | None, *planes: Tensor) -> Tensor:
         grads = [torch.empty_like(p) for p in planes] if any(ctx.needs_input_grad) else []
         units = [(n, row) for n, p in enumerate(planes) for row in range(p.shape[2])]
         rows = torch.tensor(units, dtype=torch.int64, device="cpu")
@@ -137,8 +144,9 @@ class _Bend(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        return None, None, *(saved * grad for saved in ctx.saved_tensors)
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        saved: tuple[Tensor, ...] = ctx.saved_tensors
+        return None, None, *(gradient * grads[0] for gradient in saved)
 
 
 def penalty(
@@ -151,4 +159,4 @@ def penalty(
     for plane, (down, along, still) in zip(planes, weights, strict=True):
         _, c, h, w = plane.shape
         scaled.append((down / max(1, c * (h - 2) * w), along / max(1, c * h * (w - 2)), still / (c * h * w)))
-    return _Bend.apply(torch.tensor(scaled, device="cpu"), threads, *planes)  # type: ignore[no-any-return]
+    return applied(_Bend, torch.tensor(scaled, device="cpu"), threads, *planes)

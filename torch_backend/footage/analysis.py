@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ class FrameMeasures:
     """Every other pixel of luma in [0, 1]."""
 
 
-def measure(frame: int, pixels: NDArray) -> FrameMeasures:
+def measure(frame: int, pixels: NDArray[Any]) -> FrameMeasures:
     """Measures a working frame, [H, W, 3] uint8 or uint16 sRGB."""
     scale = 1.0 / (65535.0 if pixels.dtype == np.uint16 else 255.0)
     luma = (pixels @ LUMA) * np.float32(scale)
@@ -64,7 +65,7 @@ def measure(frame: int, pixels: NDArray) -> FrameMeasures:
     )
 
 
-def thumbnail(pixels: NDArray) -> NDArray[np.float32]:
+def thumbnail(pixels: NDArray[Any]) -> NDArray[np.float32]:
     """[H, W, 3] to [36, 64, 3] block means in the units of the pixels; a smaller picture gives a smaller one."""
     sums = pixels.astype(np.float32)
     for axis, wanted in ((0, THUMB_HEIGHT), (1, THUMB_WIDTH)):
@@ -94,10 +95,10 @@ def shifted_correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float
     shape = (2 * h - 1, 2 * w - 1)
     flipped = b[::-1, ::-1]
 
-    def transform(x: NDArray) -> NDArray:
+    def transform(x: NDArray[Any]) -> NDArray[Any]:
         return np.fft.rfft2(x, shape)
 
-    def inverse(x: NDArray) -> NDArray:
+    def inverse(x: NDArray[Any]) -> NDArray[Any]:
         return np.fft.irfft2(x, shape)
 
     ones = transform(np.ones((h, w)))

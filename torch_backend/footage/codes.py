@@ -7,6 +7,7 @@ with values below 0 and above 1. A half holds light as EXR does: within 2.5e-4 o
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -27,7 +28,7 @@ def half_of(pixels: NDArray[np.float32], space: InputSpace) -> NDArray[np.float1
     return out
 
 
-def display(codes: NDArray) -> NDArray[np.float32]:
+def display(codes: NDArray[Any]) -> NDArray[np.float32]:
     """Codes of any shape to extended display-referred, white 1."""
     out = np.empty(codes.shape, np.float32)
     for top in range(0, len(codes), ROWS):
@@ -39,7 +40,7 @@ def display(codes: NDArray) -> NDArray[np.float32]:
     return out
 
 
-def linear(codes: NDArray) -> NDArray[np.float32]:
+def linear(codes: NDArray[Any]) -> NDArray[np.float32]:
     """Codes of any shape to scene-linear Rec.709."""
     if codes.dtype == np.float16:
         return codes.astype(np.float32)
@@ -49,7 +50,7 @@ def linear(codes: NDArray) -> NDArray[np.float32]:
     return out
 
 
-def from_display(pixels: NDArray[np.float32], kind: DTypeLike) -> NDArray:
+def from_display(pixels: NDArray[np.float32], kind: DTypeLike) -> NDArray[Any]:
     """Extended display-referred to codes of a kind; integers cut at 0 and 1 and round."""
     if np.dtype(kind) == np.float16:
         return np.clip(srgb_to_linear(pixels), -_HALF_MAX, _HALF_MAX).astype(np.float16)
@@ -57,7 +58,7 @@ def from_display(pixels: NDArray[np.float32], kind: DTypeLike) -> NDArray:
     return np.rint(np.clip(pixels * most, 0, most)).astype(kind)
 
 
-def resize_plate(codes: NDArray, width: int, height: int) -> NDArray:
+def resize_plate(codes: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     """Codes to [height, width, 3] codes of the same kind, by Lanczos-3, on display-referred values as `resize` does."""
     if codes.shape[:2] == (height, width):
         return codes

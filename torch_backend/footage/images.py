@@ -43,7 +43,7 @@ def told_by(source: Any = oiio) -> str:
         return "it is damaged"
 
 
-def write_png(path: str | Path, pixels: NDArray) -> None:
+def write_png(path: str | Path, pixels: NDArray[Any]) -> None:
     """Writes [H, W, 3] uint8 or uint16 as PNG of the same depth, whole or not at all. OSError if it cannot."""
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"pixels should be [H, W, 3] uint8 or uint16, got {pixels.shape} {pixels.dtype}")
@@ -64,7 +64,7 @@ def _has_end(png: Path) -> bool:
         return written.read(4) == b"IEND"
 
 
-def read_png(path: str | Path) -> NDArray:
+def read_png(path: str | Path) -> NDArray[Any]:
     """A PNG as [H, W, 3] uint8 or uint16, as stored. FileNotFoundError, or ValueError naming the file."""
     path = Path(path)
     if not path.is_file():
@@ -78,7 +78,7 @@ def read_png(path: str | Path) -> NDArray:
     return pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
 
 
-def read_frame(path: Path) -> NDArray:
+def read_frame(path: Path) -> NDArray[Any]:
     """A working frame of a shot, as `read_png`. JobError names it and the step that makes it anew."""
     try:
         return read_png(path)
@@ -104,7 +104,7 @@ def is_whole_png(path: Path) -> bool:
         return False
 
 
-def resize(pixels: NDArray, width: int, height: int) -> NDArray:
+def resize(pixels: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     """[h, w, 3] uint8 or uint16 to [height, width, 3] of the same dtype; Lanczos-3, in the space the pixels are in.
 
     By FFmpeg's scaler: 24 ms for 1080 to 720 lines where OpenImageIO takes 850, and the two differ by 0.13 of an

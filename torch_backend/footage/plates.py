@@ -78,7 +78,7 @@ class Plates:
             source = None  # the working frames are just that
         self._reader = source.plates(self._known(record)) if source is not None else None
         self._warp: tuple[PlateLens, BandUndistorter] | None = None
-        self._held: OrderedDict[int, NDArray] = OrderedDict()
+        self._held: OrderedDict[int, NDArray[Any]] = OrderedDict()
         footage = source.info.key if source is not None else "working frames"
         self.key = content_key(PLATES_VERSION, record.get("key"), solved.get("key"), footage, [self.width, self.height])
 
@@ -104,7 +104,7 @@ class Plates:
         if self._reader is not None:
             self._reader.close()
 
-    def _codes(self, frame: int) -> NDArray:
+    def _codes(self, frame: int) -> NDArray[Any]:
         if frame not in self._files:
             raise ValueError(f"the shot has no frame {frame}: it has {self.frames[0]} to {self.frames[-1]}")
         if frame in self._held:
@@ -115,7 +115,7 @@ class Plates:
         self._held[frame] = self._read(frame)
         return self._held[frame]
 
-    def _read(self, frame: int) -> NDArray:
+    def _read(self, frame: int) -> NDArray[Any]:
         if self._reader is None:
             picture = read_frame(self._shot.plate(frame))
             return codes.resize_plate(picture, self.width, self.height)
@@ -129,7 +129,7 @@ class Plates:
             ) from error
         return self._undistorted(codes.resize_plate(picture, self.width, self.height), frame)
 
-    def _undistorted(self, picture: NDArray, frame: int) -> NDArray:
+    def _undistorted(self, picture: NDArray[Any], frame: int) -> NDArray[Any]:
         """Codes without the lens; those of 8 bits become 16, which lie between them."""
         lens = self._lenses[frame] if isinstance(self._lenses, dict) else None
         if lens is None or lens.is_none:
@@ -184,7 +184,7 @@ class Plates:
         seconds = {int(row["frame"]): float(row["seconds"]) for row in rows}
         return Known(seconds, float(start) if start is not None else None, self._agrees)
 
-    def _agrees(self, frame: int, picture: NDArray) -> bool:
+    def _agrees(self, frame: int, picture: NDArray[Any]) -> bool:
         """True if a picture of the source shows what the raw working frame does."""
         try:
             raw = read_png(self._shot.frames / self._files[frame])

@@ -51,7 +51,7 @@ class VideoReader:
         self._at = 0
         """Number of the frame that was decoded last."""
 
-    def plate(self, number: int) -> NDArray:
+    def plate(self, number: int) -> NDArray[Any]:
         """See `PlateReader.plate`."""
         frame = next((frame for n, frame in self._kept if n == number), None)
         if frame is not None:
@@ -91,7 +91,7 @@ class VideoReader:
         self._decoder = self._source.decode(self._container, self._stream)
         self._counted, self._at = 0, 0
 
-    def _sought(self, number: int) -> NDArray | None:
+    def _sought(self, number: int) -> NDArray[Any] | None:
         """The plate by way of the key frame before it; None, once and for all, if this file cannot be sought in."""
         for earlier in _EARLIER:
             if not self._jump(self._time_of(number) - earlier):

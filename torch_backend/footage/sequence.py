@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -199,7 +200,7 @@ class SequenceSource:
         """See `Source.plates`."""
         return self
 
-    def plate(self, number: int) -> NDArray:
+    def plate(self, number: int) -> NDArray[Any]:
         """See `PlateReader.plate`."""
         if number not in self._files:
             raise footage_error(f"Frame {number} of the sequence is not there any more.", "Put it back.")
@@ -213,7 +214,7 @@ class SequenceSource:
     def close(self) -> None:
         """See `PlateReader.close`: files are not kept open."""
 
-    def _read(self, file: Path, met: _Met) -> tuple[NDArray, float]:
+    def _read(self, file: Path, met: _Met) -> tuple[NDArray[Any], float]:
         """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels. OSError if unreadable."""
         rgb, clipped = self._stored_pixels(file, met), 0.0
         if self.info.deep:
@@ -221,7 +222,7 @@ class SequenceSource:
             rgb = np.rint(rgb * np.float32(65535.0)).astype(np.uint16)
         return resize(np.ascontiguousarray(rgb), self.info.width, self.info.height), clipped
 
-    def _stored_pixels(self, file: Path, met: _Met) -> NDArray:
+    def _stored_pixels(self, file: Path, met: _Met) -> NDArray[Any]:
         """[h, w, 3] of the layer, straight, in the file's space and pixels: uint8, or float32 if the source is deep."""
         (spec, buffer, failed), layer = _open(file, self._layer.part), self._layer
         if spec.channelnames != self._channels:
@@ -293,7 +294,7 @@ def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:
     return rows, slice(min(max(0, left), spec.full_width), max(0, min(spec.full_width, left + spec.width)))
 
 
-def _straight(rgb: NDArray, alpha: NDArray, opaque: float) -> NDArray:
+def _straight(rgb: NDArray[Any], alpha: NDArray[Any], opaque: float) -> NDArray[Any]:
     """Colour [H, W, 3] that was multiplied by alpha [H, W] without it; as it stands where alpha is 0 (pure light)."""
     covered = (alpha > 0) & (alpha < opaque)
     if not covered.any():

@@ -29,7 +29,7 @@ class SourceFrame:
     """Frame number: from 1 in a video, the file's number in a sequence."""
     seconds: float
     """Presentation time in seconds on the source's own clock."""
-    pixels: NDArray
+    pixels: NDArray[Any]
     """[H, W, 3] uint8 or uint16 display-referred sRGB, square pixels, upright."""
     corrupt: bool = False
     """The decoder had to guess parts of it."""
@@ -86,14 +86,14 @@ class Known:
     """Time of each listed frame since the first of them, by its number."""
     start: float | None
     """Time of the first listed frame on the source's own clock; None if the import did not record it."""
-    agrees: Callable[[int, NDArray], bool]
+    agrees: Callable[[int, NDArray[Any]], bool]
     """Whether a frame's plate shows what its working frame shows."""
 
 
 class PlateReader(Protocol):
     """Single frames of a source, in any order; ascending ones, and their near neighbours, are quick."""
 
-    def plate(self, number: int) -> NDArray:
+    def plate(self, number: int) -> NDArray[Any]:
         """Frame `number`, upright, with square pixels, uncut, as `codes` has it.
 
         OSError or JobError (FOOTAGE) if it cannot be read.

@@ -143,7 +143,7 @@ class VideoSource:
 
         return VideoReader(self, known)
 
-    def plate_of(self, frame: av.VideoFrame) -> NDArray:
+    def plate_of(self, frame: av.VideoFrame) -> NDArray[Any]:
         """A decoded frame as a plate, see `codes`. JobError if its size is not the clip's."""
         if (frame.width, frame.height) != self._size:
             raise footage_error(f"{self.path.name} is not the clip that was imported: its size changes.")
@@ -203,7 +203,7 @@ class VideoSource:
         except FFmpegError as error:
             raise _no_video(self.path) from error
 
-    def _upright(self, frame: av.VideoFrame) -> tuple[NDArray, float]:
+    def _upright(self, frame: av.VideoFrame) -> tuple[NDArray[Any], float]:
         """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels."""
         if self._space.as_it_stands:
             pixels, clipped = _rgb(frame, "rgb48le" if self._deep else "rgb24"), 0.0
@@ -334,7 +334,7 @@ def _pixel_aspect(stream: Any) -> Fraction:
     return Fraction(aspect) if aspect and aspect > 0 else Fraction(1)
 
 
-def _rgb(frame: av.VideoFrame, kind: str) -> NDArray:
+def _rgb(frame: av.VideoFrame, kind: str) -> NDArray[Any]:
     """R'G'B' [H, W, 3] as FFmpeg's scaler makes it: quick, and up to 1 of 255 off."""
     return frame.reformat(format=kind, src_colorspace=_matrix(frame), interpolation=Interpolation.BICUBIC).to_ndarray()
 

@@ -86,7 +86,7 @@ def pick_columns(frames: Sequence[int], columns: int = COLUMNS, mark: int | None
 
 def _thumbnails(paths: Sequence[Path]) -> list[NDArray[np.uint8]]:
     """Pictures [h,w,3] uint8 scaled so that the longest side is `CELL`."""
-    thumbnails = []
+    thumbnails: list[NDArray[np.uint8]] = []
     for path in paths:
         picture = read_png(path)
         if picture.dtype == np.uint16:

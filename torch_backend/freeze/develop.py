@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ..scene import Scene
+from ..torch_types import backward, floats, integers
 from ..train import LoadedRun
 from ..train.adam import FusedAdam
 from ..train.losses import photometric
@@ -118,7 +119,8 @@ class _Darkroom:
 
     def run(self, check: Check | None) -> FrozenGaussians:
         """All steps, and the judgement."""
-        steps, order, before = self.config.steps, [], self._judged()
+        order: list[int] = []
+        steps, before = self.config.steps, self._judged()
         for n in range(steps):
             if check is not None:
                 check(n, steps)
@@ -127,7 +129,7 @@ class _Darkroom:
             if float(torch.rand(1, generator=self.generator, device="cpu")) < self.config.instant_share:
                 frame = self.instants[n % len(self.instants)]
             else:
-                order = order or torch.randperm(len(self.frames), generator=self.generator, device="cpu").tolist()
+                order = order or integers(torch.randperm(len(self.frames), generator=self.generator, device="cpu"))
                 frame = self.frames[order.pop()]
             self._step(frame)
         after = self._judged()
@@ -148,7 +150,8 @@ class _Darkroom:
                 error = (shown.clamp(0.0, 1.0) - self.plates.picture(frame)).square().mean(-1)[learnt]
                 sums[n] += torch.stack([error.double().sum(), torch.tensor(float(error.numel()), device=self.device)])
         errors = (sums[:, 0] / sums[:, 1].clamp_min(1.0)).clamp_min(1e-12)
-        return tuple((-10.0 * errors.log10()).tolist())
+        still, instants = floats(-10.0 * errors.log10())
+        return still, instants
 
     def _step(self, frame: int) -> None:
         shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
@@ -156,7 +159,7 @@ class _Darkroom:
         loss = photometric(shown, target, self.config.dssim)
         total = loss + self.config.opacity_weight * torch.sigmoid(self.params["opacity_logits"]).mean()
         self.optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        backward(total)
         self.optimizer.step(guard=[total])
 
     def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import OpenImageIO as oiio
@@ -82,7 +82,7 @@ class Rows(Protocol):
     @property
     def shape(self) -> tuple[int, ...]: ...
 
-    def __getitem__(self, rows: slice, /) -> NDArray: ...
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
 
 
 @dataclass(frozen=True)
@@ -91,10 +91,10 @@ class Made:
 
     shape: tuple[int, ...]
     """[H,W] or [H,W,C]."""
-    rows: Callable[[slice], NDArray]
+    rows: Callable[[slice], NDArray[Any]]
     """Those rows of it, any float; asked for once each, from the top."""
 
-    def __getitem__(self, rows: slice, /) -> NDArray:
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]:
         return self.rows(rows)
 
 
@@ -209,7 +209,7 @@ def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[Rows]) -> Path:
         output = oiio.ImageOutput.create(str(beside))
         if output is None:
             raise OSError(errno.EIO, f"OpenImageIO cannot write EXR: {oiio.geterror()}", str(path))
-        good = output.open(str(beside), spec)
+        good = bool(cast(Any, output).open(str(beside), spec))
         try:
             for top in range(0, spec.height, _ROWS) if good else ():
                 rows = _rows_of(parts, slice(top, min(top + _ROWS, spec.height)), spec.width)
@@ -230,6 +230,11 @@ def _rows_of(parts: Sequence[Rows], rows: slice, width: int) -> NDArray[np.float
     return np.concatenate([part[rows].reshape(height, width, -1) for part in parts], axis=2, dtype=np.float32)
 
 
+def channel_names(spec: oiio.ImageSpec) -> list[str]:
+    """Names of a file's channels, in its order."""
+    return list(cast(Any, spec).channelnames)
+
+
 def read_frozen_exr(path: str | Path) -> FrozenFrame:
     """Reads a file of `write_frozen_exr`; everything float32.
 
@@ -244,7 +249,7 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
         raise ValueError(f"{path}: cannot be read as EXR: {oiio.geterror()}")
     try:
         spec = image.spec()
-        names = list(spec.channelnames)
+        names = channel_names(spec)
         missing = [name for name in CHANNELS if name not in names]
         if missing:
             raise ValueError(f"{path}: not a frozen frame, it has no channel {', '.join(missing)}")
@@ -286,7 +291,7 @@ def read_key(path: str | Path) -> str | None:
         image.close()
 
 
-def _coarse(grain: NDArray) -> NDArray[np.float16]:
+def _coarse(grain: NDArray[Any]) -> NDArray[np.float16]:
     """Grain [h,W,3] as half floats whose eight lowest bits are 0, and an alpha of 0: [h,W,4]."""
     half = np.clip(grain, -HALF_MAX, HALF_MAX).astype(np.float16)
     # Rounded to the nearest: cut off, it would lose a tenth of its strength.
@@ -304,11 +309,15 @@ def _in_steps(plate: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.round(plate * _PLATE_STEPS) / _PLATE_STEPS
 
 
-_STORED: dict[str, Callable[[NDArray], NDArray]] = {"grain": _coarse, "splat": _eight_bits, "plate": _in_steps}
+_STORED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    "grain": _coarse,
+    "splat": _eight_bits,
+    "plate": _in_steps,
+}
 """What becomes of a layer's rows as they are written."""
 
 
-def _changed(layer: Rows, change: Callable[[NDArray], NDArray]) -> Made:
+def _changed(layer: Rows, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Made:
     return Made(layer.shape, lambda rows: change(layer[rows]))
 
 
@@ -333,7 +342,7 @@ def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
         if isinstance(layer, Made):
             found[name] = Made(layer.shape, functools.partial(_made, name, layer))
         elif isinstance(layer, np.ndarray):
-            check_finite(name, layer)
+            check_finite(name, cast(NDArray[Any], layer))
     return found
 
 
@@ -389,7 +398,7 @@ def linear_spec(width: int, height: int, names: tuple[str, ...], formats: tuple[
     return spec
 
 
-def _flat(matrix: NDArray) -> tuple[float, ...]:
+def _flat(matrix: NDArray[Any]) -> tuple[float, ...]:
     return tuple(float(value) for value in matrix.ravel())
 
 

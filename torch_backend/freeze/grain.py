@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..footage.color import srgb_to_linear
 from ..footage.images import read_frame
+from ..scene import evenly_spaced
 
 BINS = 8
 """Brightness levels that grain is measured at."""
@@ -67,11 +68,11 @@ class Grain:
 
 def measure_plate(files: Sequence[Path]) -> Grain:
     """Grain of a plate from up to `SAMPLED` of its PNG frames, spread over it. JobError if one cannot be read."""
-    picked = np.unique(np.linspace(0, len(files) - 1, SAMPLED).round().astype(int)) if files else ()
+    picked = evenly_spaced(len(files), SAMPLED)
     return measure([read_frame(files[i]) for i in picked])
 
 
-def measure(frames: Sequence[NDArray]) -> Grain:
+def measure(frames: Sequence[NDArray[Any]]) -> Grain:
     """Grain of frames [H, W, 3], uint8 or uint16, display-referred. None where nothing flat is to be seen."""
     found = [_blocks(frame) for frame in frames if min(frame.shape[:2]) >= _BLOCK]
     if not found:
@@ -81,7 +82,7 @@ def measure(frames: Sequence[NDArray]) -> Grain:
     step = 1.0 / (255.0 if frames[0].dtype == np.uint8 else 65535.0)
     variance = np.einsum("nci,nci->nc", residual, residual) / _BLOCK**2
     level = np.minimum((mean * BINS).astype(int), BINS - 1)
-    softness = 0.0
+    softness, flat = 0.0, np.zeros_like(usable)
     for _ in range(2):  # which blocks are flat depends on the softness a little, and the other way round
         flat = np.zeros_like(usable)
         for c in range(3):
@@ -90,7 +91,7 @@ def measure(frames: Sequence[NDArray]) -> Grain:
                 flat[here, c] = _only_grain(variance[here, c], softness)
         softness = _softness(residual, flat & (variance > 2.0 * step**2 / 12.0))
     share = _kept(softness)[0]
-    deviation: NDArray = np.full((3, BINS), np.nan)
+    deviation: NDArray[Any] = np.full((3, BINS), np.nan)
     for c in range(3):
         for k in range(BINS):
             chosen = variance[flat[:, c] & (level[:, c] == k), c]
@@ -106,7 +107,7 @@ def measure(frames: Sequence[NDArray]) -> Grain:
     )
 
 
-def draw(grain: Grain, frame: int, rgba: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
+def draw(grain: Grain, frame: int, rgba: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float32]:
     """What to add to a frozen frame to give it the plate's grain.
 
     Args:
@@ -132,7 +133,7 @@ class Brush:
         if self._noise is not None and self._noise.shape[0] > self._height:
             self._noise = _resized(self._noise, 0, self._height)
 
-    def rows(self, rows: slice, rgba: NDArray) -> NDArray[np.float32]:
+    def rows(self, rows: slice, rgba: NDArray[Any]) -> NDArray[np.float32]:
         """[h, W, 3] as `draw`, of `rgba` [h, W, 4]: these rows of the picture."""
         if self._noise is None:
             return np.zeros((*rgba.shape[:2], 3), np.float32)
@@ -141,7 +142,9 @@ class Brush:
         alpha = rgba[..., 3:4]
         color = np.clip(rgba[..., :3] / np.where(alpha > 0.0, alpha, 1.0), 0.0, 1.0).astype(np.float32)
         middles = (np.arange(BINS) + 0.5) / BINS
-        response = np.stack([np.interp(color[..., c], middles, self._grain.deviation[c]) for c in range(3)], axis=-1)
+        deviation = self._grain.deviation
+        curves = [np.asarray(np.interp(color[..., c], middles, deviation[c]), np.float64) for c in range(3)]
+        response = np.stack(curves, axis=-1)
         grainy = np.clip(color + response * noise, 0.0, 1.0)
         return ((srgb_to_linear(grainy) - srgb_to_linear(color)) * alpha).astype(np.float32)
 
@@ -160,24 +163,26 @@ def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float3
     return np.asarray(soft @ root.astype(np.float32), np.float32)
 
 
-def _resized(noise: NDArray[np.float32], axis: int, wanted: int, part: slice = slice(None)) -> NDArray[np.float32]:
-    """`noise` with `wanted` pixels along an axis, or a part: averaged where it shrinks, blended where it grows."""
-    there = noise.shape[axis]
+def _resized(noise: NDArray[np.float32], axis: int, length: int, part: slice = slice(None)) -> NDArray[np.float32]:
+    """`noise` with `length` pixels along an axis, or a part: averaged where it shrinks, blended where it grows."""
+    before = noise.shape[axis]
     along = [-1 if n == axis else 1 for n in range(3)]
-    if there == wanted:
+    if before == length:
         return noise[part] if axis == 0 else noise[:, part]
-    if wanted > there:
-        at = np.clip((np.arange(wanted)[part] + 0.5) * there / wanted - 0.5, 0.0, there - 1.0)
-        low = np.minimum(at.astype(int), max(there - 2, 0))
+    if length > before:
+        at = (np.arange(length, dtype=np.float64)[part] + 0.5) * before / length - 0.5
+        at = np.asarray(np.clip(at, 0.0, before - 1.0), np.float64)
+        low = np.minimum(at.astype(int), max(before - 2, 0))
         share = (at - low).reshape(along).astype(np.float32)
-        return noise.take(low, axis) * (1.0 - share) + noise.take(np.minimum(low + 1, there - 1), axis) * share
-    # Integral along the axis, read at the edges of the wanted pixels: exact means over them.
+        blended = noise.take(low, axis) * (1.0 - share) + noise.take(np.minimum(low + 1, before - 1), axis) * share
+        return np.asarray(blended, np.float32)
+    # Integral along the axis, read at the edges of the new pixels: exact means over them.
     total = np.concatenate([np.zeros_like(noise.take([0], axis)), np.cumsum(noise, axis, dtype=np.float64)], axis)
-    at = np.linspace(0.0, there, wanted + 1)
-    low = np.minimum(at.astype(int), there - 1)
+    at = np.asarray(np.linspace(0.0, before, length + 1), np.float64)
+    low = np.minimum(at.astype(int), before - 1)
     share = (at - low).reshape(along)
     edges = total.take(low, axis) * (1.0 - share) + total.take(low + 1, axis) * share
-    shrunk = (np.diff(edges, axis=axis) * (wanted / there)).astype(np.float32)
+    shrunk = np.asarray(np.diff(edges, axis=axis) * (length / before), np.float32)
     return shrunk[part] if axis == 0 else shrunk[:, part]
 
 
@@ -197,7 +202,7 @@ def _basis() -> NDArray[np.float64]:
     return np.linalg.qr(columns)[0]
 
 
-def _blocks(frame: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+def _blocks(frame: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Of every block: residual [n, 3, pixels], mean [n, 3], and whether nearly nothing of it is clipped [n, 3]."""
     rows, columns = frame.shape[0] // _BLOCK, frame.shape[1] // _BLOCK
     values = frame[: rows * _BLOCK, : columns * _BLOCK].astype(np.float32)
@@ -232,7 +237,7 @@ def _kept(softness: float) -> tuple[float, float, tuple[float, ...]]:
 _LAGS = ((0, 1), (1, 0), (1, 1), (0, 2), (2, 0))
 
 
-def _lag_mean(covariance: NDArray, dy: int, dx: int) -> float:
+def _lag_mean(covariance: NDArray[Any], dy: int, dx: int) -> float:
     y, x = np.mgrid[0 : _BLOCK - dy, 0 : _BLOCK - dx]
     return float(covariance[y, x, y + dy, x + dx].mean())
 
@@ -242,7 +247,7 @@ def _median_ratio(softness: float) -> float:
     return float((1.0 - 2.0 / (9.0 * _kept(softness)[1])) ** 3)
 
 
-def _only_grain(variance: NDArray, softness: float) -> NDArray[np.bool_]:
+def _only_grain(variance: NDArray[Any], softness: float) -> NDArray[np.bool_]:
     """Which blocks of one level vary no more than grain does, found from the least varying upwards."""
     if len(variance) < _FEWEST:
         return np.zeros(len(variance), bool)
@@ -266,7 +271,7 @@ def _softness(residual: NDArray[np.float32], flat: NDArray[np.bool_]) -> float:
     power = np.mean(chosen**2, axis=(1, 2))
     like = power < _STANDS_OUT**2 * np.median(power)  # levels without anything flat
     chosen, power = chosen[like], power[like]
-    seen = []
+    seen: list[float] = []
     for dy, dx in _LAGS:
         one, other = chosen[:, : _BLOCK - dy, : _BLOCK - dx], chosen[:, dy:, dx:]
         seen.append(float(np.median(np.mean(one * other, axis=(1, 2)) / power)))
@@ -274,7 +279,7 @@ def _softness(residual: NDArray[np.float32], flat: NDArray[np.bool_]) -> float:
     return float(_SOFTNESS[int(np.argmin(errors))])
 
 
-def _whole_curve(deviation: NDArray) -> NDArray[np.float32]:
+def _whole_curve(deviation: NDArray[Any]) -> NDArray[np.float32]:
     """[3, BINS] with NaN where too little was seen: filled from neighbours, and freed of single levels that stand out.
 
     A level at which the clip shows nothing flat is told too much; grain follows brightness smoothly.

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians.model import SH_C0
-from ..scene import Scene, read_image, resize_intrinsics
+from ..scene import Scene, evenly_spaced, read_image, resize_intrinsics
+from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.exposure import Exposure
 from ..train.model import gathered
@@ -132,7 +133,7 @@ def instant_layer(
         frozen = fade(frozen, kept)
         image = bench.render(frozen)
     state, mask, regions = _shell(bench, frozen, image, _regions(bench, image), things)
-    layer = InstantLayer(state, scene.frames[index], torch.from_numpy(mask), torch.from_numpy(ghost), kept, regions)
+    layer = InstantLayer(state, scene.frames[index], from_numpy(mask), from_numpy(ghost), kept, regions)
     if len(state["means"]) and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, mask > 0):
         empty = {name: value[:0] for name, value in state.items()}
         layer = replace(layer, state=empty, mask=torch.zeros_like(layer.mask), regions=[])
@@ -169,8 +170,8 @@ class _Bench:
         self.height = max(1, round(run.height * self.width / run.width))
         self.unit = self.width / _SIZE
         self.time = float(scene.times[index])
-        self._scene, self._plates, self._motion = scene, plates, motion
-        self._Ks = resize_intrinsics(scene.Ks, scene.width, scene.height, self.width, self.height)
+        self.scene, self._plates, self._motion = scene, plates, motion
+        self.Ks = resize_intrinsics(scene.Ks, scene.width, scene.height, self.width, self.height)
         self._views: dict[int, View] = {}
         self.view = self.at(index)
 
@@ -181,7 +182,7 @@ class _Bench:
         return self._views[index]
 
     def _read(self, index: int) -> View:
-        scene, size = self._scene, (self.width, self.height)
+        scene, size = self.scene, (self.width, self.height)
         if self._plates is None:
             picture = read_image(scene.image_path(index), *size).numpy()
         else:
@@ -190,36 +191,36 @@ class _Bench:
 
     def camera(self, index: int, picture: NDArray[np.float32] | None = None) -> View:
         """Its camera, with a picture or none."""
-        viewmat, K = self._scene.viewmats[index].double().numpy(), self._Ks[index].double().numpy()
+        viewmat, K = self.scene.viewmats[index].double().numpy(), self.Ks[index].double().numpy()
         return View(index, np.zeros((0, 0, 3), np.float32) if picture is None else picture, viewmat, K)
 
     def frame(self, index: int) -> tuple[View, NDArray[np.bool_]] | None:
         """A plate with its camera, and what moves there [h, w]; None if that is not known. Not kept."""
-        matte = self.matte(index) if 0 <= index < len(self._scene.frames) else None
+        matte = self.matte(index) if 0 <= index < len(self.scene.frames) else None
         return None if matte is None else (self._views.get(index) or self._read(index), matte > 0.5)
 
     def neighbours(self) -> list[View]:
         """Frames around t*, on both sides where there are any."""
         steps = self.config.depth.neighbours
         found = [self.index + sign * step for step in steps for sign in (-1, 1)]
-        return [self.at(i) for i in found if 0 <= i < len(self._scene.frames)]
+        return [self.at(i) for i in found if 0 <= i < len(self.scene.frames)]
 
     def spread(self, count: int) -> list[View]:
         """Up to `count` frames, evenly over the clip, without t*."""
-        chosen = np.unique(np.linspace(0, len(self._scene.frames) - 1, count).round().astype(int)).tolist()
+        chosen = evenly_spaced(len(self.scene.frames), count)
         return [self.at(i) for i in chosen if i != self.index]
 
     def matte(self, index: int | None = None) -> NDArray[np.float32] | None:
         """Motion matte of a frame, or of t*, [h, w] in 0..1, if there is one."""
         index = self.index if index is None else index
-        found = self._motion(self._scene.frames[index]) if self._motion else None
+        found = self._motion(self.scene.frames[index]) if self._motion else None
         if found is None:
             return None
         return _resized(np.float32(1.0 / MOVING) * found.astype(np.float32), self.width, self.height)
 
     def render(self, frozen: FrozenGaussians) -> FrozenImage:
         """A frozen scene as camera t* sees it, exposed as plate t* is."""
-        camera = self._scene.viewmats[self.index], self._Ks[self.index]
+        camera = self.scene.viewmats[self.index], self.Ks[self.index]
         return render_frozen(frozen, *camera, self.width, self.height, self.exposure, self.time)
 
     def difference(self, image: FrozenImage) -> NDArray[np.float32]:
@@ -250,7 +251,7 @@ def _regions(bench: _Bench, image: FrozenImage) -> list[NDArray[np.bool_]]:
     c, unit = bench.config, bench.unit
     difference = bench.difference(image)
     count, labels = cv2.connectedComponents((difference >= c.grow).astype(np.uint8))
-    found = []
+    found: list[NDArray[np.bool_]] = []
     for label in range(1, count):
         region = labels == label
         if difference[region].max() >= c.seed and region.sum() >= c.least * unit**2:
@@ -272,7 +273,7 @@ def _stuck(bench: _Bench, region: NDArray[np.bool_], image: FrozenImage) -> bool
     """True if a region shows the same detail in frames all over the clip, while the world behind it goes by: a logo."""
     view, unit = bench.view, bench.unit
     inverse = 1.0 / float(np.median(image.depth.numpy()[region]))
-    alike = []
+    alike: list[float] = []
     for other in bench.spread(7):
         travel = np.linalg.norm(view.project(other, inverse) - view.grid(), axis=-1)
         if np.median(travel[region]) > 3.0 * unit:
@@ -286,7 +287,7 @@ def _shell(
 ) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
     """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
     view, cover = bench.view, np.zeros((bench.height, bench.width), np.float32)
-    inverse, told = np.zeros_like(cover), []
+    inverse, told = np.zeros_like(cover), list[Region]()
     others = bench.neighbours() if regions or things else []
     explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9)
     matte = bench.matte()
@@ -343,14 +344,14 @@ def _gaussians(
     like, c = frozen.state, bench.config
     count = len(means)
     size = c.sigma / (bench.view.K[0, 0] * np.maximum(inverse[rows, columns], 1e-9))
-    opacity = torch.from_numpy(np.clip(c.opacity * cover[rows, columns], 1e-4, 1.0 - 1e-4))
-    color = _unexposed(torch.from_numpy(colors[rows, columns]), bench.exposure, bench.time)
+    opacity = from_numpy(np.clip(c.opacity * cover[rows, columns], 1e-4, 1.0 - 1e-4))
+    color = _unexposed(from_numpy(colors[rows, columns]), bench.exposure, bench.time)
     quats = torch.zeros(count, 4, device="cpu")
     quats[:, 0] = 1.0
     state = {
-        "means": torch.from_numpy(means),
+        "means": from_numpy(means),
         "quats": quats,
-        "log_scales": torch.from_numpy(np.log(np.repeat(size[:, None], 3, axis=1))),
+        "log_scales": from_numpy(np.log(np.repeat(size[:, None], 3, axis=1))),
         "opacity_logits": torch.logit(opacity),
         "sh0": ((color - 0.5) / SH_C0)[:, None, :],
         "shN": torch.zeros(count, like["shN"].shape[1], 3, device="cpu"),
@@ -435,10 +436,10 @@ def _ghosts(bench: _Bench, frozen: FrozenGaussians, image: FrozenImage) -> tuple
 
 def _shares(bench: _Bench, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
     """What camera t* sees of each Gaussian, [N] each: inside a mask [h, w], and at all. Sums of alpha T over pixels."""
-    device, scene, i = frozen.support.device, bench._scene, bench.index
-    where = torch.from_numpy(mask).to(device, torch.float32)
+    device, scene, i = frozen.support.device, bench.scene, bench.index
+    where = from_numpy(mask).to(device, torch.float32)
     weights = torch.stack([where, torch.ones_like(where)], dim=-1)
-    camera = scene.viewmats[i].to(device), bench._Ks[i].to(device)
+    camera = scene.viewmats[i].to(device), bench.Ks[i].to(device)
     inside, whole = gathered(frozen.state, *camera, bench.width, bench.height, weights).cpu().unbind(1)
     return inside, whole
 

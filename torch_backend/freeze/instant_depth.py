@@ -10,6 +10,7 @@ is to be believed. And the region hides what the model shows there: it is in fro
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +84,9 @@ class View:
     """[4, 4] world-to-camera, scene units."""
     K: NDArray[np.float64]
     """[3, 3] in pixels of `picture`."""
-    _flows: dict[int, tuple[NDArray[np.float32], NDArray[np.bool_]]] = field(default_factory=dict, repr=False)
+    _flows: dict[int, tuple[NDArray[np.float32], NDArray[np.bool_]]] = field(
+        default_factory=dict[int, "tuple[NDArray[np.float32], NDArray[np.bool_]]"], repr=False
+    )
 
     def grid(self) -> NDArray[np.float64]:
         """[h, w, 2]: x and y of the pixel centres."""
@@ -91,13 +94,13 @@ class View:
         y, x = np.mgrid[0.5:height, 0.5:width]
         return np.stack([x, y], -1)
 
-    def unproject(self, x: NDArray, y: NDArray, depth: NDArray) -> NDArray[np.float64]:
+    def unproject(self, x: NDArray[Any], y: NDArray[Any], depth: NDArray[Any]) -> NDArray[np.float64]:
         """World places [..., 3] of pixels (centres at +0.5) at depths along the axis."""
         rays = np.stack([x, y, np.ones(np.shape(x))], -1) @ np.linalg.inv(self.K).T
         camera = rays * np.asarray(depth, np.float64)[..., None]
         return (camera - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
 
-    def project(self, other: View, inverse: NDArray | float) -> NDArray[np.float64]:
+    def project(self, other: View, inverse: NDArray[Any] | float) -> NDArray[np.float64]:
         """Where another view sees this one's pixels [h, w, 2], still things of inverse depths [h, w] or one."""
         grid = self.grid()
         rays = np.concatenate([grid, np.ones((*grid.shape[:2], 1))], -1) @ np.linalg.inv(self.K).T
@@ -111,13 +114,15 @@ class View:
 
         if other.index not in self._flows:
             grey = [cv2.cvtColor(np.rint(v.picture * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY) for v in (self, other)]
-            dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-            there = np.asarray(dis.calc(grey[0], grey[1], None), np.float32)  # type: ignore[call-overload]
-            back = np.asarray(dis.calc(grey[1], grey[0], None), np.float32)  # type: ignore[call-overload]
-            at = (self.grid() - 0.5).astype(np.float32) + there
-            returned = cv2.remap(back, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore
-            inside = (at >= 0).all(-1) & (at <= np.array(there.shape[1::-1]) - 1).all(-1)
-            self._flows[other.index] = there, inside & (np.linalg.norm(there + returned, axis=-1) <= round_trip)
+            flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+            forth = np.asarray(flow.calc(grey[0], grey[1], None), np.float32)
+            back = np.asarray(flow.calc(grey[1], grey[0], None), np.float32)
+            at = (self.grid() - 0.5).astype(np.float32) + forth
+            # OpenCV takes None for its second map where the first has both coordinates; its annotations do not.
+            border, no_map = cv2.BORDER_CONSTANT, cast(NDArray[np.float32], None)
+            returned = np.asarray(cv2.remap(back, at, no_map, cv2.INTER_LINEAR, borderMode=border), np.float32)
+            inside = (at >= 0).all(-1) & (at <= np.array(forth.shape[1::-1]) - 1).all(-1)
+            self._flows[other.index] = forth, inside & (np.linalg.norm(forth + returned, axis=-1) <= round_trip)
         return self._flows[other.index]
 
 
@@ -247,7 +252,7 @@ def own_motion(
 
     What moves along the lines only is not told from what is at another depth.
     """
-    found = []
+    found: list[float] = []
     for other in others:
         matched = _matches(view, other, region, 0.0, 1.0, config, unit)
         if matched is not None:

@@ -97,14 +97,16 @@ def tracks(frames: Frames, index: int, shown: NDArray[np.float32], config: Track
     if start is None:
         return []
     view, moving = start
-    found = []
+    sighted: list[Track | None] = []
     for mask in _small(moving, config.largest * unit):
         apart = np.sqrt(np.square(view.picture - shown).mean(-1))
         core = mask & (apart > config.alike)
         if core.sum() >= 3:
             color = np.median(view.picture[core], axis=0).astype(np.float32)
-            found.append(_core(view, mask, color, config))
-    found = sorted((track for track in found if track is not None), key=lambda t: -float(t.pixels.sum()))[: config.most]
+            sighted.append(_core(view, mask, color, config))
+    found = sorted((track for track in sighted if track is not None), key=lambda t: -float(t.pixels.sum()))[
+        : config.most
+    ]
     for side in (-1, 1):
         open_ends = [_End(track, float(track.pixels.sum())) for track in found]
         for step in range(1, config.reach + 1):
@@ -229,7 +231,7 @@ def _smooth(places: dict[int, NDArray[np.float64]], unit: float) -> dict[int, ND
         near = [k for k in np.argsort(np.abs(times - times[n]), kind="stable")[: _AROUND + 1] if k != n]
         ways = np.stack([np.ones(len(near)), times[near] - times[n], np.square(times[near] - times[n])], axis=-1)
         # The least sum of distances, nearly: one wrong match among those around must not lead astray.
-        weight = np.ones(len(near))
+        weight, curve = np.ones(len(near)), np.zeros((3, points.shape[-1]))
         for _ in range(_TURNS):
             curve = np.linalg.lstsq(ways * weight[:, None], points[near] * weight[:, None], rcond=None)[0]
             weight = 1.0 / np.sqrt(np.linalg.norm(points[near] - ways @ curve, axis=-1) + 0.1 * unit)
@@ -261,6 +263,7 @@ def _fit(
     design = (terms[:, None, :, None] * rays[:, :, None, :]).reshape(len(order), 2, -1)
     weight = np.ones(len(order))
     each = np.zeros(len(order))
+    rows, found = design.reshape(2 * len(order), -1), np.zeros((terms.shape[1], 3))
     for turn in range(_TURNS):
         rows = (design * weight[:, None, None]).reshape(2 * len(order), -1)
         found = np.linalg.lstsq(rows, (wanted * weight[:, None]).ravel(), rcond=1e-10)[0].reshape(-1, 3)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..scene import Scene
 from ..supervision import nearest_bin, support_confidence
+from ..torch_types import norm
 from ..train import LoadedRun
 from ..train.exposure import Exposure
 from ..train.model import DynamicModel, render
@@ -214,7 +215,7 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     instants = torch.linspace(0, 1, 12, device=model.device)
     moves = [model.deltas(rows, instants[n : n + 1]) for n in range(len(instants))]
     places = torch.stack([move.means for move in moves if move is not None])
-    travel = (places - places.mean(0)).norm(dim=2).mean(0)
+    travel = norm(places - places.mean(0), 2).mean(0)
     support = model.gaussians.support[rows].float()
     seen = (travel[:, None] * support).sum(0) / travel.sum().clamp_min(1e-9)
     bins = [int((model.centres - float(t)).abs().argmin()) for t in times]

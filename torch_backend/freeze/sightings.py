@@ -16,6 +16,7 @@ from torch import Tensor
 from ..scene import Scene, read_image, resize_intrinsics
 from ..shot import Shot
 from ..solve.motion import MOVING, UNKNOWN, load_motion
+from ..torch_types import from_numpy
 from ..train import LoadedRun
 from .query import FrozenGaussians, FrozenImage, render_frozen
 from .regions import grown
@@ -272,7 +273,7 @@ def motion_mattes(shot: Shot) -> MovingOf:
         if told is None:
             return None
         matte = torch.zeros(told.shape, device="cpu")
-        codes = torch.from_numpy(told)
+        codes = from_numpy(told)
         matte[codes == UNKNOWN] = DOUBT
         matte[codes == MOVING] = 1.0
         return matte

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
+from ..gaussians.neighbours import nearest
 from ..scene import Scene
+from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.model import gathered, render
 from ..train.movers import mean_of
@@ -115,7 +116,8 @@ class _Pair:
     def _blamed(self, frame: int, still: bool) -> Tensor:
         """[M, 2]: how much worse a frame is for each of the rows, and how many pixels it sees of it."""
         camera, plate = self.plates.camera(frame), self.plates.picture(frame)
-        errors, paints = [], []
+        errors: list[Tensor] = []
+        paints: list[Tensor] = []
         counts = self.plates.matte(frame) < 0.5 if still else torch.ones(plate.shape[:2], device=plate.device) > 0
         for scene in self.scenes:
             picture, marks = self._shown(scene, frame)
@@ -142,5 +144,6 @@ class _Pair:
 def _nearest(means: Tensor, count: int) -> Tensor:
     """[M, K] int64: the nearest of means [M, 3] to each, itself among them."""
     count = min(count, len(means))
-    found = KDTree(means.cpu().numpy()).query(means.cpu().numpy(), k=count)[1].reshape(len(means), count)
-    return torch.from_numpy(np.ascontiguousarray(found, np.int64)).to(means.device)
+    places = means.cpu().numpy()
+    found = nearest(places, places, count)[1]
+    return from_numpy(np.ascontiguousarray(found, np.int64)).to(means.device)

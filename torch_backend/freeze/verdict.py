@@ -93,7 +93,7 @@ def _advice(
     """What to do about the worst of them."""
     if not places and word == "good":
         return []
-    said = []
+    said: list[str] = []
     if steady:
         said.append("If nothing moves there, paint it black in the motion matte.")
     worst = places[0] if places else None

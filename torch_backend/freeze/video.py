@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import av
-import av.error
 import numpy as np
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 from numpy.typing import NDArray
@@ -38,11 +37,12 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
     shape = _checked(first, 0, None).shape
     # FFmpeg's errors are OSErrors with its errno, a full disk's among them.
     with atomic_path(path) as beside, av.open(str(beside), "w", format="mp4", options={"movflags": "faststart"}) as mp4:
+        output: Any = mp4  # PyAV does not say what its packets are packets of
         stream = _add_stream(mp4, codec, rate, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
-        mp4.mux(stream.encode(_picture(first, 0, rate)))
+        output.mux(stream.encode(_picture(first, 0, rate)))
         for index, frame in enumerate(source, start=1):
-            mp4.mux(stream.encode(_picture(_checked(frame, index, shape), index, rate)))
-        mp4.mux(stream.encode(None))
+            output.mux(stream.encode(_picture(_checked(frame, index, shape), index, rate)))
+        output.mux(stream.encode(None))
     if codec == "libx264":
         return ""
     return "PyAV has no H.264 encoder here, so the video is MPEG-4 part 2: larger, and some players do not show it."

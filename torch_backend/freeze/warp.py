@@ -32,7 +32,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..contract import WARP_FOLDER
-from .exr import check_finite, linear_spec, set_margin, write_exr
+from ..torch_types import from_numpy
+from .exr import channel_names, check_finite, linear_spec, set_margin, write_exr
 
 FOLDER = WARP_FOLDER
 """Folder of the warps in a take's."""
@@ -182,7 +183,7 @@ def read_warp(path: str | Path) -> Warp:
         raise ValueError(f"{path}: cannot be read as EXR: {oiio.geterror()}")
     try:
         spec = image.spec()
-        names = list(spec.channelnames)
+        names = channel_names(spec)
         missing = [name for name in CHANNELS if name not in names]
         if missing:
             raise ValueError(f"{path}: no warp, it has no channel {', '.join(missing)}")
@@ -192,7 +193,7 @@ def read_warp(path: str | Path) -> Warp:
             raise ValueError(f"{path}: damaged, {image.geterror()}")
     finally:
         image.close()
-    found = torch.from_numpy(np.asarray(pixels, dtype=np.float32))
+    found = from_numpy(np.asarray(pixels, dtype=np.float32))
     fill, alpha, st, matte = (
         found[..., [names.index(name) for name in part]].squeeze(-1)
         for part in (CHANNELS[:3], CHANNELS[3:4], CHANNELS[4:6], CHANNELS[7:])

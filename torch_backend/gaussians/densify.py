@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..torch_types import norm
 from .model import Gaussians
 
 _SHRINK = 1.6
@@ -94,7 +95,7 @@ class Densifier:
         finite &= torch.isfinite(p["quats"]).all(1) & torch.isfinite(p["opacity_logits"])
         opaque = torch.sigmoid(p["opacity_logits"]) > self.config.prune_opacity
         largest = p["log_scales"].amax(1)
-        reach = p["means"].norm(dim=1)
+        reach = norm(p["means"], 1)
         return finite & opaque & (largest < math.log(self.config.max_scale) + torch.log(reach.clamp_min(1.0)))
 
     def _choose(self, score: Tensor, keep: Tensor, room: int) -> Tensor:

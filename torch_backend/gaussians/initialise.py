@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..scene import Scene
+from ..scene import Scene, evenly_spaced
+from ..torch_types import from_numpy
 from .model import SH_C0, Gaussians, sh_bases
+from .neighbours import nearest
 
 _PIXELS_PER_SEED = 100
 """A small picture needs no more seeds than one per so many pixels of a frame."""
@@ -60,7 +61,7 @@ def initialise(
     points, colors = scene.points, scene.colors
     opacity = torch.full((len(points),), config.opacity, device="cpu")
     if config.seeds > 0:
-        picked = np.unique(np.linspace(0, len(indices) - 1, min(config.frames, len(indices))).round().astype(int))
+        picked = evenly_spaced(len(indices), config.frames)
         each = min(config.seeds // len(picked), images.shape[1] * images.shape[2] // _PIXELS_PER_SEED)
         seeds = [_lift_seeds(scene, images[n], indices[n], each, generator) for n in picked]
         points = torch.cat([points, *(s[0] for s in seeds)])
@@ -99,8 +100,8 @@ def neighbour_distance(points: Tensor) -> Tensor:
     others = min(3, len(points) - 1)
     if others < 1:
         return torch.zeros(len(points), device="cpu")
-    distances = KDTree(points.numpy()).query(points.numpy(), k=others + 1, workers=-1)[0][:, 1:]
-    return torch.from_numpy(np.sqrt((distances**2).mean(1))).float()
+    distances = nearest(points.numpy(), points.numpy(), others + 1, workers=-1)[0][:, 1:]
+    return from_numpy(np.sqrt((distances**2).mean(1))).float()
 
 
 def _lift_seeds(
@@ -117,15 +118,13 @@ def _lift_seeds(
     seen = in_front & ((pixels >= 0) & (pixels < limits)).all(1)
     if seen.sum() < 4:
         return scene.points[:0], scene.colors[:0]
-    tree = KDTree(pixels[seen].numpy())
     candidates = torch.rand(4 * count, 2, generator=generator, device="cpu") * limits
-    distance, nearest = tree.query(candidates.numpy(), k=4)
-    distance, nearest = torch.from_numpy(distance), torch.from_numpy(nearest)
+    distance, neighbours = (from_numpy(found) for found in nearest(pixels[seen].numpy(), candidates.numpy(), 4))
     far = distance[:, 0].argsort(descending=True, stable=True)[: 2 * count]
     # Half the far ones: a bare top-k would put every seed into the largest hole.
     keep = far[torch.randperm(len(far), generator=generator, device="cpu")[:count]]
     weights = 1.0 / (distance[keep] + 1.0)
-    depth = (weights * camera[seen][:, 2][nearest[keep]]).sum(1) / weights.sum(1)
+    depth = (weights * camera[seen][:, 2][neighbours[keep]]).sum(1) / weights.sum(1)
     chosen = candidates[keep]
     rays = torch.cat([(chosen - K[:2, 2]) / K[[0, 1], [0, 1]], chosen.new_ones(len(chosen), 1)], dim=1)
     local = rays * depth.float()[:, None]

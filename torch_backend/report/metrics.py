@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..torch_types import from_numpy
 from . import colorvideovdp, stlpips
 
 METRICS = {"psnr_db": True, "ssim": True, "st_lpips": False, "flip": False}
@@ -134,7 +135,7 @@ def flip_map(image: Tensor, truth: Tensor) -> Tensor | None:
 
     reference, test = (np.ascontiguousarray(v.cpu().numpy(), dtype=np.float32) for v in (truth, image))
     values, _, _ = flip_evaluator.evaluate(reference, test, "LDR", inputsRGB=True, applyMagma=False, parameters={})
-    return torch.from_numpy(np.array(values, dtype=np.float32)).reshape(image.shape[:2])
+    return from_numpy(np.array(values, dtype=np.float32)).reshape(image.shape[:2])
 
 
 def best_share_psnr(image: Tensor, truth: Tensor, share: float = 0.9) -> float:

@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
 from ..shot import Shot
 from ..solve.motion import MOVING, STILL, find_motion, load_motion
+from ..torch_types import from_numpy
 
 MARGIN = 8.0
 """A still pixel this near to a mover, in pixels of a picture 640 wide, is no truth: outlines of movers are soft, and so
@@ -50,7 +50,7 @@ def near(mask: NDArray[np.bool_], distance: float) -> NDArray[np.bool_]:
 
 
 def _resized(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
-    return F.interpolate(torch.from_numpy(mask).float()[None, None], (height, width), mode="area")[0, 0]
+    return F.interpolate(from_numpy(mask).float()[None, None], (height, width), mode="area")[0, 0]
 
 
 def far_from(poses: Sequence[int], t_star: int, frames: int) -> list[int]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +18,7 @@ POINT_FARTHEST = 20.0
 STILL_HINT = "A freeze needs a clip in which the camera moves sideways by a step or more."
 
 
-def filter_points(points: dict[str, NDArray], centres: NDArray) -> dict[str, NDArray]:
+def filter_points(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """The points to train from: error below 2 px, seen by 3 frames or more, before all cameras, no far outliers.
 
     `points` holds xyz [P, 3], rgb, error, track and depth [P] (the least over its cameras); `centres` [C, 3] are the

@@ -45,7 +45,7 @@ def load_record(shot: Shot) -> dict[str, Any]:
     return _object(_there(shot, SOLVE_FILE))
 
 
-def load_points(shot: Shot) -> dict[str, NDArray]:
+def load_points(shot: Shot) -> dict[str, NDArray[Any]]:
     """points.npz: xyz float32 [P, 3] solve units, rgb uint8 [P, 3], error float32 [P] px, track uint16 [P].
 
     JobError (SOLVE) if the shot is not solved or the file is damaged.

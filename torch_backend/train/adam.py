@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from ..kernel_text import kernel_text
-from ..native import INTEGER, POINTER, Snippet, initialised_warp, launch_on
+from ..native import INTEGER, POINTER, Snippet, func_native, initialised_warp, launch_on
 
 _CHUNK = 4096
 """Elements per unit of work."""
@@ -48,14 +49,14 @@ def warm_up() -> None:
 @functools.lru_cache(maxsize=1)
 def _kernel() -> Any:
     """The Warp kernel of `adam.cu`, for CUDA; it runs on Warp's cpu device too, where tests compare it."""
-    wp = initialised_warp()
+    initialised_warp()
 
     def adam_element(
         wholes: wp.uint64, reals: wp.uint64, flag: wp.uint64, visible: wp.uint64, segments: wp.int32, stage: wp.int32,
         tid: wp.int32,
     ): ...  # fmt: skip
 
-    native = wp.func_native(_source("adam.cu"))(adam_element)
+    native = func_native(_source("adam.cu"))(adam_element)
 
     def entry(
         wholes: wp.uint64, reals: wp.uint64, flag: wp.uint64, visible: wp.uint64, segments: wp.int32, stage: wp.int32
@@ -102,14 +103,17 @@ class FusedAdam(torch.optim.Optimizer):
             return
         device = found[0][0].device
         kernel = device.type != "cpu" if self.kernel is None else self.kernel
-        whole, real, kept, chunks = [], [], [], 0
+        whole: list[int] = []
+        real: list[float] = []
+        kept: list[Tensor] = []  # alive until the step is done: the tables hold their addresses
+        chunks = 0
         for value in guard:
             value = value.detach().float().reshape(-1)
             kept.append(value)
             whole += (0, value.data_ptr(), 0, 0, value.numel(), 0, chunks, 0)
             real += (0.0,) * _REAL
             chunks += -(-value.numel() // _CHUNK)
-        steps = []
+        steps: list[Tensor] = []
         for p, group in found:
             if p.dtype != torch.float32 or p.device != device:
                 raise ValueError(f"FusedAdam takes float32 parameters on one device, got {p.dtype} on {p.device}")

@@ -7,16 +7,16 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import SafetensorError
 from torch import Tensor
 
 from ..contract import CHECKPOINT_FILE as CHECKPOINT_FILE
 from ..contract import ExitCode, JobError, check_version
 from ..shot import atomic_path
+from .stored_tensors import StoredTensors, open_stored, write_stored
 
 CHECKPOINT_VERSION = 1
 
@@ -34,7 +34,7 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]
     text = json.dumps({"version": CHECKPOINT_VERSION, **meta}, allow_nan=False)
     with atomic_path(path) as beside:
         try:
-            save_file(contiguous, str(beside), metadata={"splannequin": text})
+            write_stored(contiguous, beside, {"splannequin": text})
         except SafetensorError as error:  # it hands the system's reason on in words: "... (os error 28)"
             code = int(number[1]) if (number := re.search(r"os error (\d+)", str(error))) else errno.EIO
             windows = (code,) if os.name == "nt" else ()
@@ -44,7 +44,7 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """(tensors, facts). JobError in words if the file is damaged or from a newer version."""
     try:
-        with safe_open(str(path), framework="pt", device="cpu") as stored:
+        with open_stored(path) as stored:
             meta = _facts(stored)
             check_version(meta, str(path), CHECKPOINT_VERSION)
             # Copies: views of the mapped file would keep Windows from replacing it at the next save.
@@ -60,23 +60,23 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def read_meta(path: Path) -> dict[str, Any]:
     """The facts of a checkpoint without its tensors; empty if the file is damaged."""
     try:
-        with safe_open(str(path), framework="pt", device="cpu") as stored:
+        with open_stored(path) as stored:
             return _facts(stored)
     except _DAMAGED:
         return {}
 
 
-def _facts(stored: Any) -> dict[str, Any]:
+def _facts(stored: StoredTensors) -> dict[str, Any]:
     """What an open file says of itself. One of `_DAMAGED` if that is no object of JSON."""
-    facts = json.loads((stored.metadata() or {})["splannequin"])
+    facts: object = json.loads((stored.metadata() or {})["splannequin"])
     if not isinstance(facts, dict):
         raise TypeError(f"the facts are a {type(facts).__name__}")
-    return facts
+    return cast(dict[str, Any], facts)
 
 
 def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """Adam's moments by parameter name."""
-    tensors = {}
+    tensors: dict[str, Tensor] = {}
     for name, parameter in named.items():
         for key, value in optimizer.state.get(parameter, {}).items():
             tensors[f"adam.{key}.{name}"] = value
@@ -91,7 +91,7 @@ def restore_optimizer(named: dict[str, Tensor], optimizer: torch.optim.Optimizer
     for name, parameter in named.items():
         keys = ("step", "exp_avg", "exp_avg_sq")
         stored = {key: tensors.get(f"adam.{key}.{name}") for key in keys}
-        state = {}
+        state: dict[str, Tensor] = {}
         for key, value in stored.items():
             if value is not None:
                 like = torch.zeros((), device=parameter.device) if key == "step" else parameter.detach()

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from ..contract import DETECTORS, METHODS, SUPERVISIONS, TrainParams
 from ..deformation import GateConfig, HexPlaneConfig, HostConfig, host, host_config, hosts
@@ -175,6 +175,11 @@ def config_to_json(config: TrainConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def _as_tuple(value: Any) -> Any:
+    """A tuple of what JSON keeps as a list."""
+    return tuple(cast(list[Any], value)) if isinstance(value, list) else value
+
+
 def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     """Inverse of `config_to_json`; ValueError names an unknown field."""
     nested = {
@@ -182,7 +187,11 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
         "supervision": SupervisionConfig, "exposure": ExposureConfig, "needs": NeedsConfig,
         "poses": PosesConfig,
     }  # fmt: skip
-    values = {"needs": {}, "poses": {}, **data}  # earlier runs decided nothing; a finished one is only read
+    values: dict[str, Any] = {
+        "needs": {},
+        "poses": {},
+        **data,
+    }  # earlier runs decided nothing; a finished one is only read
     if "hexplane" in values:  # written before there were other hosts
         values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))
     if "rounds" in values.get("gate", {}):  # written before the gate opened on trial, and HexPlane bent by SiLU
@@ -192,7 +201,7 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     try:
         nested["field"] = host(values["host"]).settings
         for name, cls in nested.items():
-            inner = {k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()}
+            inner: dict[str, Any] = {k: _as_tuple(v) for k, v in values[name].items()}
             values[name] = cls(**inner)
         return TrainConfig(**values)
     except (TypeError, KeyError) as error:

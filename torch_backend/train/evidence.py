@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..scene import evenly_spaced
+from ..torch_types import from_numpy, norm
 from .losses import psnr
 from .model import DynamicModel, render
 from .movers import Mattes
@@ -73,10 +75,10 @@ def gather_evidence(
     images = {i: held_out[n] for n, i in enumerate(test)}
     images |= {i: trainer.images[n] for n, i in enumerate(trainer.train_ids) if n not in trainer.unusable}
     every = sorted(images)
-    picked = np.unique(np.linspace(0, len(every) - 1, min(len(every), MOST)).round().astype(int))
+    picked = evenly_spaced(len(every), MOST)
     places = seen_places(trainer.model)
     known = set(test)
-    found = []
+    found: list[FrameEvidence] = []
     for index in sorted({every[n] for n in picked} | known):
         trainer.report.check_cancelled()
         frame = trainer.scene.frames[index]
@@ -90,10 +92,10 @@ def seen_places(model: DynamicModel) -> Tensor:
     """[T, M, 3] where the open Gaussians are at `MOMENTS` times of the clip, scene units; NaN where nobody saw them."""
     rows = model.open_rows()
     count = len(model.centres)
-    bins = np.unique(np.linspace(0, count - 1, min(MOMENTS, count)).round().astype(int)).tolist()
+    bins = evenly_spaced(count, MOMENTS)
     if model.field is None or not len(rows):
         return torch.zeros(len(bins), 0, 3, device=model.device)
-    places = []
+    places: list[Tensor] = []
     for time_bin in bins:
         state = model.moved(rows, model.deltas(rows, model.centres[time_bin : time_bin + 1]))
         seen = model.gaussians.support[rows, time_bin]
@@ -113,7 +115,7 @@ def travelled(places: Tensor, viewmat: Tensor, K: Tensor) -> Tensor:
     low = torch.where(known[..., None], pixels, torch.inf).amin(0)
     high = torch.where(known[..., None], pixels, -torch.inf).amax(0)
     fine = (known.sum(0) >= 2) & ((depth > 1e-2) | ~known).all(0)
-    return torch.where(fine, (high - low).norm(dim=1), 0.0)
+    return torch.where(fine, norm(high - low, 1), 0.0)
 
 
 @torch.no_grad()
@@ -169,5 +171,5 @@ def _cells(values: Tensor, share: float) -> NDArray[np.float32]:
 
 def _resized(mask: NDArray[np.bool_], shape: torch.Size) -> Tensor:
     """bool [h, w] at another size, nearest."""
-    values = torch.from_numpy(mask.astype(np.float32))[None, None]
+    values = from_numpy(mask.astype(np.float32))[None, None]
     return F.interpolate(values, size=tuple(shape), mode="nearest")[0, 0] > 0.5

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..raster import ssim as compiled_ssim
 from ..raster import ssim_cuda
+from ..torch_types import AutogradContext, applied
 
 _C1, _C2 = 0.01**2, 0.03**2
 """Constants of SSIM for data_range = 1."""
@@ -36,7 +37,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         return compiled_ssim.ssim(image, target)
     if image.is_cuda and ssim_cuda.supports(image, target):
         return ssim_cuda.ssim(image, target)
-    return _TorchSsim.apply(image, target)  # type: ignore[no-any-return]
+    return applied(_TorchSsim, image, target)
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -66,7 +67,7 @@ class _TorchSsim(torch.autograd.Function):
     """Mean SSIM with a hand-written gradient for the first image: 5 blurs forward, 3 backward."""
 
     @staticmethod
-    def forward(ctx, image: Tensor, target: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: AutogradContext, image: Tensor, target: Tensor) -> Tensor:
         x = image.permute(2, 0, 1).contiguous()
         y = target.permute(2, 0, 1).contiguous()
         rows, columns = (_band(size, x.dtype, x.device) for size in x.shape[1:])
@@ -78,8 +79,9 @@ class _TorchSsim(torch.autograd.Function):
         return score.mean()
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        x, y, mx, my, a1, a2, b1, b2, score = ctx.saved_tensors
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor, None]:
+        saved: tuple[Tensor, ...] = ctx.saved_tensors
+        x, y, mx, my, a1, a2, b1, b2, score = saved
         rows, columns = (_band(size, x.dtype, x.device) for size in x.shape[1:])
         inverse = 1.0 / (b1 * b2)
         d_xy = 2 * a1 * inverse
@@ -88,4 +90,4 @@ class _TorchSsim(torch.autograd.Function):
         d_mx = 2 * my * (a2 - a1) * inverse - 2 * mx * score * (1.0 / b1 - 1.0 / b2)
         back = _blur(torch.cat([d_mx, d_xx, d_xy]), rows.T, columns.T).view(3, *x.shape)
         pull = back[0] + 2 * x * back[1] + y * back[2]
-        return (grad / score.numel()) * pull.permute(1, 2, 0), None
+        return (grads[0] / score.numel()) * pull.permute(1, 2, 0), None

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..deformation import Deltas, GateConfig, change_of, painted, stays_open
-from ..scene import Scene
+from ..scene import Scene, evenly_spaced
 from ..solve.motion import MOVING
 from ..supervision.support import SEEN_WEIGHT
+from ..torch_types import from_numpy
 from .model import DynamicModel, gathered
 from .run_view import RunView
 
@@ -40,8 +41,9 @@ def load_movers(mattes: Mattes, scene: Scene, indices: list[int], width: int, he
         matte = mattes(scene.frames[index])
         if matte is not None:
             found = True
-            share = cv2.resize((matte == MOVING).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-            movers[n] = torch.from_numpy(share > _COVERED)
+            moving = np.asarray(matte == MOVING, np.float32)
+            share = np.asarray(cv2.resize(moving, (width, height), interpolation=cv2.INTER_AREA))
+            movers[n] = from_numpy(share > _COVERED)
     return movers if found else None
 
 
@@ -108,7 +110,7 @@ def mean_of(model: DynamicModel, rows: Tensor) -> dict[str, Tensor]:
 def _changes(model: DynamicModel, rows: Tensor, pixels: Tensor, config: GateConfig) -> tuple[Tensor, Deltas]:
     """`change_of` at up to `MOMENTS` times of the clip."""
     count = len(model.centres)
-    picked = np.unique(np.linspace(0, count - 1, min(MOMENTS, count)).round().astype(int)).tolist()
+    picked = evenly_spaced(count, MOMENTS)
     moments = [model.deltas(rows, model.centres[n : n + 1]) for n in picked]
     present = [moment for moment in moments if moment is not None]
     return change_of(model.gaussians, rows, present, pixels, config, model.gaussians.support[rows][:, picked].T)

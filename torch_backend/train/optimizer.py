@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import nn
@@ -25,7 +26,7 @@ def optimizer_of(model: DynamicModel, poses: Poses, config: TrainConfig) -> Fuse
         "log_scales": (c.lr_scales, 0.1 * c.lr_scales), "opacity_logits": (c.lr_opacities, 0.1 * c.lr_opacities),
         "sh0": (c.lr_sh0, 0.1 * c.lr_sh0), "shN": (c.lr_sh_rest, 0.1 * c.lr_sh_rest),
     }  # fmt: skip
-    groups = [
+    groups: list[dict[str, Any]] = [
         {"params": [p[name]], "lr": start, "lr_start": start, "lr_end": end, "name": name, "rows": True}
         for name, (start, end) in rates.items()
     ]

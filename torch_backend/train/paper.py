@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..raster import RasterOutput
 from ..supervision import PaperView, paper_loss, well_supervised
+from ..torch_types import backward
 from .losses import photometric
 from .run_view import RunView
 
@@ -49,7 +50,7 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
     other_out = run.render_trained(other_state, other)
     exposed = model.exposure.apply(other_out.colors[0], run.times[other])
     loss = photometric(exposed, run.image_of(other), run.config.dssim)
-    loss.backward(retain_graph=True)
+    backward(loss, retain_graph=True)
     other_supervised = _supervised(run, other, rows, other_state, other_out)
     every = supervision.pulls == "all"
     if not every:
@@ -60,7 +61,7 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
     ]
     loss = paper_loss(views[0], views[1], run.progress, supervision)
     if loss is not None and bool(torch.isfinite(loss)):
-        loss.backward()
+        backward(loss)
     return other
 
 

@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..torch_types import from_numpy, matrix_exp, unflatten
+
 
 @dataclass
 class PosesConfig:
@@ -47,7 +49,7 @@ class Poses:
         keep = [n for n in range(len(self._times)) if n not in (held or ())]
         known = self.values.detach().cpu().numpy()[keep]
         columns = [np.interp(times, self._times[keep], known[:, n]) for n in range(6)]
-        return torch.from_numpy(np.stack(columns, axis=1)).to(self.values)
+        return from_numpy(np.stack(columns, axis=1)).to(self.values)
 
     @torch.no_grad()
     def fix_gauge(self, held: set[int]) -> None:
@@ -67,7 +69,7 @@ def corrected(viewmats: Tensor, corrections: Tensor) -> Tensor:
     """viewmats [..., 4, 4] world-to-camera after corrections [..., 6] of SE(3), differentiable in both."""
     x, y, z = corrections[..., :3].unbind(-1)
     o = torch.zeros_like(x)
-    twist = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+    twist = unflatten(torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1), -1, (3, 3))
     twist = torch.cat([twist, corrections[..., 3:, None]], dim=-1)
     twist = torch.cat([twist, torch.zeros_like(twist[..., :1, :])], dim=-2)
-    return viewmats @ torch.linalg.matrix_exp(twist)
+    return viewmats @ matrix_exp(twist)

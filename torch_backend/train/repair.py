@@ -20,12 +20,14 @@ What would leave less than half of the Gaussians is no repair: the run ends in w
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from ..contract import ExitCode, JobError
 from ..deformation import Deformation
+from ..deformation.protocol import Owned
 from ..gaussians import PARAM_NAMES, Densifier
 from ..raster.constants import QUAT_MIN
 from .model import DynamicModel
@@ -150,7 +152,8 @@ def _sound(model: DynamicModel, optimizer: torch.optim.Optimizer) -> bool:
 def _repair_gaussians(
     model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, step: int
 ) -> list[str]:
-    messages, params = [], model.gaussians.params
+    messages: list[str] = []
+    params = model.gaussians.params
     names = {name: _bad_rows(params[name]) for name in PARAM_NAMES}
     dropped = torch.stack(list(names.values())).any(0)
     count = int(dropped.sum())
@@ -165,7 +168,8 @@ def _repair_gaussians(
         messages.append(f"mended {_counted(int(flat.sum()), 'Gaussian')} (quats without length)")
         identity = params["quats"].new_tensor([1.0, 0.0, 0.0, 0.0])
         _mend(params["quats"], flat[:, None].expand(-1, 4), identity.expand(len(flat), 4), optimizer)
-    for name, owned in ({} if model.field is None else model.field.owned).items():
+    own: Mapping[str, Owned] = {} if model.field is None else model.field.owned
+    for name, owned in own.items():
         rows = _bad_rows(params[name])
         if bool(rows.any()):
             messages.append(f"mended {_counted(int(rows.sum()), 'Gaussian')} ({name} not finite)")

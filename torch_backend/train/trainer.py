@@ -19,6 +19,7 @@ from ..gaussians import Densifier, initialise
 from ..raster import RasterOutput
 from ..scene import Scene
 from ..supervision import Anchored, bin_of, bin_times, draw_anchored, mark_hidden, mark_seen, stillness, support_loss
+from ..torch_types import backward, integers, norm_of_all
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
@@ -95,7 +96,7 @@ class Trainer:
         self._recent: deque[int] = deque(maxlen=2 * _INSPECT_EVERY)
         self._memory, self._shift = FieldMemory(), torch.zeros(0, 3, device=self.device)
         low, high = field_box(scene.points)
-        self._extent = float((high - low).norm())
+        self._extent = float(norm_of_all(high - low))
         self.poses = Poses(self.times, config.poses, self.device)
         self._refined = False
         self.optimizer = optimizer_of(self.model, self.poses, config)
@@ -202,7 +203,7 @@ class Trainer:
         if pairs is not None and anchored is not None:
             total = total + self._support_loss(pairs, anchored)
         self.optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        backward(total)
         if paper:
             other = paper_step(self, frame, rows, state, out)
             self._recent.extend([] if other is None else [other])
@@ -380,7 +381,7 @@ class Trainer:
 
     def _next_frame(self) -> int:
         if not self.order:
-            drawn = torch.randperm(len(self.train_ids), generator=self.generator, device="cpu").tolist()
+            drawn = integers(torch.randperm(len(self.train_ids), generator=self.generator, device="cpu"))
             out = self.frames_left_out
             self.order = [frame for frame in drawn if frame not in out]
         self._recent.append(self.order[-1])
@@ -421,7 +422,7 @@ class Trainer:
 
     def inspect_nonfinite(self) -> None:
         """Repairs what is not finite; reads a GPU's counts of steps left out: since the last look, and in a row."""
-        count, in_a_row = (0, 0) if self.device.type == "cpu" else self._bad.tolist()
+        count, in_a_row = (0, 0) if self.device.type == "cpu" else integers(self._bad)
         self._bad[0] = 0
         if in_a_row >= _MAX_BAD_STEPS:
             raise unstable(self.iteration)
@@ -489,7 +490,7 @@ class Trainer:
 
         `options` go to `render_frame`.
         """
-        values = []
+        values: list[float] = []
         for n, i in enumerate(indices):
             self.report.check_cancelled()
             values.append(psnr(self.render_frame(i, **options), images[n].to(self.device, torch.float32)))
@@ -573,7 +574,7 @@ class Trainer:
         for name in ("gradient", "seen"):
             setattr(self.densifier, name, tensors[f"densify.{name}"].to(self.device, copy=True))
         self.generator.set_state(tensors["generator"])
-        self.order = tensors["order"].tolist()
+        self.order = integers(tensors["order"])
         self.iteration, self.initial = int(meta["iteration"]), int(meta["initial"])
         self.extensions = [Extension(**facts) for facts in meta.get("extensions", [])]
         self.policy.restore(meta["needs"])
