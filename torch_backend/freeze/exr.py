@@ -271,7 +271,7 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
         found = pixels[..., [names.index(name) for name in DETAIL_CHANNELS]]
         detail = DetailLayers(*(np.ascontiguousarray(found[..., i]) for i in (slice(0, 4), 4, 5)))
     rgba = np.ascontiguousarray(pixels[..., order[:4]])
-    more = {}
+    more: dict[str, NDArray[np.float32]] = {}
     for name, row in _MORE.items():
         if set(row.channels) <= set(names):
             at = [names.index(channel) for channel in row.channels]
