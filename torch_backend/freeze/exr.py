@@ -129,7 +129,7 @@ class FrozenFrame:
     """[H,W,3] scene-linear, premultiplied: what added to `rgba` gives it the plate's grain. None: not in the file."""
     detail: DetailLayers | None = None
     """float32. None: the frame is of splats alone."""
-    more: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    more: Mapping[str, NDArray[np.float32]] = field(default_factory=dict[str, NDArray[np.float32]])
     """Further layers of the table that are in the file, by name: [H,W], or [H,W,4] of a colour."""
 
 
