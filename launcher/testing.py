@@ -26,6 +26,10 @@ NEWS_SECONDS = 60.0
 """Legs whose output is kept until they end say this often how far they are."""
 
 
+ADDON_TESTS = ("tests/addon", "tests/addon_free")
+"""Those that run in Blender. The second need none: the backend's leg runs them too."""
+
+
 class Leg:
     """One part of the tests: its command, and what became of it."""
 
@@ -132,7 +136,7 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
     paths = [a for a in pytest_args if not a.startswith("-") and (ROOT / a.split("::")[0]).exists()]
     rest = [a for a in pytest_args if a not in paths]
     if not paths:
-        paths = ["tests/addon"] if series else ["tests", "tests/addon"]
+        paths = [*ADDON_TESTS] if series else ["tests", *ADDON_TESTS]
     addon_paths = [p for p in paths if Path(p).as_posix().startswith("tests/addon")]
     backend_paths = [p for p in paths if p not in addon_paths]
     backend = backend_environment(testing=True)
