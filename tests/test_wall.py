@@ -217,6 +217,21 @@ def test_the_scan_sees_a_child_that_stands_anywhere():
     assert not list(unplaced_children(ast.parse("subprocess.Popen(command, cwd=folder)")))
 
 
+def asks_the_version(tree: ast.AST) -> bool:
+    """True of a file that does one thing or another by Blender's version."""
+    return any(isinstance(n, ast.Attribute) and ast.unparse(n) == "bpy.app.version" for n in ast.walk(tree))
+
+
+def test_only_one_file_knows_how_blenders_differ():
+    knowing = [p for p in sources("splannequin_addon") if asks_the_version(read(p))]
+    assert knowing == [ROOT / "splannequin_addon" / "compat.py"]
+
+
+def test_the_scan_sees_who_asks_the_version():
+    assert asks_the_version(ast.parse("import bpy\nnew = bpy.app.version >= (5, 0, 0)"))
+    assert not asks_the_version(ast.parse("print(bpy.app.version_string)"))
+
+
 def test_no_module_of_the_addon_has_both_threads_and_bpy():
     for path in sources("splannequin_addon"):
         names = {name.split(".")[0] for _, name in imports(read(path), package_of(path))}
