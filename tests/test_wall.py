@@ -184,7 +184,7 @@ def unplaced_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield node.lineno, ast.unparse(node)
 
 
-@pytest.mark.parametrize("folder", ["splannequin_addon", "torch_backend", "benchmarks", "splannequin.py"])
+@pytest.mark.parametrize("folder", ["splannequin_addon", "torch_backend", "benchmarks", "launcher"])
 def test_no_python_is_started_that_takes_modules_from_where_it_stands(folder: str):
     for path in sources(folder) if (ROOT / folder).is_dir() else [ROOT / folder]:
         wrong = list(unsafe_children(read(path)))
@@ -243,6 +243,18 @@ def test_the_contract_imports_the_standard_library_and_itself(path: Path):
     assert not [f"{path}:{line}: {name}" for line, name in found if not_for_the_contract(name)]
 
 
+@pytest.mark.parametrize("path", sources("launcher"), ids=lambda p: p.name)
+def test_the_launcher_imports_the_standard_library_and_what_needs_no_environment(path: Path):
+    allowed = {"torch_backend.contract", "torch_backend.shot", "torch_backend.cards"}
+    found = imports(read(path), package_of(path))
+    assert not [
+        f"{path}:{line}: {name}"
+        for line, name in found
+        if name.split(".")[0] not in {"launcher", *sys.stdlib_module_names}
+        and ".".join(name.split(".")[:2]) not in allowed
+    ]
+
+
 @pytest.mark.parametrize("path", sources("torch_backend"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_a_station_imports_only_stations_before_it(path: Path):
     station = station_of(path.relative_to(ROOT / "torch_backend").with_suffix("").parts)
@@ -290,6 +302,10 @@ def test_the_scan_sees_a_name_of_the_layout(source: str, spelled: int):
     assert len(list(layout_names(ast.parse(source)))) == spelled
 
 
+CIRCLE_FREE = ("deformation", "gaussians", "raster", "solve", "supervision", "train")
+"""Folders of the backend."""
+
+
 def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
     """Groups of modules that import each other, however indirectly; `arrows`: module -> those it imports."""
 
@@ -306,14 +322,16 @@ def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
     return sorted(sorted(group) for group in groups if group)
 
 
-@pytest.mark.parametrize("folder", ["deformation", "gaussians", "raster", "solve", "supervision", "train"])
+@pytest.mark.parametrize("folder", ["launcher", *(f"torch_backend/{name}" for name in CIRCLE_FREE)])
 def test_no_modules_of_a_folder_import_each_other(folder: str):
     """Not even for the names of types: who can name a class of the other knows it."""
-    paths = {path.stem: path for path in sources(f"torch_backend/{folder}") if path.stem != "__init__"}
+    paths = {path.stem: path for path in sources(folder) if path.stem != "__init__"}
+    package = folder.split("/")
     arrows = {}
     for stem, path in paths.items():
         names = [name.split(".") for _, name in imports(read(path), package_of(path))]
-        arrows[stem] = {n[2] for n in names if n[:2] == ["torch_backend", folder] and n[2:] and n[2] in paths} - {stem}
+        below = [name[len(package) :] for name in names if name[: len(package)] == package]
+        arrows[stem] = {rest[0] for rest in below if rest and rest[0] in paths} - {stem}
     assert circles(arrows) == []
 
 
@@ -405,7 +423,8 @@ def test_the_scan_counts_levels():
 
 
 def test_nothing_runs_what_a_file_says():
-    files = [ROOT / "splannequin.py", ROOT / "__init__.py", *sources("torch_backend"), *sources("splannequin_addon")]
+    files = [ROOT / "splannequin.py", ROOT / "__init__.py"]
+    files += [path for folder in ("launcher", "torch_backend", "splannequin_addon") for path in sources(folder)]
     wrong = [f"{path}:{line}: {what}" for path in files for line, what in dangers(read(path))]
     assert not wrong
 
