@@ -270,7 +270,10 @@ def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path
     broken, sound = supervisor.watch_of(tmp_path), supervisor.watch_of(shot)
     broken.jobs["train"] = types.SimpleNamespace(ended=False)
     sound.redraw = True
-    assert supervisor.tick() == supervisor.TICK_SECONDS and not sound.redraw
+    for _ in range(50):  # a turn that a busy machine made too long leaves jobs to the next
+        assert supervisor.tick() == supervisor.TICK_SECONDS and not sound.redraw
+        if broken.failures:
+            break
     assert "AttributeError" in broken.failures["train"][0] and "Traceback" in capfd.readouterr().err
 
 
