@@ -364,7 +364,7 @@ def _output(args: argparse.Namespace) -> Path:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise begin.unwritable(output, error, "Choose another --output folder.") from error
+        raise contents.unwritable(output, error, "Choose another --output folder.") from error
     return output
 
 
