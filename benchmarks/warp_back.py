@@ -139,20 +139,21 @@ def inside(ask: dict[str, Any]) -> None:
 def _through_the_group(package: str, ask: dict[str, Any], folder: Path, frame: int) -> np.ndarray:
     """[H, W, 3] float32: a plate of `folder`, warped by the take, as it leaves the compositor."""
     bpy = importlib.import_module("bpy")
-    compat, compositor, steps = (
-        importlib.import_module(f"{package}.splannequin_addon.{name}") for name in ("compat", "compositor", "steps")
+    compat, numbered, freeze_group, insertion = (
+        importlib.import_module(f"{package}.splannequin_addon.{name}")
+        for name in ("compat", "scene.numbered", "bake.freeze_group", "bake.insertion")
     )
     scene = bpy.context.scene
     tree = compat.compositor_tree(scene) or compat.new_compositor_tree(scene, "Artist")
-    file = compositor.frame_path(folder, frame, ".exr")
+    file = numbered.frame_path(folder, frame, ".exr")
     plate = tree.nodes.new("CompositorNodeImage")
     plate.image = bpy.data.images.load(str(file))
     compat.set_image_colour(plate.image, "linear")
     tree.links.new(plate.outputs["Image"], compat.output_socket(tree) or compat.new_output_node(tree))
     scene.splannequin.clip = str(file)
     scene.frame_set(frame)
-    steps.insert_freeze(scene, Path(ask["shot"]), ask["take"], warp=True)
-    node = compositor.group_node(tree)
+    insertion.insert_freeze(scene, Path(ask["shot"]), ask["take"], warp=True)
+    node = freeze_group.group_node(tree)
     tree.links.new(plate.outputs["Image"], node.inputs["Image"])
     tree.links.new(node.outputs["Image"], compat.output_socket(tree))
     width, height = plate.image.size

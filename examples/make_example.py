@@ -71,7 +71,7 @@ def make(shot: Path, take: str, output: Path) -> None:
     def ours(name: str):
         return importlib.import_module(f"{_package().__name__}.splannequin_addon.{name}")
 
-    bake, compositor, shots, steps = ours("bake"), ours("compositor"), ours("shots"), ours("steps")
+    bake, shots = ours("bake.insertion"), ours("shot.contents")
     shot, output = shot.absolute(), output.absolute()
     state = shots.read(shot)
     if not state.solve or take not in state.takes:
@@ -81,18 +81,18 @@ def make(shot: Path, take: str, output: Path) -> None:
     scene = bpy.context.scene
     props = scene.splannequin
     props.shot_path, props.take_name, props.t_star = str(shot), take, int(state.takes[take]["t_star_frame"])
-    steps.load_camera(scene, shot)
-    steps.insert_freeze(scene, shot, take)
+    ours("solve.arrival").load_camera(scene, shot)
+    ours("bake.insertion").insert_freeze(scene, shot, take)
     bake.fit_take(scene, shot, take)
-    scene.render.filepath = f"//{output.stem}_frames/{bake.DIGITS}"
+    scene.render.filepath = f"//{output.stem}_frames/{ours('bake.rendering').DIGITS}"
     first, last = state.frame_range
     note = bpy.data.texts.new("Read me")
     note.write(
         NOTE.format(shot=state.info["name"], t_star=props.t_star, first=first, last=last, output=scene.render.filepath)
     )
     note.cursor_set(0)
-    compositor.relative_images()
-    props.shot_path = compositor.blend_path(shot)
+    ours("scene.sequences").relative_images()
+    props.shot_path = ours("scene.paths").blend_path(shot)
     scene.frame_set(first)
     before = bpy.context.preferences.filepaths.save_version
     bpy.context.preferences.filepaths.save_version = 0

@@ -1,42 +1,43 @@
-"""Registers everything the add-on has, in order, and unregisters it in reverse. Registering twice registers once."""
+"""Registers everything the add-on has, in order, and unregisters it in reverse. Registering twice registers once.
+
+Rooms below the steps are told of by their modules; each of the five steps hands in one object, with its classes and
+whatever else it has Blender know.
+"""
 
 from __future__ import annotations
 
 import bpy
 
-from . import (
-    cli,
-    mattes,
-    menu,
-    ops_align,
-    ops_clip,
-    ops_jobs,
-    ops_runs,
-    ops_shots,
-    ops_solves,
-    ops_steps,
-    panel,
-    pictures,
-    places,
-    points,
-    preferences,
-    props,
-    stmaps,
-    supervisor,
-    translations,
-)
+from . import settings, translations
+from .bake.step import STEP as BAKE
+from .command_line import command
+from .footage.step import STEP as IMPORT
+from .freeze.step import STEP as FREEZE
+from .process import steps, supervisor
+from .shot import places
+from .solve.step import STEP as SOLVE
+from .train.step import STEP as TRAIN
+from .ui import job_operators, menu, preferences, shots_panel
 
+_STEPS = (IMPORT, SOLVE, TRAIN, FREEZE, BAKE)
+"""In the order of the work, and of their panels."""
 _CLASSES = (
-    *ops_steps.CLASSES,
-    *ops_jobs.CLASSES,
-    *ops_clip.CLASSES,
-    *ops_runs.CLASSES,
-    *ops_align.CLASSES,
-    *ops_shots.CLASSES,
-    *ops_solves.CLASSES,
-    *stmaps.CLASSES,
-    *mattes.CLASSES,
-    *panel.CLASSES,
+    *shots_panel.CLASSES,
+    *job_operators.CLASSES,
+    *(cls for step in _STEPS for cls in step.classes),
+)
+_PARTS: tuple[steps.Part, ...] = (
+    translations,
+    settings,
+    preferences,
+)
+"""Before the classes."""
+_PARTS_AFTER: tuple[steps.Part, ...] = (
+    menu,
+    places,
+    *(part for step in _STEPS for part in step.parts),
+    supervisor,
+    command,
 )
 
 
@@ -50,36 +51,26 @@ def register() -> None:
     if registered():
         return
     _take_tooltips_from_docstrings()
-    translations.register()
-    props.register()
-    preferences.register()
+    for step in _STEPS:
+        steps.add(step)
+    for part in _PARTS:
+        part.register()
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
-    menu.register()
-    pictures.register()
-    points.register()
-    places.register()
-    supervisor.register()
-    cli.register()
+    for part in _PARTS_AFTER:
+        part.register()
 
 
 def unregister() -> None:
     """Undoes `register`, in reverse."""
     if not registered():
         return
-    ops_align.stop()
-    cli.unregister()
-    stmaps.unregister()
-    supervisor.unregister()
-    places.unregister()
-    points.unregister()
-    pictures.unregister()
-    menu.unregister()
+    for part in reversed(_PARTS_AFTER):
+        part.unregister()
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)
-    preferences.unregister()
-    props.unregister()
-    translations.unregister()
+    for part in reversed(_PARTS):
+        part.unregister()
 
 
 def _take_tooltips_from_docstrings() -> None:

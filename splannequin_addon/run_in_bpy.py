@@ -49,7 +49,7 @@ def main() -> int:
         arguments = arguments[arguments.index("--") + 1 :]
     package = load_package()
     package.register()
-    headless = importlib.import_module(PACKAGE + ".splannequin_addon.headless")
+    headless = importlib.import_module(PACKAGE + ".splannequin_addon.command_line.headless")
     try:
         return headless.main(arguments)
     finally:

@@ -30,6 +30,26 @@ STATIONS = (
     "report",
 )
 """In the order of docs/architecture.md: a station imports only stations before it. `footage/plates.py` is late."""
+ROOMS = (
+    "compat",
+    "translations",
+    "scene",
+    "shot",
+    "process",
+    "ui",
+    "footage",
+    "solve",
+    "train",
+    "freeze",
+    "bake",
+    "settings",
+    "command_line",
+    "registration",
+)
+"""Of the add-on, in the order of docs/architecture.md: a room imports only rooms before it, and no file of another
+step's `step.py`, which only the registration knows."""
+LEVELS = 8
+"""Most files of the add-on that import one another in a row."""
 CODE_RUNNING_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib", "yaml"}
 NETWORK_SERVERS = {"http.server", "socketserver", "xmlrpc.server", "wsgiref"}
 
@@ -77,8 +97,8 @@ LAYOUT = {
 }
 """Names in a shot folder, as the contract spells them."""
 OTHER_FOLDERS = {
-    ("splannequin_addon/environment.py", "summary.json"),  # of the launcher, in an environment
-    ("splannequin_addon/environment.py", ".splannequin"),
+    ("splannequin_addon/process/environment.py", "summary.json"),  # of the launcher, in an environment
+    ("splannequin_addon/process/environment.py", ".splannequin"),
     ("torch_backend/report/records.py", "summary.json"),  # of a benchmark
     ("torch_backend/solve/foreign.py", "colmap/sparse/0"),  # of another program
 }
@@ -291,6 +311,88 @@ def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
 def test_the_scan_sees_a_circle():
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
     assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
+def addon_modules() -> dict[str, set[str]]:
+    """Module of the add-on, by its dotted name below the add-on -> the modules of the add-on that it imports."""
+    paths = {}
+    for path in sources("splannequin_addon"):
+        parts = path.relative_to(ROOT / "splannequin_addon").with_suffix("").parts
+        paths[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    arrows: dict[str, set[str]] = {}
+    for module, path in paths.items():
+        names = [n.split(".") for _, n in imports(read(path), package_of(path))]
+        inside = [n[1:] for n in names if n[0] == "splannequin_addon"]
+        targets = {".".join(n) if ".".join(n) in paths else ".".join(n[:-1]) for n in inside}
+        assert targets <= paths.keys(), f"{path}: {targets - paths.keys()}"
+        arrows[module] = targets - {module}
+    return arrows
+
+
+def level(module: str, arrows: dict[str, set[str]]) -> int:
+    """How many modules stand in the longest row of imports that begins with this one, itself counted."""
+    return 1 + max((level(other, arrows) for other in arrows[module]), default=0)
+
+
+def backwards(arrows: dict[str, set[str]]) -> list[str]:
+    """Imports that go from a room to one that does not come before it."""
+    order = {room: place for place, room in enumerate(ROOMS)}
+    wrong = []
+    for module, others in arrows.items():
+        here = module.partition(".")[0]
+        for other in sorted(others):
+            there = other.partition(".")[0]
+            if here != there and order[there] >= order[here]:
+                wrong.append(f"{module} imports {other}")
+            if other.endswith(".step") and here != "registration":
+                wrong.append(f"{module} imports {other}, which only the registration does")
+    return wrong
+
+
+def test_no_modules_of_the_addon_import_each_other():
+    assert circles(addon_modules()) == []
+
+
+def test_no_file_of_the_addon_stands_on_a_high_tower_of_imports():
+    arrows = addon_modules()
+    assert len(arrows) > 60
+    high = {module: level(module, arrows) for module in arrows}
+    assert not {module: n for module, n in high.items() if n > LEVELS}
+
+
+def test_a_room_of_the_addon_imports_only_rooms_before_it():
+    assert backwards(addon_modules()) == []
+
+
+def test_every_room_of_the_addon_has_its_place_in_the_order():
+    rooms = {module.partition(".")[0] for module in addon_modules()} - {"", "run_in_bpy"}
+    assert rooms == set(ROOMS)
+
+
+@pytest.mark.parametrize(
+    ("arrows", "wrong"),
+    [
+        ({"bake.panel": {"freeze.takes"}, "freeze.takes": set()}, 0),
+        ({"freeze.takes": {"bake.insertion"}, "bake.insertion": set()}, 1),
+        (
+            {
+                "process.supervisor": {"train.pictures", "solve.cameras"},
+                "train.pictures": set(),
+                "solve.cameras": set(),
+            },
+            2,
+        ),
+        ({"bake.operators": {"bake.step"}, "bake.step": set()}, 1),
+        ({"registration": {"bake.step"}, "bake.step": set()}, 0),
+    ],
+)
+def test_the_scan_sees_an_import_that_goes_backwards(arrows: dict[str, set[str]], wrong: int):
+    assert len(backwards(arrows)) == wrong
+
+
+def test_the_scan_counts_levels():
+    arrows = {"a": {"b", "d"}, "b": {"c"}, "c": set(), "d": set()}
+    assert [level(module, arrows) for module in "abcd"] == [3, 2, 1, 1]
 
 
 def test_nothing_runs_what_a_file_says():

@@ -40,7 +40,7 @@ class Answer:
     """The test that then fails, as pytest names it."""
 
 
-CAMERAS, COMPOSITOR = f"{ADDON}cameras.py", f"{ADDON}compositor.py"
+CAMERAS, COMPOSITOR = f"{ADDON}solve/cameras.py", f"{ADDON}bake/compositor.py"
 TEST = "tests/addon/test_"
 ANSWERS = (
     Answer(
@@ -54,7 +54,7 @@ ANSWERS = (
     Answer(
         2,
         "the artist's stream goes on through the group",
-        COMPOSITOR,
+        f"{ADDON}bake/placing.py",
         '        tree.links.new(source, node.inputs["Image"])\n',
         "        pass\n",
         f"{TEST}compositor.py::test_artists_nodes_and_links_stay_identical",
@@ -63,14 +63,14 @@ ANSWERS = (
         2,
         "a second bake updates the group",
         COMPOSITOR,
-        "    if node is None:\n        node = _insert_node(tree, before)",
-        "    if True:\n        node = _insert_node(tree, before)",
+        "    if node is None:\n        node = freeze_group.new_node(tree, before)",
+        "    if True:\n        node = freeze_group.new_node(tree, before)",
         f"{TEST}compositor.py::test_second_bake_updates_the_group",
     ),
     Answer(
         2,
         "removal leads the artist's link back",
-        COMPOSITOR,
+        f"{ADDON}bake/placing.py",
         "            tree.links.new(sources[0], target)",
         "            pass",
         f"{TEST}compositor.py::test_removal_restores_the_tree",
@@ -78,7 +78,7 @@ ANSWERS = (
     Answer(
         3,
         "a camera is read frame by frame",
-        CAMERAS,
+        f"{ADDON}freeze/own_camera.py",
         "    scene.frame_set(number)\n",
         "",
         f"{TEST}cameras.py::test_an_artists_camera_is_read_in_solve_units",
@@ -86,7 +86,7 @@ ANSWERS = (
     Answer(
         3,
         "t* is read frame by frame",
-        f"{ADDON}steps.py",
+        f"{ADDON}freeze/takes.py",
         "float(curve.evaluate(n))",
         "float(curve.evaluate(low))",
         f"{TEST}cameras.py::test_a_keyed_instant_is_followed_frame_by_frame",
@@ -94,7 +94,7 @@ ANSWERS = (
     Answer(
         4,
         "the nearer of CG and frozen shows",
-        COMPOSITOR,
+        f"{ADDON}bake/group_inside.py",
         "    group.links.new(cg, ratio.inputs[0])\n    group.links.new(frozen, ratio.inputs[1])\n",
         "    group.links.new(frozen, ratio.inputs[0])\n    group.links.new(cg, ratio.inputs[1])\n",
         f"{TEST}compositor.py::test_cg_stands_in_front_and_behind_by_depth",
@@ -150,7 +150,7 @@ ANSWERS = (
     Answer(
         8,
         "frame n shows plate n",
-        COMPOSITOR,
+        f"{ADDON}scene/sequences.py",
         "    user.frame_offset = first - 1\n",
         "    user.frame_offset = 0\n",
         f"{TEST}cameras.py::test_plate_fits_the_sensor_and_follows_the_frame_numbers",
@@ -166,7 +166,7 @@ ANSWERS = (
     Answer(
         9,
         "a child that was killed has failed",
-        f"{ADDON}jobs.py",
+        f"{ADDON}process/jobs.py",
         '    status.state = "failed"\n    status.exit_code = code',
         '    status.state = "done"\n    status.exit_code = code',
         f"{TEST}jobs.py::test_a_killed_child_leaves_a_status_that_says_so",
@@ -190,7 +190,7 @@ ANSWERS = (
     Answer(
         11,
         "the environment's path is short",
-        f"{ADDON}environment.py",
+        f"{ADDON}process/environment.py",
         '    return Path.home() / ".splannequin"\n',
         '    return Path.home() / "x" * 200\n',
         f"{TEST}environment.py::test_the_folder_is_short",
@@ -198,7 +198,7 @@ ANSWERS = (
     Answer(
         12,
         "a closed session ends its process",
-        f"{ADDON}live.py",
+        f"{ADDON}freeze/live.py",
         "            self._closed = True\n",
         "            pass\n",
         f"{TEST}live.py::test_a_closed_session_leaves_no_process",
@@ -206,7 +206,7 @@ ANSWERS = (
     Answer(
         12,
         "a process that does not end is ended",
-        f"{ADDON}live.py",
+        f"{ADDON}freeze/live.py",
         "            process.kill()\n",
         "            pass\n",
         f"{TEST}live.py::test_a_session_that_hangs_is_ended",
@@ -214,7 +214,7 @@ ANSWERS = (
     Answer(
         13,
         "Cancel reaches the job",
-        f"{ADDON}jobs.py",
+        f"{ADDON}process/jobs.py",
         "        os.close(os.open(flag, os.O_WRONLY | os.O_CREAT | os.O_EXCL))",
         "        pass",
         f"{TEST}jobs.py::test_cancel_ends_a_job",
@@ -222,7 +222,7 @@ ANSWERS = (
     Answer(
         13,
         "a render can be stopped between frames",
-        f"{ADDON}bake.py",
+        f"{ADDON}bake/rendering.py",
         "                check_cancelled()\n",
         "                pass\n",
         f"{TEST}headless.py::test_ctrl_c_while_frames_render_ends_the_bake_with_130",
@@ -230,7 +230,7 @@ ANSWERS = (
     Answer(
         14,
         "running jobs are found again",
-        f"{ADDON}jobs.py",
+        f"{ADDON}process/jobs.py",
         "        found[kind] = job\n",
         "        pass\n",
         f"{TEST}jobs.py::test_another_blender_finds_a_running_job_and_its_end",
@@ -238,7 +238,7 @@ ANSWERS = (
     Answer(
         14,
         "jobs do not end with Blender",
-        f"{ADDON}jobs.py",
+        f"{ADDON}process/children.py",
         '    return {"start_new_session": True}\n',
         "    return {}\n",
         f"{TEST}jobs.py::test_a_child_runs_in_its_own_process_group",
@@ -246,7 +246,7 @@ ANSWERS = (
     Answer(
         15,
         "the module with threads knows no bpy",
-        f"{ADDON}live.py",
+        f"{ADDON}freeze/live.py",
         "import threading\n",
         "import threading\n\nimport bpy  # noqa\n",
         "tests/test_wall.py::test_no_module_of_the_addon_has_both_threads_and_bpy",
@@ -254,7 +254,7 @@ ANSWERS = (
     Answer(
         15,
         "a poll keeps its budget",
-        f"{ADDON}jobs.py",
+        f"{ADDON}process/jobs.py",
         "                if time.monotonic() > until:\n                    return events, False\n",
         "",
         f"{TEST}jobs.py::test_poll_keeps_its_budget_and_loses_nothing",

@@ -45,7 +45,7 @@ def package() -> Iterator[types.ModuleType]:
 
 @pytest.fixture(scope="session")
 def addon(package: types.ModuleType) -> Callable[[str], types.ModuleType]:
-    """addon("jobs") is the add-on's module of that name."""
+    """addon("process.jobs") is the add-on's module of that name."""
     return lambda name: importlib.import_module(f"{package.__name__}.splannequin_addon.{name}")
 
 
@@ -56,7 +56,7 @@ def contract(package: types.ModuleType) -> types.ModuleType:
 
 @pytest.fixture(autouse=True)
 def new_file(package: types.ModuleType, addon) -> None:
-    addon("supervisor").forget()
+    addon("process.supervisor").forget()
     bpy.ops.wm.read_homefile(use_factory_startup=True)
 
 

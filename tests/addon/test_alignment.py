@@ -16,7 +16,7 @@ def turned(seed: int) -> np.ndarray:
 
 @pytest.fixture
 def maths(addon):
-    return addon("alignment")
+    return addon("solve.alignment")
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -70,7 +70,7 @@ def test_what_cannot_be_aligned_is_said(maths, contract):
 
 
 def test_the_first_guess_stands_on_the_floor(addon, contract):
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     tilt = np.radians(25.0)  # looking down on a table: the camera's up leans forward
     right, down = np.array([1.0, 0, 0]), -np.array([0, np.sin(tilt), np.cos(tilt)])
     viewmat = np.eye(4)
@@ -89,7 +89,7 @@ def test_a_solve_stands_on_the_floor_that_it_found(addon, scene, shot):
     file = shot / "solve" / "solve.json"
     normal = np.array([0.1, -0.9, 0.3]) / np.linalg.norm([0.1, -0.9, 0.3])
     file.write_text(json.dumps({**json.loads(file.read_text()), "floor": {"normal": normal.tolist(), "height": 0.7}}))
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     cameras.build(scene, shot)
     root = np.array(cameras.find(scene, shot, "EMPTY").matrix_world)
     np.testing.assert_allclose(root[:3, :3] @ normal, [0, 0, 1], atol=1e-6)
@@ -111,7 +111,7 @@ def test_the_nearest_point_under_the_mouse(maths):
 @pytest.fixture
 def built(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
-    addon("steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     bpy.context.view_layer.update()
     return scene
 
@@ -119,12 +119,12 @@ def built(addon, scene, shot):
 def world(addon, scene, shot) -> np.ndarray:
     """The solve's points where they stand, [P, 3], from the file and the root."""
     bpy.context.view_layer.update()
-    matrix = np.array(addon("cameras").find(scene, shot, "EMPTY").matrix_world, dtype=np.float64)
+    matrix = np.array(addon("solve.cameras").find(scene, shot, "EMPTY").matrix_world, dtype=np.float64)
     return np.load(shot / "solve" / "points.npz")["xyz"] @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def test_the_buttons_turn_move_and_scale_the_root(addon, built, shot):
-    cameras, ops = addon("cameras"), bpy.ops.splannequin
+    cameras, ops = addon("solve.cameras"), bpy.ops.splannequin
     root = cameras.find(built, shot, "EMPTY")
     root.rotation_euler = (0.4, -0.7, 0.2)
     before = world(addon, built, shot)
@@ -161,8 +161,8 @@ def test_selected_objects_serve_as_points(addon, built, shot):
         bpy.ops.splannequin.align_floor(selected=True)
     for empty in empties:
         empty.select_set(True)
-    addon("cameras").find(built, shot, "EMPTY").select_set(True)  # ours does not count
-    root = addon("cameras").find(built, shot, "EMPTY")
+    addon("solve.cameras").find(built, shot, "EMPTY").select_set(True)  # ours does not count
+    root = addon("solve.cameras").find(built, shot, "EMPTY")
     bpy.context.view_layer.update()
     relative = [root.matrix_world.inverted() @ e.matrix_world.translation for e in empties]
     assert bpy.ops.splannequin.align_floor(selected=True) == {"FINISHED"}
@@ -173,19 +173,19 @@ def test_selected_objects_serve_as_points(addon, built, shot):
 
 def test_alignment_is_one_undo_step(addon, built, shot):
     place = world(addon, built, shot)[3]
-    stood = np.array(addon("cameras").find(built, shot, "EMPTY").matrix_world)
+    stood = np.array(addon("solve.cameras").find(built, shot, "EMPTY").matrix_world)
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.splannequin.align_origin("EXEC_DEFAULT", True, places=place) == {"FINISHED"}
     bpy.ops.ed.undo()
-    root = addon("cameras").find(bpy.context.scene, shot, "EMPTY")
+    root = addon("solve.cameras").find(bpy.context.scene, shot, "EMPTY")
     np.testing.assert_allclose(root.matrix_world, stood, atol=1e-6)
 
 
 def test_points_on_a_line_leave_the_root_alone(addon, built, shot):
-    stood = np.array(addon("cameras").find(built, shot, "EMPTY").matrix_world)
+    stood = np.array(addon("solve.cameras").find(built, shot, "EMPTY").matrix_world)
     with pytest.raises(RuntimeError, match="one line"):
         bpy.ops.splannequin.align_floor(places=[0, 0, 0, 1, 1, 1, 2, 2, 2])
-    np.testing.assert_array_equal(addon("cameras").find(built, shot, "EMPTY").matrix_world, stood)
+    np.testing.assert_array_equal(addon("solve.cameras").find(built, shot, "EMPTY").matrix_world, stood)
 
 
 def test_no_solve_no_alignment(scene):
@@ -193,27 +193,33 @@ def test_no_solve_no_alignment(scene):
 
 
 def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, built, shot):
-    bake, compositor, cameras = addon("bake"), addon("compositor"), addon("cameras")
-    panel, state = addon("panel"), addon("shots").read(shot)
-    addon("steps").insert_freeze(built, shot, "freeze")
-    assert compositor.shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
+    cameras = addon("solve.cameras")
+    state = addon("shot.contents").read(shot)
+    addon("bake.insertion").insert_freeze(built, shot, "freeze")
+    assert addon("bake.freeze_group").shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
     places = world(addon, built, shot)[[0, 1]]
     apart = float(np.linalg.norm(places[1] - places[0]))
     bpy.ops.splannequin.align_scale(places=places.ravel(), distance=3 * apart)
-    assert compositor.shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not bake.stale_scale(built, shot)
-    assert "compositor follows" in addon("supervisor").watch_of(shot).notes["camera"][0]
+    assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not addon(
+        "bake.shown_take"
+    ).stale_scale(built, shot)
+    assert "compositor follows" in addon("process.supervisor").watch_of(shot).notes["solve"][0]
     root = cameras.find(built, shot, "EMPTY")
     root.scale = (5.0, 5.0, 5.0)  # by hand
     bpy.context.view_layer.update()
-    assert bake.stale_scale(built, shot)
-    assert any("stale" in line for line in panel.view_bake(built, state).state)
-    addon("steps").insert_freeze(built, shot, "freeze")
-    assert compositor.shown(built)[1] == pytest.approx(5.0) and not bake.stale_scale(built, shot)
-    assert panel.view_bake(built, state).state[0] == "The freeze is in your compositor."
+    assert addon("bake.shown_take").stale_scale(built, shot)
+    assert any("stale" in line for line in addon("process.steps").STEPS["bake"].view(built, state).state)
+    addon("bake.insertion").insert_freeze(built, shot, "freeze")
+    assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(5.0) and not addon(
+        "bake.shown_take"
+    ).stale_scale(built, shot)
+    assert addon("process.steps").STEPS["bake"].view(built, state).state[0] == "The freeze is in your compositor."
     built.frame_set(6)
     graph = bpy.context.evaluated_depsgraph_get()
     camera = built.camera.evaluated_get(graph)
     window = camera.calc_matrix_camera(graph, x=16, y=12)
-    viewmat, _ = cameras.in_solve(built, shot, camera.matrix_world.normalized().inverted(), window, 16, 12)
+    viewmat, _ = addon("freeze.own_camera").in_solve(
+        built, shot, camera.matrix_world.normalized().inverted(), window, 16, 12
+    )
     want = contract.CameraPath.load(shot / "solve" / "cameras.json").frames[1].viewmat
     np.testing.assert_allclose(viewmat, want, atol=1e-4)

@@ -22,7 +22,7 @@ def poses_of(shot: Path) -> tuple[list[dict], int, int]:
 
 
 def test_identity_camera_looks_along_z_with_y_down(addon):
-    matrix = addon("cameras").camera_to_world(np.eye(4))
+    matrix = addon("scene.axes").camera_to_world(np.eye(4))
     # Blender's camera looks along its -z and has y up: in OpenCV's world that is +z and -y.
     np.testing.assert_allclose(matrix @ [0, 0, -1, 0], [0, 0, 1, 0])
     np.testing.assert_allclose(matrix @ [0, 1, 0, 0], [0, -1, 0, 0])
@@ -32,20 +32,20 @@ def test_identity_camera_looks_along_z_with_y_down(addon):
 def test_translation_moves_the_camera_the_other_way(addon):
     viewmat = np.eye(4)
     viewmat[:3, 3] = (1, 2, 3)
-    np.testing.assert_allclose(addon("cameras").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
+    np.testing.assert_allclose(addon("scene.axes").camera_to_world(viewmat)[:3, 3], (-1, -2, -3))
 
 
 def test_blenders_axes_are_y_up_and_z_back(addon):
-    cameras = addon("cameras")
+    addon("solve.cameras")
     turn = np.array([[0, 0, 1, 0.4], [1, 0, 0, -2.0], [0, 1, 0, 7.0], [0, 0, 0, 1]], dtype=np.float64)
-    matrix = cameras.camera_to_world(turn)
+    matrix = addon("scene.axes").camera_to_world(turn)
     np.testing.assert_allclose(np.linalg.inv(matrix @ np.diag([1.0, -1.0, -1.0, 1.0])), turn, atol=1e-12)
 
 
 def test_lens_of_a_centred_and_a_shifted_principal_point(addon):
-    cameras = addon("cameras")
-    assert cameras.lens_from_k((640, 640, 320, 240), 640, 480) == (36.0, 0.0, 0.0)
-    lens, shift_x, shift_y = cameras.lens_from_k((1280, 1280, 330, 220), 640, 480)
+    addon("solve.cameras")
+    assert addon("scene.axes").lens_from_k((640, 640, 320, 240), 640, 480) == (36.0, 0.0, 0.0)
+    lens, shift_x, shift_y = addon("scene.axes").lens_from_k((1280, 1280, 330, 220), 640, 480)
     assert (lens, shift_x, shift_y) == (72.0, -10 / 640, -20 / 640)
 
 
@@ -53,7 +53,7 @@ def test_lens_of_a_centred_and_a_shifted_principal_point(addon):
     ("k", "aspect"), [((500, 500, 0, 0), (1, 1)), ((500, 400, 0, 0), (1, 1.25)), ((400, 500, 0, 0), (1.25, 1))]
 )
 def test_pixel_aspect_stays_above_one(addon, k, aspect):
-    np.testing.assert_allclose(addon("cameras").pixel_aspect(k), aspect)
+    np.testing.assert_allclose(addon("scene.axes").pixel_aspect(k), aspect)
 
 
 @pytest.mark.parametrize("fy", [20.0, 16.0, 25.0])
@@ -63,8 +63,8 @@ def test_points_fall_where_the_solve_says(addon, scene, shot, fy):
         pose["K"][1] = fy
     path = {"version": 1, "width": width, "height": height, "frames": poses}
     (shot / "solve" / "cameras.json").write_text(json.dumps(path))
-    addon("steps").load_camera(scene, shot)
-    root = addon("cameras").find(scene, shot, "EMPTY")
+    addon("solve.arrival").load_camera(scene, shot)
+    root = addon("solve.cameras").find(scene, shot, "EMPTY")
     points = np.load(shot / "solve" / "points.npz")["xyz"].astype(np.float64)
     for pose in poses:
         scene.frame_set(pose["frame"])
@@ -76,7 +76,7 @@ def test_points_fall_where_the_solve_says(addon, scene, shot, fy):
 
 
 def test_keys_lie_on_the_clips_frames_and_are_straight(addon, scene, shot):
-    camera = addon("cameras").build(scene, shot)
+    camera = addon("solve.cameras").build(scene, shot)
     curves = list(addon("compat").fcurves(camera))
     assert len(curves) == 7
     for curve in curves:
@@ -90,7 +90,7 @@ def test_lens_is_keyed_where_it_changes(addon, scene, shot):
     poses[2]["K"] = [30.0, 30.0, 9.0, 5.0]
     path = {"version": 1, "width": width, "height": height, "frames": poses}
     (shot / "solve" / "cameras.json").write_text(json.dumps(path))
-    camera = addon("cameras").build(scene, shot)
+    camera = addon("solve.cameras").build(scene, shot)
     scene.frame_set(5)
     assert camera.data.lens == pytest.approx(20 * 36 / 16)
     scene.frame_set(7)
@@ -107,7 +107,7 @@ def test_quaternions_take_the_short_way(addon, scene, shot):
         frames.append({"frame": n, "viewmat": viewmat.ravel().tolist(), "K": poses[0]["K"]})
     path = {"version": 1, "width": width, "height": height, "frames": frames}
     (shot / "solve" / "cameras.json").write_text(json.dumps(path))
-    camera = addon("cameras").build(scene, shot)
+    camera = addon("solve.cameras").build(scene, shot)
     keys = np.array(
         [[k.co[1] for k in c.keyframe_points] for c in addon("compat").fcurves(camera) if "quat" in c.data_path]
     )
@@ -116,7 +116,7 @@ def test_quaternions_take_the_short_way(addon, scene, shot):
 
 
 def test_plate_fits_the_sensor_and_follows_the_frame_numbers(addon, scene, shot):
-    camera = addon("cameras").build(scene, shot)
+    camera = addon("solve.cameras").build(scene, shot)
     background = camera.data.background_images[0]
     user = background.image_user
     assert camera.data.show_background_images and background.frame_method == "FIT"
@@ -126,8 +126,8 @@ def test_plate_fits_the_sensor_and_follows_the_frame_numbers(addon, scene, shot)
 
 
 def test_points_keep_their_colours(addon, scene, shot):
-    addon("cameras").build(scene, shot)
-    cloud = addon("cameras").find(scene, shot, "MESH")
+    addon("solve.cameras").build(scene, shot)
+    cloud = addon("solve.cameras").find(scene, shot, "MESH")
     stored = np.load(shot / "solve" / "points.npz")
     colour = cloud.data.color_attributes["Col"]
     assert colour.domain == "POINT" and cloud.hide_render
@@ -140,7 +140,7 @@ def test_points_keep_their_colours(addon, scene, shot):
 
 
 def test_second_build_replaces_and_keeps_the_roots_place(addon, scene, shot):
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     cameras.build(scene, shot)
     root = cameras.find(scene, shot, "EMPTY")
     root.scale = (2.0, 2.0, 2.0)
@@ -153,7 +153,7 @@ def test_second_build_replaces_and_keeps_the_roots_place(addon, scene, shot):
     ]
     assert tuple(cameras.find(scene, shot, "EMPTY").location) == (1.0, 2.0, 3.0)
     bpy.context.view_layer.update()
-    assert cameras.depth_scale(scene, shot) == pytest.approx(2.0)
+    assert addon("shot.made").depth_scale(scene, shot) == pytest.approx(2.0)
 
 
 def test_remove_leaves_nothing(addon, scene, shot):
@@ -161,13 +161,13 @@ def test_remove_leaves_nothing(addon, scene, shot):
         kind: set(getattr(bpy.data, kind).keys())
         for kind in ("objects", "cameras", "meshes", "images", "actions", "collections")
     }
-    addon("cameras").build(scene, shot)
-    assert addon("cameras").remove(scene, shot)
+    addon("solve.cameras").build(scene, shot)
+    assert addon("solve.cameras").remove(scene, shot)
     assert names == {kind: set(getattr(bpy.data, kind).keys()) for kind in names}
 
 
 def test_scene_is_upright(addon, scene, shot):
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     camera = cameras.build(scene, shot)
     ups = []
     for frame in (5, 6, 7):
@@ -180,11 +180,11 @@ def test_scene_is_upright(addon, scene, shot):
 def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_path, pictures):
     for item in list(scene.objects):
         bpy.data.objects.remove(item)
-    addon("steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     poses, width, height = poses_of(shot)
     scale = 6  # a picture of 96 x 72, so that a centroid is worth a tenth of a pixel
     scene.render.resolution_x, scene.render.resolution_y = width * scale, height * scale
-    root = addon("cameras").find(scene, shot, "EMPTY")
+    root = addon("solve.cameras").find(scene, shot, "EMPTY")
     point = np.array([[-0.5, 0.2, 0.3]])
     bpy.ops.mesh.primitive_uv_sphere_add(radius=0.05, location=root.matrix_world @ Vector(point[0]))
     glow = bpy.data.materials.new("glow")
@@ -212,10 +212,10 @@ def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_pa
 
 def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     """A camera that copies the solved one, lens included, gives the solve back; its own lens and size are kept."""
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
-    addon("steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     root = cameras.find(scene, shot, "EMPTY")
     root.scale = (2.0, 2.0, 2.0)
     own = bpy.data.objects.new("mine", scene.camera.data.copy())
@@ -223,10 +223,10 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     for kind in ("COPY_LOCATION", "COPY_ROTATION"):
         own.constraints.new(kind).target = scene.camera
     scene.splannequin.path_camera = own
-    assert addon("steps").own_camera(scene) == "mine"
+    assert addon("freeze.own_camera").name_of(scene) == "mine"
     scene.frame_start, scene.frame_end, scene.frame_step = 5, 7, 1
     scene.frame_set(6)
-    path = run_out(cameras.sample_path(scene, "mine", shot, 0))
+    path = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
     want = contract.CameraPath.load(shot / "solve" / "cameras.json")
     assert scene.frame_current == 6
     assert (path.width, path.height) == (want.width, want.height)
@@ -235,17 +235,17 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
         np.testing.assert_allclose(found.viewmat, solved.viewmat, atol=5e-5)
         np.testing.assert_allclose(found.K, solved.K, rtol=1e-4)
     own.data.lens *= 2.0
-    wide = run_out(cameras.sample_path(scene, "mine", shot, 64))
+    wide = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 64))
     assert (wide.width, wide.height) == (64, 48)
     np.testing.assert_allclose(wide.frames[0].K[0], 8 * want.frames[0].K[0], rtol=1e-4)
-    params = addon("steps").freeze_from(scene, wide)
+    params = addon("freeze.takes").freeze_from(scene, wide)
     assert contract.CameraPath.load(params.camera_path) == wide
     assert params.width == 64
     own.data.type = "ORTHO"
     with pytest.raises(contract.JobError, match="mine is not a perspective camera"):
-        run_out(cameras.sample_path(scene, "mine", shot, 0))
+        run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
     scene.splannequin.path_camera = scene.camera
-    assert addon("steps").own_camera(scene) == "", "the clip's own camera is the clip's own move"
+    assert addon("freeze.own_camera").name_of(scene) == "", "the clip's own camera is the clip's own move"
 
 
 def run_out(turns):
@@ -257,31 +257,31 @@ def run_out(turns):
 
 
 def test_a_keyed_instant_is_followed_frame_by_frame(addon, scene, shot):
-    steps = addon("steps")
+    steps = addon("process.steps")
     props = scene.splannequin
     props.shot_path, props.choose_t_star = str(shot), True
     scene.frame_start, scene.frame_end = 5, 9
-    assert steps.params_of(scene, "freeze").t_star_per_frame == {}
+    assert steps.STEPS["freeze"].params(scene).t_star_per_frame == {}
     for frame, value in ((5, 5), (7, 7)):
         props.t_star = value
         assert scene.keyframe_insert("splannequin.t_star", frame=frame)
     for curve in addon("compat").fcurves(scene):
         for key in curve.keyframe_points:
             key.interpolation = "LINEAR"
-    ramp = steps.params_of(scene, "freeze").t_star_per_frame
+    ramp = steps.STEPS["freeze"].params(scene).t_star_per_frame
     assert ramp == {"5": 5.0, "6": 6.0, "7": 7.0, "8": 7.0, "9": 7.0}
     props.choose_t_star = False
-    assert steps.params_of(scene, "freeze").t_star_per_frame == {}
+    assert steps.STEPS["freeze"].params(scene).t_star_per_frame == {}
 
 
 def test_points_keep_their_own_colours(addon, scene, shot):
     """What is drawn over the view: Blender itself draws loose points black, so the object shows its bounds only."""
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     cameras.build(scene, shot)
     cloud = cameras.find(scene, shot, "MESH")
     with np.load(shot / "solve" / "points.npz") as stored:
         xyz, rgb = stored["xyz"], stored["rgb"]
-    places, colours = addon("points").coloured(cloud.data)
+    places, colours = addon("solve.points").coloured(cloud.data)
     np.testing.assert_allclose(places, xyz, atol=1e-6)
     np.testing.assert_allclose(colours[:, :3], rgb / 255.0, atol=1.1 / 255)
     assert cloud.display_type == "BOUNDS"

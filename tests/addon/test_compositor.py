@@ -10,7 +10,7 @@ from mathutils import Vector
 
 @pytest.fixture
 def take(addon, shot):
-    return addon("compositor").take_of(shot / "takes" / "freeze")
+    return addon("bake.take_files").take_of(shot / "takes" / "freeze")
 
 
 @pytest.fixture
@@ -50,48 +50,55 @@ def _plain(value):
 
 
 def test_artists_nodes_and_links_stay_identical(addon, scene, artists_tree, take):
-    compositor = addon("compositor")
+    compositor = addon("bake.compositor")
     nodes, links = snapshot(artists_tree)
     compositor.insert(scene, take)
-    after_nodes, after_links = snapshot(artists_tree, compositor.GROUP_NAME)
+    after_nodes, after_links = snapshot(artists_tree, addon("bake.node_names").GROUP_NAME)
     output = addon("compat").output_socket(artists_tree)
     lost = {link for link in links if link[2:] == (output.node.name, output.identifier)}
     assert after_nodes == nodes
     assert after_links == links - lost and len(lost) == 1
-    group = compositor.group_node(artists_tree)
+    group = addon("bake.freeze_group").group_node(artists_tree)
     assert group.inputs["Image"].links[0].from_node.bl_idname == "CompositorNodeBlur"
     assert output.links[0].from_socket == group.outputs["Image"]
 
 
 def test_second_bake_updates_the_group(addon, scene, artists_tree, take, shot, new_take):
-    compositor = addon("compositor")
+    compositor = addon("bake.compositor")
     compositor.insert(scene, take)
-    group = compositor.group_node(artists_tree)
+    group = addon("bake.freeze_group").group_node(artists_tree)
     group.inputs["Mix"].default_value = 0.25
     before = snapshot(artists_tree)
     counts = len(bpy.data.node_groups), len(bpy.data.images)
-    other = compositor.take_of(new_take(shot, "second"), depth_scale=3.0)
+    other = addon("bake.take_files").take_of(new_take(shot, "second"), depth_scale=3.0)
     said = compositor.insert(scene, other)
     assert snapshot(artists_tree) == before, "Mix and every link around the group stay"
     assert (len(bpy.data.node_groups), len(bpy.data.images)) == counts
-    frozen = compositor.group_node(artists_tree).node_tree.nodes["Frozen"]
+    frozen = addon("bake.freeze_group").group_node(artists_tree).node_tree.nodes["Frozen"]
     assert Path(bpy.path.abspath(frozen.image.filepath)).parent == other.folder
-    assert compositor.group_node(artists_tree).node_tree.nodes["Depth in scene units"].inputs[1].default_value == 3.0
-    assert said == [f'The node group "{compositor.GROUP_NAME}" was updated.']
+    assert (
+        addon("bake.freeze_group")
+        .group_node(artists_tree)
+        .node_tree.nodes["Depth in scene units"]
+        .inputs[1]
+        .default_value
+        == 3.0
+    )
+    assert said == [f'The node group "{addon("bake.node_names").GROUP_NAME}" was updated.']
 
 
 def test_removal_restores_the_tree(addon, scene, artists_tree, take):
     before = snapshot(artists_tree)
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
-    addon("compositor").insert(scene, take)
-    assert addon("compositor").remove(scene)
+    addon("bake.compositor").insert(scene, take)
+    assert addon("bake.compositor").remove(scene)
     assert snapshot(artists_tree) == before
     assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
-    assert not addon("compositor").remove(scene)
+    assert not addon("bake.compositor").remove(scene)
 
 
 def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene, take, shot):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     plate = shot / "frames" / "000005.png"
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     said = compositor.insert(scene, take, plate)
@@ -113,7 +120,7 @@ def test_scene_without_a_tree_gets_a_minimal_one_and_loses_it_again(addon, scene
 
 
 def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, shot):
-    bake = addon("bake")
+    bake = addon("bake.insertion")
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
     assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 1, "the artist's tree shows no plate of ours"
     assert set(bpy.data.node_groups.keys()) == groups
@@ -124,14 +131,14 @@ def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, 
 
 
 def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, shot, tmp_path, pictures):
-    bake, plate = addon("bake"), shot / "frames" / "000005.png"
+    bake, plate = addon("bake.insertion"), shot / "frames" / "000005.png"
     for value in (40, 200):  # the first bake ended without coming in
         pictures.write(plate, np.full((12, 16, 3), value, np.uint8))
         assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 2
     image = next(i for i in bpy.data.images if i.filepath.endswith(".png"))
     assert round(255 * image.pixels[0]) == 200
     bake.insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     node.inputs["Mix"].default_value = 0.0
     render(addon, scene, tmp_path / "out")
     assert np.abs(pictures.read(tmp_path / "out" / "000005.png") * 255 - 200).max() < 0.6
@@ -141,28 +148,28 @@ def test_compositor_that_was_off_is_said_and_put_back(addon, scene, artists_tree
     compat = addon("compat")
     switches = {name: False for name in compat.compositor_switches(scene)}
     compat.restore_compositor_switches(scene, switches)
-    said = addon("compositor").insert(scene, take)
+    said = addon("bake.compositor").insert(scene, take)
     assert compat.compositor_enabled(scene) and "The compositor was switched on." in said
-    addon("compositor").remove(scene)
+    addon("bake.compositor").remove(scene)
     assert not compat.compositor_enabled(scene)
     assert compat.compositor_switches(scene) == switches, "each switch, not just one of them"
 
 
 def test_removal_leaves_a_group_that_another_scene_shows(addon, scene, artists_tree, take):
-    compat, compositor = addon("compat"), addon("compositor")
+    compat, compositor = addon("compat"), addon("bake.compositor")
     compositor.insert(scene, take)
-    group = compositor.group_node(compat.compositor_tree(scene)).node_tree
+    group = addon("bake.freeze_group").group_node(compat.compositor_tree(scene)).node_tree
     other = bpy.data.scenes.new("other")
     compat.new_compositor_tree(other, "other").nodes.new("CompositorNodeGroup").node_tree = group
     assert compositor.remove(scene)
-    shown = compositor.group_node(compat.compositor_tree(other))
+    shown = addon("bake.freeze_group").group_node(compat.compositor_tree(other))
     assert shown is not None and "Frozen" in shown.node_tree.nodes and shown.node_tree.nodes["Frozen"].image
     assert compositor.remove(other) and not any(g.get("splannequin") for g in bpy.data.node_groups)
 
 
 def test_group_offers_what_a_compositor_needs(addon, scene, take):
-    addon("compositor").insert(scene, take)
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    addon("bake.compositor").insert(scene, take)
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     assert [s.name for s in node.inputs] == [
         "Image", "Mix", "Wipe", "Only Supported", "Only Moving", "Splat", "Show What Is Invented", "Grain", "CG",
         "CG Depth",
@@ -174,27 +181,27 @@ def test_group_offers_what_a_compositor_needs(addon, scene, take):
 def test_take_without_frames_is_refused_in_words(addon, scene, shot, contract):
     (shot / "takes" / "empty").mkdir()
     with pytest.raises(contract.JobError, match=r"'empty' .* holds no frozen frames"):
-        addon("bake").insert(scene, shot, "empty")
+        addon("bake.insertion").insert(scene, shot, "empty")
 
 
 def test_size_comes_from_the_exr_header(addon, shot, tmp_path):
-    compositor = addon("compositor")
-    assert compositor.exr_size(shot / "takes" / "freeze" / "000006.exr") == (16, 12)
+    addon("bake.compositor")
+    assert addon("bake.take_files").exr_size(shot / "takes" / "freeze" / "000006.exr") == (16, 12)
     wrong = tmp_path / "wrong.exr"
     wrong.write_bytes(b"no picture")
     with pytest.raises(ValueError, match="no OpenEXR file"):
-        compositor.exr_size(wrong)
+        addon("bake.take_files").exr_size(wrong)
 
 
 def render(addon, scene, folder: Path) -> None:
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 16, 12, 100
     scene.frame_start, scene.frame_end = 5, 7
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("bake").render(scene, folder)
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.rendering").render(scene, folder)
 
 
 def test_rendered_frames_equal_the_exr_within_one_of_255(addon, scene, take, tmp_path, layers, pictures):
-    addon("compositor").insert(scene, take)
+    addon("bake.compositor").insert(scene, take)
     render(addon, scene, tmp_path / "out")
     render(addon, scene, tmp_path / "out")  # the second render finds files and settings of the first
     for frame in (5, 6, 7):
@@ -205,8 +212,8 @@ def test_rendered_frames_equal_the_exr_within_one_of_255(addon, scene, take, tmp
 
 def test_mix_fades_between_plate_and_freeze(addon, scene, take, shot, tmp_path, layers, pictures):
     plate = shot / "frames" / "000005.png"
-    addon("compositor").insert(scene, take, plate)
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    addon("bake.compositor").insert(scene, take, plate)
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     node.inputs["Mix"].default_value = 0.0
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     render(addon, scene, tmp_path / "plate")
@@ -218,12 +225,12 @@ def test_mix_fades_between_plate_and_freeze(addon, scene, take, shot, tmp_path, 
 
 @pytest.mark.parametrize("output", ["Depth", "Support", "Motion"])
 def test_data_layers_arrive_on_the_groups_outputs(addon, scene, take, tmp_path, layers, pictures, output):
-    compositor, compat = addon("compositor"), addon("compat")
-    scaled = compositor.take_of(take.folder, depth_scale=1.0 / 32.0)
+    compositor, compat = addon("bake.compositor"), addon("compat")
+    scaled = addon("bake.take_files").take_of(take.folder, depth_scale=1.0 / 32.0)
     compositor.insert(scene, scaled)
     tree = compat.compositor_tree(scene)
     target = compat.output_socket(tree)
-    tree.links.new(compositor.group_node(tree).outputs[output], target)
+    tree.links.new(addon("bake.freeze_group").group_node(tree).outputs[output], target)
     render(addon, scene, tmp_path)
     for frame in (5, 7):
         value = layers(frame)[output.lower()]
@@ -235,12 +242,12 @@ def test_data_layers_arrive_on_the_groups_outputs(addon, scene, take, tmp_path, 
 @pytest.mark.parametrize("mix", [0.0, 1.0])
 def test_frames_of_another_size_are_fitted(addon, scene, take, shot, tmp_path, layers, pictures, mix):
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 32, 24, 100
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.compositor").insert(scene, take, shot / "frames" / "000005.png")
     tree = addon("compat").compositor_tree(scene)
-    addon("compositor").group_node(tree).inputs["Mix"].default_value = mix
+    addon("bake.freeze_group").group_node(tree).inputs["Mix"].default_value = mix
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path)
+    addon("bake.rendering").render(scene, tmp_path)
     found = pictures.read(tmp_path / "000006.png")
     assert found.shape == (24, 32, 3)
     plate = pictures.read(shot / "frames" / "000006.png")
@@ -262,7 +269,7 @@ def graded(addon, scene, shot):
         if kind == "CompositorNodeImage":
             plate.image = bpy.data.images.load(str(file))
             plate.image.source = "SEQUENCE"
-            addon("compositor").show_sequence(plate, plate.image, 5, 7)
+            addon("scene.sequences").show_sequence(plate, plate.image, 5, 7)
         else:
             plate.clip = bpy.data.movieclips.load(str(file))
         brighter = tree.nodes.new("CompositorNodeExposure")
@@ -279,21 +286,23 @@ def graded(addon, scene, shot):
 def test_behind_a_plate_the_grade_goes_on_from_the_frozen_frame(addon, scene, shot, graded, tmp_path, layers, pictures):
     tree, plate = graded(shot / "frames" / "000005.png")
     before = snapshot(tree)
-    said = addon("bake").insert(scene, shot, "freeze")
+    said = addon("bake.insertion").insert(scene, shot, "freeze")
     assert "as the plate" in said[0]
-    compositor = addon("compositor")
-    node = compositor.group_node(tree)
-    nodes, links = snapshot(tree, compositor.GROUP_NAME)
+    compositor = addon("bake.compositor")
+    node = addon("bake.freeze_group").group_node(tree)
+    nodes, links = snapshot(tree, addon("bake.node_names").GROUP_NAME)
     assert nodes == before[0] and len(before[1] - links) == 2 and not links - before[1]
     assert [link.to_node for link in plate.outputs["Image"].links] == [node]
     kinds = {link.to_node.bl_idname for link in node.outputs["Image"].links}
     assert kinds == {"CompositorNodeExposure", "CompositorNodeBlur"}
-    assert compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))[0].endswith("was updated.")
+    assert compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "freeze"))[0].endswith(
+        "was updated."
+    )
     assert [link.to_node for link in plate.outputs["Image"].links] == [node]
     render(addon, scene, tmp_path / "out")
     found = pictures.read(tmp_path / "out" / "000006.png")
     assert np.abs(found - pictures.srgb(4.0 * layers(6)["rgba"][..., :3])).max() * 255 < 1.1
-    assert addon("bake").remove(scene) and snapshot(tree) == before, "the links too"
+    assert addon("bake.insertion").remove(scene) and snapshot(tree) == before, "the links too"
 
 
 @pytest.mark.parametrize(
@@ -309,8 +318,8 @@ def test_a_plate_is_known_by_the_clips_file(addon, scene, shot, graded, tmp_path
         pictures.write(tmp_path / name.replace("####", f"{n:04d}"), np.zeros((12, 16, 3), np.uint8))
     tree, plate = graded(tmp_path / name.replace("####", "0005"), kind)
     scene.splannequin.clip = str(tmp_path / "clip.####.png")
-    addon("bake").insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(tree)
+    addon("bake.insertion").insert(scene, shot, "freeze")
+    node = addon("bake.freeze_group").group_node(tree)
     assert (plate.outputs["Image"].links[0].to_node == node) == behind
     assert (addon("compat").output_socket(tree).links[0].from_node == node) != behind
 
@@ -318,7 +327,7 @@ def test_a_plate_is_known_by_the_clips_file(addon, scene, shot, graded, tmp_path
 def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene, shot, graded, tmp_path, pictures):
     pictures.write(tmp_path / "a 0005.png", np.zeros((12, 16, 3), np.uint8))
     tree, plate = graded(tmp_path / "a 0005.png")
-    before, bake, props = snapshot(tree), addon("bake"), scene.splannequin
+    before, bake, props = snapshot(tree), addon("bake.insertion"), scene.splannequin
     output = addon("compat").output_socket(tree)
     other = tree.nodes.new("CompositorNodeImage")
     over = tree.nodes.new("CompositorNodeAlphaOver")
@@ -327,11 +336,11 @@ def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene,
     tree.nodes.active = None
     props.insert_at = "PLATE"
     bake.insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(tree)
+    node = addon("bake.freeze_group").group_node(tree)
     assert plate.outputs["Image"].links[0].to_node == node, "the only one that gets to the output"
     props.insert_at, node.inputs["Mix"].default_value = "OUTPUT", 0.25
     assert any("was moved" in line for line in bake.insert(scene, shot, "freeze"))
-    node = addon("compositor").group_node(tree)
+    node = addon("bake.freeze_group").group_node(tree)
     assert output.links[0].from_node == node and node.inputs["Mix"].default_value == 0.25
     assert not [link for link in plate.outputs["Image"].links if link.to_node == node]
     bake.remove(scene)
@@ -343,7 +352,7 @@ def test_where_the_freeze_goes_can_be_chosen_and_changed(addon, contract, scene,
     props.insert_at, bare = "PLATE", snapshot(tree)
     with pytest.raises(contract.JobError, match="No node of this compositor shows the plate"):
         bake.insert(scene, shot, "freeze")
-    assert snapshot(tree) == bare and addon("compositor").group_node(tree) is None
+    assert snapshot(tree) == bare and addon("bake.freeze_group").group_node(tree) is None
 
 
 def test_a_plate_of_another_size_is_taken_where_it_has_the_renders(addon, scene, shot, graded):
@@ -356,14 +365,14 @@ def test_a_plate_of_another_size_is_taken_where_it_has_the_renders(addon, scene,
         tree.links.new(fit.outputs[0], target)
     before = snapshot(tree)
     scene.render.resolution_x, scene.render.resolution_y = 32, 24
-    addon("bake").insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(tree)
+    addon("bake.insertion").insert(scene, shot, "freeze")
+    node = addon("bake.freeze_group").group_node(tree)
     assert [link.to_node for link in fit.outputs[0].links] == [node] and len(node.outputs["Image"].links) == 2
-    addon("bake").remove(scene)
+    addon("bake.insertion").remove(scene)
     assert snapshot(tree) == before
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
-    addon("bake").insert(scene, shot, "freeze")
-    node = addon("compositor").group_node(tree)
+    addon("bake.insertion").insert(scene, shot, "freeze")
+    node = addon("bake.freeze_group").group_node(tree)
     assert plate.outputs["Image"].links[0].to_node == node, "a scale that the artist wants, of the frozen frame too"
 
 
@@ -375,13 +384,13 @@ def test_a_take_fills_the_frame_at_any_percentage(
     """Inserted at one percentage, rendered at another: half of 32 x 24 pixel by pixel, all of it to the border."""
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = 32, 24, baked
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.compositor").insert(scene, take, shot / "frames" / "000005.png")
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     node.inputs["Mix"].default_value = mix
     render.resolution_percentage = rendered
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path)
+    addon("bake.rendering").render(scene, tmp_path)
     found = pictures.read(tmp_path / "000006.png")
     plate = pictures.read(shot / "frames" / "000006.png")
     expected = pictures.srgb(layers(6)["rgba"][..., :3]) if mix else plate
@@ -405,10 +414,10 @@ def test_a_take_of_another_shape_fits_the_width_as_the_camera_sees_it(
 ):
     """Cut above and below in a wider frame, bars in a higher one: against the nearest pixels."""
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("compositor").insert(scene, take, shot / "frames" / "000005.png")
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.compositor").insert(scene, take, shot / "frames" / "000005.png")
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path)
+    addon("bake.rendering").render(scene, tmp_path)
     found = pictures.read(tmp_path / "000006.png")
     scale = width / 16.0
     y = (np.arange(height) + 0.5 - height / 2) / scale + 6.0
@@ -422,10 +431,10 @@ def test_a_take_of_another_shape_fits_the_width_as_the_camera_sees_it(
 
 
 def test_only_moving_leaves_cg_where_nothing_moves(addon, scene, take, shot, tmp_path, layers, pictures):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     compositor.insert(scene, take, shot / "frames" / "000005.png")
-    node = compositor.group_node(compat.compositor_tree(scene))
+    node = addon("bake.freeze_group").group_node(compat.compositor_tree(scene))
     green = np.array([0.0, 1.0, 0.0, 1.0])
     node.inputs["CG"].default_value, node.inputs["CG Depth"].default_value = tuple(green), 12.0
     data = layers(6)
@@ -457,9 +466,9 @@ def in_front(cg: float | np.ndarray, frozen: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("alpha", [1.0, 0.5])
 def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, layers, pictures, alpha):
     """A wall of CG at depth 12 among frames whose depth grows downwards: pixel by pixel the nearer is in front."""
-    compositor, compat = addon("compositor"), addon("compat")
-    compositor.insert(scene, compositor.take_of(take.folder, depth_scale=2.0))
-    node = compositor.group_node(compat.compositor_tree(scene))
+    compositor, compat = addon("bake.compositor"), addon("compat")
+    compositor.insert(scene, addon("bake.take_files").take_of(take.folder, depth_scale=2.0))
+    node = addon("bake.freeze_group").group_node(compat.compositor_tree(scene))
     wall = np.array([0.5, 0.25, 0.0, 1.0], np.float32) * alpha
     node.inputs["CG"].default_value, node.inputs["CG Depth"].default_value = tuple(wall), 24.0
     render(addon, scene, tmp_path / "out")
@@ -474,10 +483,10 @@ def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, la
 
 
 def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_path, layers, pictures):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     compositor.insert(scene, take, shot / "frames" / "000005.png")
-    node = compositor.group_node(compat.compositor_tree(scene))
+    node = addon("bake.freeze_group").group_node(compat.compositor_tree(scene))
     frozen, support = layers(6)["rgba"], layers(6)["support"]
     plate = pictures.read(shot / "frames" / "000006.png")
     linear = np.where(plate <= 0.04045, plate / 12.92, ((plate + 0.055) / 1.055) ** 2.4)
@@ -500,18 +509,18 @@ def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_pat
 
 def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, scene, take, shot, tmp_path, pictures):
     """The scene's own render, through its own depth pass, from the solved camera."""
-    steps, compat = addon("steps"), addon("compat")
+    compat = addon("compat")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
-    steps.load_camera(scene, shot)
-    steps.insert_freeze(scene, shot, "freeze")
+    addon("solve.arrival").load_camera(scene, shot)
+    addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     settings = scene.render.film_transparent, scene.view_layers[0].use_pass_z
     tree = compat.compositor_tree(scene)
     nodes = len(tree.nodes)
-    said = steps.combine_cg(scene, shot)
+    said = addon("bake.insertion").combine_cg(scene, shot)
     assert "by depth" in said[0] and len(tree.nodes) == nodes + 1
     with pytest.raises(Exception, match="already"):
-        steps.combine_cg(scene, shot)
+        addon("bake.insertion").combine_cg(scene, shot)
     scene.frame_set(6)
     for other in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
         bpy.data.objects.remove(other)
@@ -532,14 +541,14 @@ def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, sce
     wall.rotation_quaternion = camera.to_quaternion()
     wall.location = camera @ Vector((0.0, 0.0, -12.0))  # facing the camera, 12 in front of it
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path / "out")
+    addon("bake.rendering").render(scene, tmp_path / "out")
     found = pictures.read(tmp_path / "out" / "000006.png")
     depth = make_depth(6)
     green = (found[..., 1] > 0.99) & (found[..., 0] < 0.01)
     sure = np.abs(depth - 12.0) > 0.05
     assert (green == (depth > 12.0))[sure & (np.arange(16) > 0)[None, :]].all()
     assert 10 < green.sum() < 150
-    steps.remove_all(scene, shot)
+    addon("process.begin").remove_all(scene, shot)
     assert (scene.render.film_transparent, scene.view_layers[0].use_pass_z) == settings
 
 
@@ -550,12 +559,12 @@ EDGE = 7.7
 @pytest.mark.parametrize("far", [3.0, 12.0, 60.0])
 def test_a_half_covered_edge_of_cg_is_blended_by_its_coverage(addon, scene, shot, tmp_path, pictures, layers, far):
     """A wall rendered in front of all that is frozen, within it and behind it, against the composite worked out."""
-    steps, cameras = addon("steps"), addon("cameras")
+    cameras = addon("solve.cameras")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
-    steps.load_camera(scene, shot)
-    steps.insert_freeze(scene, shot, "freeze")
-    steps.combine_cg(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
+    addon("bake.insertion").insert_freeze(scene, shot, "freeze")
+    addon("bake.insertion").combine_cg(scene, shot)
     scene.frame_set(6)
     for other in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
         bpy.data.objects.remove(other)
@@ -577,7 +586,7 @@ def test_a_half_covered_edge_of_cg_is_blended_by_its_coverage(addon, scene, shot
     wall.rotation_quaternion = camera.to_quaternion()
     wall.location = camera @ Vector(((EDGE - 9.0) / 20.0 * far + 200.0, 0.0, -far))  # K: f 20, middle 9
     scene.frame_start = scene.frame_end = 6
-    addon("bake").render(scene, tmp_path / "out")
+    addon("bake.rendering").render(scene, tmp_path / "out")
     covered = np.clip(np.arange(16) + 1.0 - EDGE, 0.0, 1.0)[None, :, None]
     frozen, nearer = layers(6)["rgba"], in_front(far, layers(6)["depth"])
     cg = np.broadcast_to(covered * np.array([0.0, 1.0, 0.0, 1.0]), frozen.shape)

@@ -22,7 +22,7 @@ WEIRD = [
 def full_shot(addon, contract, shot) -> Path:
     """The test shot with a paused run, measurements, and a job of every kind that has ended."""
     (shot / "runs" / "main" / "metrics.jsonl").write_text('{"seconds": 1.0, "heldout_psnr_db": 20.0}\n' * 3)
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     for kind, cls in contract.PARAMS.items():
         folder = jobs.new_job(shot, kind, cls()).folder
         status = {"kind": kind, "state": "done", "pid": 1, "started": 1.0, "process_started": 2.0, "heartbeat": 2.0}
@@ -47,23 +47,28 @@ def files_of(shot: Path) -> list[Path]:
 @pytest.fixture
 def look(addon, scene):
     """look(shot) does all that Blender does with a shot that is chosen, and returns every text that it would draw."""
-    supervisor, jobs, panel, listing = addon("supervisor"), addon("jobs"), addon("panel"), addon("listing")
+    supervisor, jobs, steps, listing = (
+        addon("process.supervisor"),
+        addon("process.jobs"),
+        addon("process.steps").STEPS,
+        addon("ui.listing"),
+    )
 
     def all_of(shot: Path) -> list[str]:
         supervisor.forget()
         scene.splannequin.shot_path = str(shot)
         watch = supervisor.watch_of(shot)
         texts = [words for failure in watch.failures.values() for words in failure]
-        for name, view in panel.VIEWS.items():
-            shown = view(scene, watch.state)
+        for name, step in steps.items():
+            shown = step.view(scene, watch.state)
             texts += [*shown.state, shown.advice, name]
         for row in listing.run_rows(watch.state) + listing.take_rows(watch.state):
             texts += row
         texts += [told for damaged in watch.state.damaged.values() for told in damaged.values()]
-        addon("training").plan(watch.state, "main", "preview")
+        addon("train.training").plan(watch.state, "main", "preview")
         for run in watch.state.runs.values():
             if len(run["history"]) > 1:
-                addon("pictures").curve(run["history"], (64, 32))
+                addon("train.pictures").curve(run["history"], (64, 32))
         for job in jobs.latest(shot).values():
             job.status = None
             jobs.poll(job)
@@ -71,8 +76,10 @@ def look(addon, scene):
             if job.status is not None:
                 texts += [job.status.message, job.status.stage, job.status.hint]
             texts += [words for warning in job.warnings for words in warning]
-        for kind in ("runs", "takes"):
-            texts += [words for pair in addon("props").names_of(scene.splannequin, kind) for words in pair]
+        names = addon("train.settings").runs_of(scene.splannequin) + addon("freeze.settings").takes_of(
+            scene.splannequin
+        )
+        texts += [words for pair in names for words in pair]
         return texts
 
     return all_of
@@ -80,7 +87,7 @@ def look(addon, scene):
 
 def test_a_whole_shot_is_not_damaged(look, full_shot, addon):
     assert not any("damaged" in text or "cannot be read" in text for text in look(full_shot))
-    state = addon("shots").read(full_shot)
+    state = addon("shot.contents").read(full_shot)
     assert state.listed("run") == ["main"] and state.listed("take") == ["freeze"] and len(state.runs["main"]["history"])
 
 
@@ -151,7 +158,7 @@ def test_files_that_are_none_hold_nothing_up(look, full_shot, what, tmp_path):
 
 
 def test_a_damaged_run_and_take_are_shown_as_such(look, full_shot, addon):
-    shots, listing = addon("shots"), addon("listing")
+    shots, listing = addon("shot.contents"), addon("ui.listing")
     for file in (RUN, TAKE):
         told = json.loads((full_shot / file).read_text())
         (full_shot / file).write_text(json.dumps({**told, "run": ["main"]}))
@@ -167,11 +174,11 @@ def test_folders_that_cannot_be_shown_are_no_runs(full_shot, addon):
     for name in names if sys.platform == "linux" else names[1:2]:
         (full_shot / "runs" / name).mkdir()
         (full_shot / "runs" / name / "summary.json").write_text('{"gaussians": 3}')
-    assert addon("shots").read(full_shot).listed("run") == ["main"]
+    assert addon("shot.contents").read(full_shot).listed("run") == ["main"]
 
 
 def test_a_line_without_end_does_not_fill_the_memory(full_shot, addon, contract):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = next(job for job in jobs.latest(full_shot).values() if job.kind == "train")
     with open(job.folder / "events.jsonl", "r+b") as events:
         events.truncate(1 << 40)  # a hole: no disk is used

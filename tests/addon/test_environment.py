@@ -20,7 +20,7 @@ def run_out(environment, setup, seconds=180.0):
 def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(
     addon, root, tmp_path, monkeypatch, hostile
 ):
-    environment = addon("environment")
+    environment = addon("process.environment")
     trap = hostile(tmp_path, tmp_path / "bäckend")  # modules where a child could stand: none is imported
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
@@ -42,7 +42,7 @@ def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(
 
 
 def test_a_cancelled_set_up_ends(addon, root, tmp_path):
-    environment = addon("environment")
+    environment = addon("process.environment")
     setup = environment.start(tmp_path / "b", sys.executable, root)
     environment.cancel(setup)
     run_out(environment, setup)
@@ -52,13 +52,13 @@ def test_a_cancelled_set_up_ends(addon, root, tmp_path):
 def test_a_folder_that_cannot_be_is_named(addon, contract, root, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(contract.JobError, match="cannot be set up in"):
-        addon("environment").start(tmp_path / "file" / "b", sys.executable, root)
+        addon("process.environment").start(tmp_path / "file" / "b", sys.executable, root)
 
 
 def test_what_is_not_ours_is_not_removed(addon, tmp_path):
     (tmp_path / ".venv").mkdir()
     with pytest.raises(ValueError, match="was not made by Splannequin"):
-        addon("environment").remove(tmp_path)
+        addon("process.environment").remove(tmp_path)
     assert (tmp_path / ".venv").is_dir()
 
 
@@ -69,18 +69,18 @@ def test_the_button_needs_leave_to_go_online(addon):
 def test_check_says_what_the_backend_can_do(addon):
     """The real backend's doctor, in words."""
     assert bpy.ops.splannequin.check_backend() == {"FINISHED"}
-    lines = addon("preferences")._findings
+    lines = addon("ui.preferences")._findings
     assert "torch 2." in lines[0]
     assert lines[1].startswith("Trains on")
 
 
 def test_the_folder_is_short(addon):
-    assert len(str(addon("environment").default_folder())) < len(str(Path.home())) + 20
+    assert len(str(addon("process.environment").default_folder())) < len(str(Path.home())) + 20
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the card is looked for by a program that a script stands in for")
 def test_torch_comes_with_cuda_only_where_there_is_a_card(addon, tmp_path, monkeypatch):
-    environment = addon("environment")
+    environment = addon("process.environment")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert environment.torch_index() == (environment.CPU_INDEX if sys.platform == "linux" else "")
     card = tmp_path / "nvidia-smi"

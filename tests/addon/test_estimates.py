@@ -14,8 +14,8 @@ def costs(addon, tmp_path):
     """costs(runs, width) is {preset: cost} for a shot of that width, and the run that tells it."""
 
     def call(runs, width=1280):
-        state = addon("shots").ShotState(tmp_path, {"width": width, "height": 720}, runs=runs)
-        rows, told = addon("estimates").costs(state)
+        state = addon("shot.shot_state").ShotState(tmp_path, {"width": width, "height": 720}, runs=runs)
+        rows, told = addon("train.estimates").costs(state)
         return {row.preset: row for row in rows}, told
 
     return call
@@ -28,7 +28,7 @@ def test_without_a_timed_run_nothing_is_promised(costs, addon, contract):
     assert {n: (r.steps, r.width) for n, r in rows.items()} == {
         n: (contract.PRESET_STEPS[n], contract.PRESET_WIDTHS[n]) for n in ("preview", "standard", "final")
     }
-    assert addon("estimates").costs(None)[1] is None
+    assert addon("train.estimates").costs(None)[1] is None
 
 
 def test_a_preset_that_was_run_takes_as_long_again_and_others_by_pixels_and_steps(costs):
@@ -54,7 +54,7 @@ def test_a_small_clip_is_not_enlarged(costs):
 
 
 def test_a_tooltip_tells_what_the_preset_is(addon, contract):
-    for name, _, words in addon("props").PRESETS:
+    for name, _, words in addon("train.settings").PRESETS:
         assert words.startswith(f"{contract.PRESET_WIDTHS[name]} pixels wide, {contract.PRESET_STEPS[name]} steps")
 
 
@@ -62,12 +62,12 @@ def test_a_tooltip_tells_what_the_preset_is(addon, contract):
 def test_the_scale_is_asked_for_until_it_was_set(addon, scene, shot, by_hand):
     scene.splannequin.shot_path = str(shot)
     bpy.ops.splannequin.load_camera()
-    scaled = addon("ops_align").scaled
+    scaled = addon("solve.align_operators").scaled
     assert not scaled(scene, shot)
     bpy.ops.splannequin.align_origin(places=(0.5, 0, 0))
     assert not scaled(scene, shot)
     if by_hand:
-        addon("cameras").find(scene, shot, "EMPTY").scale = (2.0, 2.0, 2.0)
+        addon("solve.cameras").find(scene, shot, "EMPTY").scale = (2.0, 2.0, 2.0)
         bpy.context.view_layer.update()
     else:
         places = np.array([[0, 0, 0], [1, 0, 0]], dtype=float)

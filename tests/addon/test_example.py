@@ -65,7 +65,7 @@ def test_the_shipped_example_opens_and_names_its_frames_relative_to_itself(root,
     for image in bpy.data.images:
         if image.source == "SEQUENCE":
             assert image.filepath.startswith("//") and demo in absolute(image.filepath).parents
-    assert addon("cameras").find(scene, demo, "CAMERA") == scene.camera
-    assert len(addon("cameras").find(scene, demo, "MESH").data.vertices) > 1000
-    assert addon("compositor").group_node(addon("compat").compositor_tree(scene)) is not None
+    assert addon("solve.cameras").find(scene, demo, "CAMERA") == scene.camera
+    assert len(addon("solve.cameras").find(scene, demo, "MESH").data.vertices) > 1000
+    assert addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene)) is not None
     assert (scene.frame_start, scene.frame_end) == (1, 74)

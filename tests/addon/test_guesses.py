@@ -27,7 +27,7 @@ def path_of(contract, sources: str):
 )
 def test_ranges_of_frames_that_failed(addon, contract, sources, left_out, ranges):
     solved = set(range(1, len(sources) + 1)) - set(left_out)
-    assert addon("guesses").ranges(path_of(contract, sources), solved) == ranges
+    assert addon("solve.guesses").ranges(path_of(contract, sources), solved) == ranges
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def marked(scene) -> list[tuple[str, int]]:
 
 
 def test_keys_of_guesses_have_their_own_colour(addon, failed, shot):
-    camera = addon("cameras").build(failed, shot)
+    camera = addon("solve.cameras").build(failed, shot)
     want = ["KEYFRAME"] * 2 + ["EXTREME"] * 3 + ["JITTER", "KEYFRAME", "EXTREME"]
     for curve in addon("compat").fcurves(camera):
         assert [key.type for key in curve.keyframe_points] == want
@@ -60,13 +60,13 @@ def test_keys_of_guesses_have_their_own_colour(addon, failed, shot):
 
 def test_markers_come_and_go_with_the_shot_and_the_artists_stay(addon, failed, shot):
     failed.timeline_markers.new("mine", frame=7)
-    addon("steps").load_camera(failed, shot)
+    addon("solve.arrival").load_camera(failed, shot)
     assert marked(failed) == [("mine", 7), ("no solve 12", 12), ("no solve 7-9", 7)]
-    addon("steps").load_camera(failed, shot)
+    addon("solve.arrival").load_camera(failed, shot)
     assert len(marked(failed)) == 3, "a second load does not double them"
     failed.timeline_markers["no solve 12"].frame = 13
     failed.timeline_markers.new("no solve 7-9", frame=20)
-    addon("steps").remove_all(failed, shot)
+    addon("process.begin").remove_all(failed, shot)
     assert marked(failed) == [("mine", 7), ("no solve 12", 13), ("no solve 7-9", 20)]
 
 
@@ -76,7 +76,7 @@ def test_markers_are_part_of_the_undo_step_and_of_the_file(addon, failed, shot, 
     assert len(bpy.context.scene.timeline_markers) == 2
     bpy.ops.ed.undo()
     assert not len(bpy.context.scene.timeline_markers)
-    addon("steps").load_camera(bpy.context.scene, shot)
+    addon("solve.arrival").load_camera(bpy.context.scene, shot)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.splannequin.remove_shot()
@@ -84,5 +84,5 @@ def test_markers_are_part_of_the_undo_step_and_of_the_file(addon, failed, shot, 
 
 
 def test_the_camera_step_says_how_many_are_guesses(addon, failed, shot):
-    lines = addon("panel").view_camera(failed, addon("shots").read(shot)).state
+    lines = addon("process.steps").STEPS["solve"].view(failed, addon("shot.contents").read(shot)).state
     assert lines == ["A poor solve.", "4 of 8 frames have a guessed camera: pink keys on the timeline."]

@@ -68,7 +68,7 @@ def test_no_keymap_is_touched(package, root):
 
 def test_the_search_finds_every_operator(addon):
     """It finds what stands in a menu."""
-    menu = addon("menu")
+    menu = addon("ui.menu")
     listed = [name for group in menu.entries() for name in group]
     assert len(set(listed)) == len(listed)
     assert {*listed, "use_movie_clip"} == menu.searchable()
@@ -78,7 +78,7 @@ def test_the_search_finds_every_operator(addon):
 
 
 def test_an_operator_that_is_in_no_group_of_the_menu_comes_last(addon, monkeypatch):
-    menu = addon("menu")
+    menu = addon("ui.menu")
     monkeypatch.setattr(menu, "_GROUPS", (("bake",),))
     first, rest = menu.entries()
     assert first == ["bake"] and "train" in rest and rest == sorted(rest)
@@ -100,8 +100,8 @@ def icons_in(tree: ast.AST) -> set[str]:
 
 def test_icons_exist_in_this_blender(addon, root):
     known = set(bpy.types.UILayout.bl_rna.functions["prop"].parameters["icon"].enum_items.keys())
-    used = set(addon("icons").OF.values())
-    for path in (root / "splannequin_addon").glob("*.py"):
+    used = set(addon("ui.icons").OF.values())
+    for path in (root / "splannequin_addon").rglob("*.py"):
         used |= icons_in(ast.parse(path.read_text(encoding="utf-8")))
     assert {"CHECKMARK", "INFO", "FREEZE"} <= used
     used.discard("WARNING")  # a dialog's, of which there are others
@@ -109,7 +109,7 @@ def test_icons_exist_in_this_blender(addon, root):
 
 
 def test_every_operator_has_an_icon(addon):
-    assert set(addon("icons").OF) == {f"splannequin.{name}" for name in operators()}
+    assert set(addon("ui.icons").OF) == {f"splannequin.{name}" for name in operators()}
 
 
 def test_a_video_from_the_menu_is_chosen_in_the_file_browser_and_a_dropped_one_at_once(scene, tmp_path):

@@ -20,7 +20,7 @@ def run(addon, capfd):
 
     def call(*arguments) -> tuple[int, str, str]:
         capfd.readouterr()
-        code = addon("headless").main([str(a) for a in arguments])
+        code = addon("command_line.headless").main([str(a) for a in arguments])
         out, err = capfd.readouterr()
         return code, out, err
 
@@ -185,7 +185,9 @@ def told_of(parser: argparse.ArgumentParser, command: str, to_the_launcher: set[
 @pytest.mark.parametrize("command", ["import", "solve", "train", "freeze"])
 def test_both_command_lines_print_the_same_options(addon, package, command):
     backend = importlib.import_module(f"{package.__name__}.torch_backend.cli")
-    ours = told_of(addon("headless").parser(), command, {"shot", "--shot-name", "--output", "--json", "--blend"})
+    ours = told_of(
+        addon("command_line.headless").parser(), command, {"shot", "--shot-name", "--output", "--json", "--blend"}
+    )
     theirs = told_of(backend.parser(), command, {"shot", "--shot-name", "--output"})
     if "--device" in ours:  # here the preferences are asked where nothing is said
         said, choices, default, value = ours["--device"]
@@ -195,8 +197,8 @@ def test_both_command_lines_print_the_same_options(addon, package, command):
 
 
 def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tmp_path):
-    headless = addon("headless")
-    monkeypatch.setattr(addon("backend"), "device", lambda: "cpu")  # as the preferences say
+    headless = addon("command_line.headless")
+    monkeypatch.setattr(addon("process.backend"), "device", lambda: "cpu")  # as the preferences say
 
     def asked(*words):
         return headless.asked(headless.parser().parse_args([str(w) for w in words]))

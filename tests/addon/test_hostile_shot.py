@@ -22,7 +22,7 @@ def ended(job, jobs):
 
 
 def test_scrubbing(addon, trap, shot, root):
-    session = addon("live").open_session(shot, "nothing", addon("backend").python(), root)
+    session = addon("freeze.live").open_session(shot, "nothing", addon("process.backend").python(), root)
     until = time.monotonic() + 120
     while session.open and time.monotonic() < until:
         time.sleep(0.05)
@@ -31,26 +31,26 @@ def test_scrubbing(addon, trap, shot, root):
 
 
 def test_st_maps(addon, contract, trap, shot):
-    asked = addon("stmaps").begin(shot)
+    asked = addon("solve.stmaps").begin(shot)
     asked.wait()
     with pytest.raises(contract.JobError):  # the shot has no lens
-        asked.answer()
+        addon("solve.stmaps").answer(asked)
     assert not trap.exists(), trap.read_text()
 
 
 def test_exported_cameras(addon, trap, shot):
-    solves = addon("solves")
-    process = solves.begin_export(shot, "nerfstudio", shot / "out")
-    assert str(shot / "out") in solves.finish_export(process, shot / "out")
+    solves = addon("solve.exchange")
+    asked = solves.begin_export(shot, "nerfstudio", shot / "out")
+    assert str(shot / "out") in solves.exported(asked, shot / "out")
     assert (shot / "out" / "transforms.json").is_file()
     assert not trap.exists(), trap.read_text()
 
 
 def test_a_job(addon, contract, trap, hostile, shot, root):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(shot, "import", contract.ImportParams(str(shot / "no clip.mp4")))
     hostile(job.folder, shot)
-    jobs.start(job, addon("backend").python(), root)
+    jobs.start(job, addon("process.backend").python(), root)
     status = ended(job, jobs)
     assert (status.state, status.exit_code) == ("failed", contract.ExitCode.FOOTAGE)
     assert not trap.exists(), trap.read_text()
@@ -58,7 +58,7 @@ def test_a_job(addon, contract, trap, hostile, shot, root):
 
 def test_a_child_stands_beside_its_interpreter(addon, contract):
     """Windows looks for libraries where it stands, and keeps that folder from being moved."""
-    python = addon("backend").python()
+    python = addon("process.backend").python()
     child = contract.python_child(python, "torch_backend", "doctor")
     assert child["cwd"] == os.path.dirname(os.path.abspath(python))
 

@@ -15,13 +15,13 @@ import pytest
 @pytest.fixture(scope="session")
 def python(addon) -> str:
     """The backend's Python. These tests need one: no backend is a failure, not a reason to skip."""
-    return addon("backend").python()
+    return addon("process.backend").python()
 
 
 @pytest.fixture
 def empty_shot(addon, tmp_path: Path) -> Path:
     folder = tmp_path / "ünï shot.splannequin"
-    addon("shots").create(folder)
+    addon("shot.contents").create(folder)
     return folder
 
 
@@ -31,7 +31,7 @@ def start_import(addon, contract, empty_shot, python, root):
     started = []
 
     def start(source: Path, first: int | None = None, last: int | None = None):
-        jobs = addon("jobs")
+        jobs = addon("process.jobs")
         job = jobs.new_job(empty_shot, "import", contract.ImportParams(str(source), first, last))
         jobs.start(job, python, root)
         started.append(job)
@@ -46,14 +46,14 @@ def start_import(addon, contract, empty_shot, python, root):
 
 
 def test_a_job_is_followed_to_its_end(addon, start_import, clip):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     seen = []
     job = start_import(clip, 3, 10)
     result = jobs.wait(job, seen.append)
     assert job.state == "done" and result is not None
     assert [e.seq for e in seen] == list(range(len(seen))), "every event once, in order"
     assert seen[-1].type == "done" and {e.type for e in seen} >= {"progress", "done"}
-    state = addon("shots").read(job.shot)
+    state = addon("shot.contents").read(job.shot)
     assert (state.frames, state.frame_range) == (8, (3, 10))
 
 
@@ -62,7 +62,7 @@ def test_a_child_runs_in_its_own_process_group(addon, start_import, clip):
         pytest.skip("process groups are POSIX")
     job = start_import(clip, 1, 8)
     assert os.getpgid(job.process.pid) == job.process.pid != os.getpgid(0)
-    addon("jobs").wait(job)
+    addon("process.jobs").wait(job)
 
 
 def test_a_failure_keeps_its_sentence_and_exit_code(addon, contract, start_import, tmp_path):
@@ -70,14 +70,14 @@ def test_a_failure_keeps_its_sentence_and_exit_code(addon, contract, start_impor
     wrong.write_text("this is no video")
     job = start_import(wrong)
     with pytest.raises(contract.JobError) as caught:
-        addon("jobs").wait(job)
+        addon("process.jobs").wait(job)
     assert caught.value.exit_code == contract.ExitCode.FOOTAGE
     assert "note.mp4" in caught.value.message and caught.value.message.count("\n") == 0
     assert job.state == "failed" and not (job.shot / "frames" / "frames.json").exists()
 
 
 def test_cancel_ends_a_job(addon, contract, start_import, clip):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = start_import(clip)
     jobs.cancel(job)
     with pytest.raises(contract.Cancelled):
@@ -88,7 +88,7 @@ def test_cancel_ends_a_job(addon, contract, start_import, clip):
 def test_a_killed_child_leaves_a_status_that_says_so(addon, contract, start_import, clip):
     if sys.platform == "win32":
         pytest.skip("SIGKILL is POSIX")
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = start_import(clip)
     while jobs.poll(job, 0.5) == [] and not job.ended:
         time.sleep(0.02)
@@ -103,7 +103,7 @@ def test_a_killed_child_leaves_a_status_that_says_so(addon, contract, start_impo
 
 
 def test_another_blender_finds_a_running_job_and_its_end(addon, start_import, clip):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = start_import(clip, 1, 10)
     while jobs.poll(job, 0.5) == [] and not job.ended:
         time.sleep(0.02)
@@ -115,7 +115,7 @@ def test_another_blender_finds_a_running_job_and_its_end(addon, start_import, cl
 
 
 def test_a_job_of_a_dead_machine_is_not_believed(addon, contract, empty_shot):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     ended = subprocess.Popen([sys.executable, "-c", "pass"])
     ended.wait()
@@ -130,7 +130,7 @@ def test_a_job_of_a_dead_machine_is_not_believed(addon, contract, empty_shot):
 
 
 def test_events_half_written_are_read_later(addon, contract, empty_shot):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     event = contract.Event("metric", 0, time.time(), {"stage": "train", "values": {"psnr_db": 20.5}})
     line = json.dumps(dataclasses.asdict(event)) + "\n"
@@ -143,7 +143,7 @@ def test_events_half_written_are_read_later(addon, contract, empty_shot):
 
 
 def test_poll_keeps_its_budget_and_loses_nothing(addon, contract, empty_shot):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     event = contract.Event("warning", 0, 0.0, {"message": "m", "hint": ""})
     lines = [json.dumps({**dataclasses.asdict(event), "seq": n}) for n in range(5000)]
@@ -159,12 +159,12 @@ def test_poll_keeps_its_budget_and_loses_nothing(addon, contract, empty_shot):
 def test_the_childs_environment_is_free_of_blenders_python(addon, monkeypatch, root):
     monkeypatch.setenv("PYTHONHOME", "/of/blender")
     monkeypatch.setenv("PYTHONPATH", "/of/blender")
-    environ = addon("jobs").backend_environ(root)
+    environ = addon("process.children").backend_environ(root)
     assert "PYTHONHOME" not in environ and environ["PYTHONPATH"] == str(root)
 
 
 def test_a_python_that_does_not_start_is_an_environment_error(addon, contract, empty_shot, root):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "import", contract.ImportParams("x.mp4"))
     with pytest.raises(contract.JobError) as caught:
         jobs.start(job, str(root / "no" / "python"), root)
@@ -175,11 +175,11 @@ def test_a_python_that_does_not_start_is_an_environment_error(addon, contract, e
 
 def test_new_job_refuses_the_parameters_of_another_kind(addon, contract, empty_shot):
     with pytest.raises(ValueError, match="a train job takes TrainParams, not SolveParams"):
-        addon("jobs").new_job(empty_shot, "train", contract.SolveParams())
+        addon("process.jobs").new_job(empty_shot, "train", contract.SolveParams())
 
 
 def test_a_broken_write_leaves_what_was_there(addon, tmp_path):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     target = tmp_path / "a.json"
     jobs.write_json(target, {"a": 1})
     with pytest.raises(ValueError):
@@ -188,7 +188,7 @@ def test_a_broken_write_leaves_what_was_there(addon, tmp_path):
 
 
 def test_cancel_pressed_again_does_not_put_off_the_end_by_force(addon, contract, empty_shot):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     jobs.cancel(job)
     os.utime(job.folder / "cancel", (time.time() - 5, time.time() - 5))
@@ -198,7 +198,7 @@ def test_cancel_pressed_again_does_not_put_off_the_end_by_force(addon, contract,
 
 
 def test_a_job_with_broken_files_is_passed_over(addon, contract, empty_shot):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     (job.folder / "status.json").write_text("{ half")
     assert jobs.latest(empty_shot) == {}
@@ -237,7 +237,7 @@ def believed_running(jobs, contract, shot, pid: int, started: float, host: str):
     "words", [(), ("-m", "torch_backend", "run-job", sys.prefix), ("-m", "torch_backend", "run-job")]
 )
 def test_cancel_ends_no_process_on_a_files_word(addon, contract, empty_shot, sleeper, words):
-    jobs, innocent = addon("jobs"), sleeper(*words)
+    jobs, innocent = addon("process.jobs"), sleeper(*words)
     for host in ("", contract.host_name()):
         job = believed_running(jobs, contract, empty_shot, innocent.pid, contract.process_start(innocent.pid), host)
         with pytest.raises(contract.JobError, match="cannot be told from others"):
@@ -246,7 +246,7 @@ def test_cancel_ends_no_process_on_a_files_word(addon, contract, empty_shot, sle
 
 
 def test_cancel_ends_no_process_that_has_another_start(addon, contract, empty_shot, sleeper):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     innocent = sleeper("-m", "torch_backend", "run-job", str(job.folder))
     started = contract.process_start(innocent.pid)
@@ -259,7 +259,7 @@ def test_cancel_ends_no_process_that_has_another_start(addon, contract, empty_sh
 
 
 def test_a_job_of_another_computer_is_neither_dead_nor_ended(addon, contract, empty_shot, sleeper):
-    jobs, innocent = addon("jobs"), sleeper()
+    jobs, innocent = addon("process.jobs"), sleeper()
     job = believed_running(jobs, contract, empty_shot, innocent.pid, 1.0, "elsewhere (0a1b2c3d)")
     assert jobs.is_alive(job, job.status)
     with pytest.raises(contract.JobError, match="runs on elsewhere: only there"):
@@ -280,13 +280,13 @@ def test_a_job_of_another_computer_is_neither_dead_nor_ended(addon, contract, em
 def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     addon, contract, empty_shot, scene, clip, sleeper
 ):
-    jobs, steps, worker = addon("jobs"), addon("steps"), sleeper()
+    jobs, worker = addon("process.jobs"), sleeper()
     scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(empty_shot)
     started = contract.process_start(worker.pid)
     writer = contract.Writer(contract.host_name(), worker.pid, started, "train", "from a terminal", time.time() - 90000)
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
     with pytest.raises(contract.JobError) as told:
-        steps.begin(scene, "footage")
+        addon("process.begin").begin(scene, "import")
     assert told.value.exit_code == contract.ExitCode.USAGE and told.value.hint == "Wait for it or cancel it."
     since = time.strftime("%Y-%m-%d %H:%M", time.localtime(writer.since))
     where = contract.host_name().partition(" (")[0]
@@ -296,7 +296,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     assert not (empty_shot / "jobs").exists(), "nothing was written"
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, host="elsewhere")))
     with pytest.raises(contract.JobError, match="on elsewhere since") as told:
-        steps.begin(scene, "footage")
+        addon("process.begin").begin(scene, "import")
     assert str(empty_shot / "lock.json") in told.value.hint
     ending = jobs.new_job(empty_shot, "train", contract.TrainParams())
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name)))
@@ -306,14 +306,14 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     worker.kill()
     worker.wait()
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
-    jobs.wait(steps.begin(scene, "footage", contract.ImportParams(str(clip), 1, 8)))
+    jobs.wait(addon("process.begin").begin(scene, "import", contract.ImportParams(str(clip), 1, 8)))
     assert not (empty_shot / "lock.json").exists()
 
 
 def test_a_job_that_is_stopped_is_alive_and_can_be_ended_by_another_blender(addon, contract, start_import, clip):
     if sys.platform == "win32":
         pytest.skip("SIGSTOP is POSIX")
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = start_import(clip)
     while jobs.poll(job, 0.5) == [] and not job.ended:
         time.sleep(0.02)
@@ -331,7 +331,7 @@ def test_a_job_that_is_stopped_is_alive_and_can_be_ended_by_another_blender(addo
 
 
 def test_cancel_follows_no_link(addon, contract, empty_shot, tmp_path):
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())
     (job.folder / "cancel").symlink_to(tmp_path / "elsewhere")
     jobs.cancel(job)
@@ -344,7 +344,7 @@ def test_a_job_whose_shot_goes_ends_in_a_sentence_and_makes_nothing(
 ):
     if sys.platform == "win32":
         pytest.skip("Windows keeps a folder that a process works in where it is")
-    jobs, away = addon("jobs"), empty_shot.with_name("away.splannequin")
+    jobs, away = addon("process.jobs"), empty_shot.with_name("away.splannequin")
     job = start_import(clip)
     while jobs.poll(job, 0.5) == [] and not job.ended:
         time.sleep(0.02)

@@ -47,7 +47,7 @@ def long_shot(shot) -> Path:
 
 
 def test_what_did_not_change_is_not_opened_again(addon, long_shot, opened):
-    read = addon("shots").read
+    read = addon("shot.contents").read
     first, names = opened(read, long_shot)
     assert {"shot.json", "frames.json", "cameras.json", "solve.json", "summary.json", "take.json"} <= set(names)
     again, names = opened(read, long_shot)
@@ -56,13 +56,13 @@ def test_what_did_not_change_is_not_opened_again(addon, long_shot, opened):
 
 
 def test_what_changed_is_read_again_and_only_that(addon, long_shot, opened):
-    read = addon("shots").read
+    read = addon("shot.contents").read
     read(long_shot)
     (long_shot / "takes" / "freeze" / "000008.exr").touch()
     grown, names = opened(read, long_shot)
     assert grown.takes["freeze"]["frame_count"] == 4 and names == []
     info = json.loads((long_shot / "shot.json").read_text())
-    addon("jobs").write_json(long_shot / "shot.json", info | {"name": "renamed"})
+    addon("process.jobs").write_json(long_shot / "shot.json", info | {"name": "renamed"})
     with open(long_shot / "runs" / "main" / "metrics.jsonl", "a") as more:
         more.write('{"seconds": 2.0, "heldout_psnr_db": 21.0}\n')
     changed, names = opened(read, long_shot)
@@ -71,14 +71,14 @@ def test_what_changed_is_read_again_and_only_that(addon, long_shot, opened):
 
 
 def test_what_a_reader_adds_is_not_remembered(addon, long_shot):
-    shots = addon("shots")
+    shots = addon("shot.contents")
     shots.read(long_shot).takes["freeze"]["mine"] = True
     shots.read(long_shot).info["mine"] = True
     assert "mine" not in shots.read(long_shot).takes["freeze"] and "mine" not in shots.read(long_shot).info
 
 
 def test_only_so_much_is_remembered(addon, tmp_path, monkeypatch):
-    kept = addon("kept")
+    kept = addon("shot.kept")
     monkeypatch.setattr(kept, "_MOST", 3)
     for n in range(6):
         (tmp_path / str(n)).write_text(str(n))

@@ -40,7 +40,7 @@ def graded(addon, scene, detailed):
     plate.image = bpy.data.images.load(str(folder / "000005.exr"))
     plate.image.source = "SEQUENCE"
     compat.set_image_colour(plate.image, "linear")
-    addon("compositor").show_sequence(plate, plate.image, 5, 6)
+    addon("scene.sequences").show_sequence(plate, plate.image, 5, 6)
     grade, _, first, second, result = compat.new_mix_node(tree, "MULTIPLY")
     grade.inputs[0].default_value = 1.0
     second.default_value = (2.0, 2.0, 0.5, 1.0)
@@ -72,7 +72,7 @@ def render(scene, folder: Path, frame: int = 6, size=SIZE) -> np.ndarray:
 
 
 def node_of(addon, scene):
-    return addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    return addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
 
 
 def relative(found: np.ndarray, expected: np.ndarray) -> float:
@@ -81,7 +81,7 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 
 @pytest.mark.parametrize("frame", [5, 6])
 def test_st_map_matte_and_fill_give_the_delivered_frame_back(addon, scene, detailed, graded, tmp_path, frame):
-    said = addon("steps").insert_freeze(scene, detailed, "detail", warp=True)
+    said = addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     assert any("by the take's warp" in line for line in said)
     node = node_of(addon, scene)
     tree = addon("compat").compositor_tree(scene)
@@ -102,15 +102,15 @@ def test_st_map_matte_and_fill_give_the_delivered_frame_back(addon, scene, detai
 
 
 def test_the_grade_goes_on_behind_the_warped_plate_and_goes_before_it(addon, scene, detailed, graded, tmp_path):
-    compositor, compat = addon("compositor"), addon("compat")
-    addon("steps").insert_freeze(scene, detailed, "detail", warp=True)
+    compat = addon("compat")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     node = node_of(addon, scene)
     assert node.inputs["Image"].links[0].from_node.bl_idname == "CompositorNodeImage", "as the plate"
     assert relative(render(scene, tmp_path)[..., :3], made.frozen(6) * GRADE) < 1e-3
     scene.splannequin.insert_at = "OUTPUT"
-    addon("steps").insert_freeze(scene, detailed, "detail")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node = node_of(addon, scene)
-    assert compat.output_socket(graded).links[0].from_node == node and compositor.wants_warp(scene)
+    assert compat.output_socket(graded).links[0].from_node == node and addon("bake.freeze_group").wants_warp(scene)
     moved = made.WIDTH * 2 // 3  # beyond, other things than the plate are in the picture, and they are not graded
     expected = made.moved(made.plate(6) * GRADE, 6)
     assert relative(render(scene, tmp_path)[:, :moved, :3], expected[:, :moved]) < 1e-3
@@ -122,7 +122,7 @@ def test_a_plate_of_another_size_is_brought_to_that_of_the_warp(addon, scene, de
     small[..., 0], small[..., 3] = 40.0, 1.0
     picture = bpy.data.images.new("small", made.WIDTH // 2, made.HEIGHT // 2, float_buffer=True, is_data=True)
     picture.pixels.foreach_set(small.ravel())
-    addon("steps").insert_freeze(scene, detailed, "detail", warp=True)
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     node = node_of(addon, scene)
     reader = graded.nodes.new("CompositorNodeImage")
     reader.image = picture
@@ -134,7 +134,7 @@ def test_a_plate_of_another_size_is_brought_to_that_of_the_warp(addon, scene, de
 
 
 def test_the_warp_is_switched_and_removed_without_a_trace(addon, scene, detailed, graded):
-    compositor = addon("compositor")
+    addon("bake.compositor")
     scene.splannequin.shot_path, scene.splannequin.take_name = str(detailed), "detail"
     images, groups = set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())
     links = {(k.from_socket.path_from_id(), k.to_socket.path_from_id()) for k in graded.links}
@@ -142,14 +142,14 @@ def test_the_warp_is_switched_and_removed_without_a_trace(addon, scene, detailed
     node = node_of(addon, scene)
     assert node.inputs["As Warp"].default_value == 1.0 and "Warp detail" in bpy.data.images
     node.inputs["Mix"].default_value = 0.5
-    addon("steps").insert_freeze(scene, detailed, "detail")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     assert "As Warp" in node.inputs, "an update keeps it"
     assert bpy.ops.splannequin.freeze_as_warp() == {"FINISHED"}
     node = node_of(addon, scene)
     assert "As Warp" not in node.inputs and "Warp detail" not in bpy.data.images
-    assert node.inputs["Mix"].default_value == 0.5 and not compositor.wants_warp(scene)
+    assert node.inputs["Mix"].default_value == 0.5 and not addon("bake.freeze_group").wants_warp(scene)
     bpy.ops.splannequin.freeze_as_warp()
-    assert addon("bake").remove(scene)
+    assert addon("bake.insertion").remove(scene)
     assert (set(bpy.data.images.keys()), set(bpy.data.node_groups.keys())) == (images, groups)
     assert {(k.from_socket.path_from_id(), k.to_socket.path_from_id()) for k in graded.links} == links
 
@@ -157,10 +157,10 @@ def test_the_warp_is_switched_and_removed_without_a_trace(addon, scene, detailed
 def test_a_take_without_a_warp_is_refused_in_a_sentence(addon, contract, scene, detailed, graded):
     before = [n.name for n in graded.nodes]
     with pytest.raises(contract.JobError, match="'freeze' has no warp: it was frozen without detail"):
-        addon("steps").insert_freeze(scene, detailed, "freeze", warp=True)
+        addon("bake.insertion").insert_freeze(scene, detailed, "freeze", warp=True)
     (detailed / "takes" / "detail" / "warp" / "000006.exr").unlink()
     with pytest.raises(contract.JobError, match="'detail' has no warp"):
-        addon("steps").insert_freeze(scene, detailed, "detail", warp=True)
+        addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     assert [n.name for n in graded.nodes] == before
     scene.splannequin.shot_path, scene.splannequin.take_name = str(detailed), "freeze"
     with pytest.raises(RuntimeError, match="Freeze it again with detail"):
@@ -171,29 +171,29 @@ def test_a_take_from_a_camera_of_the_artists_own_is_refused_in_a_sentence(addon,
     file = detailed / "takes" / "detail" / "take.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "camera_path": "/somewhere/path.json"}))
     with pytest.raises(contract.JobError, match="looks into other frames of the plate"):
-        addon("steps").insert_freeze(scene, detailed, "detail", warp=True)
+        addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
 
 
 def test_a_bake_of_a_take_without_a_warp_shows_its_frames_and_says_so(addon, scene, detailed, graded):
-    addon("steps").insert_freeze(scene, detailed, "detail", warp=True)
-    said = addon("steps").insert_freeze(scene, detailed, "freeze")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
+    said = addon("bake.insertion").insert_freeze(scene, detailed, "freeze")
     assert "The take has no warp: its own frames are shown." in said and "As Warp" not in node_of(addon, scene).inputs
-    said = addon("steps").insert_freeze(scene, detailed, "detail")
+    said = addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     assert "As Warp" in node_of(addon, scene).inputs, "the next take that has one is used as such again"
 
 
 def test_pictures_read_ahead_for_a_warp_are_those_that_come_in(addon, scene, detailed, graded):
-    bake = addon("bake")
-    addon("steps").insert_freeze(scene, detailed, "detail", warp=True)
+    bake = addon("bake.insertion")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail", warp=True)
     count = len(bpy.data.images)
     assert len(list(bake.read_ahead(scene, detailed, "detail"))) == 2
     bake.insert(scene, detailed, "detail")
-    assert len(bpy.data.images) == count and not addon("compositor")._ahead
+    assert len(bpy.data.images) == count and not addon("scene.sequences")._ahead
 
 
 @pytest.mark.parametrize("show", [0.0, 0.5, 1.0])
 def test_what_is_invented_is_tinted_and_the_rest_is_not(addon, scene, detailed, tmp_path, show):
-    addon("steps").insert_freeze(scene, detailed, "detail")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node_of(addon, scene).inputs["Show What Is Invented"].default_value = show
     found = render(scene, tmp_path)
     half = made.frozen(6).astype(np.float32).astype(np.float16).astype(np.float64)
@@ -207,7 +207,7 @@ def test_what_is_invented_is_tinted_and_the_rest_is_not(addon, scene, detailed, 
 @pytest.mark.parametrize("output", ["Plate", "Source"])
 def test_plate_and_source_leave_the_group_as_they_are_in_the_file(addon, scene, detailed, tmp_path, output):
     compat = addon("compat")
-    addon("steps").insert_freeze(scene, detailed, "detail")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     tree = compat.compositor_tree(scene)
     tree.links.new(node_of(addon, scene).outputs[output], compat.output_socket(tree))
     expected = made.matte(6) * made.alpha() if output == "Plate" else made.source(6)
@@ -216,7 +216,7 @@ def test_plate_and_source_leave_the_group_as_they_are_in_the_file(addon, scene, 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
 def test_the_splats_alone_can_be_had(addon, scene, detailed, tmp_path, share):
-    addon("steps").insert_freeze(scene, detailed, "detail")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node_of(addon, scene).inputs["Splat"].default_value = share
     own, splat = (
         made.frozen(6).astype(np.float32).astype(np.float16).astype(np.float64),
@@ -226,25 +226,25 @@ def test_the_splats_alone_can_be_had(addon, scene, detailed, tmp_path, share):
 
 
 def test_a_take_of_splats_alone_says_that_it_cannot_tell(addon, scene, shot, layers, tmp_path):
-    addon("steps").insert_freeze(scene, shot, "freeze")
+    addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     node = node_of(addon, scene)
     node.inputs["Show What Is Invented"].default_value = 1.0
-    said = addon("steps").insert_freeze(scene, shot, "freeze")
+    said = addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     assert any("does not tell plate from splats" in line for line in said)
     assert np.abs(render(scene, tmp_path, size=(16, 12)) - layers(6)["rgba"])[..., :3].max() < 1e-6
 
 
 def test_a_group_of_an_older_file_gets_the_new_sockets_and_keeps_its_own(addon, scene, detailed, graded, tmp_path):
     """As 0.5 left it: without them, with links and values of the artist's."""
-    compositor, compat = addon("compositor"), addon("compat")
-    addon("steps").insert_freeze(scene, detailed, "freeze")
+    compat = addon("compat")
+    addon("bake.insertion").insert_freeze(scene, detailed, "freeze")
     node = node_of(addon, scene)
     face = node.node_tree.interface
     for item in [i for i in face.items_tree if i.name in ("Splat", "Show What Is Invented", "Plate", "Source")]:
         face.remove(item)
     del node.node_tree["splannequin_warps"]
     node.inputs["Only Moving"].default_value = 0.25
-    addon("steps").insert_freeze(scene, detailed, "detail")
+    addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node = node_of(addon, scene)
     assert {"Splat", "Show What Is Invented"} <= set(node.inputs.keys()) and node.inputs["Splat"].default_value == 0.0
     assert {"Plate", "Source"} <= set(node.outputs.keys()) and node.inputs["Only Moving"].default_value == 0.25
@@ -252,7 +252,7 @@ def test_a_group_of_an_older_file_gets_the_new_sockets_and_keeps_its_own(addon, 
     assert (
         relative(render(scene, tmp_path)[..., :3], made.frozen(6).astype(np.float32).astype(np.float16) * GRADE) < 1e-3
     )
-    assert compositor.group_node(compat.compositor_tree(scene)) == node
+    assert addon("bake.freeze_group").group_node(compat.compositor_tree(scene)) == node
 
 
 def test_the_command_line_bakes_a_warp_into_the_artists_file(addon, scene, detailed, graded, tmp_path, capsys):
@@ -265,9 +265,9 @@ def test_the_command_line_bakes_a_warp_into_the_artists_file(addon, scene, detai
     blend = tmp_path / "artist.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     words = ["bake", "--shot", str(detailed), "--output", str(tmp_path / "out"), "--blend", str(blend), "--as-warp"]
-    assert addon("headless").main([*words, "--take", "freeze", "--first", "6", "--last", "6"]) == 7
+    assert addon("command_line.headless").main([*words, "--take", "freeze", "--first", "6", "--last", "6"]) == 7
     assert "has no warp" in capsys.readouterr().err
-    assert addon("headless").main([*words, "--take", "detail", "--first", "6", "--last", "6"]) == 0
+    assert addon("command_line.headless").main([*words, "--take", "detail", "--first", "6", "--last", "6"]) == 0
     image = bpy.data.images.load(str(tmp_path / "out" / "composited" / "000006.exr"))
     image.colorspace_settings.is_data = True
     found = np.array(image.pixels[:], np.float32).reshape(made.HEIGHT, made.WIDTH, 4)[::-1, :, :3]

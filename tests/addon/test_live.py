@@ -14,9 +14,9 @@ VIEWMAT = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
 def test_a_view_through_the_solved_camera_is_the_solved_camera(addon, contract, shot, scene, scale):
-    cameras, viewport = addon("cameras"), addon("viewport")
+    cameras, viewport = addon("solve.cameras"), addon("freeze.viewport")
     scene.splannequin.shot_path = str(shot)
-    addon("steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     root = cameras.find(scene, shot, "EMPTY")
     root.matrix_world = Matrix.LocRotScale((1, 2, 3), Matrix.Rotation(0.7, 3, "Y"), (scale,) * 3) @ root.matrix_world
     path = contract.CameraPath.load(shot / "solve" / "cameras.json")
@@ -48,7 +48,7 @@ def _answer(session, asked):
 
 def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, contract, shot, monkeypatch):
     """One request at a time, none while the view changes; the artist's switch is followed both ways."""
-    viewport, live = addon("viewport"), addon("live")
+    viewport, live = addon("freeze.viewport"), addon("freeze.live")
     session = live.Session(shot, "main")
     monkeypatch.setattr(viewport, "_session", session)
     monkeypatch.setattr(viewport, "_moved", {})
@@ -95,14 +95,14 @@ def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, cont
 
 def test_switching_developing_is_asked_for_like_another_view(addon, contract):
     views = [contract.LiveView(1, 0, VIEWMAT, [9.0, 9.0, 8.0, 6.0], 16, 12, 6.0, develop=on) for on in (True, False)]
-    same = addon("viewport")._same
+    same = addon("freeze.viewport")._same
     assert same(views[0], views[0]) and not same(*views)
 
 
 def test_a_view_that_came_to_rest_is_drawn_once_more_however_late_the_timer_is(addon, shot, scene, monkeypatch):
-    viewport, drawn = addon("viewport"), []
+    viewport, drawn = addon("freeze.viewport"), []
     scene.splannequin.shot_path, scene.splannequin.run_name = str(shot), "main"
-    session = addon("live").Session(addon("steps").shot_folder(scene), "main")
+    session = addon("freeze.live").Session(addon("shot.chosen").shot_folder(scene), "main")
     monkeypatch.setattr(viewport, "_session", session)
     monkeypatch.setattr(viewport, "_rested", set())
     monkeypatch.setattr(viewport, "_moved", {1: time.monotonic()})
@@ -122,21 +122,21 @@ def test_a_view_that_came_to_rest_is_drawn_once_more_however_late_the_timer_is(a
 
 def test_an_orthographic_view_is_not_asked_for(addon, shot, scene):
     scene.splannequin.shot_path = str(shot)
-    assert addon("viewport").view_of(scene, shot, (64, 48), (Matrix(), Matrix()), 6.0, 10**9) is None
+    assert addon("freeze.viewport").view_of(scene, shot, (64, 48), (Matrix(), Matrix()), 6.0, 10**9) is None
 
 
 def test_without_a_run_nothing_begins(addon, contract, shot, scene):
     scene.splannequin.shot_path = str(shot)
     with pytest.raises(contract.JobError):
-        addon("viewport").begin(scene)
-    assert addon("viewport").session() is None
+        addon("freeze.viewport").begin(scene)
+    assert addon("freeze.viewport").session() is None
     assert not bpy.ops.splannequin.live.poll()
     assert not bpy.ops.splannequin.suggested_instant.poll()
 
 
 def test_a_session_that_cannot_begin_says_why_and_ends(addon, shot, root):
     """A real backend on a shot without a run."""
-    session = addon("live").open_session(shot, "nothing", addon("backend").python(), root)
+    session = addon("freeze.live").open_session(shot, "nothing", addon("process.backend").python(), root)
     until = time.monotonic() + 120
     while session.open and time.monotonic() < until:
         time.sleep(0.05)
@@ -155,7 +155,7 @@ def _stand_in(tmp_path, name, body):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
 def test_a_closed_session_leaves_no_process(addon, contract, shot, root, tmp_path):
-    live = addon("live")
+    live = addon("freeze.live")
     session = live.open_session(shot, "main", _stand_in(tmp_path, "listens", "exec cat > /dev/null"), root)
     session.ask(contract.LiveView(1, 0, VIEWMAT, [9.0, 9, 8, 6], 16, 12, 6.0))
     time.sleep(0.2)
@@ -170,7 +170,7 @@ def test_a_closed_session_leaves_no_process(addon, contract, shot, root, tmp_pat
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
 def test_a_session_that_hangs_is_ended(addon, shot, root, tmp_path, monkeypatch):
-    live = addon("live")
+    live = addon("freeze.live")
     monkeypatch.setattr(live, "_PATIENCE_SECONDS", 0.2)
     session = live.open_session(shot, "main", _stand_in(tmp_path, "hangs", "exec sleep 600"), root)
     session.close()
@@ -179,4 +179,4 @@ def test_a_session_that_hangs_is_ended(addon, shot, root, tmp_path, monkeypatch)
 
 def test_a_python_that_does_not_start_is_named(addon, contract, shot, root):
     with pytest.raises(contract.JobError, match="could not be started"):
-        addon("live").open_session(shot, "main", str(Path(root) / "README.md"), root)
+        addon("freeze.live").open_session(shot, "main", str(Path(root) / "README.md"), root)

@@ -47,19 +47,19 @@ def grainy(addon, scene, shot):
     """The group over a take with grain, 32-bit EXR out; grainy(factor) is the two rendered frames [2, H, W, 4]."""
     folder = shot / "takes" / "grain"
     shutil.copytree(grains.FOLDER, folder)
-    compositor = addon("compositor")
+    compositor = addon("bake.compositor")
     scene.render.resolution_x, scene.render.resolution_y = grains.WIDTH, grains.HEIGHT
     scene.render.resolution_percentage = 100
-    compositor.insert(scene, compositor.take_of(folder))
-    node = compositor.group_node(addon("compat").compositor_tree(scene))
+    compositor.insert(scene, addon("bake.take_files").take_of(folder))
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     scene.frame_start, scene.frame_end = grains.FRAMES
-    addon("scene_setup").keep_plate_colours(scene)
+    addon("scene.scene_setup").keep_plate_colours(scene)
     exr_output(scene)
 
     def render(factor: float) -> np.ndarray:
         node.inputs["Grain"].default_value = factor
         out = shot / f"out{factor}"
-        addon("bake").render(scene, out, png=False)
+        addon("bake.rendering").render(scene, out, png=False)
         return np.stack([read_exr(out / f"{n:06d}.exr") for n in grains.FRAMES])
 
     return render
@@ -84,7 +84,7 @@ def test_grain_at_1_is_the_plates_and_another_one_on_every_frame(grainy):
 
 
 def test_grain_does_not_cover_what_stands_behind(addon, scene, grainy):
-    node = addon("compositor").group_node(addon("compat").compositor_tree(scene))
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     node.inputs["CG"].default_value = (0.0, 1.0, 0.0, 1.0)  # far behind, seen where the frame covers half
     grey, half = linear_of(np.float64(grains.VALUE)), grains.WIDTH // 2
     mean = grainy(1.0)[:, :, half:, :3].mean(axis=(0, 1, 2))
@@ -94,7 +94,7 @@ def test_grain_does_not_cover_what_stands_behind(addon, scene, grainy):
 def test_grain_at_0_leaves_every_bit(addon, scene, grainy, shot):
     """Against the same group over frames that have no grain layer at all."""
     clean = grainy(0.0)
-    group = addon("compositor").group_node(addon("compat").compositor_tree(scene)).node_tree
+    group = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene)).node_tree
     mix = group.nodes["Grain"]
     clean_picture, _ = [s for s in mix.inputs if s.is_linked and s.type == "RGBA"]
     socket = clean_picture.links[0].from_socket
@@ -105,15 +105,15 @@ def test_grain_at_0_leaves_every_bit(addon, scene, grainy, shot):
 
 
 def test_a_take_without_grain_still_bakes_and_one_with_it_takes_its_place(addon, scene, shot, tmp_path):
-    compositor = addon("compositor")
-    compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))
-    node = compositor.group_node(addon("compat").compositor_tree(scene))
+    compositor = addon("bake.compositor")
+    compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "freeze"))
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     assert "Grain" not in node.node_tree.nodes and node.inputs["Grain"].default_value == 0.0
     node.inputs["Grain"].default_value = 0.7
-    said = compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))
+    said = compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "freeze"))
     assert any("no grain" in line for line in said)
     shutil.copytree(grains.FOLDER, shot / "takes" / "grain")
-    said = compositor.insert(scene, compositor.take_of(shot / "takes" / "grain"))
+    said = compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "grain"))
     assert not any("no grain" in line for line in said)
     assert "Grain" in node.node_tree.nodes and node.inputs["Grain"].default_value == pytest.approx(0.7)
 
@@ -137,23 +137,23 @@ SETTINGS = {
 @pytest.mark.parametrize("kind", ["PNG", "OPEN_EXR", "OPEN_EXR_MULTILAYER"])
 def test_the_plate_passes_through_untouched(addon, scene, shot, pictures, setting, kind):
     """Within 1/255 in an sRGB PNG and 1e-3 in linear EXR of 32 bits, though the frozen frame differs everywhere."""
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     source = ramp()
     for n in (5, 6):
         pictures.write(shot / "frames" / f"{n:06d}.png", source)
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 64, 48, 100
     take = shot / "takes" / "grain"
     shutil.copytree(grains.FOLDER, take)
-    compositor.insert(scene, compositor.take_of(take), shot / "frames" / "000005.png")
-    node = compositor.group_node(compat.compositor_tree(scene))
+    compositor.insert(scene, addon("bake.take_files").take_of(take), shot / "frames" / "000005.png")
+    node = addon("bake.freeze_group").group_node(compat.compositor_tree(scene))
     for name, value in SETTINGS[setting].items():
         node.inputs[name].default_value = value
     scene.frame_start = scene.frame_end = 6
-    addon("scene_setup").keep_plate_colours(scene)
+    addon("scene.scene_setup").keep_plate_colours(scene)
     if kind != "PNG":
         exr_output(scene, kind)
     out = shot / "out"
-    addon("bake").render(scene, out, png=kind == "PNG")
+    addon("bake.rendering").render(scene, out, png=kind == "PNG")
     expected = source / 255.0
     if kind == "PNG":
         assert np.abs(pictures.read(out / "000006.png") - expected).max() * 255 < 0.5, "the very levels"
@@ -173,18 +173,18 @@ def read_layers(addon, path: Path, folder: Path) -> np.ndarray:
     tree.links.new(node.outputs["Combined" if "Combined" in node.outputs else 0], compat.output_socket(tree))
     compat.enable_compositor(scene)
     scene.render.resolution_x, scene.render.resolution_y = 64, 48
-    addon("scene_setup").keep_plate_colours(scene)
+    addon("scene.scene_setup").keep_plate_colours(scene)
     exr_output(scene)
     scene.frame_start = scene.frame_end = 1
-    addon("bake").render(scene, folder / "read", png=False)
+    addon("bake.rendering").render(scene, folder / "read", png=False)
     return read_exr(folder / "read" / "000001.exr")
 
 
 @pytest.mark.parametrize("stop_at", [2, 3])
 @pytest.mark.parametrize("movie", [True, False])
 def test_a_render_is_cancelled_between_frames_and_its_file_closed(addon, scene, shot, contract, movie, stop_at):
-    compositor = addon("compositor")
-    compositor.insert(scene, compositor.take_of(shot / "takes" / "freeze"))
+    compositor = addon("bake.compositor")
+    compositor.insert(scene, addon("bake.take_files").take_of(shot / "takes" / "freeze"))
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 64, 48, 100
     scene.frame_start, scene.frame_end = 5, 14
     scene.frame_step = 2
@@ -202,7 +202,9 @@ def test_a_render_is_cancelled_between_frames_and_its_file_closed(addon, scene, 
             raise contract.Cancelled
 
     with pytest.raises(contract.Cancelled):
-        addon("bake").render(scene, shot / "out", not movie, lambda done, total: seen.append((done, total)), check)
+        addon("bake.rendering").render(
+            scene, shot / "out", not movie, lambda done, total: seen.append((done, total)), check
+        )
     assert seen == [(n + 1, 5) for n in range(stop_at)]
     assert (scene.frame_current, scene.frame_start, scene.frame_end, scene.frame_step) == (1, 5, 14, 2)
     assert len(bpy.app.handlers.render_write) == 1, "only the supervisor's is left"

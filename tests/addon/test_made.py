@@ -22,12 +22,12 @@ def duplicate(*items):
 @pytest.fixture
 def built(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
-    addon("steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     return scene
 
 
 def test_copies_of_ours_are_the_artists(addon, built, shot):
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     ours = {kind: cameras.find(built, shot, kind) for kind in ("EMPTY", "CAMERA", "MESH")}
     ours["CAMERA"].name, ours["EMPTY"].name = "zz renamed", "aa renamed"  # in either order of the names
     copies = duplicate(*ours.values())
@@ -35,12 +35,12 @@ def test_copies_of_ours_are_the_artists(addon, built, shot):
     assert {kind: cameras.find(built, shot, kind) for kind in ours} == ours
     copies["aa renamed"].scale = (3.0, 3.0, 3.0)
     bpy.context.view_layer.update()
-    assert cameras.depth_scale(built, shot) == pytest.approx(1.0)
+    assert addon("shot.made").depth_scale(built, shot) == pytest.approx(1.0)
     names = sorted(c.name for c in copies.values())
     cameras.build(built, shot)
     assert sorted(c.name for c in copies.values()) == names, "a second build spares them"
     assert cameras.find(built, shot, "CAMERA") not in copies.values()
-    assert addon("cameras").remove(built, shot)
+    assert addon("solve.cameras").remove(built, shot)
     assert sorted(c.name for c in copies.values()) == names, "and so does removal"
     for copy in copies.values():
         assert copy.name in built.objects and not copy.keys()
@@ -49,7 +49,7 @@ def test_copies_of_ours_are_the_artists(addon, built, shot):
 
 
 def test_what_hangs_on_the_root_stays_where_it_is(addon, built, shot):
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     root = cameras.find(built, shot, "EMPTY")
     root.location, root.scale = (1.0, 2.0, 3.0), (2.0, 2.0, 2.0)
     cube = built.objects["Cube"]
@@ -67,7 +67,7 @@ def test_what_hangs_on_the_root_stays_where_it_is(addon, built, shot):
 
 
 def test_what_the_artist_deleted_is_let_go(addon, built, shot):
-    cameras, supervisor = addon("cameras"), addon("supervisor")
+    cameras, supervisor = addon("solve.cameras"), addon("process.supervisor")
     bpy.ops.object.select_all(action="DESELECT")
     cameras.find(built, shot, "CAMERA").select_set(True)
     bpy.ops.object.delete()
@@ -81,7 +81,7 @@ def test_what_the_artist_deleted_is_let_go(addon, built, shot):
 
 
 def test_ours_are_found_after_saving_and_in_a_full_copy_of_the_scene(addon, built, shot, tmp_path):
-    cameras = addon("cameras")
+    cameras = addon("solve.cameras")
     duplicate(cameras.find(built, shot, "CAMERA"))
     name = cameras.find(built, shot, "CAMERA").name
     bpy.ops.scene.new(type="FULL_COPY")
@@ -96,7 +96,7 @@ def test_ours_are_found_after_saving_and_in_a_full_copy_of_the_scene(addon, buil
 
 
 def test_two_shots_of_one_name_are_two(addon, built, shot, tmp_path):
-    cameras, made = addon("cameras"), addon("made")
+    cameras, made = addon("solve.cameras"), addon("shot.made")
     other = tmp_path / "elsewhere" / shot.name
     shutil.copytree(shot, other)
     assert cameras.find(built, other, "CAMERA") is None
@@ -111,7 +111,7 @@ def test_two_shots_of_one_name_are_two(addon, built, shot, tmp_path):
 
 
 def test_the_camera_that_was_there_before_comes_back(addon, built, shot):
-    cameras, own = addon("cameras"), bpy.data.objects["Camera"]
+    cameras, own = addon("solve.cameras"), bpy.data.objects["Camera"]
     assert built.camera == cameras.find(built, shot, "CAMERA")
     own.name = "renamed since"
     cameras.build(built, shot)
@@ -130,13 +130,13 @@ def test_the_camera_that_was_there_before_comes_back(addon, built, shot):
     bpy.ops.object.select_all(action="DESELECT")
     own.select_set(True)
     bpy.ops.object.delete()
-    addon("made").tidy(built)
+    addon("shot.made").tidy(built)
     cameras.remove(built, shot)
     assert built.camera is None and not own.users, "the file does not keep it"
 
 
 def test_another_shots_camera_takes_the_place_of_a_removed_one(addon, built, shot, tmp_path):
-    cameras, own, other = addon("cameras"), bpy.data.objects["Camera"], tmp_path / "second.splannequin"
+    cameras, own, other = addon("solve.cameras"), bpy.data.objects["Camera"], tmp_path / "second.splannequin"
     shutil.copytree(shot, other)
     cameras.build(built, other)
     cameras.remove(built, shot)
@@ -149,8 +149,8 @@ def test_another_shots_camera_takes_the_place_of_a_removed_one(addon, built, sho
 
 
 def test_a_file_of_0_2_0_is_taken_over(addon, built, shot, tmp_path):
-    cameras = addon("cameras")
-    name = addon("made").name_of(shot)
+    cameras = addon("solve.cameras")
+    name = addon("shot.made").name_of(shot)
     for kind in ("EMPTY", "CAMERA", "MESH"):  # as 0.2.0 left it: marks, no pointers
         cameras.find(built, shot, kind)["splannequin"] = name
     built.splannequin.made[0].collection["splannequin"] = name

@@ -69,7 +69,7 @@ def test_the_mattes_are_shown_as_a_sequence(matted):
 
 
 def test_what_is_painted_lands_in_the_shot_and_only_there(matted, addon):
-    mattes = addon("mattes")
+    mattes = addon("solve.mattes")
     found = {p: p.read_bytes() for p in (matted / "solve" / "motion").iterdir()}
     assert bpy.ops.splannequin.paint_motion() == {"FINISHED"}
     image = mattes.find_image(matted, 6)
@@ -88,7 +88,7 @@ def test_what_is_painted_lands_in_the_shot_and_only_there(matted, addon):
 
 
 def test_painting_goes_on_where_it_was_saved(matted, addon):
-    mattes = addon("mattes")
+    mattes = addon("solve.mattes")
     (matted / "motion_paint").mkdir()
     painted = np.full((HEIGHT, WIDTH, 2), 255, np.uint8)
     painted[:, 8:, 1] = 0  # nothing is painted there
@@ -102,13 +102,13 @@ def test_painting_goes_on_where_it_was_saved(matted, addon):
 def test_transparent_paint_stays_transparent(addon):
     pixels = np.ones((HEIGHT, WIDTH, 4), np.float32)
     pixels[:, 8:, 3] = 0.25
-    data = unpacked(addon("mattes").packed(pixels))
+    data = unpacked(addon("solve.mattes").packed(pixels))
     assert data.shape == (HEIGHT, WIDTH, 2)
     assert (data[:, :8, 1] == 255).all() and (data[:, 8:, 1] == 64).all()
 
 
 def test_clear_takes_the_painted_matte_from_the_shot(matted, addon):
-    mattes = addon("mattes")
+    mattes = addon("solve.mattes")
     bpy.ops.splannequin.paint_motion()
     bpy.ops.splannequin.save_motion()
     assert mattes.painted_file(matted, 6).is_file()
@@ -146,7 +146,7 @@ def test_nothing_is_written_through_a_link(matted, tmp_path):
 
 def test_paint_is_found_after_the_file_was_saved_and_opened(matted, addon, tmp_path):
     """Its shot is remembered relative to the .blend."""
-    mattes = addon("mattes")
+    mattes = addon("solve.mattes")
     bpy.ops.splannequin.paint_motion()
     bpy.ops.splannequin.save_motion()
     image = mattes.find_image(matted, 6)

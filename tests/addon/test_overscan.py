@@ -25,45 +25,45 @@ def take(addon, shot):
     facts = {"version": 1, "take": "over", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 1}
     facts |= {"width": 12, "height": 10, "first": 6, "last": 6, "overscan": -1.0, "margin": list(MARGIN)}
     (folder / "take.json").write_text(json.dumps(facts))
-    return addon("compositor").take_of(folder)
+    return addon("bake.take_files").take_of(folder)
 
 
 def render(addon, scene, folder: Path, size=(12, 10)) -> Path:
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *size, 100
     scene.frame_start = scene.frame_end = 6
-    addon("scene_setup").keep_plate_colours(scene)
-    addon("bake").render(scene, folder)
+    addon("scene.scene_setup").keep_plate_colours(scene)
+    addon("bake.rendering").render(scene, folder)
     return folder / "000006.png"
 
 
 def test_frame_and_margin_come_from_the_exr_header(addon, take, shot, tmp_path):
-    compositor = addon("compositor")
+    addon("bake.compositor")
     assert (take.size, take.margin) == ((12, 10), MARGIN)
-    assert compositor.exr_windows(shot / "takes" / "freeze" / "000006.exr") == ((16, 12), (0, 0))
+    assert addon("bake.take_files").exr_windows(shot / "takes" / "freeze" / "000006.exr") == ((16, 12), (0, 0))
     file = tmp_path / "aside.exr"
     header = bytearray((DATA / "overscan" / "000006.exr").read_bytes())
     at = header.find(b"displayWindow\0box2i\0") + len(b"displayWindow\0box2i\0") + 4
     header[at + 8 : at + 12] = (12).to_bytes(4, "little")  # the frame ends one pixel farther right
     file.write_bytes(header)
     with pytest.raises(ValueError, match="equally far"):
-        compositor.exr_windows(file)
+        addon("bake.take_files").exr_windows(file)
 
 
 def test_the_scene_takes_the_size_of_the_frame(addon, scene, shot, take):
     scene.splannequin.set_up_scene = True
-    addon("bake").fit_take(scene, shot, "over")
+    addon("bake.insertion").fit_take(scene, shot, "over")
     assert (scene.render.resolution_x, scene.render.resolution_y) == (1920, 1080), "never smaller"
-    addon("bake").fit_take(scene, shot, "over", new=True)
+    addon("bake.insertion").fit_take(scene, shot, "over", new=True)
     assert (scene.render.resolution_x, scene.render.resolution_y) == (12, 10), "of another shape than the plate"
 
 
 @pytest.mark.parametrize("output", ["Image", "Depth", "Support", "Motion"])
 def test_every_layer_stands_over_the_plate_pixel_by_pixel(addon, scene, take, tmp_path, layers, pictures, output):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     take.depth_scale = 1.0 / 32.0
     compositor.insert(scene, take)
     tree = compat.compositor_tree(scene)
-    tree.links.new(compositor.group_node(tree).outputs[output], compat.output_socket(tree))
+    tree.links.new(addon("bake.freeze_group").group_node(tree).outputs[output], compat.output_socket(tree))
     found = pictures.read(render(addon, scene, tmp_path))
     assert found.shape == (10, 12, 3)
     data = {"Image": layers(6)["rgba"][..., :3], "Depth": layers(6)["depth"] / 32.0}
@@ -73,7 +73,7 @@ def test_every_layer_stands_over_the_plate_pixel_by_pixel(addon, scene, take, tm
 
 
 def test_the_artists_stream_and_the_mattes_fall_on_the_same_pixels(addon, scene, take, tmp_path, layers, pictures):
-    compositor, compat = addon("compositor"), addon("compat")
+    compositor, compat = addon("bake.compositor"), addon("compat")
     tree = compat.new_compositor_tree(scene, "Artist")
     stream = tree.nodes.new("CompositorNodeImage")
     stream.image = bpy.data.images.new("stream", 12, 10, float_buffer=True, is_data=True)
@@ -82,7 +82,7 @@ def test_the_artists_stream_and_the_mattes_fall_on_the_same_pixels(addon, scene,
     stream.image.pixels.foreach_set(own[::-1].ravel())
     tree.links.new(stream.outputs["Image"], compat.output_socket(tree))
     compositor.insert(scene, take)
-    group = compositor.group_node(tree)
+    group = addon("bake.freeze_group").group_node(tree)
     group.inputs["Only Supported"].default_value = 1.0
     group.inputs["Wipe"].default_value = 0.5
     found = pictures.read(render(addon, scene, tmp_path))
@@ -93,7 +93,7 @@ def test_the_artists_stream_and_the_mattes_fall_on_the_same_pixels(addon, scene,
 
 def test_at_another_render_size_the_frame_still_fills_the_picture(addon, scene, take, tmp_path, layers, pictures):
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 24, 20, 100
-    addon("compositor").insert(scene, take)
+    addon("bake.compositor").insert(scene, take)
     found = pictures.read(render(addon, scene, tmp_path, (24, 20)))
     expected = pictures.srgb(inside(layers(6)["rgba"])[..., :3])
     for rows in (slice(2, 10), slice(10, 18)):
@@ -103,16 +103,19 @@ def test_at_another_render_size_the_frame_still_fills_the_picture(addon, scene, 
 
 
 def test_the_panels_choice_reaches_the_backend_and_a_bake_keeps_the_takes(addon, scene, shot, take):
-    steps = addon("steps")
+    steps = addon("process.steps")
     scene.splannequin.shot_path = str(shot)
-    assert steps.params_of(scene, "freeze").overscan == 0.0
+    assert steps.STEPS["freeze"].params(scene).overscan == 0.0
     scene.splannequin.overscan = "LENS"
-    assert steps.params_of(scene, "freeze").overscan == -1.0
+    assert steps.STEPS["freeze"].params(scene).overscan == -1.0
     scene.splannequin.overscan = "OFF"
-    assert steps.take_params(shot, "over").overscan == -1.0 and steps.take_params(shot, "freeze").overscan == 0.0
+    assert (
+        addon("freeze.takes").take_params(shot, "over").overscan == -1.0
+        and addon("freeze.takes").take_params(shot, "freeze").overscan == 0.0
+    )
     scene.splannequin.take_name = "over"
-    assert steps.params_of(scene, "bake").overscan == -1.0
-    view = addon("panel").view_freeze(scene, addon("shots").read(shot))
+    assert steps.STEPS["bake"].params(scene).overscan == -1.0
+    view = addon("process.steps").STEPS["freeze"].view(scene, addon("shot.contents").read(shot))
     assert "Overscan: 2 pixels on each side, 1 above and below" in view.state
 
 
@@ -156,7 +159,7 @@ def mapped(tree, picture, path: Path):
 def test_blenders_map_uv_undistorts_and_gives_the_original_back(addon, scene, lens_shot, tmp_path, pictures):
     scene.splannequin.shot_path = str(lens_shot)
     assert bpy.ops.splannequin.write_stmaps() == {"FINISHED"}
-    notes = addon("supervisor").watch_of(lens_shot).notes["camera"]
+    notes = addon("process.supervisor").watch_of(lens_shot).notes["solve"]
     assert "stmap_undistort.exr and stmap_redistort.exr are in" in notes[0] and "overscan" in notes[1]
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     original = np.stack([0.5 + 0.4 * np.sin(x / 11.0), 0.5 + 0.4 * np.cos(y / 9.0), (x + y) / 300.0], axis=2)
@@ -195,19 +198,21 @@ def test_a_lens_that_folds_over_is_said_on_the_panel(addon, scene, lens_shot):
     scene.splannequin.shot_path = str(lens_shot)
     with pytest.raises(RuntimeError, match="folds over"):
         bpy.ops.splannequin.write_stmaps()
-    assert "folds over" in addon("supervisor").watch_of(lens_shot).failures["camera"][0]
+    assert "folds over" in addon("process.supervisor").watch_of(lens_shot).failures["solve"][0]
     assert not list((lens_shot / "solve").glob("*.exr"))
 
 
 def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_shot):
-    stmaps, watch = addon("stmaps"), addon("supervisor").watch_of(lens_shot)
+    operators, supervisor = addon("solve.operators"), addon("process.supervisor")
+    watch = supervisor.watch_of(lens_shot)
     scene.splannequin.shot_path = str(lens_shot)
-    asked = stmaps.begin(lens_shot)
-    stmaps._asked.append(asked)
+    asked = addon("solve.stmaps").begin(lens_shot)
+    operators.follow_stmaps(lens_shot, asked)
     assert not bpy.ops.splannequin.write_stmaps.poll(), "one at a time"
     asked.process.wait(60)
-    assert stmaps._tick() is None and not stmaps._asked
-    assert "stmap_redistort.exr" in watch.notes["camera"][0]
+    supervisor.tick()
+    assert not operators.writing and not supervisor._meanwhile
+    assert "stmap_redistort.exr" in watch.notes["solve"][0]
     assert bpy.ops.splannequin.write_stmaps.poll()
 
 
@@ -217,11 +222,11 @@ def test_without_a_solve_the_button_is_off(addon, scene, tmp_path):
 
 
 def test_the_command_line_writes_maps_of_any_width(addon, lens_shot, tmp_path, capsys):
-    headless = addon("headless")
+    headless = addon("command_line.headless")
     assert headless.main(["stmaps", str(lens_shot), "--json", "--width", "320"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["width"], facts["height"]) == (320, 240)
-    assert addon("compositor").exr_size(Path(facts["redistort"])) == (320, 240)
+    assert addon("bake.take_files").exr_size(Path(facts["redistort"])) == (320, 240)
     assert headless.main(["stmaps", str(lens_shot), "--width", "7"]) == 2
     assert "cannot be 7 pixels wide" in capsys.readouterr().err
     assert headless.main(["stmaps", str(tmp_path)]) == 2

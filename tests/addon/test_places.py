@@ -42,20 +42,25 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     blend(project)
     there = moved(project)
     scene = opened(there)
-    assert addon("steps").shot_folder(scene) == there / "people.splannequin"
-    assert addon("places").absolute(scene.splannequin.clip) == str(there / "people.mp4")
-    assert addon("steps").params_of(scene, "footage").source == str(there / "people.mp4")
-    assert addon("cameras").find(scene, there / "people.splannequin", "CAMERA") == scene.camera
+    assert addon("shot.chosen").shot_folder(scene) == there / "people.splannequin"
+    assert addon("scene.paths").absolute(scene.splannequin.clip) == str(there / "people.mp4")
+    assert addon("process.steps").STEPS["import"].params(scene).source == str(there / "people.mp4")
+    assert addon("solve.cameras").find(scene, there / "people.splannequin", "CAMERA") == scene.camera
     assert plate_file() == there / "people.splannequin" / "frames" / "000005.png"
-    assert addon("panel").VIEWS["camera"](scene, addon("shots").read(there / "people.splannequin")).done
+    assert (
+        addon("process.steps")
+        .STEPS["solve"]
+        .view(scene, addon("shot.contents").read(there / "people.splannequin"))
+        .done
+    )
 
 
 def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
     blend(project)
     copy = Path(shutil.copytree(project, project.with_name("copy")))
     scene = opened(copy)
-    assert addon("steps").shot_folder(scene) == copy / "people.splannequin"
-    assert addon("cameras").find(scene, copy / "people.splannequin", "CAMERA") == scene.camera
+    assert addon("shot.chosen").shot_folder(scene) == copy / "people.splannequin"
+    assert addon("solve.cameras").find(scene, copy / "people.splannequin", "CAMERA") == scene.camera
 
 
 def test_an_older_file_that_holds_whole_paths_is_found_beside(addon, project):
@@ -67,7 +72,7 @@ def test_an_older_file_that_holds_whole_paths_is_found_beside(addon, project):
         bpy.context.preferences.filepaths.use_relative_paths = True
     there = moved(project)
     scene = opened(there)
-    assert addon("steps").shot_folder(scene) == there / "people.splannequin"
+    assert addon("shot.chosen").shot_folder(scene) == there / "people.splannequin"
 
 
 def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_path):
@@ -75,57 +80,57 @@ def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_pa
     (tmp_path / "other").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "copy.blend"), copy=True)
     scene = bpy.context.scene
-    assert addon("steps").shot_folder(scene) == project / "people.splannequin", "the open file stays where it is"
+    assert addon("shot.chosen").shot_folder(scene) == project / "people.splannequin", "the open file stays where it is"
     assert scene.splannequin.clip == "//people.mp4"
     blend(tmp_path / "other")
-    assert addon("steps").shot_folder(bpy.context.scene) == project / "people.splannequin"
+    assert addon("shot.chosen").shot_folder(bpy.context.scene) == project / "people.splannequin"
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "other" / "copy.blend"))
-    assert addon("steps").shot_folder(bpy.context.scene) == project / "people.splannequin"
+    assert addon("shot.chosen").shot_folder(bpy.context.scene) == project / "people.splannequin"
 
 
 def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     blend(project)
-    places, steps = addon("places"), addon("steps")
+    addon("process.steps")
     before, there = project / "people.splannequin", project / "renamed.splannequin"
     before.rename(there)
     scene = opened(project)
-    watch = addon("supervisor").watch_of(before)
-    assert places.missing(scene, watch.state)
-    for step in ("camera", "train", "freeze", "bake"):
+    watch = addon("process.supervisor").watch_of(before)
+    assert addon("shot.chosen").missing(scene, watch.state)
+    for step in ("solve", "train", "freeze", "bake"):
         with pytest.raises(contract.JobError, match="is not there any more") as told:
-            steps.begin(scene, step)
+            addon("process.begin").begin(scene, step)
         assert "Locate" in told.value.hint
     with pytest.raises(contract.JobError):
-        steps.freeze_from(scene, contract.CameraPath(4, 4, []))
+        addon("freeze.takes").freeze_from(scene, contract.CameraPath(4, 4, []))
     assert not before.exists()
     with pytest.raises(RuntimeError, match="is no shot folder"):
         bpy.ops.splannequin.locate_shot(directory=str(project))
     assert bpy.ops.splannequin.locate_shot(directory=f"{there}/") == {"FINISHED"}
-    assert steps.shot_folder(scene) == there and scene.splannequin.shot_path == "//renamed.splannequin"
-    assert addon("cameras").find(scene, there, "CAMERA") == scene.camera
+    assert addon("shot.chosen").shot_folder(scene) == there and scene.splannequin.shot_path == "//renamed.splannequin"
+    assert addon("solve.cameras").find(scene, there, "CAMERA") == scene.camera
     assert plate_file() == there / "frames" / "000005.png"
-    assert addon("bake").shown(scene, there) == "freeze", "the compositor's frames followed"
-    assert not places.missing(scene, addon("shots").read(there))
+    assert addon("bake.shown_take").shown(scene, there) == "freeze", "the compositor's frames followed"
+    assert not addon("shot.chosen").missing(scene, addon("shot.contents").read(there))
 
 
 def test_a_shot_that_is_yet_to_be_made_is_not_missed(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "new.mp4")
-    folder = addon("steps").shot_folder(scene)
-    assert not addon("places").missing(scene, addon("shots").read(folder))
+    folder = addon("shot.chosen").shot_folder(scene)
+    assert not addon("shot.chosen").missing(scene, addon("shot.contents").read(folder))
 
 
 def test_the_timer_remembers_a_shot_that_was_chosen(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
-    addon("supervisor").watch_of(shot)
-    addon("supervisor").tick()
+    addon("process.supervisor").watch_of(shot)
+    addon("process.supervisor").tick()
     shot.rename(shot.with_name("gone"))
-    assert addon("places").missing(scene, addon("shots").read(shot))
+    assert addon("shot.chosen").missing(scene, addon("shot.contents").read(shot))
 
 
 def test_the_footage_of_a_moved_shot_is_found_beside_it(addon, scene, shot, clip, tmp_path):
     info = json.loads((shot / "shot.json").read_text())
     (shot / "shot.json").write_text(json.dumps(info | {"source": "/nowhere/footage/people.mp4"}))
-    places, shots = addon("places"), addon("shots")
+    places, shots = addon("shot.places"), addon("shot.contents")
     assert places.source_of(shots.read(shot)) == ""
     (tmp_path / "footage").mkdir()
     shutil.copy(clip, tmp_path / "footage" / "people.mp4")
@@ -146,8 +151,8 @@ def test_a_failed_import_leaves_no_empty_shot(addon, scene, tmp_path):
     with pytest.raises(RuntimeError, match=r"text\.mp4"):
         bpy.ops.splannequin.import_clip()
     assert [p.name for p in tmp_path.iterdir()] == ["text.mp4"]
-    assert addon("headless").main(["import", str(tmp_path / "s.splannequin"), str(wrong)]) == 3
-    assert addon("headless").main(["freeze", str(wrong), "--output", str(tmp_path / "out")]) == 3
+    assert addon("command_line.headless").main(["import", str(tmp_path / "s.splannequin"), str(wrong)]) == 3
+    assert addon("command_line.headless").main(["freeze", str(wrong), "--output", str(tmp_path / "out")]) == 3
     assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
 
 
@@ -155,22 +160,22 @@ def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, sc
     wrong = tmp_path / "text.mp4"
     wrong.write_text("no video")
     scene.splannequin.clip = str(wrong)
-    supervisor = addon("supervisor")
-    job = addon("steps").begin(scene, "footage")
-    supervisor.follow("footage", job)
+    supervisor = addon("process.supervisor")
+    job = addon("process.begin").begin(scene, "import")
+    supervisor.follow("import", job)
     job.process.wait()
     watch = supervisor.watch_of(job.shot)
     while watch.running():
         supervisor.tick()
     assert not job.shot.exists()
-    assert watch.jobs["footage"].state == "failed" and "text.mp4" in watch.jobs["footage"].status.message
+    assert watch.jobs["import"].state == "failed" and "text.mp4" in watch.jobs["import"].status.message
 
 
 def test_a_failed_import_takes_nothing_of_a_shot_that_has_frames(addon, shot, tmp_path):
     wrong = tmp_path / "text.mp4"
     wrong.write_text("no video")
     before = sorted(str(p) for p in shot.rglob("*"))
-    assert addon("headless").main(["import", str(shot), str(wrong)]) == 3
+    assert addon("command_line.headless").main(["import", str(shot), str(wrong)]) == 3
     assert [p for p in sorted(str(p) for p in shot.rglob("*")) if "jobs" not in p] == before
 
 
@@ -179,7 +184,7 @@ def test_what_is_not_ours_stays_when_an_import_fails(addon, tmp_path):
     folder.mkdir()
     (folder / "notes.txt").write_text("mine")
     (tmp_path / "text.mp4").write_text("no video")
-    assert addon("headless").main(["import", str(folder), str(tmp_path / "text.mp4")]) == 3
+    assert addon("command_line.headless").main(["import", str(folder), str(tmp_path / "text.mp4")]) == 3
     assert [p.name for p in folder.iterdir()] == ["notes.txt"]
 
 
@@ -193,13 +198,13 @@ def test_a_folder_that_cannot_be_is_one_sentence(addon, scene, clip, tmp_path, w
     with pytest.raises(RuntimeError, match="Cannot write to") as told:
         bpy.ops.splannequin.import_clip()
     assert str(told.value).strip().count("\n") == 0
-    watch = addon("supervisor").watch_of(folder)
-    assert "Cannot write to" in watch.failures["footage"][0]
-    addon("supervisor").tick()
-    for view in addon("panel").VIEWS.values():
-        view(scene, watch.state)
+    watch = addon("process.supervisor").watch_of(folder)
+    assert "Cannot write to" in watch.failures["import"][0]
+    addon("process.supervisor").tick()
+    for step in addon("process.steps").STEPS.values():
+        step.view(scene, watch.state)
     capfd.readouterr()
-    assert addon("headless").main(["import", str(folder), str(clip)]) == 2
+    assert addon("command_line.headless").main(["import", str(folder), str(clip)]) == 2
     said = capfd.readouterr().err
     assert said.startswith("Error: Cannot write to") and said.strip().count("\n") == 0
 
@@ -209,4 +214,4 @@ def test_a_keyed_camera_of_a_moved_shot_is_found(addon, shot):
     shutil.copy(shot / "solve" / "cameras.json", shot / "paths" / "freeze.json")
     told = shot / "takes" / "freeze" / "take.json"
     told.write_text(json.dumps(json.loads(told.read_text()) | {"camera_path": "/nowhere/paths/freeze.json"}))
-    assert addon("steps").take_params(shot, "freeze").camera_path == str(shot / "paths" / "freeze.json")
+    assert addon("freeze.takes").take_params(shot, "freeze").camera_path == str(shot / "paths" / "freeze.json")

@@ -16,72 +16,74 @@ def with_shot(scene, shot):
 def test_a_bake_asks_for_the_scenes_range_and_step_of_the_take(addon, with_shot, shot):
     scene = with_shot
     scene.frame_start, scene.frame_end, scene.frame_step = 6, 7, 1
-    params = addon("steps").params_of(scene, "bake")
+    params = addon("process.steps").STEPS["bake"].params(scene)
     assert (params.first, params.last, params.step, params.only_missing) == (6, 7, 1, True)
     assert (params.take, params.run, params.t_star, params.grain) == ("freeze", "main", 6, False)
     scene.frame_start, scene.frame_end, scene.frame_step = 1, 250, 3
-    params = addon("steps").params_of(scene, "bake")
+    params = addon("process.steps").STEPS["bake"].params(scene)
     assert (params.first, params.last, params.step) == (1, 250, 3)
-    assert addon("steps").params_of(scene, "freeze").first is None, "the freeze is about all of the clip"
+    assert addon("process.steps").STEPS["freeze"].params(scene).first is None, "the freeze is about all of the clip"
 
 
 def test_a_bake_keeps_the_grain_of_its_take(addon, with_shot, shot):
     path = shot / "takes" / "freeze" / "take.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"grain": {"softness_px": 0.5}}))
-    assert addon("steps").params_of(with_shot, "bake").grain is True
+    assert addon("process.steps").STEPS["bake"].params(with_shot).grain is True
 
 
 def test_a_bake_follows_the_keys_of_t_star_as_they_are_now(addon, with_shot, shot):
     path = shot / "takes" / "freeze" / "take.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"t_star_per_frame": {"5": 5.0, "6": 5.5, "7": 6.0}}))
-    props, steps = with_shot.splannequin, addon("steps")
+    props, steps = with_shot.splannequin, addon("process.steps")
     with_shot.frame_start, with_shot.frame_end = 5, 7
-    assert steps.params_of(with_shot, "bake").t_star_per_frame == {"5": 5.0, "6": 5.5, "7": 6.0}
+    assert steps.STEPS["bake"].params(with_shot).t_star_per_frame == {"5": 5.0, "6": 5.5, "7": 6.0}
     props.choose_t_star, props.t_star = True, 7
-    params = steps.params_of(with_shot, "bake")
+    params = steps.STEPS["bake"].params(with_shot)
     assert (params.t_star, params.t_star_per_frame) == (7, {}), "one instant was chosen since"
     props.t_star = 5
     with_shot.keyframe_insert("splannequin.t_star", frame=5)
     props.t_star = 7
     with_shot.keyframe_insert("splannequin.t_star", frame=7)
-    asked = steps.params_of(with_shot, "bake").t_star_per_frame
+    asked = steps.STEPS["bake"].params(with_shot).t_star_per_frame
     assert asked["5"] == 5.0 and asked["7"] == 7.0
 
 
 def test_complete_is_about_the_frames_that_are_asked_for(addon, shot):
-    steps = addon("steps")
+    addon("process.steps")
     (shot / "takes" / "freeze" / "000006.exr").unlink()
-    assert not steps.complete(shot, "freeze")
-    assert steps.complete(shot, "freeze", range(5, 8, 2)) and steps.complete(shot, "freeze", range(7, 100))
-    assert not steps.complete(shot, "freeze", range(5, 7))
-    assert not steps.complete(shot, "nobody", range(5, 7))
+    assert not addon("freeze.takes").complete(shot, "freeze")
+    assert addon("freeze.takes").complete(shot, "freeze", range(5, 8, 2)) and addon("freeze.takes").complete(
+        shot, "freeze", range(7, 100)
+    )
+    assert not addon("freeze.takes").complete(shot, "freeze", range(5, 7))
+    assert not addon("freeze.takes").complete(shot, "nobody", range(5, 7))
 
 
 def test_a_run_that_was_trained_on_makes_a_take_suspect(addon, shot):
-    steps = addon("steps")
+    addon("process.steps")
     checkpoint, take = shot / "runs" / "main" / "checkpoint.safetensors", shot / "takes" / "freeze" / "take.json"
-    assert not steps.may_be_stale(shot, "freeze")
+    assert not addon("freeze.takes").may_be_stale(shot, "freeze")
     checkpoint.write_bytes(b"")
     os.utime(take, (1000, 1000))
-    assert steps.may_be_stale(shot, "freeze")
+    assert addon("freeze.takes").may_be_stale(shot, "freeze")
     os.utime(checkpoint, (900, 900))
-    assert not steps.may_be_stale(shot, "freeze")
+    assert not addon("freeze.takes").may_be_stale(shot, "freeze")
 
 
 def test_frames_of_the_range_that_the_take_lacks_are_told(addon, with_shot, shot):
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     with_shot.frame_start, with_shot.frame_end = 5, 7
-    said = addon("bake").insert(with_shot, shot, "freeze")
+    said = addon("bake.insertion").insert(with_shot, shot, "freeze")
     assert "1 frames of the scene's range are not in the take, the first is 6." in said
     with_shot.frame_step = 2
-    assert not any("not in the take" in line for line in addon("bake").insert(with_shot, shot, "freeze"))
+    assert not any("not in the take" in line for line in addon("bake.insertion").insert(with_shot, shot, "freeze"))
 
 
 def test_headless_bakes_a_part_of_a_take_and_leaves_it_in_the_file(addon, shot, tmp_path, capfd):
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     out = tmp_path / "out"
     arguments = ["bake", "--shot", str(shot), "--output", str(out)]
-    assert addon("headless").main([*arguments, "--first", "5", "--step", "2"]) == 0
+    assert addon("command_line.headless").main([*arguments, "--first", "5", "--step", "2"]) == 0
     assert [p.name for p in sorted((out / "composited").iterdir())] == ["000005.png", "000007.png"]
     assert not list((shot / "jobs").iterdir()) if (shot / "jobs").is_dir() else True, "no backend was asked"
     bpy.ops.wm.open_mainfile(filepath=str(out / "shot.blend"))
@@ -89,7 +91,7 @@ def test_headless_bakes_a_part_of_a_take_and_leaves_it_in_the_file(addon, shot, 
     assert (scene.frame_start, scene.frame_end, scene.frame_step) == (5, 7, 2)
     assert (scene.render.resolution_x, scene.render.resolution_y) == (16, 12)
     capfd.readouterr()
-    assert addon("headless").main([*arguments, "--first", "9"]) == 2
+    assert addon("command_line.headless").main([*arguments, "--first", "9"]) == 2
     assert "The last frame, 7, comes before the first, 9." in capfd.readouterr().err
 
 
@@ -111,42 +113,42 @@ def test_a_new_scene_bakes_at_the_size_of_the_plate_however_small_the_take(addon
     larger_plate(shot, 4)
     out = tmp_path / "out"
     arguments = ["bake", "--shot", str(shot), "--output", str(out), "--first", "6", "--last", "6"]
-    assert addon("headless").main(arguments) == 0
+    assert addon("command_line.headless").main(arguments) == 0
     assert size_of(bpy.context.scene) == (64, 48, 100)
     assert pictures.read(out / "composited" / "000006.png").shape == (48, 64, 3)
 
 
 def test_a_bake_never_lowers_the_size_of_a_scene_nor_takes_back_what_the_artist_set(addon, with_shot, shot, tmp_path):
     larger_plate(shot, 80)
-    scene, steps = with_shot, addon("steps")
-    steps.load_camera(scene, shot)
+    scene = with_shot
+    addon("solve.arrival").load_camera(scene, shot)
     assert size_of(scene) == (1280, 960, 100)
-    assert addon("bake").fit_take(scene, shot, "freeze") == [] and size_of(scene) == (1280, 960, 100)
+    assert addon("bake.insertion").fit_take(scene, shot, "freeze") == [] and size_of(scene) == (1280, 960, 100)
     scene.frame_start = 6
     blend = str(tmp_path / "mine.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend)
     arguments = ["bake", "--shot", str(shot), "--blend", blend, "--output", str(tmp_path / "out")]
-    assert addon("headless").main([*arguments, "--last", "6"]) == 0
+    assert addon("command_line.headless").main([*arguments, "--last", "6"]) == 0
     scene = bpy.context.scene
     assert size_of(scene) == (1280, 960, 100) and scene.frame_start == 6
     scene.render.resolution_x, scene.render.resolution_percentage = 2560, 50
-    steps.load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     assert size_of(scene) == (2560, 960, 50), "changed since by the artist"
     larger_plate(shot, 1)
     scene.splannequin.set_up_scene = True
-    steps.load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     assert size_of(scene) == (16, 12, 100), "asked for with Fit Scene to Clip"
 
 
 def test_the_camera_is_looked_at_again_only_if_the_take_was_seen_from_one(addon, contract, with_shot, shot):
-    steps, jobs = addon("steps"), addon("jobs")
-    assert not steps.follows_camera(with_shot)
+    jobs = addon("process.jobs")
+    assert not addon("freeze.own_camera").follows_camera(with_shot)
     with_shot.splannequin.path_camera = with_shot.camera
-    assert not steps.follows_camera(with_shot), "the take is of the clip's own move"
+    assert not addon("freeze.own_camera").follows_camera(with_shot), "the take is of the clip's own move"
     file = shot / "paths" / "freeze.json"
     take = shot / "takes" / "freeze" / "take.json"
     take.write_text(json.dumps(json.loads(take.read_text()) | {"camera_path": str(file)}))
-    assert steps.follows_camera(with_shot)
+    assert addon("freeze.own_camera").follows_camera(with_shot)
 
     def path(numbers, shift: float):
         pose = [1.0, 0, 0, shift, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0]
@@ -155,7 +157,7 @@ def test_the_camera_is_looked_at_again_only_if_the_take_was_seen_from_one(addon,
 
     jobs.write_json(file, path((5, 6, 7), 0.0).to_json())
     with_shot.frame_start, with_shot.frame_end = 6, 6
-    params = steps.freeze_from(with_shot, path((6,), 0.5), "bake")
+    params = addon("freeze.takes").freeze_from(with_shot, path((6,), 0.5), "bake")
     kept = contract.CameraPath.load(params.camera_path)
     assert [(f.frame, f.viewmat[3]) for f in kept.frames] == [(5, 0.0), (6, 0.5), (7, 0.0)]
     assert (params.first, params.last) == (6, 6)

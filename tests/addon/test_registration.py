@@ -20,7 +20,7 @@ def handlers() -> int:
 
 def test_unregister_leaves_nothing_and_register_twice_registers_once(package):
     before, hooks = ours(), handlers()
-    assert {"SPLANNEQUIN_OT_import_clip", "SPLANNEQUIN_PT_bake", "SPLANNEQUIN_PG_scene"} <= before and hooks == 8
+    assert {"SPLANNEQUIN_OT_import_clip", "SPLANNEQUIN_PT_bake", "SPLANNEQUIN_PG_scene"} <= before and hooks == 9
     try:
         package.unregister()
         assert ours() == set() and handlers() == 0
@@ -33,8 +33,9 @@ def test_unregister_leaves_nothing_and_register_twice_registers_once(package):
 
 
 def test_the_panels_stand_in_order_in_one_tab(addon):
-    panels = addon("panel").CLASSES
-    assert [p.bl_label for p in panels] == ["1  Footage", "2  Camera", "3  Train", "4  Freeze", "5  Bake"]
+    steps = addon("process.steps").STEPS.values()
+    panels = [c for step in steps for c in step.classes if hasattr(c, "step") and issubclass(c, bpy.types.Panel)]
+    assert [p.bl_label for p in panels] == ["1  Import", "2  Solve", "3  Train", "4  Freeze", "5  Bake"]
     assert {(p.bl_category, p.bl_space_type, p.bl_region_type) for p in panels} == {("Splannequin", "VIEW_3D", "UI")}
     for panel in panels:
         assert panel.operator.partition(".")[2] in dir(bpy.ops.splannequin)
@@ -42,4 +43,4 @@ def test_the_panels_stand_in_order_in_one_tab(addon):
 
 def test_handlers_and_timer_survive_another_file(addon):
     bpy.ops.wm.read_homefile(use_factory_startup=True)
-    assert handlers() == 8
+    assert handlers() == 9

@@ -37,8 +37,8 @@ def with_runs(scene, shot):
 
 
 def plan(addon, scene):
-    state = addon("shots").read(addon("steps").shot_folder(scene))
-    return addon("training").plan(state, scene.splannequin.run_name, scene.splannequin.preset)
+    state = addon("shot.contents").read(addon("shot.chosen").shot_folder(scene))
+    return addon("train.training").plan(state, scene.splannequin.run_name, scene.splannequin.preset)
 
 
 def test_the_button_says_what_it_will_do(addon, with_runs, shot):
@@ -56,7 +56,7 @@ def test_the_button_says_what_it_will_do(addon, with_runs, shot):
     grown = [{"from_iteration": 900, "steps": 300}]
     checkpoint(shot / "runs" / "main" / "extension.safetensors", iteration=1000, extensions=grown)
     assert (plan(addon, with_runs).kind, plan(addon, with_runs).button) == ("extension", "Resume")
-    assert addon("shots").read(shot).runs["main"]["extension"] == {"done": 100, "steps": 300}
+    assert addon("shot.contents").read(shot).runs["main"]["extension"] == {"done": 100, "steps": 300}
     grown[0]["from_iteration"] = 600
     checkpoint(shot / "runs" / "main" / "extension.safetensors", iteration=700, extensions=grown)
     assert plan(addon, with_runs).kind == "extend", "it was begun on a run that is no longer there"
@@ -64,7 +64,7 @@ def test_the_button_says_what_it_will_do(addon, with_runs, shot):
 
 def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, shot):
     """The backend trains other settings in the run's folder `next`: the run is still listed as it is."""
-    props, shots = with_runs.splannequin, addon("shots")
+    props, shots = with_runs.splannequin, addon("shot.contents")
     config, before = {**CONFIG, "preset": "final", "seed": 9}, shots.stamp(shot)
     work = shot / "runs" / "main" / "next" / "0123456789abcdef"
     checkpoint(work / "checkpoint.safetensors", key="other", iteration=450, config=config)
@@ -72,33 +72,33 @@ def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, sh
     assert shots.stamp(shot) != before, "the panel notices"
     state = shots.read(shot)
     assert set(state.runs) == {"main"} and set(state.unfinished) == {"better"}
-    assert addon("training").history(state.runs["main"], [(4.0, 21.0)]) == [(3.0, 20.0), (4.0, 21.0)]
+    assert addon("train.training").history(state.runs["main"], [(4.0, 21.0)]) == [(3.0, 20.0), (4.0, 21.0)]
     assert plan(addon, with_runs).button == "Train On", "the run that is there is of the preset that is chosen"
     props.preset = "final"
     assert plan(addon, with_runs).kind == "resume" and "as it was" in plan(addon, with_runs).words
-    asked = addon("steps").params_of(with_runs, "train")
+    asked = addon("process.steps").STEPS["train"].params(with_runs)
     assert (asked.run, asked.preset, asked.seed, asked.iterations, asked.extend) == ("main", "final", 9, 900, 0)
 
 
 def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
-    props, params_of = with_runs.splannequin, addon("steps").params_of
+    props, steps = with_runs.splannequin, addon("process.steps").STEPS
     props.extend_steps = 70
-    asked = params_of(with_runs, "train")
+    asked = steps["train"].params(with_runs)
     assert (asked.run, asked.extend, asked.iterations) == ("main", 70, 0)
     checkpoint(
         shot / "runs" / "main" / "extension.safetensors", iteration=1000,
         extensions=[{"from_iteration": 900, "steps": 300}],
     )  # fmt: skip
-    assert params_of(with_runs, "train").extend == 300, "the steps that were begun, not those in the field"
+    assert steps["train"].params(with_runs).extend == 300, "the steps that were begun, not those in the field"
     props.run_name = "better"
-    asked = params_of(with_runs, "train")
+    asked = steps["train"].params(with_runs)
     assert (asked.run, asked.extend, asked.iterations, asked.width) == ("better", 0, 900, 48)
     assert (asked.max_gaussians, asked.holdout, asked.seed) == (1234, 5, 7)
     assert (asked.host, asked.host_config, asked.supervision, asked.detector) == ("mlp", "reference", "paper", "weight")
     props.preset = "standard"
-    assert (params_of(with_runs, "train").preset, params_of(with_runs, "train").iterations) == ("standard", 0)
+    assert (steps["train"].params(with_runs).preset, steps["train"].params(with_runs).iterations) == ("standard", 0)
     props.run_name = "new"
-    assert params_of(with_runs, "train").extend == 0
+    assert steps["train"].params(with_runs).extend == 0
 
 
 def test_more_steps_are_a_third_of_the_presets_at_first(scene, contract):
@@ -126,19 +126,19 @@ def test_after_another_solve_training_begins_anew(addon, with_runs, shot):
 
 
 def test_broken_checkpoints_are_passed_over(addon, shot, tmp_path):
-    read = addon("checkpoints").facts
+    read = addon("shot.checkpoints").facts
     assert read(tmp_path / "none") == {}
     for content in (b"", b"\x05", struct.pack("<Q", 1 << 60) + b"{}", struct.pack("<Q", 2) + b"[]"):
         (tmp_path / "bad").write_bytes(content)
         assert read(tmp_path / "bad") == {}
     (shot / "runs" / "odd").mkdir()
     (shot / "runs" / "odd" / "checkpoint.safetensors").write_bytes(b"odd")
-    assert addon("shots").read(shot).unfinished == {}
+    assert addon("shot.contents").read(shot).unfinished == {}
 
 
 def test_runs_and_takes_stand_side_by_side(addon, with_runs, shot, new_take):
     new_take(shot, "second")
-    state, listing = addon("shots").read(shot), addon("listing")
+    state, listing = addon("shot.contents").read(shot), addon("ui.listing")
     assert listing.run_rows(state) == [
         ("better", "paused at 33 %"),
         ("main", "24.00", "12.3k", "5%", "2m"),
@@ -166,7 +166,7 @@ def test_a_click_picks_a_run_with_its_preset_and_a_take(addon, with_runs, shot, 
 
 def test_removing_a_run_removes_its_folder_and_nothing_else(addon, with_runs, shot):
     kept = sorted(p for p in shot.rglob("*") if "better" not in p.parts)
-    watch = addon("supervisor").watch_of(shot)
+    watch = addon("process.supervisor").watch_of(shot)
     assert set(watch.state.unfinished) == {"better"}
     assert bpy.ops.splannequin.remove_run(name="better") == {"FINISHED"}
     assert sorted(shot.rglob("*")) == kept, "nor is there a trash left"
@@ -190,14 +190,14 @@ def test_a_take_that_the_compositor_shows_is_not_removed(addon, with_runs, shot,
 
 
 def test_nothing_is_picked_or_removed_while_a_step_runs(addon, contract, with_runs, shot):
-    addon("jobs").new_job(shot, "train", contract.TrainParams())
-    assert addon("supervisor").watch_of(shot).running() == "train"
+    addon("process.jobs").new_job(shot, "train", contract.TrainParams())
+    assert addon("process.supervisor").watch_of(shot).running() == "train"
     for name in ("pick_run", "pick_take", "remove_run", "remove_take"):
         assert not getattr(bpy.ops.splannequin, name).poll(), name
 
 
 def test_new_buttons_have_tooltips(addon):
-    for cls in addon("ops_runs").CLASSES:
+    for cls in [*addon("train.operators").CLASSES, *addon("freeze.operators").CLASSES]:
         kind = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type()
         assert len(kind.description) > 10 and not kind.description.endswith("."), cls
         assert all(p.identifier == "rna_type" or p.description for p in kind.properties), cls
@@ -205,7 +205,7 @@ def test_new_buttons_have_tooltips(addon):
 
 def test_the_curve_of_an_added_stretch_follows_the_runs_own(addon):
     told = {"history": [(1.0, 20.0), (2.0, 21.0), (3.0, 22.0)]}
-    history = addon("training").history
+    history = addon("train.training").history
     assert history(told, []) == told["history"]
     assert history(told, [(2.5, 21.5), (4.0, 23.0)]) == [(1.0, 20.0), (2.0, 21.0), (2.5, 21.5), (4.0, 23.0)]
     assert history({}, [(1.0, 9.0)]) == [(1.0, 9.0)]
@@ -215,17 +215,17 @@ _WORLD = "import sys; from pathlib import Path; from tests.backend.conftest impo
 
 
 def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root, tmp_path, capfd):
-    steps, jobs, shots, python = addon("steps"), addon("jobs"), addon("shots"), addon("backend").python()
+    jobs, shots, python = addon("process.jobs"), addon("shot.contents"), addon("process.backend").python()
     subprocess.run([python, "-c", _WORLD.format(str(tmp_path))], cwd=root, check=True)
     shot = tmp_path / "tiny.splannequin"
     (shot / "solve" / "solve.json").write_text('{"version": 1, "quality": "true"}')
     arguments = ["train", str(shot), "--run", "main", "--iterations", "150", "--max-gaussians", "1500"]
-    assert addon("headless").main(arguments) == 0
+    assert addon("command_line.headless").main(arguments) == 0
     scene.splannequin.shot_path = str(shot)
     assert plan(addon, scene).kind == "extend"
 
     scene.splannequin.extend_steps = 200
-    job = steps.begin(scene, "train")
+    job = addon("process.begin").begin(scene, "train")
     while "preview" not in job.images and not job.ended:
         jobs.poll(job, 0.05)
     assert job.images["preview"].endswith("000170.png")
@@ -234,16 +234,16 @@ def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root,
     assert plan(addon, scene).button == "Resume"
     state = shots.read(shot)
     assert state.runs["main"]["iterations"] == 150 and 20 <= state.runs["main"]["extension"]["done"] < 200
-    addon("supervisor").forget()
+    addon("process.supervisor").forget()
     assert bpy.ops.splannequin.train() == {"FINISHED"}
     run = shots.read(shot).runs["main"]
     assert (run["iterations"], run["extension"]) == (350, None)
     assert [seconds for seconds, _ in run["history"]] == sorted({seconds for seconds, _ in run["history"]})
     assert run["preview"].name == "000350.png"
 
-    assert addon("headless").main(["train", str(shot), "--extend", "10"]) == 0
+    assert addon("command_line.headless").main(["train", str(shot), "--extend", "10"]) == 0
     assert shots.read(shot).runs["main"]["iterations"] == 360
-    assert addon("headless").main(["train", str(shot), "--run", "none", "--extend", "10"]) == 5
+    assert addon("command_line.headless").main(["train", str(shot), "--run", "none", "--extend", "10"]) == 5
     assert "no trained run 'none'" in capfd.readouterr().err
 
 
@@ -260,7 +260,7 @@ def test_removing_a_take_deletes_nothing_behind_a_link(addon, shot, new_take, tm
     else:
         path.symlink_to(mine, target_is_directory=True)
     take = shot / "takes" / ("freeze" if link == "trash" else "mine")
-    remove = addon("listing").remove
+    remove = addon("ui.listing").remove
     if link == "takes":
         with pytest.raises(OSError, match="takes is a link to another folder"):
             remove(shot, take, wait=True)

@@ -21,15 +21,15 @@ def two(addon, scene, shot, other):
     """Both in the scene with their cameras; the second is chosen."""
     props = scene.splannequin
     props.shot_path, props.run_name = str(shot), "first run"
-    addon("steps").load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     assert bpy.ops.splannequin.shot_add() == {"FINISHED"}
     props.shot_path = str(other)
-    addon("steps").load_camera(scene, other)
+    addon("solve.arrival").load_camera(scene, other)
     return scene
 
 
 def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
-    props, steps, shot_list = scene.splannequin, addon("steps"), addon("shot_list")
+    props, shot_list = scene.splannequin, addon("shot.chosen")
     assert not bpy.ops.splannequin.shot_add.poll(), "there is no first shot yet"
     props.shot_path, props.clip = str(shot), "//first.mov"
     own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
@@ -49,10 +49,10 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     assert (props.clip, props.shot_path, props.run_name, props.path_camera) == ("", "", "main", None)
     assert props.set_up_scene, "what is the scene's own stays"
     props.shot_path, props.t_star = str(other), 7
-    assert shot_list.folders(scene) == [shot, other] and steps.shot_folder(scene) == other
+    assert shot_list.folders(scene) == [shot, other] and addon("shot.chosen").shot_folder(scene) == other
     assert [shot_list.label(one) for one in shot_list.settings(scene)] == ["my shot é", "second"]
     props.active_shot = 0
-    assert steps.shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
+    assert addon("shot.chosen").shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
     assert shot_list.folders(scene) == [shot, other]
     props.active_shot = 1
     assert (props.shot_path, props.t_star, props.run_name) == (str(other), 7, "main")
@@ -66,7 +66,7 @@ def keyed(addon, scene):
 
 
 def test_a_keyed_instant_goes_with_its_shot(addon, two):
-    props, steps = two.splannequin, addon("steps")
+    props = two.splannequin
     two["mine"] = 1.0
     two.keyframe_insert('["mine"]', frame=1)
     artists = set(keyed(addon, two))
@@ -76,9 +76,9 @@ def test_a_keyed_instant_goes_with_its_shot(addon, two):
         two.keyframe_insert("splannequin.t_star", frame=5)
     ours = {"splannequin.t_star": [5.0], "splannequin.shots[1].t_star": [7.0]}
     assert {k: v for k, v in keyed(addon, two).items() if k not in artists} == ours
-    assert steps.keyed_instants(two)["6"] == 5.0
+    assert addon("freeze.takes").keyed_instants(two)["6"] == 5.0
     props.active_shot = 1
-    assert steps.keyed_instants(two)["6"] == 7.0
+    assert addon("freeze.takes").keyed_instants(two)["6"] == 7.0
     two.frame_set(6)
     assert props.t_star == 7 and props.shots[0].t_star == 5
     assert set(keyed(addon, two)) == {*artists, "splannequin.t_star", "splannequin.shots[0].t_star"}
@@ -102,7 +102,7 @@ def test_keys_move_up_when_a_shot_before_them_goes(addon, two, shot, tmp_path):
 
 
 def test_the_chosen_shots_camera_is_the_scenes(addon, two, shot, other):
-    cameras, props = addon("cameras"), two.splannequin
+    cameras, props = addon("solve.cameras"), two.splannequin
     assert two.camera == cameras.find(two, other, "CAMERA")
     props.active_shot = 0
     assert two.camera == cameras.find(two, shot, "CAMERA")
@@ -122,17 +122,17 @@ def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
     """Put back at switching, as the artist left them; the scene's own come back with the last shot."""
     first, second = ((16, 12, 100), 12.5, (5, 7)), ((32, 24, 100), 25.0, (5, 7))
     original = seen(scene)
-    props, steps = scene.splannequin, addon("steps")
+    props = scene.splannequin
     for name, change in (("shot.json", {"fps": 25.0}), ("solve/cameras.json", {})):
         told = json.loads((other / name).read_text()) | change | {"width": 32, "height": 24}
         (other / name).write_text(json.dumps(told))
     props.shot_path = str(shot)
-    steps.load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     assert seen(scene) == first
     bpy.ops.splannequin.shot_add()
     assert seen(scene) == first, "nothing of the new one is known"
     props.shot_path = str(other)
-    steps.load_camera(scene, other)
+    addon("solve.arrival").load_camera(scene, other)
     assert seen(scene) == second
     props.active_shot = 0
     assert seen(scene) == first
@@ -142,8 +142,8 @@ def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
     props.active_shot = 0
     assert seen(scene) == ((16, 12, 50), 12.5, (6, 7))
     bpy.ops.splannequin.shot_remove(things=True)
-    assert seen(scene) == second and scene.camera == addon("cameras").find(scene, other, "CAMERA")
-    steps.remove_all(scene, other)
+    assert seen(scene) == second and scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
+    addon("process.begin").remove_all(scene, other)
     assert seen(scene) == original and scene.camera == scene.objects["Camera"]
 
 
@@ -155,18 +155,18 @@ def test_what_the_artist_set_for_a_shot_is_still_the_artists_after_switching(add
     props.active_shot = 1
     assert two.render.resolution_x == 4000
     for folder in (shot, other):
-        addon("steps").remove_all(two, folder)
+        addon("process.begin").remove_all(two, folder)
     assert two.render.resolution_x == 4000 and two.frame_end == 250
 
 
 def test_a_scene_that_was_left_alone_stays_so_at_switching(addon, scene, shot, other):
     scene.render.resolution_x, scene.frame_end = 640, 99
-    props, steps = scene.splannequin, addon("steps")
+    props = scene.splannequin
     props.shot_path = str(shot)
-    steps.load_camera(scene, shot)
+    addon("solve.arrival").load_camera(scene, shot)
     bpy.ops.splannequin.shot_add()
     props.shot_path = str(other)
-    steps.load_camera(scene, other)
+    addon("solve.arrival").load_camera(scene, other)
     scene.frame_end = 50
     props.active_shot = 0
     assert (scene.render.resolution_x, scene.frame_end) == (640, 50)
@@ -178,70 +178,70 @@ def things(scene) -> set[str]:
 
 
 def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
-    props, steps, compositor = scene.splannequin, addon("steps"), addon("compositor")
+    props = scene.splannequin
     props.shot_path = str(shot)
-    steps.load_camera(scene, shot)
-    steps.insert_freeze(scene, shot, "freeze")
+    addon("solve.arrival").load_camera(scene, shot)
+    addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     before = things(scene)
     bpy.context.view_layer.update()
-    pose = np.array(addon("cameras").find(scene, shot, "CAMERA").matrix_world)
+    pose = np.array(addon("solve.cameras").find(scene, shot, "CAMERA").matrix_world)
     bpy.ops.splannequin.shot_add()
     props.shot_path = str(other)
-    steps.load_camera(scene, other)
+    addon("solve.arrival").load_camera(scene, other)
     assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
     assert things(scene) == before
-    assert not len(props.shots) and steps.shot_folder(scene) == shot
-    assert scene.camera == addon("cameras").find(scene, shot, "CAMERA")
+    assert not len(props.shots) and addon("shot.chosen").shot_folder(scene) == shot
+    assert scene.camera == addon("solve.cameras").find(scene, shot, "CAMERA")
     bpy.context.view_layer.update()
     np.testing.assert_array_equal(scene.camera.matrix_world, pose)
-    assert compositor.shown(scene)[0] == shot / "takes" / "freeze"
+    assert addon("bake.freeze_group").shown(scene)[0] == shot / "takes" / "freeze"
     assert scene.view_settings.view_transform == "Standard", "the shot that stays needs its settings"
     assert not bpy.ops.splannequin.shot_remove.poll()
-    steps.remove_all(scene, shot)
-    assert compositor.shown(scene) is None and scene.view_settings.view_transform == "AgX"
+    addon("process.begin").remove_all(scene, shot)
+    assert addon("bake.freeze_group").shown(scene) is None and scene.view_settings.view_transform == "AgX"
     assert scene.render.resolution_x == 1920
 
 
 def test_removing_the_baked_shot_takes_its_group_out(addon, two, shot, other):
-    steps, compositor = addon("steps"), addon("compositor")
-    steps.insert_freeze(two, other, "freeze")
-    steps.remove_all(two, other)
-    assert compositor.shown(two) is None and addon("cameras").find(two, shot, "CAMERA")
+    addon("process.steps")
+    addon("bake.insertion").insert_freeze(two, other, "freeze")
+    addon("process.begin").remove_all(two, other)
+    assert addon("bake.freeze_group").shown(two) is None and addon("solve.cameras").find(two, shot, "CAMERA")
     assert two.render.resolution_x == 16, "the settings go with the last shot"
 
 
 def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other, new_take):
-    steps, panel, shots = addon("steps"), addon("panel"), addon("shots")
-    steps.insert_freeze(two, other, "freeze")
-    assert panel.view_bake(two, shots.read(other)).done
+    shots = addon("shot.contents")
+    addon("bake.insertion").insert_freeze(two, other, "freeze")
+    assert addon("process.steps").STEPS["bake"].view(two, shots.read(other)).done
     two.splannequin.active_shot = 0
-    view = panel.view_bake(two, shots.read(shot))
+    view = addon("process.steps").STEPS["bake"].view(two, shots.read(shot))
     assert not view.done and "another shot, second" in view.state[0]
-    steps.insert_freeze(two, shot, "freeze")
-    assert panel.view_bake(two, shots.read(shot)).done
+    addon("bake.insertion").insert_freeze(two, shot, "freeze")
+    assert addon("process.steps").STEPS["bake"].view(two, shots.read(shot)).done
     new_take(shot, "later")
     two.splannequin.take_name = "later"
-    assert "take freeze" in panel.view_bake(two, shots.read(shot)).state[0]
+    assert "take freeze" in addon("process.steps").STEPS["bake"].view(two, shots.read(shot)).state[0]
 
 
 def test_undo_brings_a_shot_back(addon, two, shot, other):
     bpy.ops.ed.undo_push(message="two shots")
     assert bpy.ops.splannequin.shot_remove("EXEC_DEFAULT", True) == {"FINISHED"}
-    assert addon("shot_list").folders(bpy.context.scene) == [shot]
+    assert addon("shot.chosen").folders(bpy.context.scene) == [shot]
     bpy.ops.ed.undo()
     scene = bpy.context.scene
-    assert addon("shot_list").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
-    assert scene.camera == addon("cameras").find(scene, other, "CAMERA")
+    assert addon("shot.chosen").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
+    assert scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
     scene.splannequin.active_shot = 0
-    assert addon("steps").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
+    assert addon("shot.chosen").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
 
 
 def ended(addon, contract, folder, step, kind, params, result):
     """A job of a shot that the supervisor follows and that has just ended well."""
-    jobs = addon("jobs")
+    jobs = addon("process.jobs")
     job = jobs.new_job(folder, kind, params)
     (job.folder / "step").write_text(step)
-    addon("supervisor").follow(step, job)
+    addon("process.supervisor").follow(step, job)
     event = contract.Event("done", 1, 1.0, {"result": result})
     (job.folder / contract.EVENTS_FILE).write_text(json.dumps(event.__dict__) + "\n")
     status = contract.Status(job.folder.name, "done", 1, 1.0, 2.0, 2.0, fraction=1.0)
@@ -250,12 +250,12 @@ def ended(addon, contract, folder, step, kind, params, result):
 
 
 def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene, shot, other):
-    props, supervisor, cameras = scene.splannequin, addon("supervisor"), addon("cameras")
+    props, supervisor, cameras = scene.splannequin, addon("process.supervisor"), addon("solve.cameras")
     props.shot_path, props.t_star = str(shot), 2
     bpy.ops.splannequin.shot_add()
     props.shot_path, props.t_star = str(other), 3
     frozen = ended(addon, contract, shot, "freeze", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
-    solved = ended(addon, contract, shot, "camera", "solve", contract.SolveParams(), {})
+    solved = ended(addon, contract, shot, "solve", "solve", contract.SolveParams(), {})
     baked = ended(addon, contract, shot, "bake", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
     for _ in range(100):  # a turn has a budget, and the machine may be busy
         supervisor.tick()
@@ -263,14 +263,14 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
             break
     assert solved.ended and baked.ended and props.t_star == 3 and props.shots[0].t_star == 2
     assert cameras.find(scene, shot, "CAMERA") is None and set(supervisor.watch_of(shot).pending) == {
-        "freeze", "camera", "bake",
+        "freeze", "solve", "bake",
     }  # fmt: skip
     supervisor.tick()
     assert supervisor.watch_of(shot).jobs, "a shot of the list is followed on"
     props.active_shot = 0
     supervisor.tick()
     assert props.t_star == 6 and cameras.find(scene, shot, "CAMERA") == scene.camera
-    assert addon("compositor").shown(scene) is None, "choosing a shot bakes nothing"
+    assert addon("bake.freeze_group").shown(scene) is None, "choosing a shot bakes nothing"
     assert "Bake again" in supervisor.watch_of(shot).notes["bake"][0]
     props.t_star = 7
     supervisor.tick()
@@ -279,10 +279,11 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
 
 
 def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, other):
-    supervisor = addon("supervisor")
-    supervisor.sample(two, other, iter_path(contract))
+    supervisor = addon("process.supervisor")
+    read = addon("freeze.takes").reading(two.name, other, "freeze", iter_path(contract), 1)
+    supervisor.work(other, "freeze", read)
     two.splannequin.active_shot = 0
-    while supervisor.watch_of(other).sampling is not None:
+    while supervisor.watch_of(other).work is not None:
         supervisor.tick()
     assert "Another shot was chosen" in supervisor.watch_of(other).failures["freeze"][0]
     assert not (shot / "jobs").exists() and not (other / "jobs").exists()

@@ -76,7 +76,7 @@ def relative(viewmats) -> np.ndarray:
 
 
 def test_what_blender_tracked_comes_out_as_it_was_filmed(addon, tracked):
-    told = addon("solves").transforms(tracked)
+    told = addon("solve.exchange").transforms(tracked)
     assert [f["file_path"] for f in told["frames"]] == [f"{n}.png" for n in range(101, 101 + FRAMES)]
     found = opencv([f["transform_matrix"] for f in told["frames"]])
     np.testing.assert_allclose(relative(found), relative(TRUTH), atol=1e-4)
@@ -90,9 +90,9 @@ def test_the_solve_is_asked_for_with_what_was_tracked(addon, tracked, scene, sho
     listing.write_text(json.dumps({**json.loads(listing.read_text()), "key": "imported"}))
     props = scene.splannequin
     props.shot_path, props.cameras_from, props.tracking_clip = str(shot), "TRACKING", tracked
-    params = addon("steps").params_of(scene, "camera")
+    params = addon("process.steps").STEPS["solve"].params(scene)
     assert params.cameras == str(shot / "tracking" / "transforms.json")
-    assert json.loads(Path(params.cameras).read_text(encoding="utf-8")) == addon("solves").transforms(tracked)
+    assert json.loads(Path(params.cameras).read_text(encoding="utf-8")) == addon("solve.exchange").transforms(tracked)
     # The backend understands it, and finds that it is of another clip: the test shot has frames 5 to 7 of 16 x 12.
     with pytest.raises(RuntimeError, match=r"Only 0 of the 3 frames needed, from 5 to 7, have a camera.* 101 to 114"):
         bpy.ops.splannequin.solve_camera()
@@ -100,42 +100,42 @@ def test_the_solve_is_asked_for_with_what_was_tracked(addon, tracked, scene, sho
 
 
 def test_numbers_are_those_of_the_files(addon, clip):
-    assert addon("solves").first_number(clip) == 101
+    assert addon("solve.exchange").first_number(clip) == 101
     clip.frame_offset = 3
-    assert addon("solves").first_number(clip) == 104
+    assert addon("solve.exchange").first_number(clip) == 104
 
 
 def test_pixels_that_are_not_square_have_two_focal_lengths(addon, clip):
     camera = clip.tracking.camera
     camera.units, camera.focal_length_pixels, camera.pixel_aspect = "PIXELS", 300.0, 1.25
-    told = addon("solves").lens(clip)
+    told = addon("solve.exchange").lens(clip)
     assert (told["fl_x"], told["fl_y"]) == pytest.approx((300.0, 375.0))
 
 
 @pytest.mark.parametrize(("model", "name"), [("DIVISION", "division_k1"), ("NUKE", "nuke_k1"), ("BROWN", "brown_p1")])
 def test_other_lens_models_are_refused_unless_they_bend_nothing(addon, contract, clip, model, name):
     clip.tracking.camera.distortion_model = model
-    assert "k1" not in addon("solves").lens(clip)
+    assert "k1" not in addon("solve.exchange").lens(clip)
     setattr(clip.tracking.camera, name, 0.01)
     with pytest.raises(contract.JobError, match=f"distortion model {model.title()}"):
-        addon("solves").lens(clip)
+        addon("solve.exchange").lens(clip)
 
 
 def test_missing_cameras_are_said(addon, contract, scene, clip, shot):
-    params_of, props = addon("steps").params_of, scene.splannequin
+    steps, props = addon("process.steps").STEPS, scene.splannequin
     props.shot_path, props.cameras_from = str(shot), "FILE"
     with pytest.raises(contract.JobError, match="No file with cameras is chosen"):
-        params_of(scene, "camera")
+        steps["solve"].params(scene)
     props.cameras_path = str(shot / "x" / ".." / "model")
-    assert params_of(scene, "camera").cameras == str(shot / "model")
+    assert steps["solve"].params(scene).cameras == str(shot / "model")
     props.cameras_from = "TRACKING"
     with pytest.raises(contract.JobError, match="No tracked clip is chosen"):
-        params_of(scene, "camera")
+        steps["solve"].params(scene)
     props.tracking_clip = clip
     with pytest.raises(contract.JobError, match="is not solved"):
-        params_of(scene, "camera")
+        steps["solve"].params(scene)
     props.cameras_from = "SOLVE"
-    assert params_of(scene, "camera") == contract.SolveParams()
+    assert steps["solve"].params(scene) == contract.SolveParams()
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap_text", "nerfstudio"])
@@ -173,17 +173,23 @@ def test_the_export_button_says_what_is_wrong(scene, shot, tmp_path):
 
 
 @pytest.mark.parametrize("well", [True, False])
-def test_an_export_in_a_window_is_followed_without_waiting(addon, shot, tmp_path, well):
-    solves, told = addon("solves"), []
-    process = solves.begin_export(shot if well else tmp_path, "colmap", tmp_path / "out")
-    assert solves.look_after(process, tmp_path / "out", lambda *said: told.append(said)) and not told
-    process.wait(60)
-    assert solves.look_after(process, tmp_path / "out", lambda *said: told.append(said)) is None
-    assert told[0][1] is well and (str(tmp_path / "out") if well else "is not a shot folder") in told[0][0]
+def test_an_export_in_a_window_is_followed_without_waiting(addon, scene, shot, tmp_path, well):
+    solves, supervisor = addon("solve.exchange"), addon("process.supervisor")
+    scene.splannequin.shot_path = str(shot)
+    asked = solves.begin_export(shot if well else tmp_path, "colmap", tmp_path / "out")
+    told = addon("solve.operators").tell
+    supervisor.when_answered(asked, lambda: told(shot, lambda: [solves.exported(asked, tmp_path / "out")]))
+    supervisor.tick()
+    watch = supervisor.watch_of(shot)
+    assert not watch.notes and not watch.failures
+    asked.process.wait(60)
+    supervisor.tick()
+    said = watch.notes["solve"][0] if well else watch.failures["solve"][0]
+    assert (str(tmp_path / "out") if well else "is not a shot folder") in said
 
 
 def test_export_and_given_cameras_from_the_command_line(addon, shot, tmp_path, capfd):
-    main = addon("headless").main
+    main = addon("command_line.headless").main
     assert main(["export", str(shot), "--format", "nerfstudio", "--output", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "transforms.json").is_file()
     assert main(["export", str(tmp_path / "nowhere"), "--output", str(tmp_path / "out")]) == 2

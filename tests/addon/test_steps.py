@@ -20,7 +20,7 @@ def test_the_import_button_brings_the_clip_in(addon, scene, clip, tmp_path):
     props.clip, props.shot_path = str(clip), str(tmp_path / "s.splannequin")
     props.use_range, props.first, props.last = True, 2, 9
     assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
-    state = addon("shots").read(tmp_path / "s.splannequin")
+    state = addon("shot.contents").read(tmp_path / "s.splannequin")
     assert state.frames == 8 and state.frame_range == (2, 9)
     assert (scene.frame_start, scene.frame_end) == (2, 9), "a new scene takes the clip's range"
     assert (scene.render.resolution_x, scene.render.resolution_y) == state.size
@@ -30,10 +30,10 @@ def test_the_import_button_brings_the_clip_in(addon, scene, clip, tmp_path):
 
 def test_a_scene_in_use_is_left_alone_without_consent(addon, scene, shot):
     scene.render.resolution_x, scene.frame_end = 4096, 99
-    said = addon("steps").imported(scene, shot)
+    said = addon("footage.arrival").imported(scene, shot)
     assert (scene.render.resolution_x, scene.frame_end) == (4096, 99) and "left alone" in said[0]
     scene.splannequin.set_up_scene = True
-    addon("steps").imported(scene, shot)
+    addon("footage.arrival").imported(scene, shot)
     assert (scene.render.resolution_x, scene.frame_end) == (16, 7)
 
 
@@ -43,8 +43,8 @@ def test_a_button_says_what_is_wrong(addon, scene, tmp_path):
     scene.splannequin.clip = str(wrong)
     with pytest.raises(RuntimeError, match=r"text\.mp4"):
         bpy.ops.splannequin.import_clip()
-    watch = addon("supervisor").watch_of(tmp_path / "text.splannequin")
-    assert watch.jobs["footage"].state == "failed"
+    watch = addon("process.supervisor").watch_of(tmp_path / "text.splannequin")
+    assert watch.jobs["import"].state == "failed"
 
 
 def test_no_clip_is_said_in_words(scene):
@@ -68,21 +68,21 @@ def test_a_folder_of_no_shot_is_refused(scene, tmp_path):
 
 def test_the_shot_folder_stands_beside_the_clip(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a clip.mov")
-    assert addon("steps").shot_folder(scene) == tmp_path / "a clip.splannequin"
+    assert addon("shot.chosen").shot_folder(scene) == tmp_path / "a clip.splannequin"
 
 
 def test_relative_paths_follow_the_blend(addon, scene, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.context.scene.splannequin.shot_path = "//x.splannequin"
-    assert addon("steps").shot_folder(bpy.context.scene) == tmp_path / "x.splannequin"
+    assert addon("shot.chosen").shot_folder(bpy.context.scene) == tmp_path / "x.splannequin"
 
 
 def test_load_camera_is_one_undo_step(with_shot, shot, addon):
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.splannequin.load_camera("EXEC_DEFAULT", True) == {"FINISHED"}
-    assert addon("cameras").find(bpy.context.scene, shot, "CAMERA")
+    assert addon("solve.cameras").find(bpy.context.scene, shot, "CAMERA")
     bpy.ops.ed.undo()
-    assert addon("cameras").find(bpy.context.scene, shot, "CAMERA") is None
+    assert addon("solve.cameras").find(bpy.context.scene, shot, "CAMERA") is None
     assert bpy.context.scene.render.resolution_x == 1920, "the scene's own size came back with it"
 
 
@@ -94,8 +94,8 @@ def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, sh
     bpy.ops.splannequin.load_camera()
     bpy.ops.splannequin.insert_freeze()
     assert scene.view_settings.view_transform == "Standard" and scene.render.dither_intensity == 0.0
-    notes = addon("supervisor").watch_of(shot).notes
-    assert notes["camera"] and notes["bake"]
+    notes = addon("process.supervisor").watch_of(shot).notes
+    assert notes["solve"] and notes["bake"]
     assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
     assert set(notes) == {"bake"}, "nothing says any more that the shot's camera is the scene's"
     assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == names
@@ -125,7 +125,7 @@ def test_bake_without_a_backend_renders_a_complete_take(
 
 def test_the_artists_output_path_is_kept(addon, with_shot, shot, tmp_path):
     with_shot.render.filepath = str(tmp_path / "mine_")
-    assert addon("bake").choose_output(with_shot, shot, "freeze") == []
+    assert addon("bake.rendering").choose_output(with_shot, shot, "freeze") == []
     assert with_shot.render.filepath == str(tmp_path / "mine_")
 
 
@@ -136,7 +136,7 @@ def test_t_star_is_held_within_the_clip(with_shot):
 
 
 def test_bake_asks_for_the_take_as_it_was_made(addon, with_shot):
-    params = addon("steps").params_of(with_shot, "bake")
+    params = addon("process.steps").STEPS["bake"].params(with_shot)
     assert (params.run, params.take, params.t_star, params.width, params.only_missing) == (
         "main",
         "freeze",
@@ -145,45 +145,48 @@ def test_bake_asks_for_the_take_as_it_was_made(addon, with_shot):
         True,
     )
     with_shot.splannequin.choose_t_star, with_shot.splannequin.t_star = True, 7
-    assert addon("steps").params_of(with_shot, "bake").t_star == 7
+    assert addon("process.steps").STEPS["bake"].params(with_shot).t_star == 7
 
 
 def test_the_timer_applies_a_job_that_ended_and_gives_each_step_its_words(addon, scene, clip, tmp_path):
     props = scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
     props.use_range, props.first, props.last = True, 1, 8
-    job = addon("steps").begin(scene, "footage")
-    supervisor = addon("supervisor")
-    supervisor.follow("footage", job)
+    job = addon("process.begin").begin(scene, "import")
+    supervisor = addon("process.supervisor")
+    supervisor.follow("import", job)
     watch = supervisor.watch_of(job.shot)
-    assert watch.running() == "footage"
+    assert watch.running() == "import"
     job.process.wait()
     while watch.running():
         assert supervisor.tick() == supervisor.TICK_SECONDS
     assert watch.state.frames == 8
-    assert "Frame range set to 1 to 8." in watch.notes["footage"] and scene.frame_end == 8
+    assert "Frame range set to 1 to 8." in watch.notes["import"] and scene.frame_end == 8
 
 
-@pytest.mark.parametrize("step", ["footage", "camera", "train", "freeze", "bake"])
+@pytest.mark.parametrize("step", ["import", "solve", "train", "freeze", "bake"])
 def test_each_step_says_what_comes_next(addon, scene, step):
-    view = addon("panel").VIEWS[step](scene, None)
+    view = addon("process.steps").STEPS[step].view(scene, None)
     assert view.advice.endswith(".") and not view.done
-    assert view.ready == (step == "footage")
+    assert view.ready == (step == "import")
 
 
 def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
-    panel, state = addon("panel"), addon("shots").read(shot)
-    shown = {step: view(with_shot, state) for step, view in panel.VIEWS.items()}
-    assert shown["footage"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
-    assert shown["camera"].state == ["A good solve."] and "load it" in shown["camera"].advice
+    steps, state = addon("process.steps").STEPS, addon("shot.contents").read(shot)
+    shown = {name: step.view(with_shot, state) for name, step in steps.items()}
+    assert shown["import"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
+    assert shown["solve"].state == ["A good solve."] and "load it" in shown["solve"].advice
     assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % may move"]
     assert shown["freeze"].state == ["Take freeze: 3 frames, 16 x 12", "Time stands still at frame 6"]
     assert not shown["bake"].done and shown["bake"].ready
 
 
 def test_every_button_and_setting_has_a_tooltip(addon):
-    operators = [*addon("ops_steps").CLASSES, *addon("ops_jobs").CLASSES, *addon("ops_align").CLASSES]
-    for cls in [*operators, *(c for c in addon("ops_shots").CLASSES if issubclass(c, bpy.types.Operator))]:
+    classes = [*addon("ui.job_operators").CLASSES, *addon("ui.shots_panel").CLASSES]
+    classes += [cls for step in addon("process.steps").STEPS.values() for cls in step.classes]
+    operators = [cls for cls in classes if issubclass(cls, bpy.types.Operator)]
+    assert len(operators) > 25
+    for cls in operators:
         kind = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type()
         assert len(kind.description) > 10 and not kind.description.endswith("."), cls
         for prop in kind.properties:
@@ -195,19 +198,19 @@ def test_every_button_and_setting_has_a_tooltip(addon):
 def test_a_newer_shot_is_refused_in_words(addon, contract, tmp_path: Path):
     (tmp_path / "shot.json").write_text('{"version": 99, "name": "x"}')
     with pytest.raises(ValueError, match="version 99"):
-        addon("shots").read(tmp_path)
-    watch = addon("supervisor").watch_of(tmp_path)
-    assert "version 99" in watch.failures["footage"][0], "the panel shows it instead of breaking"
+        addon("shot.contents").read(tmp_path)
+    watch = addon("process.supervisor").watch_of(tmp_path)
+    assert "version 99" in watch.failures["import"][0], "the panel shows it instead of breaking"
 
 
 def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_path):
-    steps, props = addon("steps"), scene.splannequin
+    props = scene.splannequin
     props.use_range, props.first, props.last = True, 1, 8
     for name in ("first.mp4", "second.mp4"):
         props.clip = str(shutil.copy(clip, tmp_path / name))
-        steps.run(scene, "footage")
+        addon("process.begin").run(scene, "import")
     assert {p.name for p in tmp_path.glob("*.splannequin")} == {"first.splannequin", "second.splannequin"}
-    assert steps.shot_folder(scene) == tmp_path / "second.splannequin"
+    assert addon("shot.chosen").shot_folder(scene) == tmp_path / "second.splannequin"
 
 
 def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, shot, tmp_path):
@@ -217,7 +220,7 @@ def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, sh
     with_shot.render.filepath = str(tmp_path / "file" / "######")
     with pytest.raises(RuntimeError, match="Blender did not render the scene"):
         bpy.ops.splannequin.render()
-    assert addon("supervisor").watch_of(shot).running() is None
+    assert addon("process.supervisor").watch_of(shot).running() is None
 
 
 def test_bake_asks_for_a_ramp_or_a_path_as_it_was_made(addon, shot):
@@ -225,17 +228,17 @@ def test_bake_asks_for_a_ramp_or_a_path_as_it_was_made(addon, shot):
     facts = json.loads(path.read_text())
     ramp = {"5": 5.0, "6": 5.5}
     path.write_text(json.dumps({**facts, "last": 6, "t_star_per_frame": ramp, "camera_path": "/a/path.json"}))
-    params = addon("steps").take_params(shot, "freeze")
+    params = addon("freeze.takes").take_params(shot, "freeze")
     assert (params.first, params.last, params.t_star_per_frame, params.camera_path) == (5, 6, ramp, "/a/path.json")
 
 
 def test_a_step_is_refused_while_another_of_the_shot_runs(addon, contract, scene, clip, tmp_path):
-    steps, jobs, props = addon("steps"), addon("jobs"), scene.splannequin
+    jobs, props = addon("process.jobs"), scene.splannequin
     props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
-    job = steps.begin(scene, "footage")
+    job = addon("process.begin").begin(scene, "import")
     try:
         with pytest.raises(contract.JobError, match="is still running"):
-            steps.begin(scene, "footage")
+            addon("process.begin").begin(scene, "import")
     finally:
         jobs.cancel(job)
         job.process.wait()
@@ -243,16 +246,16 @@ def test_a_step_is_refused_while_another_of_the_shot_runs(addon, contract, scene
 
 
 def test_a_job_found_again_belongs_to_the_step_that_asked_for_it(addon, contract, shot):
-    jobs, steps = addon("jobs"), addon("steps")
+    jobs, steps = addon("process.jobs"), addon("process.steps")
     job = jobs.new_job(shot, "freeze", contract.FreezeParams())
     assert steps.step_of(job) == "freeze", "a job of the backend's own command line names no step"
     (job.folder / "step").write_text("bake")
-    watch = addon("supervisor").watch_of(shot)
+    watch = addon("process.supervisor").watch_of(shot)
     assert watch.running() == "bake" and watch.jobs["bake"].folder == job.folder
 
 
 def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path, capfd):
-    supervisor = addon("supervisor")
+    supervisor = addon("process.supervisor")
     broken, sound = supervisor.watch_of(tmp_path), supervisor.watch_of(shot)
     broken.jobs["train"] = types.SimpleNamespace(ended=False)
     sound.redraw = True
@@ -261,7 +264,7 @@ def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path
 
 
 def test_a_view_that_the_colour_configuration_lacks_is_said(addon, contract, scene, monkeypatch):
-    setup = addon("scene_setup")
+    setup = addon("scene.scene_setup")
     monkeypatch.setattr(setup, "_NEUTRAL", ("Plain",))
     with pytest.raises(contract.JobError, match=r"no view that leaves colours alone \(Plain\)"):
         setup.keep_plate_colours(scene)
@@ -282,7 +285,7 @@ def test_a_dropped_video_becomes_the_clip_and_an_earlier_shot_stays_on_disk(scen
 
 
 def test_marker_and_instant_follow_whichever_changed_last(addon, with_shot, shot):
-    scene, markers = with_shot, addon("markers")
+    scene, markers = with_shot, addon("shot.markers")
     scene.splannequin.t_star = 6
     bpy.ops.splannequin.t_star_marker()
     marker = scene.timeline_markers[markers.NAME]
@@ -297,19 +300,19 @@ def test_marker_and_instant_follow_whichever_changed_last(addon, with_shot, shot
     markers.follow(scene)
     assert marker.frame == 5, "after a file load the setting in the file leads"
     other = scene.timeline_markers.new("mine", frame=3)
-    assert "The marker t* was removed." in addon("steps").remove_all(scene, shot)
+    assert "The marker t* was removed." in addon("process.begin").remove_all(scene, shot)
     assert list(scene.timeline_markers) == [other]
 
 
 def test_what_the_artist_changed_since_is_not_taken_back(addon, scene, shot):
-    setup, steps = addon("scene_setup"), addon("steps")
+    setup = addon("scene.scene_setup")
     scene.splannequin.shot_path = str(shot)
     rate = scene.render.fps, scene.render.fps_base
     setup.fit_clip(scene, (16, 12), 12.5, (5, 7))
     setup.keep_plate_colours(scene)
     scene.render.resolution_x = 4000
     scene.view_settings.exposure = 1.5
-    steps.remove_all(scene, shot)
+    addon("process.begin").remove_all(scene, shot)
     assert (scene.render.resolution_x, scene.render.resolution_y) == (4000, 12), "a size belongs together"
     assert scene.view_settings.exposure == 1.5 and scene.view_settings.view_transform == "AgX"
     assert (scene.render.fps, scene.render.fps_base) == rate and (scene.frame_start, scene.frame_end) == (1, 250)

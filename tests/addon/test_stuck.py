@@ -27,8 +27,10 @@ def with_raw(shot) -> Path:
 @pytest.fixture
 def session(addon, shot, monkeypatch):
     """A session of a real backend, as the view holds one."""
-    viewport = addon("viewport")
-    one = addon("live").open_session(shot, "nothing", addon("backend").python(), addon("backend").package_root())
+    viewport = addon("freeze.viewport")
+    one = addon("freeze.live").open_session(
+        shot, "nothing", addon("process.backend").python(), addon("process.backend").package_root()
+    )
     monkeypatch.setattr(viewport, "_session", one)
     yield one
     viewport.end()
@@ -36,26 +38,26 @@ def session(addon, shot, monkeypatch):
 
 
 def test_scrubbing_can_be_stopped_while_a_job_runs_and_when_the_shot_is_gone(addon, with_shot, shot, session):
-    panel, viewport = addon("panel"), addon("viewport")
+    viewport = addon("freeze.viewport")
     session.failure = None
     assert session.open and not bpy.ops.splannequin.suggested_instant.poll()
-    nothing = panel.View(False, False, [], "")
-    assert panel.can_scrub(nothing, "train")
+    nothing = addon("process.steps").View(False, False, [], "")
+    assert addon("freeze.panel").can_scrub(nothing, "train")
     shot.rename(shot.with_name("gone"))
-    addon("supervisor").forget()
+    addon("process.supervisor").forget()
     assert bpy.ops.splannequin.live.poll()
     assert bpy.ops.splannequin.live() == {"FINISHED"} and viewport.session() is None
-    assert not panel.can_scrub(nothing, "train") and not panel.can_scrub(nothing, None)
+    assert not addon("freeze.panel").can_scrub(nothing, "train") and not addon("freeze.panel").can_scrub(nothing, None)
 
 
 def test_the_solve_can_be_loaded_while_the_shot_trains(addon):
-    can = addon("panel").can_load_camera
+    can = addon("solve.panel").can_load_camera
     assert can(None) and can("train") and can("freeze") and can("bake")
-    assert not can("footage") and not can("camera")
+    assert not can("import") and not can("solve")
 
 
 def test_an_instant_that_nobody_chose_is_the_one_that_is_drawn(addon, with_shot, session):
-    viewport, props = addon("viewport"), with_shot.splannequin
+    viewport, props = addon("freeze.viewport"), with_shot.splannequin
     session.facts = {"suggestions": [{"frame": 6, "seen": 0.9, "sharpness": 0.8}]}
     viewport._suggest(with_shot)
     assert (props.t_star, props.choose_t_star) == (6, False) and viewport.instant(with_shot) == 6
@@ -65,25 +67,24 @@ def test_an_instant_that_nobody_chose_is_the_one_that_is_drawn(addon, with_shot,
 
 
 def test_the_log_that_is_offered_has_something_in_it(addon, contract, shot, with_shot):
-    log_of, watch = addon("ops_jobs").log_of, addon("supervisor").watch_of(shot)
-    assert log_of(watch, "camera") is None
-    job = watch.jobs["camera"] = addon("jobs").new_job(shot, "solve", contract.SolveParams())
+    steps = addon("process.steps").STEPS
+    job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
     (job.folder / "log.txt").touch()
-    assert log_of(watch, "camera") is None, "an empty file helps nobody"
+    assert steps["solve"].log(job) is None, "an empty file helps nobody"
     (shot / "solve" / "colmap.log").write_text("what COLMAP said")
-    assert log_of(watch, "camera") == shot / "solve" / "colmap.log"
+    assert steps["solve"].log(job) == shot / "solve" / "colmap.log"
     (job.folder / "log.txt").write_text("what the backend said")
-    assert log_of(watch, "camera") == job.folder / "log.txt"
-    watch.jobs["train"] = addon("jobs").new_job(shot, "train", contract.TrainParams())
-    assert log_of(watch, "train") is None
+    assert steps["solve"].log(job) == job.folder / "log.txt"
+    other = addon("process.jobs").new_job(shot, "train", contract.TrainParams())
+    assert steps["train"].log(other) is None
 
 
 def test_which_frames_are_solved_is_a_setting(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a.mp4")
-    asked = addon("steps").params_of(scene, "footage")
+    asked = addon("process.steps").STEPS["import"].params(scene)
     assert (asked.step, asked.fps) == (0, 0.0)
     scene.splannequin.solve_step, scene.splannequin.fps = 3, 25.0
-    asked = addon("steps").params_of(scene, "footage")
+    asked = addon("process.steps").STEPS["import"].params(scene)
     assert (asked.step, asked.fps) == (3, 25.0)
 
 
@@ -96,13 +97,13 @@ def test_the_rate_of_a_sequence_is_the_one_that_was_set(addon, scene, tmp_path, 
         pictures.write(tmp_path / f"f.{n:04d}.png", np.ascontiguousarray(wide[:, 8 * n : 8 * n + 160]))
     scene.splannequin.clip, scene.splannequin.fps = str(tmp_path / "f.0001.png"), 30.0
     assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
-    assert addon("shots").read(addon("steps").shot_folder(scene)).info["fps"] == 30.0
+    assert addon("shot.contents").read(addon("shot.chosen").shot_folder(scene)).info["fps"] == 30.0
 
 
 def test_after_the_import_the_clip_is_seen_and_nothing_else_is_touched(addon, with_shot, with_raw):
-    scene, plate = with_shot, addon("plate")
+    scene, plate = with_shot, addon("footage.plate")
     mine, objects = scene.camera, set(scene.objects)
-    said = addon("steps").imported(scene, with_raw)
+    said = addon("footage.arrival").imported(scene, with_raw)
     camera = plate.find(scene, with_raw)
     assert f"{camera.name} shows the clip until the camera is solved." in said
     assert scene.camera == mine and set(scene.objects) - objects == {camera}
@@ -110,25 +111,27 @@ def test_after_the_import_the_clip_is_seen_and_nothing_else_is_touched(addon, wi
     assert Path(background.image.filepath) == with_raw / "frames" / "raw" / "000005.png"
     assert (background.image_user.frame_start, background.image_user.frame_duration) == (5, 3)
     assert camera.data.show_background_images
-    addon("steps").imported(scene, with_raw)
+    addon("footage.arrival").imported(scene, with_raw)
     assert set(scene.objects) - objects == {plate.find(scene, with_raw)}, "again: in place of the first"
 
 
 def test_the_solved_camera_takes_the_clips_place(addon, with_shot, with_raw):
-    scene, plate = with_shot, addon("plate")
+    scene, plate = with_shot, addon("footage.plate")
     before = set(bpy.data.images), set(bpy.data.cameras)
-    addon("steps").imported(scene, with_raw)
+    addon("footage.arrival").imported(scene, with_raw)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
-    assert plate.find(scene, with_raw) is None and scene.camera == addon("cameras").find(scene, with_raw, "CAMERA")
+    assert plate.find(scene, with_raw) is None and scene.camera == addon("solve.cameras").find(
+        scene, with_raw, "CAMERA"
+    )
     assert not [c for c in bpy.data.cameras if "plate" in c.name]
-    addon("steps").remove_all(scene, with_raw)
+    addon("process.begin").remove_all(scene, with_raw)
     assert (set(bpy.data.images), set(bpy.data.cameras)) == before
 
 
 def test_removing_the_shot_before_the_solve_takes_the_clips_camera_along(addon, with_shot, with_raw):
     before = set(bpy.data.objects), set(bpy.data.images), set(bpy.data.cameras)
-    addon("steps").imported(with_shot, with_raw)
-    addon("steps").remove_all(with_shot, with_raw)
+    addon("footage.arrival").imported(with_shot, with_raw)
+    addon("process.begin").remove_all(with_shot, with_raw)
     assert (set(bpy.data.objects), set(bpy.data.images), set(bpy.data.cameras)) == before
 
 
@@ -136,13 +139,13 @@ def test_a_listing_that_is_broken_shows_no_plate(addon, with_shot, with_raw):
     listing = with_raw / "frames" / "frames.json"
     for text in ('{"frames": []}', '{"frames": [{"frame": 1, "file": 3}]}', "[", '{"frames": 3}'):
         listing.write_text(text)
-        assert addon("plate").show(with_shot, with_raw) is None
+        assert addon("footage.plate").show(with_shot, with_raw) is None
     listing.write_text(json.dumps({"frames": [{"frame": 1, "file": "../../../etc/hostname"}]}))
-    assert addon("plate").show(with_shot, with_raw) is None, "no picture of another place"
+    assert addon("footage.plate").show(with_shot, with_raw) is None, "no picture of another place"
 
 
 def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
-    supervisor = addon("supervisor")
+    supervisor = addon("process.supervisor")
     monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))
     assert "does not exist" in supervisor.backend_trouble().message
@@ -156,7 +159,7 @@ def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
 
 
 def test_the_sidebar_is_laid_out_once_after_each_change(addon):
-    supervisor = addon("supervisor")
+    supervisor = addon("process.supervisor")
     supervisor.redraw()
     supervisor.redraw()
     first = supervisor.lay_out()

@@ -104,11 +104,16 @@ def registered() -> Iterator[tuple[str, str]]:
                 yield from ((text, f"{cls.__name__}.{prop.identifier}") for text in (item.name, item.description))
 
 
+def sources(root: Path) -> list[Path]:
+    """Of the add-on, without the translations themselves."""
+    return [p for p in sorted((root / "splannequin_addon").rglob("*.py")) if p.parent.name != "translations"]
+
+
 @pytest.fixture
 def shown(package, root) -> dict[str, str]:
     """Text -> where it is shown."""
     found: dict[str, str] = {}
-    for path in sorted((root / "splannequin_addon").glob("*.py")):
+    for path in sources(root):
         if path.name not in NOT_ON_SCREEN:
             for text, line in shown_by(path):
                 found.setdefault(text, f"{path.name}:{line}")
@@ -120,7 +125,7 @@ def shown(package, root) -> dict[str, str]:
 def written(root: Path) -> set[str]:
     """All texts in the sources, and the backend's stages as the panel writes them."""
     found: set[str] = set()
-    for path in [*(root / "torch_backend").rglob("*.py"), *(root / "splannequin_addon").glob("*.py")]:
+    for path in [*(root / "torch_backend").rglob("*.py"), *sources(root)]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             found.update(map(str.strip, strings(node)))
     return found | {text[:1].upper() + text[1:] for text in found}
@@ -154,7 +159,7 @@ def test_translations_are_filled_in_and_have_the_fields_of_the_original(addon):
 def test_what_is_composed_is_not_left_to_blender_to_look_up(root):
     """A label finds "Import Clip" by itself, but not "74 frames": f-strings go through tr()."""
     wrong = []
-    for path in sorted((root / "splannequin_addon").glob("*.py")):
+    for path in sources(root):
         if path.name in NOT_ON_SCREEN:
             continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -50,20 +50,52 @@ def test_names_defaults_and_choices_of_saved_properties_are_what_they_were(scene
 def test_an_old_shot_is_shown_whole(addon, tmp_path):
     root = tmp_path / "old.splannequin"
     shutil.copytree(OLD / "shot", root)
-    state = addon("shots").read(root)
+    state = addon("shot.contents").read(root)
     assert (state.frames, state.frame_range, state.size) == (74, (1, 74), (640, 480))
     assert state.runs["tiny"]["gaussians"] == 100 and state.takes["freeze"]["frame_count"] == 2
     assert not state.damaged["run"] and not state.damaged["take"] and not state.unfinished
     assert not state.runs["tiny"]["other_cameras"]
-    assert {kind: job.state for kind, job in addon("jobs").latest(root).items()} == dict.fromkeys(
+    assert {kind: job.state for kind, job in addon("process.jobs").latest(root).items()} == dict.fromkeys(
         ("import", "solve", "train", "freeze"), "done"
     )
-    assert addon("steps").take_params(root, "freeze").width == 64
-    assert addon("steps").complete(root, "freeze") and not addon("steps").may_be_stale(root, "freeze")
+    assert addon("freeze.takes").take_params(root, "freeze").width == 64
+    assert addon("freeze.takes").complete(root, "freeze") and not addon("freeze.takes").may_be_stale(root, "freeze")
+
+
+@pytest.mark.parametrize(
+    ("kind", "told", "step"),
+    [
+        ("import", "footage", "import"),
+        ("solve", "camera", "solve"),
+        ("train", "train", "train"),
+        ("freeze", "bake", "bake"),
+        ("freeze", "freeze", "freeze"),
+        ("freeze", "", "freeze"),
+    ],
+)
+def test_a_job_of_an_old_shot_belongs_to_its_step(addon, contract, tmp_path, kind, told, step):
+    """What 0.2.0 wrote into job folders: its names of the steps."""
+    shot = tmp_path / "a.splannequin"
+    addon("shot.contents").create(shot)
+    params = contract.ImportParams("a.mp4") if kind == "import" else contract.PARAMS[kind]()
+    job = addon("process.jobs").new_job(shot, kind, params)
+    (job.folder / contract.STEP_FILE).write_text(told)
+    assert addon("process.steps").step_of(job) == step
+    assert set(addon("process.supervisor").watch_of(shot).jobs) == {step}
+
+
+def test_buttons_take_the_old_names_of_steps(addon, contract, scene, tmp_path):
+    shot = tmp_path / "a.splannequin"
+    addon("shot.contents").create(shot)
+    job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
+    scene.splannequin.shot_path = str(shot)
+    assert addon("process.supervisor").watch_of(shot).running() == "solve"
+    assert bpy.ops.splannequin.cancel(step="camera") == {"FINISHED"}
+    assert (job.folder / contract.CANCEL_FILE).exists()
 
 
 def test_old_command_lines_ask_for_the_same(addon, contract):
-    headless = addon("headless")
+    headless = addon("command_line.headless")
     for line in LINES:
         args = headless.parser().parse_args(line["argv"])
         found = headless.asked(args)
@@ -82,7 +114,9 @@ def test_old_command_lines_ask_for_the_same(addon, contract):
 
 @pytest.mark.parametrize("command", OPTIONS)
 def test_an_old_option_is_still_taken_with_its_choices(addon, command):
-    commands = next(a for a in addon("headless").parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+    commands = next(
+        a for a in addon("command_line.headless").parser()._actions if isinstance(a, argparse._SubParsersAction)
+    ).choices
     known = {tuple(a.option_strings) or a.dest: a for a in commands[command]._actions}
     for old in OPTIONS[command]:
         option = known[tuple(old["flags"]) or old["dest"]]

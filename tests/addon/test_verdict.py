@@ -20,25 +20,31 @@ def add(path, **more):
 
 
 def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_under_bake(addon, with_shot, shot):
-    panel, shots = addon("panel"), addon("shots")
+    shots = addon("shot.contents")
     add(shot / "runs" / "main" / "summary.json", verdict=RUN)
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE, detail={"plate_share": 0.98})
     state = shots.read(shot)
-    assert panel.view_train(with_shot, state).state[2:] == [
+    assert addon("process.steps").STEPS["train"].view(with_shot, state).state[2:] == [
         "Fair. It does not hold in frames 10 to 31, lower left.",
         "Choose t* in frames 34 to 73, or train on that range alone.",
     ]
-    assert panel.view_freeze(with_shot, state).state[-1] == "Good. 98 % of the picture is plate, 2 % is a guess."
-    addon("steps").insert_freeze(with_shot, shot, "freeze")
-    assert not any("plate, 2 %" in line for line in panel.view_bake(with_shot, state).state)
+    assert (
+        addon("process.steps").STEPS["freeze"].view(with_shot, state).state[-1]
+        == "Good. 98 % of the picture is plate, 2 % is a guess."
+    )
+    addon("bake.insertion").insert_freeze(with_shot, shot, "freeze")
+    assert not any("plate, 2 %" in line for line in addon("process.steps").STEPS["bake"].view(with_shot, state).state)
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE | {"word": "poor"})
     state = shots.read(shot)
-    assert "Poor. 98 % of the picture is plate, 2 % is a guess." in panel.view_bake(with_shot, state).state
+    assert (
+        "Poor. 98 % of the picture is plate, 2 % is a guess."
+        in addon("process.steps").STEPS["bake"].view(with_shot, state).state
+    )
 
 
 def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):
     add(shot / "runs" / "main" / "summary.json", quality="Poor")
-    lines = addon("panel").view_train(with_shot, addon("shots").read(shot)).state
+    lines = addon("process.steps").STEPS["train"].view(with_shot, addon("shot.contents").read(shot)).state
     assert lines[2:] == ["It is poor: take a range in which nobody walks, or solve the camera again."]
 
 
@@ -46,13 +52,13 @@ def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):
 def test_a_damaged_verdict_is_left_out(addon, with_shot, shot, damaged):
     for path in (shot / "runs" / "main" / "summary.json", shot / "takes" / "freeze" / "take.json"):
         add(path, verdict=damaged)
-    state = addon("shots").read(shot)
-    assert len(addon("panel").view_train(with_shot, state).state) == 2
-    assert len(addon("panel").view_freeze(with_shot, state).state) == 2
+    state = addon("shot.contents").read(shot)
+    assert len(addon("process.steps").STEPS["train"].view(with_shot, state).state) == 2
+    assert len(addon("process.steps").STEPS["freeze"].view(with_shot, state).state) == 2
 
 
 def test_what_the_verdict_tells_is_not_told_twice(addon):
-    unsaid = addon("panel").unsaid
+    unsaid = addon("ui.step_panel").unsaid
     warnings = [("Poor. It does not hold.", "Solve again."), ("Something else.", "")]
     assert unsaid(warnings, ["Run main", "Poor. It does not hold."]) == ["Something else."]
     assert unsaid(warnings, []) == ["Poor. It does not hold. Solve again.", "Something else."]
@@ -74,48 +80,48 @@ def test_verdicts_are_told_in_german(addon):
 
 
 def test_detail_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
-    steps = addon("steps")
-    assert steps.params_of(with_shot, "freeze").detail == "on"
+    steps = addon("process.steps")
+    assert steps.STEPS["freeze"].params(with_shot).detail == "on"
     with_shot.splannequin.detail = False
-    assert steps.params_of(with_shot, "freeze").detail == "off"
+    assert steps.STEPS["freeze"].params(with_shot).detail == "off"
     with_shot.splannequin.detail = True
-    assert steps.params_of(with_shot, "bake").detail == "off", "its frames are of before there was detail"
+    assert steps.STEPS["bake"].params(with_shot).detail == "off", "its frames are of before there was detail"
     add(shot / "takes" / "freeze" / "take.json", detail={"plate_share": 0.9})
     with_shot.splannequin.detail = False
-    assert steps.params_of(with_shot, "bake").detail == "on"
+    assert steps.STEPS["bake"].params(with_shot).detail == "on"
 
 
 def test_the_command_line_takes_detail(addon, tmp_path):
-    headless = addon("headless")
+    headless = addon("command_line.headless")
     for words, expected in (([], "on"), (["--detail", "off"], "off")):
         args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
         assert headless.asked(args)["freeze"].detail == expected
 
 
 def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
-    steps, props, take = addon("steps"), with_shot.splannequin, shot / "takes" / "freeze" / "take.json"
+    steps, props, take = addon("process.steps"), with_shot.splannequin, shot / "takes" / "freeze" / "take.json"
     asked = []
     for wanted in (True, False):
         props.develop = wanted
-        asked.append(steps.params_of(with_shot, "freeze").develop)
+        asked.append(steps.STEPS["freeze"].params(with_shot).develop)
     assert asked == ["on", "off"]
     props.develop = True
-    assert steps.params_of(with_shot, "bake").develop == "off", "its frames are of before instants were developed"
+    assert steps.STEPS["bake"].params(with_shot).develop == "off", "its frames are of before instants were developed"
     props.develop = False
     for frames in ([6], []):  # of a ramp with many instants none is
         add(take, developed=frames)
-        assert steps.params_of(with_shot, "bake").develop == "on"
+        assert steps.STEPS["bake"].params(with_shot).develop == "on"
 
 
 def test_the_command_line_takes_develop(addon, tmp_path):
-    headless = addon("headless")
+    headless = addon("command_line.headless")
     for words, expected in (([], "on"), (["--develop", "off"], "off")):
         args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
         assert headless.asked(args)["freeze"].develop == expected
 
 
 def test_a_figure_stays_with_its_unit(addon):
-    lines = addon("sentences").lines
+    lines = addon("ui.sentences").lines
     assert lines("Good. 97 % of the picture is plate, 3 % is a guess.", 37) == [
         "Good. 97 % of the picture is plate,", "3 % is a guess.",
     ]  # fmt: skip

@@ -50,8 +50,13 @@ class LiveView:
 
 LIVE_LIMIT = 8192
 """Most pixels of a live view along a side."""
-LIVE_SHOWS = ("color", "guesses", "support", "motion")
-"""What a live view can show."""
+LIVE_SHOWS = {
+    "color": ("Picture", "The frozen people and place"),
+    "guesses": ("Guesses", "The picture, tinted where no frame near t* saw what is shown"),
+    "support": ("Support", "White where frames near t* saw what is shown, black where it is a guess"),
+    "motion": ("Motion", "White where something moves in the clip"),
+}
+"""What a live view can show: as messages and files name it -> its name and tooltip on the panel."""
 _MESSAGE = struct.Struct("<4sIQ")
 """Before every message: a mark, bytes of the header, bytes of the body."""
 _MARK = b"SPL1"

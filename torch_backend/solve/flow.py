@@ -48,6 +48,8 @@ class FlowConfig:
     """Only where the picture changes by so much over that distance is it more than an error of the flow."""
     likeness: float = 8.0
     """Pictures that differ by less show the same."""
+    blurred: float = 0.25
+    """Share of another picture's sharpness (mean square step) below which a picture is blurred beside it."""
     better: float = 1.5
     """By this factor the picture differs more (squared) where a still point would be seen than where it is matched."""
     haste: float = 0.3

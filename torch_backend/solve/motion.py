@@ -34,7 +34,7 @@ from .stored import load_cameras
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
-MOTION_VERSION = 3
+MOTION_VERSION = 4
 PAINTED = PAINTED_FOLDER
 """Of painted mattes, in the shot's folder."""
 _RECORD, _UNFINISHED = MOTION_FILE, MOTION_UNFINISHED_FILE

@@ -19,6 +19,8 @@ FEW = 50
 """Fewer points say nothing of a picture."""
 _OUTLINE = 0.25
 """Depths that differ by this share are two surfaces."""
+_NEAR = 2
+"""Key frames so near show the same even if one is blurred."""
 _MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
 """Square differences: above the one all are alike (hidden, or gone), by the other a point's own depth is preferred."""
 
@@ -52,6 +54,9 @@ class Look:
         half = picture.shape[1] // 2, picture.shape[0] // 2
         self.grid = cv2.resize(self._smooth, half, interpolation=cv2.INTER_AREA).astype(np.float32)
         """[h, w] at the grid's points."""
+        steps = (np.diff(self.grid, axis=0), np.diff(self.grid, axis=1))
+        self.sharpness = float(sum(np.mean(step * step) for step in steps))
+        """Mean square difference of neighbouring points."""
 
     def unlike(self, values: Map, at: tuple[Map, Map], gain: tuple[float, float]) -> Map:
         """Mean square difference around each point between `values` and this picture, times and plus `gain`, there."""
@@ -213,9 +218,13 @@ def _counted(
         better = pair.right & (unlike > config.better * pair.matched + config.contrast**2)
         off += away & better & (texture.change(x, y, length) > config.contrast**2)
         weight = min(1.0, abs(after) / config.baselines[-1]) ** config.haste
-        on += weight * ((found & ~away) + 0.5 * ((away & ~better) | (within & alike & ~found)))
-        gone[after] = within & ~found & ~alike
-    for step in config.baselines[:2]:
+        # Flow over a plain wall carries what is before it along: a match there that looks like nothing says nothing.
+        smeared = found & ~away & ~alike & ~pair.right
+        on += weight * ((found & ~away & ~smeared) + 0.5 * ((away & ~better) | (within & alike & ~found)))
+        # A picture lost in blur looks like nothing far from it, wherever it moves.
+        if abs(after) <= _NEAR or look.sharpness >= config.blurred * pair.there.sharpness:
+            gone[after] = within & ~alike & (~found | smeared)
+    for step in config.baselines[:3]:
         if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
             off += gone[step] & gone[-step]  # behind something is so on one side as a rule.
     return on, off

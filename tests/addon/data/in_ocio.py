@@ -53,28 +53,28 @@ def main() -> None:
     spec.loader.exec_module(runner)
     package = runner.load_package()
     package.register()
-    scene, steps, compat = bpy.context.scene, add_on("steps"), add_on("compat")
+    scene, compat = bpy.context.scene, add_on("compat")
     scene.splannequin.shot_path = str(shot)
     told = {"blender": bpy.app.version_string}
-    told["first"] = tried(scene, lambda: steps.load_camera(scene, shot))
+    told["first"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
     if "error" in told["first"]:  # without a plate nothing has to be shown: a camera that a second try must spare
         (shot / "frames").rename(shot / "away")
-        told["without a plate"] = tried(scene, lambda: steps.load_camera(scene, shot))
+        told["without a plate"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
         (shot / "away").rename(shot / "frames")
-        told["again"] = tried(scene, lambda: steps.load_camera(scene, shot))
-    told["freeze"] = tried(scene, lambda: steps.insert_freeze(scene, shot, "freeze"))
+        told["again"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
+    told["freeze"] = tried(scene, lambda: add_on("bake.insertion").insert_freeze(scene, shot, "freeze"))
     if "error" in told["freeze"]:
         scene.splannequin.keep_colours = False
-        told["as they come"] = tried(scene, lambda: steps.insert_freeze(scene, shot, "freeze"))
+        told["as they come"] = tried(scene, lambda: add_on("bake.insertion").insert_freeze(scene, shot, "freeze"))
     else:
-        told["combined"] = tried(scene, lambda: steps.combine_cg(scene, shot))
-        node = add_on("compositor").group_node(compat.compositor_tree(scene))
+        told["combined"] = tried(scene, lambda: add_on("bake.insertion").combine_cg(scene, shot))
+        node = add_on("bake.freeze_group").group_node(compat.compositor_tree(scene))
         node.inputs["CG"].links[0].from_node.mute = True
         scene.frame_start = scene.frame_end = 6
         for name, mix in (("plate", 0.0), ("frozen", 1.0)):
             node.inputs["Mix"].default_value = mix
-            add_on("bake").render(scene, out / name)
-    told["removed"] = tried(scene, lambda: steps.remove_all(scene, shot))
+            add_on("bake.rendering").render(scene, out / name)
+    told["removed"] = tried(scene, lambda: add_on("process.begin").remove_all(scene, shot))
     told["end"] = there(scene)
     (out / "told.json").write_text(json.dumps(told))
     package.unregister()

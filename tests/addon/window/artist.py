@@ -145,7 +145,7 @@ def _set_up(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     for value in ("PRESS", "RELEASE"):
         window.event_simulate(type="RET", value=value, x=300, y=500)
     began = time.monotonic()
-    preferences = sys.modules[f"{module}.splannequin_addon.preferences"]
+    preferences = sys.modules[f"{module}.splannequin_addon.ui.preferences"]
     yield 2.0
     if not preferences.busy():
         raise RuntimeError("the set-up did not begin")

@@ -61,7 +61,7 @@ def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
     import cube
     import numpy as np
 
-    scene, compositor, compat = bpy.context.scene, press.addon_module("compositor"), press.addon_module("compat")
+    scene, compat = bpy.context.scene, press.addon_module("compat")
     scene.render.resolution_percentage = 100
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.samples, scene.cycles.use_denoising = 1, False
@@ -70,7 +70,7 @@ def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
     told["filled"] = bool((border.max(axis=1) > 0.02).mean() > 0.9)
     yield from _show(work, "11-half-at-full", "Rendering")
     _press("combine_cg")
-    node = compositor.group_node(compat.compositor_tree(scene))
+    node = press.addon_module("bake.freeze_group").group_node(compat.compositor_tree(scene))
     depth = cube.see(node.outputs["Depth"], work, "depth")[..., 0]
     cube.put_cube(depth)
     scene.cycles.samples = 12
@@ -111,7 +111,7 @@ def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
     import bpy
     import numpy as np
 
-    scene, compositor, compat = bpy.context.scene, press.addon_module("compositor"), press.addon_module("compat")
+    scene, compositor, compat = bpy.context.scene, press.addon_module("bake.compositor"), press.addon_module("compat")
     tree = compat.compositor_tree(scene)
     if tree is None or not len(tree.nodes):
         tree = compat.new_compositor_tree(scene, "Comp")
@@ -119,9 +119,11 @@ def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
     plate, fit, grade = (tree.nodes.new(f"CompositorNode{n}") for n in ("Image", "Scale", "HueSat"))
     tree.nodes.remove(fit)
     fit = compat.new_fit_node(tree, "Crop")
-    plate.image = bpy.data.images.load(str(compositor.frame_path(shot / "frames", FRAME, ".png")))
+    plate.image = bpy.data.images.load(
+        str(press.addon_module("scene.numbered").frame_path(shot / "frames", FRAME, ".png"))
+    )
     plate.image.source = "SEQUENCE"
-    compositor.show_sequence(plate, plate.image, 1, 74)
+    press.addon_module("scene.sequences").show_sequence(plate, plate.image, 1, 74)
     grade.inputs["Saturation"].default_value = 0.0
     plate.label, grade.label = "My plate", "My grade: no colour"
     end = compat.output_socket(tree) or compat.new_output_node(tree)
@@ -134,7 +136,7 @@ def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
     mine = _render(work, "plate")
     _press("load_camera")
     _press("insert_freeze")
-    node = compositor.group_node(tree)
+    node = press.addon_module("bake.freeze_group").group_node(tree)
     told["as_plate"] = grade.inputs["Image"].links[0].from_node == node
     graded = _render(work, "graded")
     told["grade_kept"] = bool(np.ptp(graded, axis=2).max() < 0.02)

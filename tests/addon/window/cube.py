@@ -44,18 +44,21 @@ def start() -> None:
 def bake(shot: Path) -> None:
     """The frozen frame in the compositor of a new scene, behind the solved camera."""
     bpy.ops.wm.read_homefile(use_empty=True)
-    scene, steps = bpy.context.scene, add_on("steps")
+    scene = bpy.context.scene
     scene.splannequin.shot_path, scene.splannequin.set_up_scene = str(shot), True
-    for line in steps.load_camera(scene, shot):
+    for line in add_on("solve.arrival").load_camera(scene, shot):
         print(line)
     scene.frame_start = scene.frame_end = FRAME
     contract = importlib.import_module("bl_ext.user_default.splannequin.torch_backend.contract")
     params = contract.FreezeParams(
         take=TAKE, t_star=FRAME, width=scene.render.resolution_x, first=FRAME, last=FRAME, only_missing=True
     )
-    if not steps.complete(shot, TAKE, [FRAME]):
-        steps.run(scene, "freeze", params)
-    for line in [*steps.insert_freeze(scene, shot, TAKE), *steps.combine_cg(scene, shot)]:
+    if not add_on("freeze.takes").complete(shot, TAKE, [FRAME]):
+        add_on("process.begin").run(scene, "freeze", params)
+    for line in [
+        *add_on("bake.insertion").insert_freeze(scene, shot, TAKE),
+        *add_on("bake.insertion").combine_cg(scene, shot),
+    ]:
         print(line)
     scene.frame_set(FRAME)
     for item in scene.objects:
@@ -71,7 +74,7 @@ def see(socket, folder: Path, name: str) -> np.ndarray:
     tree.links.new(socket, target)
     settings = scene.render.image_settings
     settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
-    add_on("bake").render(scene, folder / name, png=False)
+    add_on("bake.rendering").render(scene, folder / name, png=False)
     tree.links.new(kept, target)
     image = bpy.data.images.load(str(folder / name / f"{FRAME:06d}.exr"))
     image.colorspace_settings.name = "Non-Color"
@@ -154,7 +157,7 @@ def keep(picture: Path, folder: Path) -> None:
     settings = scene.render.image_settings
     for quality in (92, 85, 75, 60):
         settings.file_format, settings.quality, settings.color_mode = "JPEG", quality, "RGB"
-        add_on("bake").render(scene, folder / "jpeg", png=False)
+        add_on("bake.rendering").render(scene, folder / "jpeg", png=False)
         data = (folder / "jpeg" / f"{FRAME:06d}.jpg").read_bytes()
         if len(data) <= 150_000:
             break
@@ -172,9 +175,9 @@ def main() -> None:
     start()
     bake(args.shot.absolute())
     scene = bpy.context.scene
-    compat, compositor = add_on("compat"), add_on("compositor")
+    compat = add_on("compat")
     tree = compat.compositor_tree(scene)
-    group = compositor.group_node(tree)
+    group = add_on("bake.freeze_group").group_node(tree)
     layers = next(n for n in tree.nodes if n.bl_idname == "CompositorNodeRLayers")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -95,7 +95,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
         return scene.splannequin.made[0].points.matrix_world @ picks[n]
 
     def free() -> bool:
-        return press.addon_module("ops_align").picking() is None
+        return press.addon_module("solve.align_operators").picking() is None
 
     stood = cloud.matrix_world.copy()
     artist.invoke("align_origin")
@@ -116,7 +116,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
         yield from artist.press("LEFTMOUSE", *artist.at(world(n)))
         if n == 2:
             yield from artist.press("BACK_SPACE", *artist.at(world(n)))
-            told["backspace"] = len(press.addon_module("ops_align").picking().picked) == 1
+            told["backspace"] = len(press.addon_module("solve.align_operators").picking().picked) == 1
             yield from artist.press("LEFTMOUSE", *artist.at(world(n)))
             yield from press._shoot(work, "10-two-of-three")
     told["floor"] = free() and max(abs(world(n).z) for n in (1, 2, 3)) < 1e-4

@@ -22,8 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 STEPS = (
-    ("1-footage", "splannequin.import_clip"),
-    ("2-camera", "splannequin.solve_camera"),
+    ("1-import", "splannequin.import_clip"),
+    ("2-solve", "splannequin.solve_camera"),
     ("3-train", "splannequin.train"),
     ("4-freeze", "splannequin.freeze"),
     ("5-bake", "splannequin.bake"),
@@ -353,9 +353,9 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
     while watch.running() is not None:
         job = next((j for j in watch.jobs.values() if not j.ended), None)
         status = job.status if job is not None else None
-        share = 0.3 if name in ("2-camera", "3-train") else 0.05  # the others are over soon
+        share = 0.3 if name in ("2-solve", "3-train") else 0.05  # the others are over soon
         far = status is not None and status.fraction > share and status.stage.startswith(stage)
-        drawn = watch.rendered is not None and watch.rendered[0] > 0
+        drawn = watch.work is not None and watch.work.progress is not None and watch.work.progress.done > 0
         if not taken and (drawn if name == "5-bake" else far):
             yield from _shoot(work, f"{name}-running", settle=2)
             taken = True
@@ -379,7 +379,7 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
 
 
 def _supervisor():
-    return addon_module("supervisor")
+    return addon_module("process.supervisor")
 
 
 def addon_module(name: str):

@@ -29,7 +29,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     yield from press._arrange()
     scene = bpy.context.scene
     scene.splannequin.shot_path = plan["shot"]
-    viewport = press.addon_module("viewport")
+    viewport = press.addon_module("freeze.viewport")
     stalls = _time(viewport, told)
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.splannequin.load_camera()
@@ -142,7 +142,7 @@ def _time(viewport: Any, told: dict[str, Any]) -> dict[str, list[float]]:
         return call
 
     viewport._draw, viewport._tick = timed("draw", viewport._draw), timed("live tick", viewport._tick)
-    supervisor = press.addon_module("supervisor")
+    supervisor = press.addon_module("process.supervisor")
     bpy.app.timers.unregister(supervisor.tick)
     supervisor.tick = timed("tick", supervisor.tick)
     bpy.app.timers.register(supervisor.tick, persistent=True)

@@ -101,7 +101,17 @@ def _watch_calls(calls: list[tuple[str, float]]) -> None:
 
         return call
 
-    for part in ("steps", "bake", "cameras", "compat", "compositor", "guesses", "made", "scene_setup", "supervisor"):
+    for part in (
+        "process.steps",
+        "bake.insertion",
+        "solve.cameras",
+        "compat",
+        "bake.compositor",
+        "solve.guesses",
+        "shot.made",
+        "scene.scene_setup",
+        "process.supervisor",
+    ):
         module = press.addon_module(part)
         for name, function in list(vars(module).items()):
             if isinstance(function, types.FunctionType) and function.__module__ == module.__name__ and name != "tick":

@@ -145,7 +145,7 @@ def _imported(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield from press._click("splannequin.import_clip")
     shot = work / "clip" / "people.splannequin"
     yield from _ended(shot)
-    camera = press.addon_module("plate").find(scene, shot)
+    camera = press.addon_module("footage.plate").find(scene, shot)
     space = press._view(bpy.context.window_manager.windows[0]).spaces.active
     told["plate_seen"] = camera is not None and space.camera == camera and space.region_3d.view_perspective == "CAMERA"
     told["scene_camera_kept"] = scene.camera == mine
@@ -161,7 +161,7 @@ def _solved(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield 1.0
     yield from press._click("splannequin.load_camera")
     yield 1.0
-    scaled = press.addon_module("ops_align").scaled
+    scaled = press.addon_module("solve.align_operators").scaled
     told["scale_asked_for"] = not scaled(scene, shot)
     yield from press._shoot(work, "11-presets-and-scale", settle=0)
     for name, x in (("one", 0.0), ("other", 1.0)):
@@ -180,7 +180,7 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     import bpy
 
     shot, scene = work / "project" / "tiny.splannequin", bpy.context.scene
-    props, viewport = scene.splannequin, press.addon_module("viewport")
+    props, viewport = scene.splannequin, press.addon_module("freeze.viewport")
     yield from press._click("splannequin.live")
     yield from _until(lambda: viewport.session() is not None and viewport.session().facts, 90, "the session")
     yield 2.0
@@ -214,8 +214,8 @@ def _moved(work: Path, told: dict[str, Any]) -> Iterator[float]:
     there = (work / "project").rename(work / "moved")
     yield from _opened(there / "work.blend")
     scene = bpy.context.scene
-    folder = press.addon_module("steps").shot_folder(scene)
-    camera = press.addon_module("cameras").find(scene, folder, "CAMERA")
+    folder = press.addon_module("shot.chosen").shot_folder(scene)
+    camera = press.addon_module("solve.cameras").find(scene, folder, "CAMERA")
     told["moved"] = folder == there / "tiny.splannequin" and camera is not None and scene.camera == camera
     yield from press._shoot(work, "11-moved")
 
@@ -226,8 +226,10 @@ def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
 
     before, there = work / "moved" / "tiny.splannequin", work / "moved" / "renamed.splannequin"
     before.rename(there)
-    places, watch = press.addon_module("places"), press._supervisor().watch_of(before)
-    yield from _until(lambda: places.missing(bpy.context.scene, watch.state), 10, "the shot to be missed")
+    watch = press._supervisor().watch_of(before)
+    yield from _until(
+        lambda: press.addon_module("shot.chosen").missing(bpy.context.scene, watch.state), 10, "the shot to be missed"
+    )
     yield 1.0
     told["missed"] = not before.exists()
     yield from press._shoot(work, "11-missing")
@@ -242,8 +244,8 @@ def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
         bpy.ops.file.execute("INVOKE_DEFAULT")
     yield 2.0
     scene = bpy.context.scene
-    camera = press.addon_module("cameras").find(scene, there, "CAMERA")
-    told["located"] = press.addon_module("steps").shot_folder(scene) == there and camera == scene.camera
+    camera = press.addon_module("solve.cameras").find(scene, there, "CAMERA")
+    told["located"] = press.addon_module("shot.chosen").shot_folder(scene) == there and camera == scene.camera
     yield from press._shoot(work, "11-located")
 
 

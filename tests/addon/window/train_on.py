@@ -78,7 +78,7 @@ def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
     def module(name: str) -> Any:
         return importlib.import_module(f"{package}.splannequin_addon.{name}")
 
-    work, pictures, panel = Path(os.environ[PLAN]), module("pictures"), module("panel")
+    work, pictures, panel = Path(os.environ[PLAN]), module("train.pictures"), module("ui.step_panel")
     yield from press._arrange()
     props = bpy.context.scene.splannequin
     props.shot_path, props.extend_steps = str(work / "tiny.splannequin"), MORE
@@ -87,7 +87,7 @@ def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
     yield 1.0
     yield from press._scroll_down()
     yield from press._shoot(work, "10-runs")
-    watch = module("supervisor").watch_of(work / "tiny.splannequin")
+    watch = module("process.supervisor").watch_of(work / "tiny.splannequin")
     yield from press._click("splannequin.train")
     shown: dict[str, int] = {}
     while len(shown) < 4 and watch.running() == "train":
@@ -101,7 +101,7 @@ def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
     while watch.running() is not None:
         yield 0.2
     yield 1.5
-    plan = module("training").plan(watch.state, props.run_name, props.preset)
+    plan = module("train.training").plan(watch.state, props.run_name, props.preset)
     told["button_when_paused"] = plan.button
     told["iterations_when_paused"] = watch.state.runs["main"]["iterations"]
     yield from press._shoot(work, "10-paused")

@@ -1,0 +1,123 @@
+"""A take's layers at the size of the scene's picture, and what knows a pixel's place in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import numpy as np
+
+from .. import compat
+from ..scene.mark import TAG
+from .node_names import GAP, GRAIN
+
+
+def across(group: Any) -> Any:
+    """Socket of a value that rises from 0 at the frame's left to 1 at its right."""
+    if compat.HAS_TEXTURE_NODE:
+        node = group.nodes.new("CompositorNodeTexture")
+        node.texture = _blend()
+        node.label = "From left to right"
+        node.location = (-2 * GAP, 330.0)
+        return node.outputs["Value"]
+    ramp = group.nodes.new("CompositorNodeImage")
+    ramp.image = _ramp()
+    ramp.label = "From left to right"
+    wide = compat.new_fit_node(group, "Stretch")
+    group.links.new(ramp.outputs["Image"], wide.inputs[0])
+    # A scaled picture fades out over its last pixels: those of the ramp lie outside of the frame.
+    larger = group.nodes.new("CompositorNodeScale")
+    larger.inputs["X"].default_value = larger.inputs["Y"].default_value = _BEYOND
+    group.links.new(wide.outputs[0], larger.inputs[0])
+    ramp.location, wide.location = (-3 * GAP, 330.0), (-2 * GAP, 330.0)
+    return larger.outputs[0]
+
+
+RAMP = "Splannequin Ramp"
+_STEPS, _ROWS = 1024, 32
+_BEYOND = 1.1
+"""How much larger than the frame the ramp is shown."""
+
+
+def _blend() -> Any:
+    """A texture that rises from left to right. A scaled picture would do, but 4.3 leaves its lowest row unset."""
+    texture = next((t for t in bpy.data.textures if t.get(TAG) and t.type == "BLEND"), None)
+    if texture is None:
+        texture = bpy.data.textures.new(RAMP, "BLEND")
+        texture[TAG] = True
+    return texture
+
+
+def _ramp() -> Any:
+    """A picture that rises from 0 at the frame's left to 1 at its right: 5.0 has no node that does."""
+    image = next((i for i in bpy.data.images if i.get(TAG) and i.name.startswith(RAMP)), None)
+    if image is not None:
+        return image
+    image = bpy.data.images.new(RAMP, _STEPS, _ROWS, alpha=False, float_buffer=True, is_data=True)
+    image[TAG] = True
+    across = 0.5 + _BEYOND * ((np.arange(_STEPS, dtype=np.float32) + 0.5) / _STEPS - 0.5)
+    row = np.repeat(across[:, None], 4, axis=1)
+    row[:, 3] = 1.0
+    image.pixels.foreach_set(np.tile(row, (_ROWS, 1)).ravel())
+    image.update()
+    image.pack()
+    return image
+
+
+def fitted(
+    scene: Any, group: Any, size: tuple[int, int], margin: tuple[int, int], layers: dict[str, Any]
+) -> dict[str, Any]:
+    """The layers' sockets, by name: without overscan, and scaled to the render's size, whatever it is when it renders.
+
+    Frames wider than the scene's picture are cut, as the camera sees it; flatter ones leave bars.
+    """
+    names, sockets = tuple(layers), dict(layers)
+    for row, name in enumerate(names if any(margin) else ()):
+        node = compat.new_crop_node(group, margin, size)
+        node.label = f"{name} without overscan"
+        node.location = (-2 * GAP, -50.0 - 170.0 * row)
+        group.links.new(sockets[name], node.inputs[0])
+        sockets[name] = node.outputs[0]
+    how, shown = how_it_fits(scene, size), _whole(group, sockets["Depth"])
+    coverage = None
+    for row, name in enumerate(("", *names) if shown is not None else names):
+        node = compat.new_fit_node(group, how)
+        node.label = f"Fit {name}" if name else "Fit what there is"
+        node.location = (-GAP, 150.0 - 170.0 * row)
+        group.links.new(sockets[name] if name else shown, node.inputs[0])
+        if not name:
+            coverage = node.outputs[0]
+        else:
+            sockets[name] = _unfaded(group, node.outputs[0], coverage, name in ("Combined", GRAIN))
+    return sockets
+
+
+def how_it_fits(scene: Any, size: tuple[int, int]) -> str:
+    """How a picture of a size is brought to the scene's: its width fits, as the solved camera's does."""
+    tall = scene.render.resolution_x * size[1] / (scene.render.resolution_y * size[0])
+    # Of one shape but for rounding: both do; where cropping leaves a line unset, not that.
+    alike = abs(tall - 1.0) < 0.01 and not compat.CROPS_WHOLE
+    return "Crop" if tall > 0.99 and not alike else "Fit"
+
+
+def _whole(group: Any, layer: Any) -> Any | None:
+    """Socket of 1 wherever a layer has pixels; None where a scaled picture does not fade out at its border."""
+    if compat.HAS_COMPOSITING_GROUP:
+        return None
+    node = compat.new_math_node(group, "GREATER_THAN")
+    node.inputs[1].default_value = -1.0
+    node.label = "Everywhere"
+    group.links.new(layer, node.inputs[0])
+    return node.outputs[0]
+
+
+def _unfaded(group: Any, layer: Any, coverage: Any | None, picture: bool) -> Any:
+    """Socket of a scaled layer whose outermost pixels are as strong as the others."""
+    if coverage is None:
+        return layer
+    if picture:
+        return compat.new_quotient(group, layer, coverage)
+    node = compat.new_math_node(group, "DIVIDE")
+    group.links.new(layer, node.inputs[0])
+    group.links.new(coverage, node.inputs[1])
+    return node.outputs[0]

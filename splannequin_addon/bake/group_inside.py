@@ -1,0 +1,214 @@
+"""The inside of the freeze's group: frames, warp, grain, objects among the frozen, mattes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from .. import compat
+from ..scene import sequences
+from . import fitting, warp_nodes
+from .node_names import AS_WARP, DEPTH, FROZEN, GAP, GRAIN, INVENTED
+from .take_files import Take
+
+_NOTHING = 0.1 * contract.NO_DEPTH
+"""A depth of CG from here on is no surface's."""
+_SOFT = 0.01
+"""Share of the frozen depth within which CG goes from in front to behind. What is as far as the frozen is in front:
+frozen depth is a little uneven, and would come through what stands on it."""
+
+
+def fill(scene: Any, node: Any, take: Take, image: Any, warp: Any | None) -> None:
+    """(Re)builds the inside of our node's group; its sockets, and so the links around it, stay."""
+    group, shown = node.node_tree, {i.name for i in (image, warp) if i is not None}
+    old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image} - {fitting.RAMP}
+    group.nodes.clear()
+    enter = group.nodes.new("NodeGroupInput")
+    leave = group.nodes.new("NodeGroupOutput")
+    frozen = group.nodes.new("CompositorNodeImage")
+    frozen.name = frozen.label = FROZEN
+    sequences.show_sequence(frozen, image, take.first, take.last)
+    mix, factor, first, second, mixed = compat.new_mix_node(group)
+    depth = compat.new_math_node(group)
+    depth.name = depth.label = DEPTH
+    depth.inputs[1].default_value = take.depth_scale
+    enter.location, frozen.location = (-2 * GAP, 150.0), (-3 * GAP, -100.0)
+    mix.location, depth.location, leave.location = (3 * GAP, 150.0), (GAP, -100.0), (4 * GAP, 0.0)
+
+    layers = {n: frozen.outputs[n] for n in (layer.name for layer in contract.FRAME_LAYERS) if n in frozen.outputs}
+    if warp is not None:
+        layers["Combined"] = _warped(group, enter, layers["Combined"], warp, take)
+    if "Plate" in layers:
+        layers["Combined"] = _looked_at(group, enter, layers)
+    layers.pop("Splat", None)
+    fitted = fitting.fitted(scene, group, take.size, take.margin, layers)
+    share = _share(group, enter, fitted)
+    nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0])
+    group.links.new(share, factor)
+    # CG stands in both: Mix, Wipe and mattes choose between stream and frozen frame, not whether an object is there.
+    group.links.new(_among(group, enter, enter.outputs["Image"], nearer, "CG in your stream"), first)
+    group.links.new(_among(group, enter, _grainy(group, enter, fitted), nearer, "CG among the frozen"), second)
+    group.links.new(mixed, leave.inputs["Image"])
+    group.links.new(fitted["Depth"], depth.inputs[0])
+    group.links.new(depth.outputs[0], leave.inputs["Depth"])
+    if "Source" in fitted:  # numbers, whatever scaling made of them
+        whole = compat.new_math_node(group, "ROUND")
+        group.links.new(fitted["Source"], whole.inputs[0])
+        fitted["Source"] = whole.outputs[0]
+    for layer in contract.FRAME_LAYERS:
+        if layer.output and layer.name in fitted and layer.name not in ("Combined", "Depth"):
+            group.links.new(fitted[layer.name], leave.inputs[layer.output])
+    for name in old - shown:
+        stale = bpy.data.images.get(name)
+        if stale is not None and stale.users == 0:
+            bpy.data.images.remove(stale)
+
+
+def _warped(group: Any, enter: Any, own: Any, image: Any, take: Take) -> Any:
+    """Socket of the frozen picture: the take's own, or what is led into the group, frozen by the take's warp."""
+    reader = group.nodes.new("CompositorNodeImage")
+    reader.name = reader.label = "Warp"
+    reader.location = (-3 * GAP, -1500.0)
+    sequences.show_sequence(reader, image, take.first, take.last)
+    frozen = warp_nodes.frozen(group, enter.outputs["Image"], reader.outputs, take.plate_size)
+    node, factor, first, second, mixed = compat.new_mix_node(group)
+    node.label, node.location = AS_WARP, (-2 * GAP, 330.0)
+    group.links.new(enter.outputs[AS_WARP], factor)
+    group.links.new(own, first)
+    group.links.new(frozen, second)
+    return mixed
+
+
+_TINT, _TINTED = (1.0, 0.0, 0.4, 1.0), 0.6
+"""Colour that shows what is invented, and how much of it there is where nothing is plate."""
+
+
+def _looked_at(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+    """Socket of the frozen picture, or of the splats alone, with what is invented tinted as much as is asked for."""
+    node, factor, first, second, chosen = compat.new_mix_node(group)
+    node.label, node.location = "Splat", (-2 * GAP, 500.0)
+    group.links.new(enter.outputs["Splat"], factor)
+    group.links.new(layers["Combined"], first)
+    group.links.new(layers["Splat"], second)
+    # tinted * (1 - plate), by as much as is asked for
+    invented = compat.new_math_node(group, "MULTIPLY_ADD")
+    invented.inputs[1].default_value, invented.inputs[2].default_value = -_TINTED, _TINTED
+    group.links.new(layers["Plate"], invented.inputs[0])
+    amount = _product(group, enter.outputs[INVENTED], invented.outputs[0])
+    tint, factor, first, second, tinted = compat.new_mix_node(group)
+    tint.label, second.default_value = INVENTED, _TINT
+    group.links.new(amount, factor)
+    group.links.new(chosen, first)
+    invented.location, tint.location = (-2 * GAP, 670.0), (-GAP, 500.0)
+    return tinted
+
+
+def _grainy(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+    """Socket of the frozen picture with as much of its grain as is asked for; takes of before have none."""
+    if GRAIN not in layers:
+        return layers["Combined"]
+    node, factor, first, second, summed = compat.new_mix_node(group, "ADD")
+    node.name = node.label = GRAIN
+    node.location = (0.0, -900.0)
+    group.links.new(enter.outputs[GRAIN], factor)
+    group.links.new(layers["Combined"], first)
+    group.links.new(layers[GRAIN], second)
+    return summed
+
+
+def _among(group: Any, enter: Any, picture: Any, nearer: Any, label: str) -> Any:
+    """Socket of a picture with CG in front of it, as far as it is nearer, else behind, by as much as both cover."""
+    front, under, over = compat.new_over_node(group)
+    group.links.new(picture, under)
+    group.links.new(enter.outputs["CG"], over)
+    back, below, above = compat.new_over_node(group)
+    group.links.new(enter.outputs["CG"], below)
+    group.links.new(picture, above)
+    choose, factor, first, second, chosen = compat.new_mix_node(group)
+    choose.label = label
+    group.links.new(nearer, factor)
+    group.links.new(back.outputs[0], first)
+    group.links.new(front.outputs[0], second)
+    for row, node in enumerate((front, back)):
+        node.location = (GAP, -350.0 - 170.0 * row)
+    choose.location = (2 * GAP, -350.0)
+    return chosen
+
+
+def _cg_depth(group: Any, enter: Any) -> Any:
+    """Socket of the depth of CG; where a pixel has none, the nearest of its neighbours': it may be that one's edge.
+
+    A pixel that CG covers in part often tells the depth of what is behind: nothing.
+    """
+    around = compat.new_nearest_node(group)
+    group.links.new(enter.outputs["CG Depth"], around.inputs[0])
+    # Where there is a depth, the other is made so large that the lesser of the two is the pixel's own.
+    there = compat.new_math_node(group, "LESS_THAN")
+    there.inputs[1].default_value = _NOTHING
+    group.links.new(enter.outputs["CG Depth"], there.inputs[0])
+    far = compat.new_math_node(group, "MULTIPLY_ADD")
+    far.inputs[1].default_value = contract.NO_DEPTH
+    group.links.new(there.outputs[0], far.inputs[0])
+    group.links.new(around.outputs[0], far.inputs[2])
+    depth = compat.new_math_node(group, "MINIMUM")
+    depth.label = "Depth of CG, edges too"
+    group.links.new(enter.outputs["CG Depth"], depth.inputs[0])
+    group.links.new(far.outputs[0], depth.inputs[1])
+    for column, node in enumerate((around, there, far, depth)):
+        node.location = (GAP * (column - 3), -1100.0)
+    return depth.outputs[0]
+
+
+def _nearer(group: Any, cg: Any, frozen: Any) -> Any:
+    """Socket of how much CG is in front: 1 up to the frozen depth, 0 from `_SOFT` of it behind, smooth between."""
+    ratio = compat.new_math_node(group, "DIVIDE")
+    group.links.new(cg, ratio.inputs[0])
+    group.links.new(frozen, ratio.inputs[1])
+    rise = compat.new_math_node(group, "MULTIPLY_ADD")
+    rise.inputs[1].default_value, rise.inputs[2].default_value = -1.0 / _SOFT, 1.0 + 1.0 / _SOFT
+    rise.use_clamp = True
+    group.links.new(ratio.outputs[0], rise.inputs[0])
+    # t * t * (3 - 2 * t)
+    square, slope, smooth = (compat.new_math_node(group, o) for o in ("MULTIPLY", "MULTIPLY_ADD", "MULTIPLY"))
+    slope.inputs[1].default_value, slope.inputs[2].default_value = -2.0, 3.0
+    smooth.label = "CG is nearer"
+    for source, target in (
+        (rise, square.inputs[0]), (rise, square.inputs[1]), (rise, slope.inputs[0]),
+        (square, smooth.inputs[0]), (slope, smooth.inputs[1]),
+    ):  # fmt: skip
+        group.links.new(source.outputs[0], target)
+    for column, node in enumerate((ratio, rise, square, slope, smooth)):
+        node.location = (GAP * (column - 3), -1300.0)
+    return smooth.outputs[0]
+
+
+def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+    """Socket of how much of the frozen frame shows: Mix, left of Wipe, and where the mattes let it."""
+    left = compat.new_math_node(group, "LESS_THAN")
+    left.label = "Left of the wipe"
+    group.links.new(fitting.across(group), left.inputs[0])
+    group.links.new(enter.outputs["Wipe"], left.inputs[1])
+    total = _product(group, enter.outputs["Mix"], left.outputs[0])
+    for row, (name, layer) in enumerate((("Only Supported", "Support"), ("Only Moving", "Motion"))):
+        # 1 - amount * (1 - matte)
+        lacking = compat.new_math_node(group, "SUBTRACT")
+        lacking.inputs[0].default_value = 1.0
+        group.links.new(layers[layer], lacking.inputs[1])
+        taken = _product(group, enter.outputs[name], lacking.outputs[0])
+        kept = compat.new_math_node(group, "SUBTRACT")
+        kept.inputs[0].default_value = 1.0
+        group.links.new(taken, kept.inputs[1])
+        total = _product(group, total, kept.outputs[0])
+        lacking.location, kept.location = (-2 * GAP, 500.0 + 170.0 * row), (-GAP, 500.0 + 170.0 * row)
+    left.location = (-GAP, 330.0)
+    return total
+
+
+def _product(group: Any, one: Any, other: Any) -> Any:
+    node = compat.new_math_node(group)
+    node.location = (0.0, 330.0)
+    group.links.new(one, node.inputs[0])
+    group.links.new(other, node.inputs[1])
+    return node.outputs[0]

@@ -1,0 +1,176 @@
+"""Frozen frames through the scene's compositor to the artist's output."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from ..process import supervisor
+from ..scene import intact, scene_setup
+from ..shot import contents, made
+from ..shot.shot_state import ShotState
+from . import compositor, freeze_group, rendering, take_files
+from .take_files import Take
+
+
+def insert(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[str]:
+    """Puts a take into the scene's compositor, or updates it; returns what was changed, in words.
+
+    Args:
+        scene: the scene.
+        shot: shot folder.
+        take: name of the take.
+        warp: True freezes the plate that is led into the group, False shows the take's own frames, None: as it does.
+
+    Raises:
+        contract.JobError: the take has no frames, or is to be used as a warp and cannot be.
+    """
+    frozen, plate = _sources(scene, shot, take)
+    if warp:
+        _need_warp(shot, frozen)
+    footage = _footage(scene, shot, plate)
+    changes = compositor.insert(scene, frozen, plate, footage, scene.splannequin.insert_at, warp)
+    lacking = contents.missing_frames(shot, take, rendering.frames_of(scene))
+    if lacking:
+        changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
+    return changes
+
+
+def read_ahead(scene: Any, shot: Path, take: str) -> Iterator[None]:
+    """Has Blender read what `insert` will need, a picture a turn. JobError as `insert`."""
+    frozen, plate = _sources(scene, shot, take)
+    shown = plate if freeze_group.shows_plate(scene) else None
+    return compositor.read_ahead(frozen, shown, freeze_group.wants_warp(scene))
+
+
+def _need_warp(shot: Path, take: Take) -> None:
+    """JobError if a take cannot freeze a plate that shows frame n at frame n."""
+    name = take.folder.name
+    if not any(take.plate_size):
+        raise contract.JobError(
+            f"The take {name!r} has no warp: it was frozen without detail.",
+            "Freeze it again with detail.",
+            contract.ExitCode.BAKE,
+        )
+    if contents.read(shot).takes.get(name, {}).get("camera_path"):
+        raise contract.JobError(
+            f"The take {name!r} is seen from a camera of your own: its warp looks into other frames of the plate.",
+            "Use its frozen frames, or freeze a take on the clip's own camera.",
+            contract.ExitCode.BAKE,
+        )
+
+
+def _sources(scene: Any, shot: Path, take: str) -> tuple[Take, Path | None]:
+    """A take, and the first picture of its plate if there is one. JobError if the take has no frames."""
+    try:
+        frozen = take_files.take_of(contract.ShotFolder(shot).takes / take, made.depth_scale(scene, shot))
+    except FileNotFoundError as error:
+        raise contract.JobError(
+            f"The take {take!r} of {shot.name} holds no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
+        ) from error
+    plate = contract.ShotFolder(shot).plate(frozen.first)
+    return frozen, plate if plate.is_file() else None
+
+
+def _footage(scene: Any, shot: Path, plate: Path | None) -> list[Path]:
+    """Files by which a node that shows the plate is known: the undistorted plate, the clip."""
+    told = str(contents.read(shot).info.get("source", ""))
+    chosen = scene.splannequin.clip
+    files = [plate, Path(told) if told else None, Path(bpy.path.abspath(chosen)) if chosen else None]
+    return [file for file in files if file is not None]
+
+
+def remove(scene: Any) -> bool:
+    """Takes the freeze out of the scene's compositor. True if it was there."""
+    return compositor.remove(scene)
+
+
+def fit_take(scene: Any, shot: Path, take: str, new: bool = False) -> list[str]:
+    """Gives the scene the rate and range of a take, and a size that loses no pixel of it; says what changed.
+
+    Args:
+        scene: the scene. What the artist has set in it stays, and it never becomes smaller.
+        shot: shot folder.
+        take: name of the take.
+        new: the scene is a new one, which takes the plate's size.
+    """
+    frozen, state, render = (
+        take_files.take_of(contract.ShotFolder(shot).takes / take),
+        contents.read(shot),
+        scene.render,
+    )
+    width, height = size = _plate_size(state) if new else (render.resolution_x, render.resolution_y)
+    alike = abs(width * frozen.size[1] - height * frozen.size[0]) <= 0.02 * width * frozen.size[1]
+    if frozen.size[0] > width or (new and not alike):  # of a camera of the artist's own
+        size = frozen.size
+    elif not new:
+        size = None
+    fps = float(state.info.get("fps", 0.0))
+    return scene_setup.fit_clip(scene, size, fps, (frozen.first, frozen.last), over=new)
+
+
+def _plate_size(state: ShotState) -> tuple[int, int]:
+    """Width and height of the undistorted plate in pixels, (0, 0) before the import."""
+    solved = contract.ShotFolder(state.folder).cameras
+    if not solved.is_file():
+        return state.size
+    path = contract.CameraPath.load(solved)
+    return path.width, path.height
+
+
+def insert_freeze(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[str]:
+    """Puts a take into the scene's compositor, or its warp, and keeps the plate's colours if the artist consents."""
+    with intact.scene_of(scene):
+        changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
+        return insert(scene, shot, take, warp) + changes
+
+
+def combine_cg(scene: Any, shot: Path) -> list[str]:
+    """Has the scene's own objects stand among the frozen. JobError if the freeze is not in the compositor."""
+    compositor.may_combine_cg(scene)
+    with intact.scene_of(scene):
+        changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
+        return compositor.combine_cg(scene) + changes
+
+
+def bring_in(scene: Any, shot: Path, take: str, alone: bool = True) -> None:
+    """Has a take put into the compositor and rendered by the timer, in turns: Blender stands still in each.
+
+    Args:
+        scene: the scene; with `alone` no other one that works on the shot is changed.
+        shot: shot folder.
+        take: name of a take.
+        alone: see `scene`.
+    """
+    supervisor.work(shot, "bake", _turns(scene.name, shot, take, scene.name if alone else ""))
+
+
+def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
+    """A picture a turn; the compositor; the render, a turn after it, since Blender takes its time for both."""
+    with contextlib.suppress(
+        contract.JobError, OSError, RuntimeError, ValueError
+    ):  # inserting fails alike, and says so
+        yield from read_ahead(bpy.data.scenes[scene_name], shot, take)
+    seen = ""
+
+    def put_in(scene: Any) -> list[str]:
+        nonlocal seen
+        changes = insert_freeze(scene, shot, take)
+        if supervisor.window_of(scene) is not None:
+            changes += rendering.choose_output(scene, shot, take)  # here, for it belongs to the same undo step
+            seen = scene.name
+        return changes
+
+    supervisor.change(supervisor.watch_of(shot), "bake", put_in, only)
+    if not seen:
+        return
+    yield None
+    window = supervisor.window_of(bpy.data.scenes.get(seen))
+    if window is not None:
+        with bpy.context.temp_override(window=window, scene=window.scene):
+            bpy.ops.splannequin.render("INVOKE_DEFAULT")

@@ -1,0 +1,168 @@
+"""The button Bake, and its parts one by one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..freeze import own_camera, takes
+from ..process import backend, begin, supervisor
+from ..shot import chosen
+from ..translations import tr
+from ..ui import step_operator
+from . import freeze_group, insertion, progress, rendering
+
+
+class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
+    """Freeze those frames of the scene's range that are missing or stale, put the freeze before the output of the
+    scene's compositor, and render the range to the scene's output path"""
+
+    bl_idname = "splannequin.bake"
+    bl_label = "Bake and Render"
+    bl_options = {"REGISTER"}
+    step = "bake"
+
+    def execute(self, context: Any) -> set[str]:
+        """Bakes; a complete take needs no backend."""
+        scene = context.scene
+        folder = chosen.shot_folder(scene)
+        take = scene.splannequin.take_name
+        if folder is None or backend.available() or not takes.complete(folder, take, rendering.frames_of(scene)):
+            if folder is not None and not bpy.app.background and own_camera.follows_camera(scene):
+                takes.read_in_turns(scene, folder, self.step)
+                return {"FINISHED"}
+            return super().execute(context)
+        if not bpy.app.background:
+            insertion.bring_in(scene, folder, take)
+            return {"FINISHED"}
+        outcome = step_operator.edit(
+            self, context, "bake", lambda scene, shot: insertion.insert_freeze(scene, shot, take)
+        )
+        if outcome == {"FINISHED"}:
+            try:
+                bpy.ops.splannequin.render("EXEC_DEFAULT")
+            except RuntimeError as error:
+                self.report({"ERROR"}, str(error).strip())
+                return {"CANCELLED"}
+        return outcome
+
+    def params(self, scene: Any) -> Any:
+        """Reads the artist's camera again, if the take is seen from one: what moved since is stale."""
+        return takes.read_camera(scene, self.step) if own_camera.follows_camera(scene) else None
+
+    def after(self, scene: Any, job: Any) -> list[str]:
+        """Inserts the freeze, then renders."""
+        notes = super().after(scene, job)
+        notes += rendering.choose_output(scene, job.shot, job.params["take"])
+        bpy.ops.render.render(animation=True, scene=scene.name)
+        return notes
+
+
+class SPLANNEQUIN_OT_render(bpy.types.Operator):
+    """Render the scene's range through the compositor to its output path"""
+
+    bl_idname = "splannequin.render"
+    bl_label = "Render Baked Shot"
+    bl_options = {"REGISTER"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Blocks until the frames are on disk."""
+        return self._render(context, "EXEC_DEFAULT")
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Renders in the background of the window, as Blender's own Render Animation does."""
+        return self._render(context, "INVOKE_DEFAULT")
+
+    def _render(self, context: Any, how: str) -> set[str]:
+        scene = context.scene
+        folder = chosen.shot_folder(scene)
+        if folder is None:
+            self.report({"ERROR"}, "No shot is chosen: import a clip first")
+            return {"CANCELLED"}
+        notes = rendering.choose_output(scene, folder, scene.splannequin.take_name)
+        if notes:
+            supervisor.undo_step("bake")
+        progress.began(folder, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
+        try:
+            refused = "CANCELLED" in bpy.ops.render.render(how, animation=True, scene=scene.name) and "it was cancelled"
+        except RuntimeError as error:
+            refused = str(error).strip()
+        if refused:
+            progress.refused(folder)
+            self.report({"ERROR"}, tr(f"Blender did not render the scene: {refused}"))
+            return {"CANCELLED"}
+        for note in notes:
+            self.report({"INFO"}, tr(note))
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_insert_freeze(bpy.types.Operator):
+    """Put the frozen take before the output of the scene's compositor, or update it, without rendering"""
+
+    bl_idname = "splannequin.insert_freeze"
+    bl_label = "Insert Freeze in Compositor"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Inserts or updates the group."""
+        take = context.scene.splannequin.take_name
+        return step_operator.edit(self, context, "bake", lambda scene, shot: insertion.insert_freeze(scene, shot, take))
+
+
+class SPLANNEQUIN_OT_freeze_as_warp(bpy.types.Operator):
+    """Freeze your own plate, whatever is led into the group, instead of showing the take's frames: it keeps its own
+    grade, highlights and grain. Press again to show the take's frames"""
+
+    bl_idname = "splannequin.freeze_as_warp"
+    bl_label = "Freeze as Warp"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Inserts or updates the group, the other way."""
+        take, warp = context.scene.splannequin.take_name, not freeze_group.wants_warp(context.scene)
+        return step_operator.edit(
+            self, context, "bake", lambda scene, shot: insertion.insert_freeze(scene, shot, take, warp)
+        )
+
+
+class SPLANNEQUIN_OT_combine_cg(bpy.types.Operator):
+    """Lead the scene's own render into the freeze, so that your objects stand in front of and behind the frozen people
+    by depth. Sets the film transparent and the depth pass on"""
+
+    bl_idname = "splannequin.combine_cg"
+    bl_label = "Combine with Scene's Objects"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Adds one Render Layers node and two links."""
+        return step_operator.edit(self, context, "bake", insertion.combine_cg)
+
+
+class SPLANNEQUIN_OT_remove_shot(bpy.types.Operator):
+    """Take camera, points and the compositor group of this shot out of the file, and give the scene its own settings
+    back. The shot folder on disk stays"""
+
+    bl_idname = "splannequin.remove_shot"
+    bl_label = "Remove Shot from Scene"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Removes what Splannequin put into the file."""
+
+        def remove(scene: Any, shot: Any) -> list[str]:
+            notes = begin.remove_all(scene, shot)
+            supervisor.watch_of(shot).notes.clear()  # they tell of what is no longer there
+            return notes
+
+        return step_operator.edit(self, context, "bake", remove)
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_bake,
+    SPLANNEQUIN_OT_render,
+    SPLANNEQUIN_OT_insert_freeze,
+    SPLANNEQUIN_OT_freeze_as_warp,
+    SPLANNEQUIN_OT_combine_cg,
+    SPLANNEQUIN_OT_remove_shot,
+)

@@ -1,0 +1,39 @@
+"""The panel of the step Bake."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..ui import icons, step_panel
+
+
+class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
+    """Step 5: bake"""
+
+    bl_label = "5  Bake"
+    bl_idname = "SPLANNEQUIN_PT_bake"
+    step = "bake"
+    operator = "splannequin.bake"
+    folds = "bake"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """Which take, and which of its frames: Blender's own range and step."""
+        layout.prop(context.scene.splannequin, "take_name")
+        row = layout.row(align=True)
+        row.prop(context.scene, "frame_start", text="First")
+        row.prop(context.scene, "frame_end", text="Last")
+        row.prop(context.scene, "frame_step", text="Step")
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """Colours, and the parts of the step one by one."""
+        layout.prop(context.scene.splannequin, "keep_colours")
+        layout.prop(context.scene.splannequin, "insert_at")
+        name = "splannequin.insert_freeze"
+        layout.operator(name, text="Insert in Compositor Only", icon=icons.of(name))
+        for name in ("splannequin.freeze_as_warp", "splannequin.combine_cg", "splannequin.remove_shot"):
+            layout.operator(name, icon=icons.of(name))
+
+
+CLASSES = (SPLANNEQUIN_PT_bake,)

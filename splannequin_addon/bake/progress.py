@@ -1,0 +1,61 @@
+"""How far a render of a baked shot is: Blender renders by itself, and tells handlers of every frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..process import supervisor
+from ..process.supervisor import Progress, Watch, Work
+
+
+def began(shot: Path, frames: int) -> None:
+    """A render of a baked shot begins."""
+    supervisor.watch_of(shot).work = Work("bake", None, _progress(0, frames))
+
+
+def refused(shot: Path) -> None:
+    """It did not begin: nothing else would tell the panel."""
+    supervisor.watch_of(shot).work = None
+
+
+def _progress(done: int, total: int) -> Progress:
+    return Progress(f"Rendering, frame {done} of {total}", done, total, "Press Esc in the render window to stop.")
+
+
+def _renders() -> list[tuple[Watch, Progress]]:
+    """Shots that are being rendered, and how far they are."""
+    works = [(watch, watch.work) for watch in supervisor.watches()]
+    return [(w, k.progress) for w, k in works if k is not None and k.turns is None and k.progress is not None]
+
+
+@persistent
+def _on_frame(*_: Any) -> None:
+    for watch, now in _renders():
+        watch.work = Work("bake", None, _progress(now.done + 1, now.total))
+        watch.redraw = True
+
+
+@persistent
+def _on_end(*_: Any) -> None:
+    for watch, now in _renders():
+        watch.work = None
+        watch.redraw = True
+        watch.notes.setdefault("bake", []).append(f"{now.done} of {now.total} frames rendered.")
+
+
+def register() -> None:
+    """Listens to renders."""
+    bpy.app.handlers.render_write.append(_on_frame)
+    bpy.app.handlers.render_complete.append(_on_end)
+    bpy.app.handlers.render_cancel.append(_on_end)
+
+
+def unregister() -> None:
+    """Undoes `register`."""
+    bpy.app.handlers.render_cancel.remove(_on_end)
+    bpy.app.handlers.render_complete.remove(_on_end)
+    bpy.app.handlers.render_write.remove(_on_frame)

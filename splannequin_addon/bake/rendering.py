@@ -1,0 +1,105 @@
+"""The render of a baked shot: which frames, where to, and as pictures on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from .. import compat
+from ..scene import paths
+
+DIGITS = "######"
+_DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (what Blender gives a new file)
+
+
+def frames_of(scene: Any) -> range:
+    """Frames that a bake is about: the scene's range and step, as Blender renders them."""
+    return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+
+
+def default_output(shot: Path, take: str) -> Path:
+    """Where a bake goes if the scene names no folder of its own."""
+    return shot / "bake" / take
+
+
+def choose_output(scene: Any, shot: Path, take: str) -> list[str]:
+    """Gives the scene an output path if it still has Blender's default; returns what was changed, in words."""
+    if scene.render.filepath not in _DEFAULT_OUTPUTS:
+        return []
+    folder = default_output(shot, take)
+    scene.render.filepath = paths.blend_path(folder / DIGITS)
+    return [f"Output path set to {folder}."]
+
+
+def render(
+    scene: Any,
+    folder: Path,
+    png: bool = True,
+    on_frame: Callable[[int, int], None] | None = None,
+    check_cancelled: Callable[[], None] | None = None,
+) -> list[int]:
+    """Renders the scene's range through the compositor to folder/NNNNNN.*, blocking; returns the frames written.
+
+    Args:
+        scene: a scene with the freeze inserted.
+        folder: where the pictures go.
+        png: write 8-bit RGB PNG; else what the scene's output format says.
+        on_frame: called with (frames done, frames in all).
+        check_cancelled: called between frames; what it raises ends the bake. Frames written so far stay, a movie file
+            is closed and holds them.
+
+    Raises:
+        contract.JobError: Blender refused, or a frame is not on disk afterwards.
+    """
+    wanted = list(frames_of(scene))
+    folder.mkdir(parents=True, exist_ok=True)
+    scene.render.filepath = str(folder / DIGITS)
+    scene.render.use_file_extension = True
+    scene.render.use_overwrite = True
+    if png:
+        compat.set_png(scene.render.image_settings)
+    done: list[int] = []
+    stopped: list[BaseException] = []
+
+    def count(rendered: Any, *_: Any) -> None:
+        try:
+            done.append(rendered.frame_current)
+            if on_frame:
+                on_frame(len(done), len(wanted))
+            if check_cancelled:
+                check_cancelled()
+        except BaseException as error:  # Blender prints what a handler raises, and renders on
+            stopped.append(error)
+        if stopped:
+            # The render's loop counts on from here: at the last frame it ends, and closes what it writes to.
+            rendered.frame_current = rendered.frame_end
+
+    now = scene.frame_current
+    bpy.app.handlers.render_write.append(count)
+    try:
+        bpy.ops.render.render(animation=True, scene=scene.name)
+    except RuntimeError as error:
+        raise contract.JobError(
+            f"Blender could not render the scene: {str(error).strip()}",
+            "Open shot.blend and render it there to see why.",
+            contract.ExitCode.BAKE,
+        ) from error
+    finally:
+        bpy.app.handlers.render_write.remove(count)
+    scene.frame_set(now)
+    if not stopped and check_cancelled:
+        check_cancelled()  # asked for while Blender was at work, in a handler of someone else's
+    if stopped:
+        raise stopped[0]
+    lost = [n for n in wanted if not Path(scene.render.frame_path(frame=n)).is_file()]
+    if lost:
+        raise contract.JobError(
+            f"Blender wrote no picture for frame {lost[0]} in {folder}.",
+            "Is the disk full, or the folder not yours to write?",
+            contract.ExitCode.BAKE,
+        )
+    return wanted

@@ -1,0 +1,121 @@
+"""The step Bake: what it asks the backend for, what its end changes, and what the panel says of it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from .. import compat
+from ..freeze import takes
+from ..process import backend, jobs
+from ..process.steps import Step, View
+from ..scene import scene_setup
+from ..shot import chosen, made
+from ..shot.shot_state import ShotState
+from . import freeze_group, insertion, operators, panel, progress, shown_take
+
+
+class Bake(Step):
+    """The take in the scene's compositor, and its render. Its job freezes what the take lacks."""
+
+    name = "bake"
+    label = "Bake"
+    kind = "freeze"
+    button = "Bake and Render"
+    again = "Bake Again"
+    needs = "Freeze first."
+    classes = (*operators.CLASSES, *panel.CLASSES)
+    parts = (progress,)
+
+    def params(self, scene: Any) -> contract.FreezeParams:
+        """What the take was asked for with, for the frames of the scene's range."""
+        props, folder = scene.splannequin, chosen.shot_folder(scene)
+        params = takes.params_of(scene)
+        if folder is None:
+            return params
+        asked = takes.take_params(folder, props.take_name, params.t_star)
+        if asked is not None and props.choose_t_star:
+            asked.t_star_per_frame = params.t_star_per_frame
+        params = asked or params
+        params.device = backend.device()
+        params.first, params.last, params.step = scene.frame_start, scene.frame_end, scene.frame_step
+        return params
+
+    def view(self, scene: Any, state: ShotState | None) -> View:
+        """Bake: whether the freeze is in the scene's compositor."""
+        if state is None or scene.splannequin.take_name not in state.takes:
+            return View(False, False, [], self.needs)
+        tree = compat.compositor_tree(scene)
+        if tree is None or freeze_group.group_node(tree) is None:
+            return View(False, True, [], "Put the freeze before your compositor's output and render.")
+        there, take = freeze_group.shown(scene), shown_take.shown(scene, state.folder)
+        if there is not None and take != scene.splannequin.take_name:
+            shown = f"take {take}" if take else f"another shot, {made.name_of(there[0].parent.parent)}"
+            lines = [f"Your compositor shows {shown}: the one that was baked last."]
+            return View(False, True, lines, "Baking puts this take in its place.")
+        lines = ["The freeze is in your compositor.", *unsure(state.takes[scene.splannequin.take_name])]
+        if shown_take.stale_scale(scene, state.folder):
+            lines.append("The shot was scaled since: its depth is stale until you bake again.")
+        if not scene_setup.keeps_plate_colours(scene):
+            lines.append(f"The view transform {scene.view_settings.view_transform} changes the plate's colours.")
+        return View(True, True, lines, f"Frames go to {scene.render.filepath}")
+
+    def finish(self, scene: Any, job: jobs.Job) -> list[str]:
+        """The take comes into the compositor."""
+        return insertion.insert_freeze(scene, job.shot, job.params["take"])
+
+    def arrive(self, scene: Any, job: jobs.Job) -> bool:
+        """In turns: Blender reads pictures, compositor and render."""
+        insertion.bring_in(scene, job.shot, str(job.params["take"]), alone=False)
+        return True
+
+    def late(self, job: jobs.Job) -> str:
+        """Choosing a shot starts no render, and leaves the other's take in the compositor."""
+        return "Its frames were rendered meanwhile. Bake again to put them into your compositor."
+
+    def in_use(self, shot: Path, folder: Path) -> str:
+        """A take whose frames are shown in this file."""
+        if shown(folder):
+            return "The compositor shows this take: bake another one, or remove the shot from the scene, first"
+        return ""
+
+    def stands(self, scene: Any, shot: Path) -> bool:
+        """True if the compositor shows a take of the shot."""
+        return _baked(scene) == shot
+
+    def remove(self, scene: Any, shot: Path, others: list[Path]) -> list[str]:
+        """Takes the freeze out of the compositor, unless it is another shot's."""
+        gone = _baked(scene) not in others and insertion.remove(scene)
+        return ["The freeze left the compositor."] if gone else []
+
+    def scaled(self, scene: Any, shot: Path) -> list[str]:
+        """Depth in the compositor is in scene units."""
+        return shown_take.follow_scale(scene, shot)
+
+
+def _baked(scene: Any) -> Path | None:
+    """The shot whose take the compositor shows."""
+    there = freeze_group.shown(scene)
+    return there[0].parent.parent if there is not None else None
+
+
+def shown(take: Path) -> bool:
+    """True if an image of this file that something uses is a frame of the take."""
+    wanted = os.path.abspath(take)
+    return any(
+        image.users and image.filepath and os.path.dirname(os.path.abspath(bpy.path.abspath(image.filepath))) == wanted
+        for image in bpy.data.images
+    )
+
+
+def unsure(take: dict[str, Any]) -> list[str]:
+    """What a take's verdict says, if that is not that all is well: there is no need to hear it again."""
+    verdict = contract.verdict_of(take)
+    return [] if verdict is None or verdict.word == "good" else verdict.lines()
+
+
+STEP = Bake()

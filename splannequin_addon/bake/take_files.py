@@ -1,0 +1,91 @@
+"""A take's files on disk, as the compositor reads them: which frames there are, and what their headers say. No bpy."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...torch_backend import contract
+from ..scene import numbered
+
+
+@dataclass
+class Take:
+    """Frozen frames on disk, as the compositor reads them."""
+
+    folder: Path
+    """Folder of NNNNNN.exr."""
+    first: int
+    """First frame number there is."""
+    last: int
+    """Last frame number there is, inclusive."""
+    depth_scale: float = 1.0
+    """Scene units per solve unit: what the depth layer is multiplied by."""
+    size: tuple[int, int] = (0, 0)
+    """Width and height of the frames in pixels, without overscan."""
+    margin: tuple[int, int] = (0, 0)
+    """Pixels beyond the frame on the left and right, and above and below: overscan."""
+    plate_size: tuple[int, int] = (0, 0)
+    """Width and height in pixels of the plate that the take's warp is for; (0, 0): it has none."""
+
+
+def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
+    """The take in a folder. FileNotFoundError if it holds no frozen frame."""
+    numbers = numbered.frame_numbers(folder)
+    if not numbers:
+        raise FileNotFoundError(f"{folder} holds no frozen frames (NNNNNN.exr)")
+    windows = exr_windows(numbered.frame_path(folder, numbers[0]))
+    return Take(folder, numbers[0], numbers[-1], depth_scale, *windows, _plate_size(folder, numbers))
+
+
+def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:
+    """Width and height of the plate that a take's warp is for; (0, 0) if a frame lacks its warp."""
+    folder = take / WARP_FOLDER
+    if set(numbers) - set(numbered.frame_numbers(folder)):
+        return 0, 0
+    header = _exr_header(numbered.frame_path(folder, numbers[0]))
+    found = [_exr_value(header, f"splannequin:{name}", "int", "<i") for name in ("plateWidth", "plateHeight")]
+    return (found[0][0], found[1][0]) if found[0] and found[1] else (0, 0)
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Width and height of an EXR's frame, as `exr_windows`."""
+    return exr_windows(path)[0]
+
+
+def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
+    """An EXR's width and height, and the pixels it has beyond them left and right, and above and below.
+
+    From its header: Blender says 0 x 0 of a multilayer file. ValueError without one, or for margins that are not the
+    same on opposite sides: Blender centres the pixels, wherever the frame lies in them.
+    """
+    header = _exr_header(path)
+    frame, data = (_exr_value(header, name, "box2i", "<4i") for name in ("displayWindow", "dataWindow"))
+    if frame is None or data is None:
+        raise ValueError(f"{path} is no OpenEXR file: render the take again")
+    (left, top, right, bottom), (data_left, data_top, data_right, data_bottom) = frame, data
+    margin = (left - data_left, top - data_top)
+    if margin != (data_right - right, data_bottom - bottom) or min(margin) < 0:
+        raise ValueError(f"{path} does not reach equally far beyond its frame on all sides: render the take again")
+    return (right - left + 1, bottom - top + 1), margin
+
+
+def _exr_header(path: Path) -> bytes:
+    """What a file begins with, attributes first; empty if it is no OpenEXR file."""
+    with contract.open_regular(path) as source:
+        header = source.read(16384)
+    return header if header[:4] == b"\x76\x2f\x31\x01" else b""
+
+
+def _exr_value(header: bytes, name: str, kind: str, form: str) -> tuple[Any, ...] | None:
+    """Value of an attribute, as `struct` unpacks it; None if the header lacks it."""
+    key = f"{name}\0{kind}\0".encode()
+    at = header.find(key)
+    return None if at < 0 else struct.unpack_from(form, header, at + len(key) + 4)
+
+
+WARP_FOLDER = "warp"
+"""Folder of the warps in a take's."""

@@ -1,0 +1,76 @@
+"""Nodes that freeze a plate by a take's warp: matte * plate(ST) + fill, as `torch_backend/freeze/warp.py` says.
+
+Blender's own smooth filters differ from version to version, and none leaves a pixel that does not move as it is. So the
+four pixels around a place are looked up as they are, and blended by how far the place lies between them, in steps of
+1/256 of a pixel: what lies on a pixel's centre is that pixel.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .. import compat
+
+LAYERS = ("Combined", "Alpha", "ST", "Matte")
+"""Of a warp: the fill, how opaque the frozen frame is, coordinates, and how much the plate gives."""
+_STEPS = 256.0
+_WIDE = 180.0
+
+
+def frozen(tree: Any, plate: Any, warp: Any, size: tuple[int, int]) -> Any:
+    """Socket of a plate frozen by a warp, as large as the warp.
+
+    Args:
+        tree: where the nodes are made.
+        plate: socket of the plate.
+        warp: outputs of the Image node that shows the warp, `LAYERS`.
+        size: width and height of the plate that the warp is for.
+    """
+    there = {node.name for node in tree.nodes}
+    plate = compat.sized(tree, plate, size)
+    s, t = compat.new_coordinates(tree, warp["ST"])
+    (left, right, across), (low, high, up) = (_between(tree, v, n) for v, n in zip((s, t), size, strict=True))
+    rows = [
+        _mixed(tree, across, compat.new_look_up(tree, plate, left, y), compat.new_look_up(tree, plate, right, y))
+        for y in (low, high)
+    ]
+    shown = _mixed(tree, up, *rows)
+    whole = _mixed(tree, 1.0, _mixed(tree, 1.0, shown, warp["Matte"], "MULTIPLY"), warp["Combined"], "ADD")
+    whole = compat.with_alpha(tree, whole, warp["Alpha"])
+    for column, node in enumerate(n for n in tree.nodes if n.name not in there):
+        node.location = (_WIDE * (column % 8 - 3), -1700.0 - _WIDE * (column // 8))
+    return whole
+
+
+def _between(tree: Any, share: Any, size: int) -> tuple[Any, Any, Any]:
+    """Two neighbouring pixels of a row of `size`, 0..1 over it, and how far towards the second one a place lies."""
+
+    def on(source: Any, operation: str, *values: float) -> Any:
+        node = compat.new_math_node(tree, operation)
+        tree.links.new(source, node.inputs[0])
+        for socket, value in zip(node.inputs[1:], values, strict=False):
+            socket.default_value = value
+        return node.outputs[0]
+
+    steps = on(on(share, "MULTIPLY_ADD", _STEPS * size, -0.5 * _STEPS), "ROUND")
+    place = on(on(on(steps, "MULTIPLY", 1.0 / _STEPS), "MAXIMUM", 0.0), "MINIMUM", size - 1.0)
+    first = on(place, "FLOOR")
+    rest = compat.new_math_node(tree, "SUBTRACT")
+    tree.links.new(place, rest.inputs[0])
+    tree.links.new(first, rest.inputs[1])
+    # A quarter into a pixel, Nearest finds it in 4.3, too, where it takes a pixel's centre for the border to the next.
+    at = [on(first, "MULTIPLY_ADD", 1.0 / size, (n + 0.25) / size) for n in (0, 1)]
+    # The second may lie past the last pixel, where there is nothing: then the place lies on the first.
+    return at[0], at[1], rest.outputs[0]
+
+
+def _mixed(tree: Any, amount: Any, one: Any, other: Any, blend: str = "MIX") -> Any:
+    """Socket of two pictures, or a picture and a value, mixed."""
+    _, factor, first, second, result = compat.new_mix_node(tree, blend)
+    if isinstance(amount, float):
+        factor.default_value = amount
+    else:
+        tree.links.new(amount, factor)
+    tree.links.new(one, first)
+    tree.links.new(other, second)
+    return result

@@ -1,0 +1,419 @@
+"""The command line of the Blender side: the buttons' own code, blocking, with a console instead of a panel.
+
+    blender --background [FILE.blend] --command splannequin freeze CLIP --t-star 34 --output DIR
+    .venv-bpy-5.0/bin/python splannequin_addon/run_in_bpy.py bake --shot SHOT --take freeze --output DIR
+
+Exit codes are `contract.ExitCode`: 0 done, 2 wrong arguments, 3 footage, 4 solve, 5 train, 6 freeze, 7 bake, 8 disk,
+9 no backend, 130 cancelled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from ...torch_backend.contract import ExitCode
+from ..bake import insertion, rendering
+from ..freeze import takes
+from ..process import backend, begin, jobs, steps
+from ..scene import paths, scene_setup, sequences
+from ..shot import contents
+from ..solve import arrival, cameras, exchange, stmaps
+
+
+class Console:
+    """Prints what jobs say: lines for people, or events as JSON lines."""
+
+    def __init__(self, as_json: bool) -> None:
+        self.as_json = as_json
+        self._last = ("", 0.0)
+        self._seq = 0
+
+    def __call__(self, event: contract.Event) -> None:
+        if self.as_json:
+            print(json.dumps(dataclasses.asdict(event)), flush=True)
+        elif event.type == "progress":
+            self._progress(event)
+        elif event.type == "warning":
+            print(f"  note: {event.data['message']} {event.data['hint']}".rstrip(), flush=True)
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
+        """Progress of work that is Blender's own."""
+        data = {"stage": stage, "done": done, "total": total, "message": message, "eta_seconds": None}
+        self(contract.Event("progress", self._seq, time.time(), data))
+        self._seq += 1
+
+    def say(self, sentence: str) -> None:
+        """A sentence for people."""
+        if not self.as_json:
+            print(sentence, flush=True)
+
+    def _progress(self, event: contract.Event) -> None:
+        data = event.data
+        share = data["done"] / data["total"] if data["total"] else 0.0
+        stage, since = self._last
+        if data["stage"] == stage and share < 1.0 and event.time - since < 5.0:
+            return
+        self._last = (data["stage"], event.time)
+        eta = f", {data['eta_seconds']:.0f} s left" if data.get("eta_seconds") and share < 1.0 else ""
+        print(f"  {data['stage']:<22} {100 * share:3.0f}%  {data['message']}{eta}".rstrip(), flush=True)
+
+
+_interrupts: list[int] = []
+"""Signals that asked this command to stop."""
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    """Remembered, because Blender swallows what is raised in a handler of its own while it renders."""
+    _interrupts.append(number)
+    raise KeyboardInterrupt
+
+
+def _stop_if_interrupted() -> None:
+    if _interrupts:
+        raise KeyboardInterrupt
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs one command; returns an exit code. Ctrl-C and SIGTERM cancel the job at work with a checkpoint."""
+    before = {}
+    _interrupts.clear()
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):
+        if hasattr(signal, name):
+            number = getattr(signal, name)
+            before[number] = signal.signal(number, _interrupt)
+    try:
+        args = parser().parse_args(list(argv))
+        if getattr(args, "tied", False):
+            contract.end_with_starter()
+        return int(args.does(args, Console(args.json)))
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except (contract.Cancelled, KeyboardInterrupt):
+        print("Cancelled. Start the same command again to go on: finished work is kept.", file=sys.stderr)
+        return ExitCode.CANCELLED
+    except contract.JobError as error:
+        print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
+        return error.exit_code
+    except (ValueError, FileNotFoundError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return ExitCode.USAGE
+    except OSError as error:
+        print(f"Error: {error.strerror or error}: {error.filename or ''}", file=sys.stderr)
+        return ExitCode.DISK
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+# ------------------------------------------------------------------------------------------------- commands
+
+
+def import_clip(args: argparse.Namespace, console: Console) -> int:
+    """`import SHOT CLIP`."""
+    return _one_step(args, console, "import")
+
+
+def solve(args: argparse.Namespace, console: Console) -> int:
+    """`solve SHOT`."""
+    return _one_step(args, console, "solve")
+
+
+def export(args: argparse.Namespace, console: Console) -> int:
+    """`export SHOT --output DIR`: cameras and points for other programs."""
+    output = Path(args.output).absolute()
+    asked = exchange.begin_export(Path(args.shot).absolute(), args.format, output, args.text)
+    console.say(exchange.exported(asked, output))
+    return ExitCode.OK
+
+
+def train(args: argparse.Namespace, console: Console) -> int:
+    """`train SHOT`."""
+    return _one_step(args, console, "train")
+
+
+def freeze(args: argparse.Namespace, console: Console) -> int:
+    """`freeze CLIP`: import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
+    began = time.perf_counter()
+    output = _output(args)
+    shot = output / (args.shot_name + contract.SHOT_SUFFIX)
+    scene, fresh = _scene(args.blend)
+    scene.splannequin.shot_path = str(shot)
+    requests = asked(args)
+    stages: dict[str, float] = {}
+    results: dict[str, Any] = {}
+    for step in ("import", "solve", "train", "freeze"):
+        since = time.perf_counter()
+        kind = steps.STEPS[step].kind
+        params = requests[kind]
+        results[kind], notes = begin.run(scene, step, params, console)
+        stages[kind] = round(time.perf_counter() - since, 2)
+        for note in notes:
+            console.say(f"  {note}")
+    since = time.perf_counter()
+    baked = _bake(scene, fresh, shot, args.take, output, console)
+    stages["bake"] = round(time.perf_counter() - since, 2)
+    source = str(contents.read(shot).info.get("source", args.clip))
+    summary = contract.summarise(str(shot), source, results, stages, time.perf_counter() - began)
+    jobs.write_json(output / contract.SUMMARY_FILE, {**summary, **baked})
+    for line in summary["verdict"]:
+        console.say(line)
+    console.say(f"Composited frames: {baked['composited_dir']}")
+    return ExitCode.OK
+
+
+def bake_take(args: argparse.Namespace, console: Console) -> int:
+    """`bake --shot SHOT --take TAKE --output DIR`: a frozen take through the compositor."""
+    began = time.perf_counter()
+    shot = _shot(args)
+    output = _output(args)
+    scene, fresh = _scene(args.blend)
+    scene.splannequin.shot_path = str(shot)
+    if fresh:  # else the range is the artist's, like everything else in the file
+        _fit_range(scene, shot, args.take)
+    first = scene.frame_start if args.first is None else args.first
+    last = scene.frame_end if args.last is None else args.last
+    if last < first:
+        raise contract.JobError(
+            f"The last frame, {last}, comes before the first, {first}.",
+            "Name both with --first and --last.",
+            ExitCode.USAGE,
+        )
+    span = range(first, last + 1, args.step if args.step > 0 else scene.frame_step)
+    stale = backend.available() and takes.may_be_stale(shot, args.take)
+    if stale or not takes.complete(shot, args.take, span):
+        params = takes.take_params(shot, args.take) or contract.FreezeParams(take=args.take, only_missing=True)
+        params.first, params.last, params.step = span.start, span.stop - 1, span.step
+        params.device = _device(args)
+        begin.run(scene, "freeze", params, console)
+    if cameras.find(scene, shot, "CAMERA") is None and contract.ShotFolder(shot).cameras.is_file():
+        arrival.load_camera(scene, shot)
+    baked = _bake(scene, fresh, shot, args.take, output, console, span, args.as_warp or None)
+    path = output / contract.SUMMARY_FILE
+    summary = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
+    summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
+    jobs.write_json(path, {**summary, **baked})
+    console.say(f"Composited frames: {baked['composited_dir']}")
+    return ExitCode.OK
+
+
+def write_stmaps(args: argparse.Namespace, console: Console) -> int:
+    """`stmaps SHOT`: ST maps of the lens, both ways."""
+    shot = _shot(args)
+    asked = stmaps.begin(shot, args.width)
+    asked.wait()
+    facts = stmaps.answer(asked)
+    if console.as_json:
+        print(json.dumps(facts))
+    for line in stmaps.sentences(facts):
+        console.say(line)
+    return ExitCode.OK
+
+
+def status(args: argparse.Namespace, console: Console) -> int:
+    """`status SHOT`: the newest job of each kind, one line each."""
+    shot = _shot(args)
+    for kind, job in jobs.latest(shot).items():
+        told = job.status or contract.Status(kind, "queued", 0, 0.0, 0.0, 0.0)
+        if console.as_json:
+            print(json.dumps({"job": job.folder.name, **dataclasses.asdict(told)}))
+        else:
+            share = f"{told.stage} {100 * told.fraction:.0f}%" if told.stage else ""
+            print(contract.printable(f"{job.folder.name}  {told.state:<9} {share}  {told.message}").rstrip())
+    return ExitCode.OK
+
+
+def doctor(args: argparse.Namespace, console: Console) -> int:
+    """`doctor`: this Blender, and what the backend's environment can do, as JSON."""
+    facts: dict[str, Any] = {"blender": bpy.app.version_string, "blender_python": sys.version.split()[0]}
+    facts["backend_python"] = backend.python()
+    facts["backend"] = json.loads(backend.doctor())
+    print(json.dumps(facts, indent=1))
+    return ExitCode.OK
+
+
+# ------------------------------------------------------------------------------------------------- inside
+
+
+def _one_step(args: argparse.Namespace, console: Console, step: str) -> int:
+    (params,) = asked(args).values()
+    scene = bpy.context.scene
+    scene.splannequin.shot_path = str(Path(args.shot).absolute())
+    job = begin.begin(scene, step, params)
+    result = begin.wait(job, console)
+    if console.as_json:
+        print(json.dumps({"result": result}))
+    elif isinstance(result, dict):
+        for line in contract.verdict_lines(result):
+            console.say(line)
+    return ExitCode.OK
+
+
+def _scene(blend: str) -> tuple[Any, bool]:
+    """The scene to work in, and whether it is a new one: `blend`'s, or the file that Blender was started with."""
+    if blend:
+        path = Path(blend).absolute()
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist: --blend names a .blend file")
+        bpy.ops.wm.open_mainfile(filepath=str(path))
+    if bpy.data.filepath:
+        return bpy.context.scene, False
+    bpy.ops.wm.read_homefile(use_empty=True)
+    return bpy.context.scene, True
+
+
+def _fit_range(scene: Any, shot: Path, take: str) -> None:
+    """A new scene's range: the take's, or the clip's before there is a take."""
+    state = contents.read(shot)
+    facts = state.takes.get(take)
+    scene.frame_start, scene.frame_end = (facts["first"], facts["last"]) if facts else state.frame_range
+
+
+def _bake(
+    scene: Any,
+    fresh: bool,
+    shot: Path,
+    take: str,
+    output: Path,
+    console: Console,
+    span: range | None = None,
+    warp: bool | None = None,
+) -> dict[str, Any]:
+    """Compositor, render of `span` (None: the scene's range), shot.blend; returns what the summary tells of it."""
+    changes = insertion.fit_take(scene, shot, take, fresh) if fresh or scene_setup.fitted(scene) else []
+    if span is not None:
+        scene.frame_start, scene.frame_end, scene.frame_step = span.start, span.stop - 1, span.step
+    changes += insertion.insert_freeze(scene, shot, take, warp)
+    for change in changes:
+        console.say(f"  {change}")
+    folder = output / "composited"
+    blend = output / "shot.blend"
+    numbers = rendering.render(
+        scene, folder, fresh, lambda done, total: console.progress("baking", done, total), _stop_if_interrupted
+    )
+    _save(scene, blend, folder)
+    return {
+        "composited_dir": str(folder),
+        "composited_frames": len(numbers),
+        "blend": str(blend),
+        "blender_version": bpy.app.version_string,
+    }
+
+
+def _save(scene: Any, blend: Path, frames: Path) -> None:
+    """Saves the file with paths relative to it, so that its folder can be moved and rendered elsewhere."""
+    files = bpy.context.preferences.filepaths
+    backups = files.save_version
+    try:
+        # The first save gives the file its place; what is relative to it is only known then.
+        bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
+        files.save_version = 0
+        scene = bpy.context.scene
+        sequences.relative_images()
+        scene.render.filepath = paths.blend_path(frames / rendering.DIGITS)
+        bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
+    except RuntimeError as error:
+        raise contract.JobError(
+            f"{blend} could not be saved: {str(error).strip()}", "Is the disk full?", ExitCode.BAKE
+        ) from error
+    finally:
+        files.save_version = backups
+
+
+def asked(args: argparse.Namespace) -> dict[str, Any]:
+    """Kind of job -> parameters that a parsed command line asks for; none of a command that starts no job."""
+    kinds = contract.COMMANDS.get(args.command, {})
+    return contract.asked(args, kinds, args.command, {"device": backend.device()})
+
+
+def _device(args: argparse.Namespace) -> str:
+    """Where the backend works: as this command says, else as the preferences do."""
+    return args.device or backend.device()
+
+
+def _shot(args: argparse.Namespace) -> Path:
+    """The shot folder that a command is about. JobError if there is none."""
+    shot = Path(args.shot).absolute()
+    if not contents.read(shot).info:
+        raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
+    return shot
+
+
+def _output(args: argparse.Namespace) -> Path:
+    """The --output folder, made if it is not there. JobError if it cannot be."""
+    output = Path(args.output).absolute()
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise begin.unwritable(output, error, "Choose another --output folder.") from error
+    return output
+
+
+_UNSET = {"device": "as the preferences say"}
+"""Field -> what is taken for it where a command says nothing."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The grammar of the command line."""
+    codes = "exit codes: " + ", ".join(f"{c.value} {c.name.lower()}" for c in ExitCode)
+    top = argparse.ArgumentParser(
+        prog="blender --background [FILE.blend] --command splannequin",
+        description="Freeze time in a handheld clip of people holding still.",
+        epilog=codes,
+    )
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(name: str, run: Any, text: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=text, description=text, epilog=codes)
+        command.add_argument("--json", action="store_true", help="print events as JSON lines instead of text")
+        command.set_defaults(does=run)
+        return command
+
+    def on_a_shot(name: str, run: Any, text: str, shot: str = "shot folder") -> None:
+        command = add(name, run, text)
+        command.add_argument("shot", help=shot)
+        contract.add_options(command, contract.COMMANDS[name], name, _UNSET)
+
+    on_a_shot("import", import_clip, "Footage into a shot folder.", "shot folder, made if it is not there")
+    on_a_shot("solve", solve, "Cameras of a shot.")
+    on_a_shot("train", train, "Train a run of a shot.")
+    one = add("export", export, "Cameras and points of a solved shot for other programs.")
+    one.add_argument("shot", help="shot folder")
+    one.add_argument("--format", default="colmap", choices=("colmap", "nerfstudio"), help="what to write")
+    one.add_argument("--text", action="store_true", help="a COLMAP model as .txt instead of .bin")
+    one.add_argument("--output", required=True, metavar="DIR", help="folder to write into")
+    whole = add("freeze", freeze, "Clip to baked shot: import, solve, train, freeze, bake; writes OUTPUT/shot.blend.")
+    contract.add_options(whole, contract.COMMANDS["freeze"], "freeze", _UNSET)
+    whole.add_argument("--shot-name", default="shot", metavar="NAME", help="name of the shot folder in OUTPUT")
+    whole.add_argument("--output", default="output", metavar="DIR", help="folder for everything that comes out")
+    whole.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
+    one = add("bake", bake_take, "A frozen take through the compositor; writes DIR/composited and DIR/shot.blend.")
+    one.add_argument("--shot", required=True, help="shot folder")
+    one.add_argument("--take", default="freeze", help="name of the take")
+    one.add_argument("--output", required=True, metavar="DIR", help="folder for what comes out")
+    one.add_argument("--first", type=int, help="first frame to bake (default: the take's, or the .blend's range)")
+    one.add_argument("--last", type=int, help="last frame to bake, inclusive")
+    one.add_argument("--step", type=int, default=0, help="bake every n-th frame (0: the scene's step)")
+    text = "where to freeze what is missing (default: as the preferences say)"
+    one.add_argument("--device", default="", choices=contract.DEVICES, help=text)
+    one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
+    text = "freeze the plate that the .blend shows by the take's warp, instead of showing the take's frames"
+    one.add_argument("--as-warp", action="store_true", help=text)
+    one.add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # to the launcher, by the standard input
+    one = add("stmaps", write_stmaps, "ST maps of the lens, both ways, into SHOT/solve.")
+    one.add_argument("shot", help="shot folder")
+    one.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")
+    one = add("status", status, "Jobs of a shot.")
+    one.add_argument("shot", help="shot folder")
+    add("doctor", doctor, "What this Blender and its backend can do, as JSON.")
+    return top

@@ -1,0 +1,1 @@
+"""The step Import: footage into a shot folder."""

@@ -1,0 +1,40 @@
+"""What a finished import changes in the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ...torch_backend import contract
+from ..scene import scene_setup
+from ..shot import chosen, contents
+from ..shot.shot_state import ShotState
+from . import plate
+
+
+def imported(scene: Any, shot: Path) -> list[str]:
+    """After the import: the scene takes the clip's size, rate and range if it is new or the artist consents."""
+    state = contents.read(shot)
+    props = scene.splannequin
+    chosen.see(scene, state)
+    first, last = state.frame_range
+    if not first <= props.t_star <= last:
+        props.t_star = (first + last) // 2
+    changes, camera = fit(scene, state), plate.show(scene, shot)
+    if camera is not None:
+        changes.append(f"{camera.name} shows the clip until the camera is solved.")
+    return changes
+
+
+def fit(scene: Any, state: ShotState, force_k: bool = False) -> list[str]:
+    """Size, rate and range of the scene as the clip's, if the artist consents; with `force_k` as the solved plates'."""
+    props = scene.splannequin
+    if not (props.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
+        return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]
+    size, k = state.size, None
+    if force_k:
+        path = contract.CameraPath.load(contract.ShotFolder(state.folder).cameras)
+        size = (path.width, path.height)
+        k = (path.frames[0].K[0], path.frames[0].K[1], path.frames[0].K[2], path.frames[0].K[3])
+    fps = float(state.info.get("fps", 0.0))
+    return scene_setup.fit_clip(scene, size, fps, state.frame_range, k, props.set_up_scene)

@@ -1,0 +1,116 @@
+"""Other ways to choose the clip: dropped on the 3D view, or from the Movie Clip editor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.props import BoolProperty, StringProperty
+
+from ..process import supervisor
+from ..shot import chosen
+from ..ui import icons, step_operator
+
+VIDEO = ".mp4;.mov;.m4v;.mkv;.avi;.mxf;.mts;.webm;.mpg;.mpeg"
+"""Endings of what is taken for footage when it is dropped. Images stay Blender's: they are often references."""
+
+
+class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
+    """Make this video the clip of the scene's shot; nothing is imported yet"""
+
+    bl_idname = "splannequin.use_clip"
+    bl_label = "Use as Splannequin Clip"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filepath: StringProperty(name="File", description="Video to be used", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_movie: BoolProperty(name="Movies Only", description="Show videos only", default=True, options={"HIDDEN"})
+    filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """A file that was dropped is used; from a menu, one is chosen."""
+        if self.filepath:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Sets the clip; another clip than before begins with a shot of its own, beside one that was imported."""
+        props = context.scene.splannequin
+        if not self.filepath:
+            self.report({"ERROR"}, "No file was given")
+            return {"CANCELLED"}
+        known = [i for i, one in enumerate(chosen.settings(context.scene)) if one.clip == self.filepath]
+        if known and len(props.shots):
+            chosen.choose(context.scene, known[0])
+        elif props.clip != self.filepath:
+            folder = chosen.shot_folder(context.scene)
+            state = supervisor.watch_of(folder).state if folder is not None else None
+            if state is not None and state.frames:
+                chosen.add(context.scene)
+            props.clip, props.shot_path = self.filepath, ""
+        self.report({"INFO"}, "Clip chosen: press Import Clip in the Splannequin tab")
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_use_movie_clip(bpy.types.Operator):
+    """Make the clip that this editor shows the clip of the scene's shot"""
+
+    bl_idname = "splannequin.use_movie_clip"
+    bl_label = "Use This Clip"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """On where a clip is shown."""
+        return getattr(context.space_data, "clip", None) is not None
+
+    def execute(self, context: Any) -> set[str]:
+        """Hands its file on."""
+        return bpy.ops.splannequin.use_clip(filepath=bpy.path.abspath(context.space_data.clip.filepath))
+
+
+class SPLANNEQUIN_PT_movie_clip(bpy.types.Panel):
+    """The clip of this editor for a frozen shot"""
+
+    bl_label = "Splannequin"
+    bl_idname = "SPLANNEQUIN_PT_movie_clip"
+    bl_space_type = "CLIP_EDITOR"
+    bl_region_type = "UI"
+    bl_category = "Splannequin"
+
+    def draw(self, context: Any) -> None:
+        """One button; the five steps are in the 3D view."""
+        self.layout.operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
+        self.layout.label(text="Then see the 3D view's sidebar.", icon="INFO")
+
+
+class SPLANNEQUIN_FH_video(bpy.types.FileHandler):
+    """A video dropped on the 3D view"""
+
+    bl_idname = "SPLANNEQUIN_FH_video"
+    bl_label = "Splannequin Clip"
+    bl_import_operator = "splannequin.use_clip"
+    bl_file_extensions = VIDEO
+
+    @classmethod
+    def poll_drop(cls, context: Any) -> bool:
+        """Only over the 3D view."""
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator):
+    """Take the clip's frames into the shot folder and check them"""
+
+    bl_idname = "splannequin.import_clip"
+    bl_label = "Import Clip"
+    bl_options = {"REGISTER"}
+    step = "import"
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_use_clip,
+    SPLANNEQUIN_OT_use_movie_clip,
+    SPLANNEQUIN_PT_movie_clip,
+    SPLANNEQUIN_FH_video,
+    SPLANNEQUIN_OT_import_clip,
+)

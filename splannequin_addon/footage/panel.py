@@ -1,0 +1,80 @@
+"""The panel of the step Import."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..process import backend, steps, supervisor
+from ..shot import chosen
+from ..ui import icons, preferences, step_panel
+from ..ui.sentences import wrap
+
+
+class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
+    """Step 1: footage into a shot folder"""
+
+    bl_label = "1  Import"
+    bl_idname = "SPLANNEQUIN_PT_footage"
+    step = "import"
+    operator = "splannequin.import_clip"
+    folds = "footage"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """Clip, range, shot folder."""
+        props = context.scene.splannequin
+        layout.prop(props, "clip", text="")
+        row = layout.row(heading="Range")
+        row.prop(props, "use_range", text="")
+        span = row.row(align=True)
+        span.enabled = props.use_range
+        span.prop(props, "first", text="")
+        span.prop(props, "last", text="")
+
+    def draw_trouble(self, context: Any, layout: Any) -> None:
+        """No backend, no shot folder: what to do about it."""
+        self._backend_trouble(context, layout)
+        watch = self._watch(context)
+        if watch is not None and chosen.missing(context.scene, watch.state):
+            box = layout.box()
+            column = box.column(align=True)
+            column.alert = True
+            name = watch.shot.name
+            wrap(column, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
+            box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
+
+    def _backend_trouble(self, context: Any, layout: Any) -> None:
+        """No backend, or one that is being set up."""
+        trouble, setup = supervisor.backend_trouble(), preferences.running_setup()
+        if setup is not None:
+            wrap(layout, context, "The backend is being set up.", "IMPORT")
+            for line in setup.said[-1:]:
+                wrap(layout, context, line)
+            layout.operator("splannequin.cancel_setup", icon=icons.of("splannequin.cancel_setup"))
+        elif trouble is not None:
+            box = layout.box()
+            column = box.column(align=True)
+            column.alert = True
+            wrap(column, context, trouble.message, "ERROR")
+            if not bpy.app.online_access:
+                wrap(
+                    column, context, "Blender may not go online: allow it in Preferences > System > Network.", "BLANK1"
+                )
+            box.operator("splannequin.set_up", icon=icons.of("splannequin.set_up"))
+            box.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = backend.PACKAGE
+
+    def _label(self, context: Any, view: steps.View) -> str:
+        watch = self._watch(context)
+        gone = watch is not None and chosen.missing(context.scene, watch.state)
+        return "Import Anew" if gone else super()._label(context, view)
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """Shot folder, which frames are solved, consent to set the scene up."""
+        layout.prop(context.scene.splannequin, "shot_path", text="Folder")
+        layout.prop(context.scene.splannequin, "solve_step")
+        layout.prop(context.scene.splannequin, "fps")
+        layout.prop(context.scene.splannequin, "set_up_scene")
+
+
+CLASSES = (SPLANNEQUIN_PT_footage,)

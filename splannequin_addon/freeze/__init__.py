@@ -1,0 +1,1 @@
+"""The step Freeze: the frozen instant, rendered or scrubbed through."""

@@ -1,0 +1,196 @@
+"""A live session of the backend, as Blender holds it: views are asked for, frames arrive. No bpy here.
+
+The child draws (torch_backend/live.py); two threads move bytes, so that the main thread never waits for a pipe. They
+touch nothing but this module's plain data.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import subprocess
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+
+from ...torch_backend import contract
+from ..process import children
+
+_PATIENCE_SECONDS = 10.0
+"""How long a closed child may take to end by itself."""
+
+
+@dataclass
+class Frame:
+    """A frozen view that arrived."""
+
+    asked: contract.LiveView
+    """What it was asked for with."""
+    t_star: int
+    """Frame number at which time stands still: the asked one, or the nearest that was trained on."""
+    rgba: np.ndarray
+    """[H, W, 4] float32, premultiplied, display-referred, first row on top."""
+    depth: np.ndarray
+    """[H, W] float32, along the camera's axis in solve units."""
+    arrived: float
+    """Monotonic seconds."""
+
+
+@dataclass
+class Session:
+    """A child that draws one run of one shot. Made by `open_session`."""
+
+    shot: Path
+    """Shot folder."""
+    run: str
+    """Name of the run."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Its `ready` message (torch_backend/live.py); empty while it loads."""
+    frames: dict[int, Frame] = field(default_factory=dict)
+    """Newest frame of each view."""
+    failure: tuple[str, str] | None = None
+    """(sentence, hint) of what ended it."""
+    drawn: int = 0
+    """Frames that have arrived."""
+    _process: subprocess.Popen[bytes] | None = None
+    _asked: dict[int, contract.LiveView] = field(default_factory=dict)
+    _to_send: dict[int, contract.LiveView] = field(default_factory=dict)
+    _sent: dict[int, contract.LiveView] = field(default_factory=dict)
+    _change: threading.Condition = field(default_factory=threading.Condition)
+    _closed: bool = False
+    _seq: int = 0
+
+    @property
+    def open(self) -> bool:
+        """True while it draws, or is about to."""
+        return not self._closed and self.failure is None
+
+    def ask(self, view: contract.LiveView) -> None:
+        """Asks for a view, without waiting; `seq` is set here. A newer one for the same view replaces an older one."""
+        with self._change:
+            self._seq += 1
+            view.seq = self._seq
+            self._asked[view.view] = self._to_send[view.view] = self._sent[view.seq] = view
+            self._change.notify()
+
+    def wanted(self, view: int) -> contract.LiveView | None:
+        """What was last asked for a view."""
+        return self._asked.get(view)
+
+    def busy(self, view: int) -> bool:
+        """True while the last request for a view is not answered."""
+        with self._change:
+            return any(asked.view == view for asked in self._sent.values())
+
+    def close(self) -> None:
+        """Ends the child; returns at once. Its memory is free as soon as it has seen that its input ended."""
+        with self._change:
+            self._closed = True
+            self._change.notify()
+
+    def _send(self) -> None:
+        process = self._process
+        if process is None or process.stdin is None:
+            return
+        requests = cast("BinaryIO", process.stdin)
+        try:
+            while True:
+                with self._change:
+                    self._change.wait_for(lambda: self._closed or self._to_send or self.failure)
+                    if self._closed or self.failure:
+                        break
+                    views, self._to_send = list(self._to_send.values()), {}
+                for view in views:
+                    contract.write_message(requests, {"kind": "view", **dataclasses.asdict(view)})
+        except (OSError, ValueError):
+            pass  # the reader finds the end of the child's output and says why
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+        try:
+            process.wait(_PATIENCE_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+    def _read(self, log: Path) -> None:
+        process = self._process
+        if process is None or process.stdout is None:
+            return
+        answers = cast("BinaryIO", process.stdout)
+        try:
+            while (message := contract.read_message(answers)) is not None:
+                self._take_in(*message)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            self._fail(f"The live session broke: {error}.", f"Start it again. Its log is {log}.")
+        process.stdout.close()
+        code = process.wait()
+        if not self._closed and self.failure is None:
+            words = last_line(log)
+            told = f" Last line of its log: {words}" if words else ""
+            self._fail(f"The live session ended without a word (exit code {code}).{told}", "Start it again.")
+
+    def _take_in(self, header: dict[str, Any], body: bytes) -> None:
+        if header["kind"] == "ready":
+            self.facts = header
+        elif header["kind"] == "error" and "seq" not in header:
+            self._fail(header["message"], header["hint"])
+        elif header["kind"] == "error":
+            self._answered(header["seq"])  # this view cannot be drawn; the next one may
+        elif header["kind"] == "frame":
+            asked = self._answered(header["seq"])
+            w, h = header["width"], header["height"]
+            values = np.frombuffer(body, np.float32)
+            rgba, depth = values[: 4 * w * h].reshape(h, w, 4), values[4 * w * h :].reshape(h, w)
+            self.frames[asked.view] = Frame(asked, header["t_star"], rgba, depth, time.monotonic())
+            self.drawn += 1
+
+    def _answered(self, seq: int) -> contract.LiveView:
+        """The request that was answered; it and those of its view that it took the place of wait no more."""
+        with self._change:
+            asked = self._sent.pop(seq)
+            for older in [s for s, v in self._sent.items() if v.view == asked.view and s < seq]:
+                del self._sent[older]
+        return asked
+
+    def _fail(self, message: str, hint: str) -> None:
+        with self._change:
+            self.failure = (message, hint)
+            self._change.notify()
+
+
+def open_session(shot: Path, run: str, python: str, package_root: Path) -> Session:
+    """Starts a child for a run of a shot. JobError if its Python cannot be started.
+
+    Args:
+        python: interpreter of the backend's environment.
+        package_root: folder that holds `torch_backend`.
+    """
+    session = Session(shot, run)
+    log = contract.ShotFolder(shot).live_log
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with open(log, "wb") as errors:
+            placed = contract.python_child(python, "torch_backend", "live", str(shot.absolute()), "--run", run)
+            piped = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors}
+            session._process = children.start(placed, package_root, outlives=False, **piped)
+    except OSError as error:
+        raise contract.JobError(
+            f"The live session could not be started: {error.strerror or error}.",
+            "Check the backend's Python in the add-on's preferences.",
+            contract.ExitCode.ENVIRONMENT,
+        ) from error
+    threading.Thread(target=session._send, name="splannequin live out", daemon=True).start()
+    threading.Thread(target=session._read, args=(log,), name="splannequin live in", daemon=True).start()
+    return session
+
+
+def last_line(log: Path) -> str:
+    """Last line of a session's log that says something, at most 200 characters."""
+    try:
+        lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    except OSError:
+        return ""
+    return lines[-1].strip()[:200] if lines else ""

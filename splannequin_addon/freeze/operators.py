@@ -1,0 +1,179 @@
+"""The button Freeze, the instant, scrubbing, and the buttons of the list of takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.props import StringProperty
+
+from ...torch_backend import contract
+from ..process import supervisor
+from ..shot import chosen, markers
+from ..translations import tr
+from ..ui import pick_operators, step_operator
+from . import own_camera, takes, viewport
+
+
+class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
+    """Render time standing still at t*: from every pose of the clip, or from an animated camera of your own"""
+
+    bl_idname = "splannequin.freeze"
+    bl_label = "Freeze"
+    bl_options = {"REGISTER"}
+    step = "freeze"
+
+    def execute(self, context: Any) -> set[str]:
+        """Runs the step. In a window a camera of the artist's is read a few frames per turn of the timer."""
+        scene = context.scene
+        folder = chosen.shot_folder(scene)
+        if not own_camera.name_of(scene) or folder is None or bpy.app.background:
+            return super().execute(context)
+        takes.read_in_turns(scene, folder, self.step)
+        return {"FINISHED"}
+
+    def params(self, scene: Any) -> Any:
+        """Reads the artist's camera, if one is chosen, all at once."""
+        return takes.read_camera(scene, self.step)
+
+
+class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
+    """Let time stand still at the current frame"""
+
+    bl_idname = "splannequin.t_star_here"
+    bl_label = "Set t* from Current Frame"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Takes the current frame, held within the clip's range."""
+        scene = context.scene
+        folder = chosen.shot_folder(scene)
+        frame = scene.frame_current
+        state = supervisor.watch_of(folder).state if folder else None
+        if state is not None and state.frames:
+            first, last = state.frame_range
+            frame = min(max(frame, first), last)
+        scene.splannequin.t_star = frame
+        scene.splannequin.choose_t_star = True
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_t_star_marker(bpy.types.Operator):
+    """Show t* as a marker on the timeline, to be dragged; press again to take it away"""
+
+    bl_idname = "splannequin.t_star_marker"
+    bl_label = "Marker for t*"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Adds or removes the marker."""
+        markers.toggle(context.scene)
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_live(bpy.types.Operator):
+    """Draw the frozen instant over the 3D view while you scrub t* and move the view; press again to stop"""
+
+    bl_idname = "splannequin.live"
+    bl_label = "Scrub in View"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off without a trained run, and where there is no view."""
+        if viewport.session() is not None:
+            return True  # it can be stopped, whatever became of the run
+        if bpy.app.background:
+            cls.poll_message_set(tr("There is no 3D view"))
+            return False
+        folder = chosen.shot_folder(context.scene)
+        state = supervisor.watch_of(folder).state if folder else None
+        if state is None or context.scene.splannequin.run_name not in state.runs:
+            cls.poll_message_set(tr("Train first"))
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Starts or stops the session."""
+        if viewport.session() is not None:
+            viewport.end()
+            return {"FINISHED"}
+        try:
+            viewport.begin(context.scene)
+        except contract.JobError as error:
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
+    """Set t* to the previous or next suggested instant: one that saw most of what moves, and whose plate is sharp"""
+
+    bl_idname = "splannequin.suggested_instant"
+    bl_label = "Suggested Instant"
+    bl_options = {"REGISTER", "UNDO"}
+
+    step: bpy.props.IntProperty(name="Step", description="1: the next one, -1: the one before", default=1)
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """On while scrubbing: the backend ranks the instants."""
+        if not viewport.suggestions():
+            cls.poll_message_set(tr("Suggestions come with Scrub in View"))
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Takes the nearest suggestion on that side; at the end, the first on the other."""
+        props = context.scene.splannequin
+        frames = sorted(s["frame"] for s in viewport.suggestions())
+        now = viewport.instant(context.scene)
+        beyond = [f for f in frames if now is None or (f - now) * self.step > 0]
+        ordered = beyond or frames
+        props.t_star = ordered[0] if self.step > 0 else ordered[-1]
+        props.choose_t_star = True
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_pick_take(pick_operators.Pick, bpy.types.Operator):
+    """Work with this take: it is shown, and baked next"""
+
+    bl_idname = "splannequin.pick_take"
+    bl_label = "Pick Take"
+    bl_options = {"REGISTER", "UNDO"}
+
+    name: StringProperty(name="Take", description="Name of the take", options={"SKIP_SAVE"})
+
+    def execute(self, context: Any) -> set[str]:
+        """Sets the take's name."""
+        state = pick_operators.known(context)[1]
+        if self.name not in state.takes:
+            refusal = state.damaged["take"].get(self.name) or f"This shot has no take {self.name!r}"
+            self.report({"ERROR"}, tr(refusal))
+            return {"CANCELLED"}
+        context.scene.splannequin.take_name = self.name
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_remove_take(pick_operators.Remove, bpy.types.Operator):
+    """Delete the frozen frames of this take from the shot folder on disk, after a question"""
+
+    bl_idname = "splannequin.remove_take"
+    bl_label = "Remove Take"
+    bl_options = {"REGISTER", "INTERNAL"}
+    kind = "take"
+    question = "Delete the frozen frames of this take from disk?"
+    warning = "It can be frozen again from its run. This cannot be undone."
+
+    name: StringProperty(name="Take", description="Name of the take to delete", options={"SKIP_SAVE"})
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_freeze,
+    SPLANNEQUIN_OT_t_star_here,
+    SPLANNEQUIN_OT_t_star_marker,
+    SPLANNEQUIN_OT_live,
+    SPLANNEQUIN_OT_suggested_instant,
+    SPLANNEQUIN_OT_pick_take,
+    SPLANNEQUIN_OT_remove_take,
+)

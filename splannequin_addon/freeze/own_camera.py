@@ -1,0 +1,104 @@
+"""Views of the scene in the solve's coordinates: a camera of the artist's, read frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...torch_backend import contract
+from ..scene import axes, scene_setup
+from ..shot import chosen, contents, made
+
+
+def in_solve(
+    scene: Any, shot: Path, view_matrix: Any, window_matrix: Any, width: int, height: int
+) -> tuple[list[float], list[float]]:
+    """(viewmat, K) in solve units of what a view of the scene shows.
+
+    Args:
+        scene: the scene, in which the shot's root says where the solve stands.
+        shot: shot folder.
+        view_matrix: world to view, Blender's axes, [4, 4].
+        window_matrix: perspective projection, [4, 4].
+        width: of the picture in pixels.
+        height: of the picture in pixels.
+
+    Returns:
+        viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
+        K: fx, fy, cx, cy in pixels.
+    """
+    root = made.part(scene, shot, "root")
+    placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
+    return axes.in_solve(view_matrix, window_matrix, placed, made.depth_scale(scene, shot), (width, height))
+
+
+def sample_path(scene: Any, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:
+    """Reads an animated camera over the scene's range, a frame per turn; yields frames done, returns the CameraPath.
+
+    Nothing of bpy is kept between two turns. The scene's current frame is put back at the end.
+
+    Args:
+        scene: the scene, whose range, render size and pixel aspect say what the camera sees.
+        name: of the camera object.
+        shot: shot folder whose solve the path is to be in.
+        width: of the frames in pixels; 0: the scene's.
+
+    Raises:
+        contract.JobError: the camera is gone, or is no perspective camera.
+    """
+    named, before = scene.name, scene.frame_current
+    size = scene_setup.render_size(scene)
+    width = width or size[0]
+    height = max(1, round(size[1] * width / size[0]))
+    numbers = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+    del scene
+    frames: list[contract.CameraFrame] = []
+    try:
+        for number in numbers:
+            frames.append(_sampled(named, name, shot, number, (width, height)))
+            yield len(frames)
+    finally:
+        back = bpy.data.scenes.get(named)
+        if back is not None:
+            back.frame_set(before)
+    return contract.CameraPath(width, height, frames)
+
+
+def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[int, int]) -> contract.CameraFrame:
+    """A camera at one frame, as `sample_path` reads it."""
+    scene = bpy.data.scenes[scene_name]
+    camera = scene.objects.get(name)
+    if camera is None or camera.type != "CAMERA" or camera.data.type != "PERSP":
+        raise contract.JobError(
+            f"{name} is not a perspective camera of this scene.",
+            "Choose another camera to freeze from.",
+            contract.ExitCode.USAGE,
+        )
+    scene.frame_set(number)
+    graph = bpy.context.evaluated_depsgraph_get()
+    seen = camera.evaluated_get(graph)
+    aspect = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
+    window = seen.calc_matrix_camera(graph, x=size[0], y=size[1], scale_x=aspect[0], scale_y=aspect[1])
+    view = seen.matrix_world.normalized().inverted()
+    return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size), "blender")
+
+
+def name_of(scene: Any) -> str:
+    """Name of the artist's camera to freeze from; empty for the clip's own move."""
+    camera, folder = scene.splannequin.path_camera, chosen.shot_folder(scene)
+    if camera is None or folder is None or camera == made.part(scene, folder, "camera"):
+        return ""
+    return str(camera.name)
+
+
+def follows_camera(scene: Any) -> bool:
+    """True if a bake has to look at the artist's camera again: the take was seen from one, and one is chosen."""
+    folder = chosen.shot_folder(scene)
+    if folder is None or not name_of(scene):
+        return False
+    return bool(contents.read(folder).takes.get(scene.splannequin.take_name, {}).get("camera_path"))

@@ -1,0 +1,108 @@
+"""The panel of the step Freeze."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..process import steps
+from ..shot import markers
+from ..translations import tr
+from ..ui import listing, step_panel
+from ..ui.sentences import wrap
+from . import viewport
+
+
+def can_scrub(view: steps.View, running: str | None) -> bool:
+    """True if scrubbing may begin, and always while there is a session to be stopped."""
+    return viewport.session() is not None or (view.ready and running is None)
+
+
+class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
+    """Step 4: the freeze"""
+
+    bl_label = "4  Freeze"
+    bl_idname = "SPLANNEQUIN_PT_freeze"
+    step = "freeze"
+    operator = "splannequin.freeze"
+    folds = "freeze"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """The instant."""
+        props = context.scene.splannequin
+        row = layout.row()
+        if props.choose_t_star:
+            row.prop(props, "choose_t_star", text="t*")
+            row.prop(props, "t_star", text="")
+        else:
+            at = self._suggested(context)
+            words = tr(f"t*: {at}, suggested") if at is not None else tr("t* as suggested")
+            row.prop(props, "choose_t_star", text=words, translate=False)
+        row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
+        shown = context.scene.timeline_markers.get(markers.NAME) is not None
+        row.operator("splannequin.t_star_marker", text="", icon="MARKER_HLT" if shown else "MARKER", depress=shown)
+
+    def _suggested(self, context: Any) -> int | None:
+        """The instant that is taken while none is chosen, once it is known: scrubbing asks for it, so does Freeze."""
+        session, watch, props = viewport.session(), self._watch(context), context.scene.splannequin
+        at = viewport.instant(context.scene) if session is not None and watch and session.shot == watch.shot else None
+        if at is not None:
+            return round(at)
+        take = watch.state.takes.get(props.take_name) if watch is not None and watch.state is not None else None
+        return props.t_star if take is not None and take["t_star_frame"] == props.t_star else None
+
+    def draw_always(self, context: Any, layout: Any) -> None:
+        """Scrubbing: it can be stopped whatever runs, and whatever became of the shot."""
+        watch, live = self._watch(context), layout.column()
+        live.enabled = can_scrub(self._view(context), watch.running() if watch else None)
+        self._live(context, live)
+
+    def draw(self, context: Any) -> None:
+        """The step's body, and the takes to compare."""
+        super().draw(context)
+        watch = self._watch(context)
+        if watch is None or watch.state is None or not watch.state.listed("take"):
+            return
+        body = step_panel.sub_panel(self.layout, "takes", "Takes")  # type: ignore[attr-defined]
+        if body is not None:
+            listing.draw(body, "take", watch.state, context.scene.splannequin.take_name)
+            for told in watch.state.damaged["take"].values():
+                wrap(body, context, told, "ERROR")
+
+    def _live(self, context: Any, layout: Any) -> None:
+        """Scrubbing: on or off, what is shown, suggestions and why."""
+        session = viewport.session()
+        row = layout.row(align=True)
+        icon = "PAUSE" if session is not None else "HIDE_OFF"
+        text = "Stop Scrubbing" if session is not None else "Scrub in View"
+        row.operator("splannequin.live", text=text, icon=icon, depress=session is not None)
+        if session is None:
+            told = viewport.failure()
+            if told is not None:
+                wrap(layout, context, f"{told[0]} {told[1]}".strip(), "ERROR")
+            return
+        row.operator("splannequin.suggested_instant", text="", icon="TRIA_LEFT").step = -1
+        row.operator("splannequin.suggested_instant", text="", icon="TRIA_RIGHT").step = 1
+        layout.row().prop(context.scene.splannequin, "live_show", expand=True)
+        wrap(layout, context, viewport.reason(context.scene), "INFO")
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """The take's name, what it is made of, its size, and where it is seen from."""
+        layout.prop(context.scene.splannequin, "take_name")
+        layout.prop(context.scene.splannequin, "detail")
+        layout.prop(context.scene.splannequin, "develop")
+        layout.prop(context.scene.splannequin, "freeze_width")
+        layout.prop(context.scene.splannequin, "overscan")
+        layout.prop(context.scene.splannequin, "path_camera")
+        camera = context.scene.splannequin.path_camera
+        if camera is not None and camera.data.dof.use_dof:
+            wrap(
+                layout,
+                context,
+                "Frozen frames are sharp throughout: the camera's depth of field is not in them.",
+                "INFO",
+            )
+
+
+CLASSES = (SPLANNEQUIN_PT_freeze,)

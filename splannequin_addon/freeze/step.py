@@ -1,0 +1,59 @@
+"""The step Freeze: what it asks the backend for, what its end changes, and what the panel says of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ...torch_backend import contract
+from ..process import jobs
+from ..process.steps import Step, View
+from ..shot.shot_state import ShotState
+from . import operators, panel, takes, viewport
+
+
+class Freeze(Step):
+    """The frozen instant, as frames of a take."""
+
+    name = "freeze"
+    label = "Freeze"
+    kind = "freeze"
+    button = "Freeze"
+    again = "Freeze Again"
+    needs = "Train first."
+    classes = (*operators.CLASSES, *panel.CLASSES)
+    parts = (viewport,)
+
+    def params(self, scene: Any) -> contract.FreezeParams:
+        """The instant, and what the frames are made of."""
+        return takes.params_of(scene)
+
+    def view(self, scene: Any, state: ShotState | None) -> View:
+        """Freeze: which frames there are."""
+        if state is None or scene.splannequin.run_name not in state.runs:
+            return View(False, False, [], self.needs)
+        take = state.takes.get(scene.splannequin.take_name)
+        if take is None:
+            return View(False, True, [], "Render the clip's move with time standing still.")
+        frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
+        instant = f"Time stands still at frame {take['t_star_frame']}"
+        across, down = take.get("margin", (0, 0))
+        beyond = [f"Overscan: {across} pixels on each side, {down} above and below"] if across or down else []
+        lines = [frames, *beyond, instant, *contract.verdict_lines(take)]
+        return View(True, True, lines, "Next: bake it into your compositor.")
+
+    def finish(self, scene: Any, job: jobs.Job) -> list[str]:
+        """An instant that nobody chose is the one that was taken."""
+        if not scene.splannequin.choose_t_star:
+            scene.splannequin.t_star = int(job.result["t_star_frame"])
+        return []
+
+    def in_use(self, shot: Path, folder: Path) -> str:
+        """A run that is scrubbed through."""
+        session = viewport.session()
+        if session is not None and folder == contract.ShotFolder(shot).runs / session.run and session.shot == shot:
+            return "You are scrubbing through this run: stop scrubbing first"
+        return ""
+
+
+STEP = Freeze()

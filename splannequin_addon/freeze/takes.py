@@ -1,0 +1,183 @@
+"""Takes of a shot: what they are asked for with, which frames are there, and cameras that are read for them."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Generator, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from .. import compat
+from ..process import backend, begin, steps, supervisor
+from ..shot import chosen, contents
+from . import own_camera
+
+READING_SECONDS = 0.02
+"""Of a turn of the timer, spent on reading a camera; one frame of a heavy scene may take longer."""
+
+
+def params_of(scene: Any) -> contract.FreezeParams:
+    """What a take is asked for with, from what the artist set."""
+    props = scene.splannequin
+    return contract.FreezeParams(
+        run=props.run_name,
+        take=props.take_name,
+        t_star=props.t_star if props.choose_t_star else None,
+        t_star_per_frame=keyed_instants(scene),
+        width=props.freeze_width,
+        overscan=-1.0 if props.overscan == "LENS" else 0.0,
+        detail="on" if props.detail else "off",
+        develop="on" if props.develop else "off",
+        only_missing=True,
+        device=backend.device(),
+    )
+
+
+def keyed_instants(scene: Any) -> dict[str, float]:
+    """Frame -> t* of a keyed t*, for every frame of the clip and of the scene's range; empty if it is not keyed."""
+    curve = next((c for c in compat.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
+    if curve is None or not scene.splannequin.choose_t_star:
+        return {}
+    folder = chosen.shot_folder(scene)
+    first, last = contents.read(folder).frame_range if folder else (scene.frame_start, scene.frame_end)
+    low, high = min(first, scene.frame_start), max(last, scene.frame_end)
+    return {str(n): min(max(float(curve.evaluate(n)), first), last) for n in range(low, high + 1)}
+
+
+def freeze_from(scene: Any, path: contract.CameraPath, step: str = "freeze") -> contract.FreezeParams:
+    """Parameters of a take from a camera path, which is written into the shot. OSError if it cannot be.
+
+    A bake is about a part of the take: where the camera was not looked at now, it stays as it was.
+    """
+    folder = begin.needed(scene, step)
+    file = contract.ShotFolder(folder).camera_path(scene.splannequin.take_name)
+    if step == "bake" and file.is_file():
+        path = _with_rest(path, contract.CameraPath.load(file))
+    contract.write_json(file, path.to_json(), parents=False)
+    params = steps.STEPS[step].params(scene)
+    params.camera_path, params.width = str(file), path.width
+    return params
+
+
+def _with_rest(path: contract.CameraPath, old: contract.CameraPath) -> contract.CameraPath:
+    """A camera path, and of an older one of the same size the frames that it lacks."""
+    if (path.width, path.height) != (old.width, old.height):
+        return path
+    frames = {f.frame: f for f in [*old.frames, *path.frames]}
+    return dataclasses.replace(path, frames=[frames[n] for n in sorted(frames)])
+
+
+def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.FreezeParams | None:
+    """What a take was asked for with, from its take.json, to render what it lacks; None if it was never finished."""
+    facts = contents.read(shot).takes.get(take)
+    if facts is None:
+        return None
+    return contract.FreezeParams(
+        run=facts["run"],
+        take=take,
+        t_star=facts["t_star_frame"] if t_star is None else t_star,
+        t_star_per_frame=facts.get("t_star_per_frame", {}),
+        first=facts.get("first"),
+        last=facts.get("last"),
+        camera_path=_path_of(shot, facts),
+        query=facts["query"],
+        width=facts["width"],
+        overscan=facts.get("overscan", 0.0),
+        only_missing=True,
+        grain=bool(facts.get("grain")),
+        detail="on" if facts.get("detail") else "off",
+        develop="on" if facts.get("developed") is not None else "off",
+    )
+
+
+def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool:
+    """True if every frame of a finished take is on disk: it can be baked without a backend.
+
+    Args:
+        shot: the shot folder.
+        take: name of the take.
+        frames: only these are asked for, as far as the clip or the take's camera has them; None: all between the
+            take's first and last.
+    """
+    facts = contents.read(shot).takes.get(take)
+    if facts is None:
+        return False
+    if frames is None:
+        wanted: Iterable[int] = range(facts["first"], facts["last"] + 1)
+    else:
+        can = _possible(shot, facts)
+        wanted = [n for n in frames if n in can]
+    return not contents.missing_frames(shot, take, wanted)
+
+
+def may_be_stale(shot: Path, take: str) -> bool:
+    """True if a take's run was trained on after the take was frozen: the backend can tell which frames that changed."""
+    facts = contents.read(shot).takes.get(take, {})
+    there = contract.ShotFolder(shot)
+    trained = contract.RunFolder(there.runs / str(facts.get("run", ""))).checkpoint
+    told = contract.TakeFolder(there.takes / take).facts
+    return trained.is_file() and told.is_file() and trained.stat().st_mtime > told.stat().st_mtime
+
+
+def _path_of(shot: Path, facts: dict[str, Any]) -> str:
+    """File of the camera path that a take was seen from: as it was named, or in the shot, if that was moved since."""
+    named = str(facts.get("camera_path", ""))
+    moved = contract.ShotFolder(shot).camera_path(str(facts.get("take", "")))
+    return str(moved) if named and not Path(named).is_file() and moved.is_file() else named
+
+
+def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
+    """Frames that a take can have: those of its camera's path, or the clip's."""
+    path = _path_of(shot, facts)
+    if path and Path(path).is_file():
+        return {f.frame for f in contract.CameraPath.load(path).frames}
+    first, last = (facts["first"], facts["last"]) if path else contents.read(shot).frame_range
+    return set(range(first, last + 1))
+
+
+def read_camera(scene: Any, step: str) -> contract.FreezeParams | None:
+    """What a step asks for from the artist's camera, read all at once; None if none is chosen."""
+    name, folder = own_camera.name_of(scene), chosen.shot_folder(scene)
+    if not name or folder is None:
+        return None
+    turns = own_camera.sample_path(scene, name, folder, steps.STEPS[step].params(scene).width)
+    while True:
+        try:
+            next(turns)
+        except StopIteration as end:
+            return freeze_from(scene, end.value, step)
+
+
+def read_in_turns(scene: Any, shot: Path, step: str) -> None:
+    """Has the artist's camera read by the timer; then the take is begun, by the step freeze or bake."""
+    supervisor.watch_of(shot).notes.clear()
+    turns = own_camera.sample_path(scene, own_camera.name_of(scene), shot, steps.STEPS[step].params(scene).width)
+    total = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
+    supervisor.work(shot, step, reading(scene.name, shot, step, turns, total))
+
+
+def reading(
+    scene_name: str, shot: Path, step: str, turns: Generator[int, None, contract.CameraPath], total: int
+) -> Iterator[supervisor.Progress]:
+    """A camera read by `turns`, `own_camera.sample_path`, for part of a turn of the timer each; then its take begun."""
+    done, path = 0, None
+    while path is None:
+        until = time.monotonic() + READING_SECONDS
+        try:
+            while time.monotonic() < until:
+                done = next(turns)
+            yield supervisor.Progress(f"Reading the camera, frame {done} of {total}", done, total)
+        except StopIteration as end:
+            path = end.value
+    found = bpy.data.scenes.get(scene_name)
+    if found is None:
+        return
+    if chosen.shot_folder(found) != shot:
+        raise contract.JobError(
+            "Another shot was chosen while the camera was read.", "Choose this one and freeze again."
+        )
+    supervisor.follow(step, begin.begin(found, step, freeze_from(found, path, step)))

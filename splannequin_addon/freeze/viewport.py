@@ -1,0 +1,347 @@
+"""Scrubbing: the frozen instant drawn over the 3D view by the warm backend, in front of and behind what is there.
+
+A view asks for what it shows, at a size that is drawn at once; left alone, it asks again, sharper, and then once more,
+made of the plates. What has arrived is drawn until something newer has. Nothing of bpy is kept between two draws but
+the handler.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from bpy.app.handlers import persistent
+from gpu_extras.batch import batch_for_shader
+
+from ...torch_backend import contract
+from ..process import backend
+from ..shot import chosen, made
+from . import live, own_camera
+
+TICK_SECONDS = 1 / 60
+QUICK_PIXELS = 320 * 180
+"""Most pixels of a view while it changes."""
+SHARP_PIXELS = 960 * 540
+"""Most pixels once it rests."""
+_REST_SECONDS = 0.35
+
+_session: live.Session | None = None
+_handler: Any = None
+_shader: Any = None
+_told: tuple[str, str] | None = None
+"""Why the last session ended, (sentence, hint)."""
+_shown: dict[int, tuple[int, Any, Any]] = {}
+"""View -> (seq of the frame, texture of its colour, of its depth)."""
+_moved: dict[int, float] = {}
+"""View -> when it last showed something else, monotonic seconds."""
+_rested: set[int] = set()
+"""Views that have been drawn again since they came to rest."""
+
+
+def session() -> live.Session | None:
+    """The live session, if there is one that draws."""
+    return _session if _session is not None and _session.open else None
+
+
+def failure() -> tuple[str, str] | None:
+    """Why the last session ended, (sentence, hint); None if it was ended on purpose."""
+    return _told
+
+
+def begin(scene: Any) -> None:
+    """Starts drawing the scene's run. JobError if there is no run, no backend, or no window."""
+    global _session, _handler, _told
+    if bpy.app.background:
+        raise contract.JobError("There is no view to draw in.", "Use Freeze.", contract.ExitCode.USAGE)
+    shot, run = chosen.shot_folder(scene), scene.splannequin.run_name
+    if shot is None or not contract.RunFolder(contract.ShotFolder(shot).runs / run).checkpoint.is_file():
+        raise contract.JobError(f"There is no trained run {run!r}.", "Train first.", contract.ExitCode.USAGE)
+    end()
+    _told = None
+    _session = live.open_session(shot, run, backend.python(), backend.package_root())
+    _show_points(scene, shot, False)
+    _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+    bpy.app.timers.register(_tick, first_interval=TICK_SECONDS, persistent=True)
+
+
+def end() -> None:
+    """Stops drawing; the backend's process ends and frees what it held."""
+    global _session, _handler
+    if _session is not None:
+        _session.close()
+        for scene in bpy.data.scenes:  # also where another shot was chosen since
+            _show_points(scene, _session.shot, True)
+        _session = None
+    if _handler is not None:
+        bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
+        _handler = None
+    _shown.clear()
+    _moved.clear()
+    _rested.clear()
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+    redraw()
+
+
+def _show_points(scene: Any, shot: Path, shown: bool) -> None:
+    """Opens or closes the eye of our point cloud: its dots would cover the picture."""
+    cloud = made.part(scene, shot, "points")
+    for layer in scene.view_layers if cloud is not None else ():
+        if cloud.name in layer.objects:
+            cloud.hide_set(not shown, view_layer=layer)
+
+
+def instant(scene: Any) -> float | None:
+    """The frame at which time stands still in the view: the artist's t*, else the best suggestion; None before any."""
+    props = scene.splannequin
+    if props.choose_t_star:
+        return float(props.t_star)
+    suggested = _session.facts.get("suggestions") if _session is not None else None
+    return float(suggested[0]["frame"]) if suggested else None
+
+
+def _suggest(scene: Any) -> None:
+    """Has an instant that nobody chose be the one that is drawn: what is shown and what is set agree."""
+    at, props = instant(scene), scene.splannequin
+    if at is not None and not props.choose_t_star and props.t_star != round(at):
+        props.t_star = round(at)
+
+
+def suggestions() -> list[dict[str, Any]]:
+    """Instants worth freezing, best first: frame, seen and sharpness in 0..1; empty before the backend has said."""
+    return list(_session.facts.get("suggestions", [])) if _session is not None else []
+
+
+def reason(scene: Any) -> str:
+    """One sentence about the instant in the view: why it is a good one, or where better ones are."""
+    if _session is None or not _session.facts:
+        return "The backend is loading the run."
+    at = instant(scene)
+    shown = {frame.t_star for frame in _session.frames.values()}
+    for rank, one in enumerate(suggestions()):
+        if one["frame"] == at:
+            share, sharp = round(100 * one["seen"]), round(100 * one["sharpness"])
+            return (
+                f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, "
+                f"and is sharper than {sharp} % of the frames."
+            )
+    suggested = f"Suggested: {', '.join(str(one['frame']) for one in suggestions())}."
+    return f"Shown: frame {shown.pop()}. " + suggested if len(shown) == 1 and at not in shown else suggested
+
+
+def redraw(kinds: tuple[str, ...] = ("WINDOW", "UI")) -> None:
+    """Draws these regions of every 3D view again; without a graphics card each one's drawing is dear."""
+    manager = bpy.context.window_manager
+    for window in manager.windows if manager else ():
+        for area in window.screen.areas:
+            for region in area.regions if area.type == "VIEW_3D" else ():
+                if region.type in kinds:
+                    region.tag_redraw()
+
+
+_last: tuple[int, tuple[Any, ...]] = (-1, ())
+_last_told: tuple[str, ...] = ()
+
+
+def _tick() -> float | None:
+    """Draws again when a frame has arrived, when t* changed, or when a view rests; ends with the session."""
+    global _told, _last, _last_told
+    if _session is None:
+        return None
+    if _session.failure is not None:
+        _told = _session.failure
+        end()
+        return None
+    scenes = [s for s in bpy.data.scenes if chosen.shot_folder(s) == _session.shot]
+    if not any(s.splannequin.run_name == _session.run for s in scenes):
+        end()  # another file, another shot or another run
+        return None
+    for scene in scenes:
+        _suggest(scene)
+    state = (
+        _session.drawn,
+        (
+            bool(_session.facts),
+            *((instant(s), p.live_show, p.detail, p.develop, s.frame_current) for s in scenes for p in [s.splannequin]),
+        ),
+    )
+    now = time.monotonic()
+    # However late this timer is: without a graphics card one drawing may take longer than many of its turns.
+    resting = {v for v, moved in _moved.items() if now - moved > _REST_SECONDS} - _rested
+    _rested.update(resting)
+    if state != _last or resting:
+        _last = state
+        redraw(("WINDOW",))
+    told = tuple(reason(s) for s in scenes)
+    if told != _last_told and not _moving(now):
+        _last_told = told
+        redraw(("UI",))
+    return TICK_SECONDS
+
+
+def _moving(now: float) -> bool:
+    """True while a view changes: the sidebar's sentence can wait until it rests."""
+    return any(now - moved < _REST_SECONDS for moved in _moved.values())
+
+
+def view_of(
+    scene: Any, shot: Path, size: tuple[int, int], matrices: tuple[Any, Any], t_star: float, pixels: int
+) -> contract.LiveView | None:
+    """What a view of the scene shows, as the backend is asked for it; None for an orthographic view.
+
+    Args:
+        scene: the scene whose shot is drawn.
+        shot: its shot folder.
+        size: width and height of the region in pixels.
+        matrices: world to view, and the projection; Blender's axes.
+        t_star: frame number at which time stands still.
+        pixels: most pixels to ask for.
+    """
+    window = np.array(matrices[1])
+    if abs(window[3, 3]) > 1e-6:
+        return None
+    shrink = min(1.0, (pixels / max(1, size[0] * size[1])) ** 0.5)
+    width, height = max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
+    viewmat, K = own_camera.in_solve(scene, shot, matrices[0], matrices[1], width, height)
+    return contract.LiveView(0, 0, viewmat, K, width, height, t_star, show=scene.splannequin.live_show)
+
+
+def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
+    """True if both show the same, at whatever size, made of plates or not."""
+    told = [(v.t_star, v.show, v.exposed_like, v.develop) for v in (one, other)]
+    if told[0] != told[1]:
+        return False
+    ks = [np.array(v.K) / (v.width, v.height, v.width, v.height) for v in (one, other)]
+    return bool(np.allclose(ks[0], ks[1], atol=2e-3) and np.allclose(one.viewmat, other.viewmat, atol=1e-6))
+
+
+def _draw() -> None:
+    """One region's part: ask for what it shows, draw what has arrived."""
+    context = bpy.context
+    scene, region, view = context.scene, context.region, context.region_data
+    if _session is None or view is None or chosen.shot_folder(scene) != _session.shot:
+        return
+    t_star = instant(scene)
+    if t_star is None:
+        return
+    key = region.as_pointer() & 0x7FFFFFFF
+    size, matrices = (region.width, region.height), (view.view_matrix, view.window_matrix)
+    quick, sharp = (view_of(scene, _session.shot, size, matrices, t_star, p) for p in (QUICK_PIXELS, SHARP_PIXELS))
+    if quick is None or sharp is None:
+        return
+    # Through the clip's camera the picture stands before the plate, and is exposed like it.
+    if view.view_perspective == "CAMERA" and scene.camera == made.part(scene, _session.shot, "camera"):
+        quick.exposed_like = sharp.exposed_like = float(scene.frame_current)
+    quick.view = sharp.view = key
+    sharp.detail = scene.splannequin.detail and sharp.show == "color"
+    quick.develop = sharp.develop = scene.splannequin.develop
+    _ask(key, quick, sharp)
+    frame = _session.frames.get(key)
+    if frame is not None:
+        _paint(key, frame, view, made.depth_scale(scene, _session.shot))
+
+
+def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:
+    """Asks for the quick view if it shows something new; once that rests for the sharp one, then for its detail."""
+    if _session is None:
+        return
+    asked, now = _session.wanted(key), time.monotonic()
+    if asked is None or not _same(asked, quick):
+        _moved[key] = now
+        _rested.discard(key)
+        _session.ask(quick)
+    elif now - _moved[key] > _REST_SECONDS and not _session.busy(key):
+        if asked.width < sharp.width:
+            _session.ask(dataclasses.replace(sharp, detail=asked.detail))
+        elif asked.detail != sharp.detail:
+            _session.ask(sharp)
+
+
+def _paint(key: int, frame: live.Frame, view: Any, scale: float) -> None:
+    """Draws a frame over the region, each pixel at its own depth."""
+    shader = _shader_of()
+    seq, colour, depth = _shown.get(key, (-1, None, None))
+    if seq != frame.asked.seq:
+        h, w = frame.depth.shape
+        colour = gpu.types.GPUTexture((w, h), format="RGBA16F", data=_buffer(frame.rgba))
+        depth = gpu.types.GPUTexture((w, h), format="R32F", data=_buffer(frame.depth * np.float32(scale)))
+        _shown[key] = (frame.asked.seq, colour, depth)
+    window = view.window_matrix
+    batch = batch_for_shader(shader, "TRI_STRIP", {"pos": ((-1, -1), (1, -1), (-1, 1), (1, 1))})
+    gpu.state.blend_set("ALPHA_PREMULT")
+    gpu.state.depth_test_set("LESS_EQUAL")
+    gpu.state.depth_mask_set(True)
+    try:
+        shader.bind()
+        shader.uniform_sampler("colour", colour)
+        shader.uniform_sampler("range", depth)
+        shader.uniform_float("project", (window[2][2], window[2][3], window[3][2], window[3][3]))
+        batch.draw(shader)
+    finally:
+        gpu.state.depth_mask_set(False)
+        gpu.state.depth_test_set("NONE")
+        gpu.state.blend_set("NONE")
+
+
+def _buffer(values: np.ndarray) -> Any:
+    values = np.ascontiguousarray(values, dtype=np.float32)
+    return gpu.types.Buffer("FLOAT", values.size, values.ravel())
+
+
+def _shader_of() -> Any:
+    """The shader, made at the first draw: there is no GPU context before."""
+    global _shader
+    if _shader is None:
+        between = gpu.types.GPUStageInterfaceInfo("splannequin_frozen")
+        between.smooth("VEC2", "at")
+        info = gpu.types.GPUShaderCreateInfo()
+        info.vertex_in(0, "VEC2", "pos")
+        info.vertex_out(between)
+        info.push_constant("VEC4", "project")
+        info.sampler(0, "FLOAT_2D", "colour")
+        info.sampler(1, "FLOAT_2D", "range")
+        info.fragment_out(0, "VEC4", "painted")
+        if hasattr(info, "depth_write"):  # 4.4 on; OpenGL, which was the rule before, needs no word about it
+            info.depth_write("ANY")
+        info.vertex_source("void main() { at = vec2(pos.x, -pos.y) * 0.5 + 0.5; gl_Position = vec4(pos, 0.0, 1.0); }")
+        info.fragment_source(
+            """
+            void main()
+            {
+              vec4 c = texture(colour, at);
+              if (c.a < 0.01) { discard; }
+              ivec2 size = textureSize(range, 0);
+              float z = -texelFetch(range, clamp(ivec2(at * vec2(size)), ivec2(0), size - 1), 0).r;
+              float clip = (project.x * z + project.y) / (project.z * z + project.w);
+              gl_FragDepth = clamp(clip * 0.5 + 0.5, 0.0, 0.999999);
+              /* Pictures are display-referred, the view's overlay takes linear light and encodes it. */
+              vec3 shown = c.rgb / c.a;
+              vec3 light = mix(shown / 12.92, pow((shown + 0.055) / 1.055, vec3(2.4)), step(vec3(0.04045), shown));
+              painted = vec4(light * c.a, c.a);
+            }
+            """
+        )
+        _shader = gpu.shader.create_from_info(info)
+    return _shader
+
+
+@persistent
+def _on_load(*_: Any) -> None:
+    """Another file has other scenes."""
+    end()
+
+
+def register() -> None:
+    """Listens to file loads."""
+    bpy.app.handlers.load_post.append(_on_load)
+
+
+def unregister() -> None:
+    """Stops drawing."""
+    end()
+    bpy.app.handlers.load_post.remove(_on_load)

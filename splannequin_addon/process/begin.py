@@ -1,0 +1,100 @@
+"""A step begun, followed to its end when blocking, and undone: for buttons, timer and command line alike."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ...torch_backend import contract
+from ..scene import scene_setup
+from ..shot import chosen, contents, markers
+from . import backend, jobs, steps
+
+
+def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
+    """Starts the job behind a step on the scene's shot, detached.
+
+    Raises:
+        contract.JobError: nothing to work on, no backend, or the shot cannot be written.
+    """
+    params = params or steps.STEPS[step].params(scene)
+    folder = needed(scene, step)
+    backend.python()  # before anything is written: without a backend there is nothing to start
+    try:
+        jobs.refuse_second_writer(folder)
+        if steps.STEPS[step].makes_shot:
+            contents.create(folder)
+        job = jobs.new_job(folder, steps.STEPS[step].kind, params)
+        (job.folder / contract.STEP_FILE).write_text(step, encoding="utf-8")
+    except OSError as error:
+        raise unwritable(folder, error, "Choose another shot folder.") from error
+    try:
+        backend.start(job)
+    except contract.JobError:
+        shutil.rmtree(job.folder)  # else it would pass for one that is about to start
+        steps.STEPS[step].ended(job)
+        raise
+    return job
+
+
+def needed(scene: Any, step: str) -> Path:
+    """The scene's shot folder, which a step needs to be there unless it makes it. JobError says what to do."""
+    folder = chosen.shot_folder(scene)
+    if folder is None:
+        raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
+    if not steps.STEPS[step].makes_shot and not os.path.isfile(contract.ShotFolder(folder).info_path):
+        if chosen.missing(scene, None):
+            message, hint = f"The shot folder {folder} is not there any more.", "Press Locate and choose it."
+            raise contract.JobError(message, hint, contract.ExitCode.USAGE)
+        raise contract.JobError(f"{folder} is no shot folder.", steps.STEPS[step].needs, contract.ExitCode.USAGE)
+    return folder
+
+
+def unwritable(folder: Path, error: OSError, hint: str) -> contract.JobError:
+    """What is said of a folder that cannot be written, with the exit code that the backend's command line gives it."""
+    code = contract.ExitCode.DISK if error.errno in (errno.ENOSPC, errno.EDQUOT) else contract.ExitCode.USAGE
+    return contract.JobError(f"Cannot write to {folder}: {error.strerror or error}.", hint, code)
+
+
+def remove_all(scene: Any, shot: Path) -> list[str]:
+    """Takes everything of a shot out of the file; its folder on disk stays. Returns what was done, in words.
+
+    What another shot of the scene needs stays: its own things, and the settings of the scene.
+    """
+    others = [f for f in chosen.folders(scene) if f is not None and f != shot]
+    others = [f for f in others if any(step.stands(scene, f) for step in steps.STEPS.values())]
+    done = []
+    for step in reversed(steps.STEPS.values()):
+        done += step.remove(scene, shot, others)
+    if others:
+        return done
+    if markers.remove(scene):
+        done.append("The marker t* was removed.")
+    if scene_setup.restore(scene):
+        done.append("The scene's settings are as they were.")
+    return done
+
+
+def run(
+    scene: Any, step: str, params: Any = None, on_event: Callable[[contract.Event], None] | None = None
+) -> tuple[Any, list[str]]:
+    """A whole step, blocking: for scripts and the command line. Returns the job's result and what changed, in words.
+
+    Raises:
+        contract.JobError, contract.Cancelled: as the job ended.
+    """
+    job = begin(scene, step, params)
+    return wait(job, on_event), steps.STEPS[step].finish(scene, job)
+
+
+def wait(job: jobs.Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
+    """`jobs.wait`; an import that does not end well leaves no empty shot."""
+    try:
+        return jobs.wait(job, on_event)
+    except (contract.JobError, contract.Cancelled):
+        steps.STEPS[steps.step_of(job)].ended(job)
+        raise

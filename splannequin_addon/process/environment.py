@@ -1,0 +1,171 @@
+"""Setting the backend up from Blender: a detached child of the launcher, followed through its log. No bpy here.
+
+The launcher (`splannequin.py setup --backend`) makes the environment, says which step failed, and goes on where it
+stopped when it is started again; it outlives Blender like every job. This file starts it, reads what it said, and takes
+the environment away again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ...torch_backend import contract
+from . import children
+
+CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
+"""Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
+CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+"""Where torch without CUDA comes from on Linux, whose PyPI build brings 4 GB for a card that is not there."""
+SIZE = "about 1.5 GB on disk (6 GB with CUDA)"
+LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp (Apache) and what they need"
+_STATE = "setup"
+_SHOWN = 6
+
+
+def default_folder() -> Path:
+    """Where the environment goes: a short path, since packages nest deep and Windows counts 260 characters."""
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home()) / "Splannequin"
+    return Path.home() / ".splannequin"
+
+
+def torch_index() -> str:
+    """Package index, beside PyPI, that has the torch this machine needs; empty if PyPI's own is the one."""
+    if sys.platform == "win32":
+        return CUDA_INDEX if nvidia_card() else ""
+    return "" if sys.platform != "linux" or nvidia_card() else CPU_INDEX
+
+
+def sources() -> str:
+    """Where the packages come from, in words."""
+    return "PyPI and PyTorch's own index" if torch_index() else "PyPI"
+
+
+def nvidia_card() -> bool:
+    """True if this machine has an NVIDIA driver."""
+    return contract.program("nvidia-smi") is not None
+
+
+@dataclass
+class SetUp:
+    """A set-up that runs or ended."""
+
+    folder: Path
+    """Folder that holds the environment."""
+    process: subprocess.Popen[bytes] | None = None
+    said: list[str] = field(default_factory=list)
+    """Last lines of what it said."""
+    failure: str = ""
+    """Why it ended, if not well."""
+    running: bool = True
+    """Until it has ended."""
+
+    @property
+    def log(self) -> Path:
+        """What it said, whole."""
+        return self.folder / _STATE / "said.txt"
+
+    @property
+    def summary(self) -> Path:
+        """How it ended, as the launcher tells it."""
+        return self.folder / _STATE / "summary.json"
+
+
+def start(folder: Path, python: str, package_root: Path) -> SetUp:
+    """Starts a set-up in `folder`, or goes on with one that was interrupted.
+
+    Args:
+        folder: holds the environment afterwards.
+        python: a Python that makes the environment; Blender's own will do.
+        package_root: holds `splannequin.py`.
+
+    Raises:
+        contract.JobError: the folder cannot be written, or Python not started.
+    """
+    setup = SetUp(folder)
+    environ = {"SPLANNEQUIN_HOME": str(folder.absolute())}
+    if torch_index() and "SPLANNEQUIN_TORCH_INDEX" not in os.environ:
+        environ["SPLANNEQUIN_TORCH_INDEX"] = torch_index()
+    python = os.path.abspath(python)
+    launcher = str(package_root / "splannequin.py")
+    command = [python, "-P", launcher, "setup", "--backend", "--output", str(setup.log.parent.absolute())]
+    try:
+        setup.log.parent.mkdir(parents=True, exist_ok=True)
+        with open(setup.log, "wb") as log:
+            placed = {"args": command, "cwd": os.path.dirname(python)}  # see contract.python_child
+            setup.process = children.start(placed, package_root, environ=environ, stdout=log, stderr=subprocess.STDOUT)
+    except OSError as error:
+        raise contract.JobError(
+            f"The backend cannot be set up in {folder}: {error.strerror or error}.",
+            "Choose another folder in the add-on's preferences.",
+            contract.ExitCode.ENVIRONMENT,
+        ) from error
+    return setup
+
+
+def poll(setup: SetUp) -> bool:
+    """Reads what was said since; True if something is new."""
+    before = (list(setup.said), setup.running)
+    try:
+        with open(setup.log, "rb") as log:
+            log.seek(0, os.SEEK_END)
+            log.seek(max(0, log.tell() - 4096))
+            lines = log.read().decode("utf-8", "replace").splitlines()
+    except OSError:
+        lines = []
+    setup.said = [line.strip() for line in lines if line.strip()][-_SHOWN:]
+    code = setup.process.poll() if setup.process is not None else 0
+    if code is not None:
+        setup.running = False
+        setup.failure = "" if code == 0 else _why(setup, code)
+    return before != (setup.said, setup.running)
+
+
+def _why(setup: SetUp, code: int) -> str:
+    try:
+        told = str(contract.read_json(setup.summary).get("error", ""))
+    except (OSError, ValueError):
+        told = ""
+    return told or f"The set-up ended with exit code {code}: {' '.join(setup.said[-1:])}"
+
+
+def cancel(setup: SetUp) -> None:
+    """Asks a set-up to end; started again, it goes on."""
+    if setup.process is not None and setup.process.poll() is None:
+        setup.process.terminate()
+
+
+def remove(folder: Path) -> bool:
+    """Takes the environment in `folder` away. True if there was one; ValueError if it is not one of ours."""
+    environment = folder / ".venv"
+    if not environment.is_dir():
+        return False
+    if not (environment / ".splannequin").is_dir():
+        raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
+    # Renamed first: whatever is interrupted, no half of it passes for an environment.
+    gone = folder / f".venv-removed-{os.getpid()}"
+    os.replace(environment, gone)
+    shutil.rmtree(gone, ignore_errors=True)
+    shutil.rmtree(folder / _STATE, ignore_errors=True)
+    return True
+
+
+def findings(facts: str) -> list[str]:
+    """What a backend's doctor (JSON) means for an artist, a sentence each."""
+    told = json.loads(facts)
+    lines = [f"Python {told['python']}, torch {told['packages'].get('torch')}."]
+    if told.get("trains_on") == "cuda":
+        lines.append(f"Trains on {told.get('cuda_device')}.")
+    else:
+        lines.append(f"Trains on the processor, {told.get('cores')} cores.")
+        refusal = re.sub(r"\s+", " ", str(told.get("cuda_refusal") or ""))
+        if nvidia_card() and refusal:
+            lines.append(f"The NVIDIA card is not used: {refusal}")
+    return lines

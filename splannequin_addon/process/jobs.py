@@ -1,0 +1,459 @@
+"""Jobs of the backend as Blender sees them: start a detached child, follow its files, cancel it, find it again.
+
+No bpy here: the job folder is all the state there is, so that any Blender that opens the shot sees the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ...torch_backend import contract
+from . import children
+
+_LAST_WORD_SECONDS = 10.0
+"""How long a job's process is waited for after it told its end."""
+_START_SECONDS = 30.0
+"""A job without a status this long after it was made never started."""
+_LOG_LINES = 6
+_KILL_SECONDS = 20.0
+"""A job that has not ended this long after it was asked to is ended by force on a second request."""
+_LONGEST_SECONDS = 1e7
+"""What is said to take longer is not told."""
+_LONGEST_REQUEST = 1 << 24
+"""Bytes of a request that are read; one with a t* for each of 100,000 frames takes a fifth."""
+_SILENT_SECONDS = 10 * contract.HEARTBEAT_SECONDS
+"""A job of an older backend is believed dead after this long without a sign of life."""
+
+
+@dataclass
+class Job:
+    """A job that this Blender follows. Holds paths and what was read so far."""
+
+    folder: Path
+    """Job folder, shot/jobs/<id>."""
+    kind: str
+    """import, solve, train or freeze."""
+    params: dict[str, Any] = field(default_factory=dict)
+    """Parameters of the request."""
+    process: subprocess.Popen[bytes] | None = None
+    """The child, if this Blender started it."""
+    status: contract.Status | None = None
+    """Last status read."""
+    read_to: int = 0
+    """Bytes of events.jsonl read so far."""
+    warnings: list[tuple[str, str]] = field(default_factory=list)
+    """(sentence, hint) the job wants the artist to know."""
+    metrics: dict[str, Any] = field(default_factory=dict)
+    """Latest figures of the job, by name."""
+    history: list[tuple[float, float]] = field(default_factory=list)
+    """(seconds of training, dB on frames kept out) as they came."""
+    images: dict[str, str] = field(default_factory=dict)
+    """Latest picture by label: path."""
+    result: Any = None
+    """What the job answered in its `done` event."""
+    end: tuple[str, _Words] | None = None
+    """State and last words of the job, as its events tell them."""
+    beat: tuple[float, float] | None = None
+    """Last sign of life of a job of another computer, and when it was first seen, monotonic seconds."""
+
+    @property
+    def shot(self) -> Path:
+        """Shot folder the job belongs to."""
+        return self.folder.parent.parent
+
+    @property
+    def ended(self) -> bool:
+        """True once the job will write nothing more and all it wrote is read."""
+        return self.status is not None and self.status.ended
+
+    @property
+    def state(self) -> str:
+        """queued, running, done, failed or cancelled."""
+        return self.status.state if self.status else "queued"
+
+
+def new_job(shot: Path, kind: str, params: Any) -> Job:
+    """Makes a job folder in `shot` with its request. `params` is the kind's dataclass of `contract.PARAMS`."""
+    return Job(contract.new_job(shot, kind, params), kind, dataclasses.asdict(params))
+
+
+def start(job: Job, python: str, package_root: Path) -> None:
+    """Starts the backend on a job, detached: it outlives this Blender.
+
+    Args:
+        job: a job made by `new_job`.
+        python: interpreter of the backend's environment.
+        package_root: folder that holds `torch_backend`.
+
+    Raises:
+        contract.JobError: the interpreter cannot be started.
+    """
+    command = contract.python_child(python, "torch_backend", "run-job", str(job.folder.absolute()))
+    try:
+        with open(job.folder / contract.LOG_FILE, "ab") as log:
+            job.process = children.start(command, package_root, stdout=log, stderr=subprocess.STDOUT)
+    except OSError as error:
+        raise contract.JobError(
+            f"The backend's Python could not be started: {python}: {error.strerror or error}.",
+            "Choose the Python of the backend's environment in the add-on's preferences.",
+            contract.ExitCode.ENVIRONMENT,
+        ) from error
+
+
+def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
+    """Reads what the job wrote since the last poll, for at most about `budget_seconds`; returns the new events.
+
+    A child that died without a last word is given one: its status is rewritten as failed, with the end of its log.
+    """
+    until = time.monotonic() + budget_seconds
+    status = _read_status(job.folder) or job.status
+    events, all_read = _read_events(job, until)
+    if status is not None and status.ended and not all_read:
+        return events  # ended, but not told yet: the next poll reads the rest
+    if (status is None or not status.ended) and not is_alive(job, status):
+        status = _read_status(job.folder) or status  # it may have ended between the two reads above
+        events += _read_events(job, until + 1.0)[0]
+        if status is None or not status.ended:
+            status = _declare_dead(job, status)
+    job.status = status
+    return events
+
+
+def _last_words(job: Job, status: contract.Status | None) -> contract.Status | None:
+    """The end that a job told in its events and could not write into its status: its shot was moved or deleted."""
+    if job.end is None:
+        return None
+    now = time.time()
+    status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
+    state, words = job.end
+    status.state = state if state in ("done", "failed", "cancelled") else "failed"
+    status.message, status.hint, status.exit_code, status.eta_seconds = words.message, words.hint, words.exit_code, None
+    return status
+
+
+def is_alive(job: Job, status: contract.Status | None) -> bool:
+    """True if the job's process still works on it, or may be about to.
+
+    A process that is only stopped, as by a computer that slept, is alive whatever its last sign of life. One of
+    another computer is alive as long as the shot's lock is its: that can be taken away there, or by hand.
+    """
+    if job.process is not None:
+        return job.process.poll() is None
+    if status is None or not status.pid:
+        return time.time() - _made(job.folder) < _START_SECONDS
+    if status.host and status.host != contract.host_name():
+        return _holds(job) or not _silent(job, status)
+    if status.host or (status.process_started and sys.platform == "linux"):
+        return contract.runs_still(status.pid, status.process_started)
+    return time.time() - status.heartbeat < _SILENT_SECONDS  # from an older backend, that did not say where it ran
+
+
+def refuse_second_writer(shot: Path) -> None:
+    """JobError, with what runs, since when, where and what to do, if a job writes into the shot or is about to."""
+    try:
+        writer = contract.read_writer(shot)
+    except (OSError, ValueError):
+        writer = None  # a damaged lock: the backend says so
+    if writer is not None and writer.works() and not contract.gives_back(shot, writer):
+        raise contract.busy(shot, writer)
+    for job in latest(shot).values():
+        here = job.status is None or job.status.host in ("", contract.host_name())  # others have the lock
+        if here and not job.ended and is_alive(job, job.status):
+            raise contract.JobError(
+                f"A step of {shot.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
+            )
+
+
+def _holds(job: Job) -> bool:
+    """True if the shot's lock is the job's, or cannot be read."""
+    try:
+        writer = contract.read_writer(job.shot)
+    except (OSError, ValueError):
+        return True
+    return writer is not None and writer.job == job.folder.name
+
+
+def _silent(job: Job, status: contract.Status) -> bool:
+    """True if a job gave no sign of life while we watched: another computer's clock may be wrong, its beats are not."""
+    now = time.monotonic()
+    if job.beat is None or job.beat[0] != status.heartbeat:
+        job.beat = (status.heartbeat, now)
+    return now - job.beat[1] > _SILENT_SECONDS
+
+
+def cancel(job: Job) -> None:
+    """Asks the job to stop with a checkpoint; asked again after `_KILL_SECONDS`, ends it by force.
+
+    JobError if it should be ended by force and cannot be told from other processes beyond doubt: those stay.
+    """
+    flag = job.folder / contract.CANCEL_FILE
+    try:
+        os.close(os.open(flag, os.O_WRONLY | os.O_CREAT | os.O_EXCL))  # whatever lies there, also a link, is left alone
+    except FileNotFoundError:
+        return  # the shot was moved or deleted, which ends the job too
+    except FileExistsError:
+        since = flag.lstat().st_mtime
+        if time.time() - since > _KILL_SECONDS and is_alive(job, job.status):
+            _kill(job)
+
+
+def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
+    """Blocks until the job has ended; returns its result. Ctrl-C asks it to stop and waits for its checkpoint.
+
+    Raises:
+        contract.JobError: it failed; the sentence, hint and exit code are the job's own.
+        contract.Cancelled: it was cancelled.
+    """
+    while not job.ended:
+        try:
+            for event in poll(job, 1.0):
+                if on_event:
+                    on_event(event)
+            time.sleep(0.0 if job.ended else 0.05)
+        except KeyboardInterrupt:
+            cancel(job)
+    if job.process is not None:
+        # After its last word it lets go of the shot's lock; on a busy machine whoever goes on at once would meet it.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            job.process.wait(_LAST_WORD_SECONDS)
+    raise_if_failed(job)
+    return job.result
+
+
+def raise_if_failed(job: Job) -> None:
+    """JobError or Cancelled if the ended job did not finish its work."""
+    status = job.status
+    if status is None or status.state == "done":
+        return
+    if status.state == "cancelled":
+        raise contract.Cancelled
+    code = status.exit_code if status.exit_code is not None else contract.ExitCode.INTERNAL
+    raise contract.JobError(status.message, status.hint, code)
+
+
+def open_job(folder: Path) -> Job | None:
+    """A job from its folder; None if its request cannot be read, or is none."""
+    try:
+        data = contract.read_json(folder / contract.REQUEST_FILE, _LONGEST_REQUEST)
+        contract.check_version(data, "job request")
+        request: contract.JobRequest = contract.from_dict(contract.JobRequest, data)
+        params = dataclasses.asdict(request.typed_params())
+    except (OSError, ValueError):
+        return None
+    return Job(folder, request.kind, params)
+
+
+def latest(shot: Path) -> dict[str, Job]:
+    """The newest job of each kind in a shot, polled once: those that run are found again here."""
+    found: dict[str, Job] = {}
+    there = contract.ShotFolder(shot).jobs
+    folders = sorted(there.glob("*/"), key=lambda p: p.name, reverse=True) if shot.is_dir() else []
+    for folder in folders:
+        kind = next((k for k in contract.PARAMS if f"-{k}-" in folder.name), None)
+        if kind is None or kind in found:
+            continue
+        job = open_job(folder)
+        if job is None:
+            continue
+        try:
+            poll(job, 1.0)
+        except (OSError, ValueError):
+            continue  # files that another hand broke: the one before it is asked
+        found[kind] = job
+    return found
+
+
+def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
+    """Last lines of the job's log; empty if it has none."""
+    try:
+        with contract.open_regular(folder / contract.LOG_FILE) as log:
+            log.seek(0, os.SEEK_END)
+            log.seek(max(log.tell() - 8192, 0))
+            text = log.read(8192).decode("utf-8", "replace")
+    except (OSError, ValueError):
+        return []
+    return [contract.printable(line) for line in text.splitlines() if line.strip()][-lines:]
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """As the contract's, but makes no folder above the file's own: FileNotFoundError in a shot that was moved."""
+    contract.write_json(path, data, parents=False)
+
+
+def _read_status(folder: Path) -> contract.Status | None:
+    """The status as it stands; None before there is one. ValueError if it is none of ours."""
+    try:
+        data = contract.read_json(folder / contract.STATUS_FILE, contract.SHORT_JSON)
+    except OSError:
+        return None
+    contract.check_version(data, "job status", contract.STATUS_VERSION)
+    status: contract.Status = contract.from_dict(contract.Status, data)
+    for name in ("stage", "message", "hint", "host"):
+        setattr(status, name, contract.printable(getattr(status, name)))
+    status.fraction = min(max(status.fraction, 0.0), 1.0)
+    if status.eta_seconds is not None and not 0.0 <= status.eta_seconds < _LONGEST_SECONDS:
+        status.eta_seconds = None
+    return status
+
+
+def _read_events(job: Job, until: float) -> tuple[list[contract.Event], bool]:
+    """New whole lines of events.jsonl, and whether they were all read. A line that is no event is passed over."""
+    events: list[contract.Event] = []
+    try:
+        with contextlib.closing(contract.read_lines(job.folder / contract.EVENTS_FILE, job.read_to)) as lines:
+            for line, job.read_to in lines:
+                event = _event(line)
+                if event is not None:
+                    _take_in(job, event)
+                    events.append(event)
+                if time.monotonic() > until:
+                    return events, False
+    except OSError:
+        pass  # not there yet
+    return events, True
+
+
+def _event(line: bytes) -> contract.Event | None:
+    try:
+        event: contract.Event = contract.from_dict(contract.Event, json.loads(line))
+        if event.type in _EVENT_DATA:
+            contract.from_dict(_EVENT_DATA[event.type], event.data)
+    except (ValueError, TypeError, RecursionError):
+        return None
+    return event
+
+
+@dataclass
+class _Words:
+    message: str
+    hint: str = ""
+    exit_code: int = 1
+
+
+@dataclass
+class _Figures:
+    values: dict[str, Any]
+    stage: str = ""
+
+
+@dataclass
+class _Picture:
+    label: str
+    path: str
+
+
+@dataclass
+class _End:
+    state: str = "done"
+    result: Any = None
+
+
+_EVENT_DATA: dict[str, type] = {
+    "warning": _Words, "error": _Words, "metric": _Figures, "image": _Picture, "done": _End,
+}  # fmt: skip
+"""What an event has to hold to be believed; those of other types are only handed on."""
+
+
+def _take_in(job: Job, event: contract.Event) -> None:
+    if event.type == "warning":
+        words = _Words(**event.data)
+        job.warnings.append((contract.printable(words.message), contract.printable(words.hint)))
+    elif event.type == "metric":
+        values = event.data["values"]
+        job.metrics.update(values)
+        point = contract.measured(values)
+        if point is not None:
+            job.history.append(point)
+    elif event.type == "image":
+        job.images[event.data["label"]] = event.data["path"]
+    elif event.type == "error":
+        words = _Words(**event.data)
+        words.message, words.hint = contract.printable(words.message), contract.printable(words.hint)
+        job.end = ("failed", words)
+    elif event.type == "done":
+        job.result = event.data.get("result")
+        job.end = (_End(**event.data).state, job.end[1] if job.end else _Words("", exit_code=0))
+
+
+def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
+    told = _last_words(job, status)
+    if told is not None:
+        return _keep(job, told)
+    now = time.time()
+    status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
+    if not job.folder.is_dir():
+        lost = contract.gone(job.shot, job.kind)
+        status.state, status.message, status.hint, status.exit_code = "failed", lost.message, lost.hint, lost.exit_code
+        return status
+    code = job.process.returncode if job.process else None
+    how = f" (exit code {code})" if code is not None else ""
+    last = log_tail(job.folder, 1)
+    status.state = "failed"
+    status.exit_code = code if code is not None and code > 0 else int(contract.ExitCode.INTERNAL)
+    status.message = f"The backend stopped without a word during {status.stage or 'the start'}{how}."
+    if last:
+        status.message += f" Last line of its log: {last[0].strip()[:200]}"
+    killed = code is not None and code < 0
+    status.hint = (
+        "It was killed, perhaps for want of memory: close other programs or choose a smaller preset, then start again."
+        if killed
+        else f"Start it again: finished work is kept. Its whole log is {job.folder / contract.LOG_FILE}"
+    )
+    return _keep(job, status)
+
+
+def _keep(job: Job, status: contract.Status) -> contract.Status:
+    """Writes the status of a job that can no longer do so; what another computer writes is not ours to correct."""
+    if status.host in ("", contract.host_name()):
+        write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
+    return status
+
+
+def _made(folder: Path) -> float:
+    try:
+        return (folder / contract.REQUEST_FILE).stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _kill(job: Job) -> None:
+    """Ends the job's process and its children: our own child, or what is the job's beyond doubt. JobError if not."""
+    if job.process is not None:
+        pid = job.process.pid  # ours until it is waited for: the system gives its number to no other
+    else:
+        status = job.status
+        if status is None or status.host not in ("", contract.host_name()):
+            where = status.host.partition(" (")[0] if status else "another computer"
+            raise _not_ours(f"This step runs on {where}: only there it can be ended.")
+        pid = status.pid
+        if not contract.runs_job(pid, status.process_started, job.folder):
+            raise _not_ours("The process of this step cannot be told from others for sure, so none was ended.")
+    if sys.platform == "win32":
+        program = os.path.join(os.environ.get("SYSTEMROOT", r"C:\Windows"), "System32", "taskkill.exe")
+        subprocess.run([program, "/F", "/T", "/PID", str(pid)], capture_output=True, check=False)
+        return
+    try:
+        if os.getpgid(pid) == pid:
+            os.killpg(pid, signal.SIGKILL)
+        else:
+            os.kill(pid, signal.SIGKILL)  # in somebody else's group
+    except ProcessLookupError:
+        return  # it ended by itself in the meantime
+
+
+def _not_ours(message: str) -> contract.JobError:
+    return contract.JobError(
+        message, "It was asked to stop and does so with its next step, or end it where it was started.",
+        contract.ExitCode.USAGE,
+    )  # fmt: skip

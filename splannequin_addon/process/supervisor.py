@@ -1,0 +1,398 @@
+"""Follows running jobs from one persistent timer, within a time budget per tick, and keeps what the panel shows.
+
+Jobs outlive undo, file load and Blender itself: nothing of bpy is kept here, only shot folders and job folders, and
+the jobs of a shot that is opened are found again in its folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ...torch_backend import contract
+from ..scene import sequences
+from ..shot import chosen, contents, made, markers
+from ..shot.shot_state import ShotState
+from ..translations import tr
+from . import backend, children, jobs, steps
+
+TICK_SECONDS = 0.25
+BUDGET_SECONDS = 0.01
+WORKING_SECONDS = 0.04
+"""Between two turns of work that Blender does itself."""
+_LOOK_SECONDS = 1.0
+"""How often the shot folder is looked at for changes."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far work is that Blender does itself."""
+
+    text: str
+    """What is done, a few words with the figures."""
+    done: int
+    """Of `total`."""
+    total: int
+    hint: str = ""
+    """How it is stopped, a sentence."""
+
+
+@dataclass
+class Work:
+    """What Blender itself does for a step, beside the backend's jobs."""
+
+    step: str
+    """Name of the step."""
+    turns: Iterator[Progress | None] | None = None
+    """It is done a turn of the timer at a time, by asking for the next; None if Blender goes on by itself."""
+    progress: Progress | None = None
+    """How far it is, once it tells."""
+
+
+@dataclass
+class Watch:
+    """What is known of one shot folder."""
+
+    shot: Path
+    """Shot folder."""
+    jobs: dict[str, jobs.Job] = field(default_factory=dict)
+    """Newest job of each step, by the step's name."""
+    state: ShotState | None = None
+    """What the folder holds."""
+    stamp: tuple[float, ...] = ()
+    """Of the folder when `state` was read."""
+    looked: float = 0.0
+    """When the folder was last looked at, monotonic seconds."""
+    notes: dict[str, list[str]] = field(default_factory=dict)
+    """What a finished step changed in the scene, or why it could not, by the step's name."""
+    failures: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """(sentence, hint) of what failed on Blender's side, by the step's name."""
+    work: Work | None = None
+    """What Blender itself is doing for it."""
+    pending: dict[str, jobs.Job] = field(default_factory=dict)
+    """Jobs that ended well while another shot of the scene was chosen, by the step's name: they wait for this one."""
+    redraw: bool = False
+    """Something changed outside the timer: draw at its next turn."""
+
+    def running(self) -> str | None:
+        """Name of the step at work, if any."""
+        if self.work is not None:
+            return self.work.step
+        return next((step for step, job in self.jobs.items() if not job.ended), None)
+
+    def fail(self, step: str, error: BaseException) -> None:
+        """Notes why a step failed."""
+        self.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
+
+
+_watches: dict[Path, Watch] = {}
+_meanwhile: list[Callable[[], bool]] = []
+"""What is looked after beside the shots, until it says that it is done."""
+_layout = (False, False)
+"""Whether the empty panel of `lay_out` stands, and whether it is to be turned about."""
+_backend: tuple[contract.JobError | None, float] = (None, 0.0)
+"""Why there is no backend, and when that was looked up, monotonic seconds."""
+
+
+def watch_of(shot: Path) -> Watch:
+    """What is known of a shot; its jobs are found again the first time it is asked for."""
+    watch = _watches.get(shot)
+    if watch is None:
+        watch = _watches[shot] = Watch(shot)
+        with contextlib.suppress(OSError):  # a path that can be none: `refresh` says so
+            watch.jobs = {steps.step_of(job): job for job in jobs.latest(shot).values()}
+    if watch.state is None:
+        refresh(watch)
+    return watch
+
+
+def watches() -> list[Watch]:
+    """All shots that are watched."""
+    return list(_watches.values())
+
+
+def backend_trouble() -> contract.JobError | None:
+    """Why there is no Python for the backend, None if there is; looked up every few seconds, as drawing asks all the
+    time."""
+    global _backend
+    if not _backend[1] or time.monotonic() - _backend[1] > 5 * _LOOK_SECONDS:
+        _backend = (backend.trouble(), time.monotonic())
+    return _backend[0]
+
+
+def follow(step: str, job: jobs.Job) -> None:
+    """Watches a job that was just started."""
+    watch = watch_of(job.shot)
+    watch.jobs[step] = job
+    watch.notes.clear()  # what earlier steps said has been read
+    watch.failures.pop(step, None)
+    steps.STEPS[step].began(job)
+
+
+def work(shot: Path, step: str, turns: Iterator[Progress | None]) -> None:
+    """Has the timer do work for a step, a turn at a time; what it raises is the step's failure.
+
+    Nothing of bpy may be kept between two turns.
+    """
+    watch = watch_of(shot)
+    watch.notes.pop(step, None)
+    watch.failures.pop(step, None)
+    watch.work = Work(step, turns)
+
+
+def _work_on(watch: Watch, doing: Work) -> None:
+    """One more turn of what Blender itself does."""
+    try:
+        doing.progress = next(doing.turns or iter(()))
+        return
+    except StopIteration:
+        pass
+    except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
+        watch.fail(doing.step, error)
+    if watch.work is doing:  # its last turn may have begun something else
+        watch.work = None
+
+
+def meanwhile(turn: Callable[[], bool]) -> None:
+    """Has the timer call `turn` at each of its turns, until it returns False."""
+    _meanwhile.append(turn)
+
+
+def when_answered(question: children.Question, then: Callable[[], None]) -> None:
+    """Calls `then` from the timer once a backend that was asked something has ended."""
+
+    def look() -> bool:
+        if question.ended:
+            then()
+            redraw()
+            return False
+        return True
+
+    meanwhile(look)
+
+
+def refresh(watch: Watch) -> bool:
+    """Reads the shot folder again if something in it changed. True if it did."""
+    watch.looked = time.monotonic()
+    try:
+        stamp = contents.stamp(watch.shot)
+        if stamp == watch.stamp and watch.state is not None:
+            return False
+        watch.stamp = stamp
+        watch.state = contents.read(watch.shot)
+    except (OSError, ValueError, KeyError) as error:
+        watch.state = ShotState(watch.shot)
+        why = getattr(error, "strerror", None) or error
+        first = next(iter(steps.STEPS))
+        watch.failures[first] = (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one.")
+    return True
+
+
+def tick() -> float:
+    """One turn of the timer: reads what jobs wrote, applies those that ended, redraws what shows them."""
+    until = time.monotonic() + BUDGET_SECONDS
+    changed = False
+    for watch in list(_watches.values()):
+        try:
+            changed |= _turn(watch, until)
+        except Exception as error:  # whatever it is: an exception would end the timer, and with it every shot's panel
+            step, told = watch.running() or next(iter(steps.STEPS)), f"{type(error).__name__}: {error}"
+            if watch.failures.get(step, ("",))[0] != told:  # once, not at every turn
+                traceback.print_exc()
+            watch.failures[step] = (told, "The console has the details.")
+            changed = True
+    for turn in list(_meanwhile):
+        try:
+            goes_on = turn()
+        except Exception:  # as above
+            traceback.print_exc()
+            goes_on = False
+        if not goes_on:
+            _meanwhile.remove(turn)
+    if changed:
+        redraw()
+    works = any(w.work is not None and w.work.turns is not None for w in _watches.values())
+    return WORKING_SECONDS if works else TICK_SECONDS
+
+
+def _turn(watch: Watch, until: float) -> bool:
+    """One shot's part of a tick, `until` a time of `time.monotonic`; True if its panel should be drawn again."""
+    changed, watch.redraw = watch.redraw, False
+    for scene in chosen.scenes_of(watch.shot):
+        changed |= markers.follow(scene)
+        made.tidy(scene)
+        chosen.see(scene, watch.state)
+    if watch.work is not None and watch.work.turns is not None:
+        _work_on(watch, watch.work)
+        return True
+    for step, job in list(watch.jobs.items()):
+        if job.ended or time.monotonic() > until:
+            continue
+        try:
+            before = _told(job)
+            jobs.poll(job, max(until - time.monotonic(), 0.001))
+            changed |= before != _told(job)
+        except (OSError, ValueError, KeyError) as error:
+            watch.failures[step] = (f"The job in {job.folder} cannot be read: {error}", "")
+            del watch.jobs[step]
+            continue
+        if job.ended:
+            _ended(watch, step, job)
+    if watch.pending and chosen.scenes_of(watch.shot):
+        for step, job in watch.pending.items():
+            _apply_late(watch, step, job)
+        watch.pending.clear()
+        changed = True
+    if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
+        if watch.running() is None and not chosen.scenes_with(watch.shot):
+            del _watches[watch.shot]  # a path that was typed and left again
+            return changed
+        changed |= refresh(watch)
+    return changed
+
+
+def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
+    """A job has ended just now: its scenes are changed, at once, in turns, or when its shot is chosen."""
+    steps.STEPS[step].ended(job)
+    refresh(watch)
+    scenes = chosen.scenes_of(watch.shot)
+    if job.state != "done":
+        return
+    if not scenes:
+        watch.pending[step] = job
+    elif not steps.STEPS[step].arrive(scenes[0], job):
+        _apply(watch, step, job)
+
+
+def _told(job: jobs.Job) -> tuple[Any, ...]:
+    """What the panel shows of a job."""
+    status = job.status
+    shown = (status.state, status.stage, round(status.fraction, 2), status.message) if status is not None else ()
+    return (shown, len(job.warnings), len(job.history), *job.images.values())
+
+
+def lay_out() -> bool:
+    """Whether an empty panel stands in the sidebar: turned about once after each `redraw`.
+
+    Blender moves panels that grew to their places step by step, by events that a sidebar gets while the mouse is over
+    it: until then they lie on top of each other. When a panel comes or goes it puts all in their places at once.
+    """
+    global _layout
+    stands, stale = _layout
+    _layout = (stands != stale, False)
+    return _layout[0]
+
+
+def redraw() -> None:
+    """Draws the sidebar of every 3D view again; the view itself, which may be a heavy scene, is left alone."""
+    global _layout
+    _layout = (_layout[0], True)
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            for region in area.regions if area.type == "VIEW_3D" else ():
+                if region.type == "UI":
+                    region.tag_redraw()
+
+
+def look_through_camera(window: Any, camera: Any = None) -> None:
+    """Turns the window's first 3D view to the scene's camera, where the plate is; or to another one, which the view
+    alone takes, until it is turned again."""
+    for area in window.screen.areas:
+        if area.type == "VIEW_3D":
+            space = area.spaces.active
+            if camera is not None:
+                space.use_local_camera, space.camera = True, camera
+            elif space.use_local_camera and (space.camera is None or made.is_plate(space.camera)):  # or it is gone
+                space.use_local_camera = False
+            space.region_3d.view_perspective = "CAMERA"
+            return
+
+
+def undo_step(step: str) -> None:
+    """Ends an undo step, named after a step of ours, for a change of the scene that no operator's own undo covers."""
+    if not bpy.app.background:
+        bpy.ops.ed.undo_push(message=tr(f"Splannequin {steps.STEPS[step].label}"))
+
+
+def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
+    """Lets a job that ended well change the scenes that work on its shot."""
+    change(watch, step, lambda scene: steps.STEPS[step].finish(scene, job))
+
+
+def window_of(scene: Any) -> Any | None:
+    """The window that shows a scene, if one does."""
+    return next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
+
+
+def change(watch: Watch, step: str, how: Callable[[Any], list[str]], only: str = "") -> None:
+    """Changes the scenes that work on a shot, or the one of them that is named `only`: as one undo step each in a
+    window. Notes what was changed or why not."""
+    for scene in [s for s in chosen.scenes_of(watch.shot) if only in ("", s.name)]:
+        window = window_of(scene)
+        try:
+            if window is None:
+                watch.notes[step] = how(scene)
+                continue
+            with bpy.context.temp_override(window=window, scene=scene):
+                before = scene.splannequin.t_star
+                watch.notes[step] = how(scene)
+                steps.STEPS[step].look(window, scene, watch.shot)
+                if watch.notes[step] or before != scene.splannequin.t_star:
+                    undo_step(step)
+        except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
+            watch.fail(step, error)
+
+
+def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
+    """`_apply` for a job that had ended before its shot was chosen."""
+    said = steps.STEPS[step].late(job)
+    if said:
+        watch.notes[step] = [said]
+    else:
+        _apply(watch, step, job)
+
+
+@persistent
+def _on_load(*_: Any) -> None:
+    """Another file: its shots are looked at afresh; running jobs go on and are found again."""
+    markers.forget()
+    sequences.forget_ahead()
+    for scene in bpy.data.scenes:
+        folder = chosen.shot_folder(scene)
+        if folder is not None:
+            made.adopt(scene, folder)
+    for shot in [s for s, w in _watches.items() if w.running() is None]:
+        del _watches[shot]
+    redraw()
+    for watch in _watches.values():
+        watch.work = None
+        watch.pending.clear()
+
+
+def forget() -> None:
+    """Drops all that is known; the shots' folders tell it again when asked."""
+    _watches.clear()
+    _meanwhile.clear()
+
+
+def register() -> None:
+    """Starts the timer (in a window: headless Blender has none) and listens to file loads."""
+    bpy.app.handlers.load_post.append(_on_load)
+    if not bpy.app.background:
+        bpy.app.timers.register(tick, first_interval=TICK_SECONDS, persistent=True)
+
+
+def unregister() -> None:
+    """Undoes `register`. Running jobs go on."""
+    if bpy.app.timers.is_registered(tick):
+        bpy.app.timers.unregister(tick)
+    bpy.app.handlers.load_post.remove(_on_load)
+    forget()

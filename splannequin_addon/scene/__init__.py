@@ -1,0 +1,1 @@
+"""Blender's scene: its settings, picture sequences, paths, and changes of it that are whole or nothing."""

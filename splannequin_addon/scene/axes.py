@@ -1,0 +1,92 @@
+"""Camera axes and lenses: the only place where they are converted.
+
+OpenCV (x right, y down, z forward; viewmat world-to-camera) against Blender (x right, y up, looking along -z; camera to
+world).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...torch_backend import contract
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenCV camera axes to Blender's, and back."""
+SENSOR_MM = 36.0
+"""Width given to the camera's sensor. Only its ratio to the focal length matters."""
+
+
+def camera_to_world(viewmat: np.ndarray) -> np.ndarray:
+    """Blender's camera matrices from rigid OpenCV ones.
+
+    Args:
+        viewmat: world-to-camera, OpenCV axes, [..., 4, 4] float64.
+
+    Returns:
+        Camera-to-world with Blender's camera axes, [..., 4, 4] float64, in the same world.
+    """
+    viewmat = np.asarray(viewmat, dtype=np.float64)
+    turned = np.swapaxes(viewmat[..., :3, :3], -1, -2)
+    result = np.zeros_like(viewmat)
+    # No LAPACK: on a busy machine its threads keep Blender's main thread waiting for milliseconds, once per frame.
+    result[..., :3, :3] = turned
+    result[..., :3, 3] = -(turned * viewmat[..., None, :3, 3]).sum(-1)
+    result[..., 3, 3] = 1.0
+    return result * np.diagonal(FLIP)
+
+
+def poses(path: contract.CameraPath) -> np.ndarray:
+    """`camera_to_world` of every frame of a path, [F, 4, 4]."""
+    return camera_to_world(np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4))
+
+
+def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -> tuple[float, float, float]:
+    """(focal length in mm, shift_x, shift_y) for a camera with horizontal sensor fit and a sensor of `SENSOR_MM`.
+
+    Args:
+        k: fx, fy, cx, cy in pixels, pixel centres at +0.5.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    fx, fy, cx, cy = k
+    # Shift is counted in widths of the picture, also down, where a pixel that is not square is fx / fy high.
+    return fx * SENSOR_MM / width, (width / 2 - cx) / width, (cy - height / 2) * (fx / fy) / width
+
+
+def pixel_aspect(k: tuple[float, float, float, float]) -> tuple[float, float]:
+    """(pixel_aspect_x, pixel_aspect_y) of a render that shows fx and fy as they are; Blender wants both >= 1."""
+    fx, fy = k[0], k[1]
+    ratio = fx / fy
+    if abs(ratio - 1.0) < 5e-4:  # half a pixel over a thousand
+        return 1.0, 1.0
+    return (1.0, ratio) if ratio > 1.0 else (1.0 / ratio, 1.0)
+
+
+def in_solve(
+    view_matrix: Any, window_matrix: Any, placed: np.ndarray, scale: float, size: tuple[int, int]
+) -> tuple[list[float], list[float]]:
+    """(viewmat, K) in solve units of what a view shows.
+
+    Args:
+        view_matrix: world to view, Blender's axes, [4, 4].
+        window_matrix: perspective projection, [4, 4].
+        placed: where the solve stands in the world, [4, 4] float64.
+        scale: scene units per solve unit.
+        size: width and height of the picture in pixels.
+
+    Returns:
+        viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
+        K: fx, fy, cx, cy in pixels.
+    """
+    (width, height), window = size, np.array(window_matrix, dtype=np.float64)
+    to_view = FLIP @ np.array(view_matrix, dtype=np.float64) @ placed
+    to_view[:3] /= scale
+    K = [
+        0.5 * width * window[0, 0],
+        0.5 * height * window[1, 1],
+        0.5 * width * (1.0 - window[0, 2]),
+        0.5 * height * (1.0 + window[1, 2]),
+    ]
+    return to_view.ravel().tolist(), K

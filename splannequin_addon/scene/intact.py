@@ -1,0 +1,62 @@
+"""A change of the scene that fails leaves it as it was."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import bpy
+
+from .. import compat
+
+_KINDS = ("objects", "cameras", "meshes", "collections", "node_groups", "actions", "images", "textures")
+"""Kinds of data-blocks that are made here; users before what they use."""
+_SETTINGS = {
+    "render": (
+        "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "fps", "fps_base",
+        "dither_intensity", "film_transparent", "filepath",
+    ),
+    "view_settings": ("view_transform", "look", "exposure", "gamma", "use_curve_mapping"),
+    "scene": ("frame_start", "frame_end", "frame_current"),
+    "layer": ("use_pass_z",),
+}  # fmt: skip
+"""What a step may set, by owner."""
+
+
+@contextlib.contextmanager
+def scene_of(scene: Any) -> Iterator[None]:
+    """Within it, a change is whole or nothing: if it raises, what it made is removed and what it set is set back.
+
+    What it took away is not brought back: that has to come last, when nothing can fail any more.
+    """
+    there = {kind: {block.session_uid for block in getattr(bpy.data, kind)} for kind in _KINDS}
+    names = [(owner, name) for owner, names in _SETTINGS.items() for name in names]
+    values = {(owner, name): getattr(_owner(scene, owner), name) for owner, name in names}
+    camera = scene.camera.session_uid if scene.camera is not None else None
+    switches = compat.compositor_switches(scene)
+    own = {key: scene[key] for key in scene.keys() if key.startswith("splannequin_")}  # noqa: SIM118
+    made = len(scene.splannequin.made)
+    try:
+        yield
+    except BaseException:
+        for kind in _KINDS:
+            bpy.data.batch_remove([b for b in getattr(bpy.data, kind) if b.session_uid not in there[kind]])
+        for (owner, name), value in values.items():
+            if getattr(_owner(scene, owner), name) != value:
+                setattr(_owner(scene, owner), name, value)
+        scene.camera = next((o for o in scene.objects if o.session_uid == camera), None)
+        compat.restore_compositor_switches(scene, switches)
+        for key in [k for k in scene.keys() if k.startswith("splannequin_")]:  # noqa: SIM118
+            del scene[key]
+        for key, value in own.items():
+            scene[key] = value
+        while len(scene.splannequin.made) > made:
+            scene.splannequin.made.remove(made)
+        raise
+
+
+def _owner(scene: Any, name: str) -> Any:
+    return {
+        "scene": scene, "render": scene.render, "view_settings": scene.view_settings, "layer": scene.view_layers[0],
+    }[name]  # fmt: skip

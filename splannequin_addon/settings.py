@@ -1,0 +1,83 @@
+"""What the artist sets, kept in the scene: it travels with the .blend. Each step's settings stand in its room."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
+
+from .bake.settings import BakeSettings
+from .footage.settings import ImportSettings
+from .freeze.settings import FreezeSettings
+from .shot import chosen, made
+from .solve.settings import SolveSettings
+from .train.settings import TrainSettings
+
+
+def _chosen(props: Any, context: Any) -> None:
+    """Another shot of the list was clicked."""
+    chosen.choose(props.id_data, props.active_shot)
+
+
+class ShotSettings(ImportSettings, SolveSettings, TrainSettings, FreezeSettings):
+    """One shot and what is to be done with it. What is named here is put away when another shot is chosen."""
+
+
+class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
+    """Settings of a shot of the scene that is not the chosen one."""
+
+    scene_settings: StringProperty(
+        name="Scene Settings",
+        description="Size, rate and range of the scene while this shot was chosen",
+        options={"HIDDEN"},
+    )
+
+
+class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, bpy.types.PropertyGroup):
+    """The chosen shot of the scene, and what is the scene's own."""
+
+    set_up_scene: BoolProperty(
+        name="Fit Scene to Clip",
+        description="Set resolution, frame rate and frame range of the scene to the clip's. "
+        "Off: only a new scene is set up, one you have worked in is left alone",
+        default=False,
+        options=set(),
+    )
+    shots: CollectionProperty(
+        name="Shots",
+        description="All shots of the scene if there are several",
+        type=SPLANNEQUIN_PG_shot,
+        options=set(),
+    )
+    active_shot: IntProperty(
+        name="Shot", description="The shot that the steps are about", default=0, min=0, options=set(), update=_chosen
+    )
+    loaded_shot: IntProperty(
+        name="Loaded", description="Shot of the list whose settings are the scene's", default=0, options={"HIDDEN"}
+    )
+    camera_before: PointerProperty(
+        name="Camera Before",
+        description="Camera of the scene before a shot's was put in its place",
+        type=bpy.types.Object,
+        options={"HIDDEN"},
+    )
+    made: CollectionProperty(
+        name="Made", description="What was put into this scene, by shot", type=made.SPLANNEQUIN_PG_made, options=set()
+    )
+
+
+def register() -> None:
+    """Registers the property groups and hangs them on the scene."""
+    bpy.utils.register_class(made.SPLANNEQUIN_PG_made)
+    bpy.utils.register_class(SPLANNEQUIN_PG_shot)
+    bpy.utils.register_class(SPLANNEQUIN_PG_scene)
+    bpy.types.Scene.splannequin = PointerProperty(type=SPLANNEQUIN_PG_scene)
+
+
+def unregister() -> None:
+    """Undoes `register`."""
+    del bpy.types.Scene.splannequin
+    bpy.utils.unregister_class(SPLANNEQUIN_PG_scene)
+    bpy.utils.unregister_class(SPLANNEQUIN_PG_shot)
+    bpy.utils.unregister_class(made.SPLANNEQUIN_PG_made)

@@ -1,0 +1,103 @@
+"""What a checkpoint of the backend says about itself, read without the backend. No bpy: a file in, plain values out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...torch_backend import contract
+from ...torch_backend.contract import RunFolder
+from . import kept
+
+
+def facts(path: Path) -> dict[str, Any]:
+    """The facts that the backend stored in a checkpoint, read from the file's header; empty if there is none. Not to be
+    changed: they are remembered."""
+    try:
+        return kept.of(path, _facts)
+    except OSError:
+        return {}
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    try:
+        return contract.checkpoint_facts(path)
+    except (OSError, ValueError):
+        return {}
+
+
+def paused(run: Path) -> dict[str, Any] | None:
+    """Of a run that has a checkpoint and is not finished: at which `iteration` of `end`, `preset` and `config`."""
+    told = facts(RunFolder(run).checkpoint)
+    try:
+        config = told["config"]
+        asked: contract.TrainParams = contract.from_dict(contract.TrainParams, params_of(config))
+        done: _Count = contract.from_dict(_Count, {"steps": told["iteration"]})
+    except (KeyError, TypeError, AttributeError, ValueError):
+        return None
+    return {"iteration": done.steps, "end": asked.iterations, "preset": asked.preset, "config": config}
+
+
+@dataclass
+class _Count:
+    steps: int
+
+
+def anew(run: Path) -> dict[str, Any] | None:
+    """Of a run that is trained anew, paused or at work: as `paused`, of the training that was saved last."""
+    saved = sorted(RunFolder(run).next.glob(f"*/{contract.CHECKPOINT_FILE}"), key=_saved)
+    told = paused(saved[-1].parent) if saved else None
+    return None if told is None else {**told, "folder": saved[-1].parent}
+
+
+def _saved(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def extension(run: Path) -> dict[str, int] | None:
+    """Of steps that were begun to be added to a finished run: how many of `steps` are `done`."""
+    there = RunFolder(run)
+    if not there.extension.is_file():
+        return None
+    told, base = facts(there.extension), facts(there.checkpoint)
+    try:
+        last = told["extensions"][-1]
+        if (told["key"], last["from_iteration"]) != (base["key"], base["iteration"]):
+            return None
+        done: _Count = contract.from_dict(_Count, {"steps": told["iteration"] - last["from_iteration"]})
+        added: _Count = contract.from_dict(_Count, {"steps": last["steps"]})
+    except (KeyError, TypeError, ValueError, IndexError):
+        return None
+    return {"done": done.steps, "steps": added.steps}
+
+
+def params_of(config: dict[str, Any]) -> dict[str, Any]:
+    """Fields of `contract.TrainParams` that ask for the run of a stored `config` again, whatever it was begun with."""
+    anchors = config.get("supervision", {})
+    return {
+        "preset": config["preset"], "method": config["method"], "host": config.get("host", "hexplane"),
+        "host_config": config.get("host_config", "default"), "iterations": config["iterations"],
+        "width": config["width"], "max_gaussians": config["densify"]["budget"], "holdout": config["holdout"],
+        "seed": config["seed"], "supervision": anchors["preset"], "detector": anchors.get("detector", "grad_norm"),
+    }  # fmt: skip
+
+
+def other_cameras(shot: Path, run: Path) -> bool:
+    """True if the shot was solved again, with another result, after the run was trained."""
+    cameras, there = contract.ShotFolder(shot).cameras, RunFolder(run)
+    try:
+        if cameras.stat().st_mtime <= there.checkpoint.stat().st_mtime:
+            return False
+        told = kept.of(there.config, contract.read_json)["solve"]
+        return kept.of(cameras, _key) != told
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _key(cameras: Path) -> str:
+    """What a run notes of the solve it was trained on."""
+    return contract.content_key(contract.read_json(cameras))

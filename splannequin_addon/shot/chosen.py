@@ -1,0 +1,158 @@
+"""Several shots in one scene. The scene's settings are those of the chosen shot; the others wait in a list.
+
+The list is empty while there is one shot. The item of the chosen one is behind: its values stand in the scene's
+settings, where everything looks for them, and are put back when another is chosen. So are the scene's own size, rate
+and range, where a shot has set them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from .. import compat
+from ..scene import paths, scene_setup
+from . import made
+from .shot_state import ShotState
+
+_T_STAR = "splannequin.t_star"
+"""Data path of the one setting that can be keyed."""
+_ITEMS_OWN = ("rna_type", "name", "scene_settings")
+"""What an item of the list has beside a shot's settings."""
+
+
+def names() -> list[str]:
+    """Settings that belong to a shot."""
+    rna = bpy.types.Scene.bl_rna.properties["splannequin"].fixed_type.properties["shots"].fixed_type
+    return [one.identifier for one in rna.properties if one.identifier not in _ITEMS_OWN]
+
+
+def folder_of(one: Any) -> Path | None:
+    """Shot folder that settings name; None while neither it nor a clip is chosen."""
+    if one.shot_path:
+        return Path(os.path.abspath(bpy.path.abspath(one.shot_path)))
+    if not one.clip:
+        return None
+    return beside(Path(os.path.abspath(bpy.path.abspath(one.clip))))
+
+
+def beside(clip: Path) -> Path:
+    """The shot folder of a clip for which none was chosen."""
+    return clip.with_name(clip.stem + contract.SHOT_SUFFIX)
+
+
+def settings(scene: Any) -> list[Any]:
+    """The settings of every shot of a scene in order, the chosen one's where they are used; one without a list."""
+    held = scene.splannequin
+    return [held if i == held.loaded_shot else item for i, item in enumerate(held.shots)] or [held]
+
+
+def folders(scene: Any) -> list[Path | None]:
+    """Shot folders in order, None for a shot without a clip."""
+    return [folder_of(one) for one in settings(scene)]
+
+
+def label(one: Any) -> str:
+    """What a shot is called: as its folder, which is called as its clip."""
+    folder = folder_of(one)
+    return made.name_of(folder) if folder is not None else "New shot"
+
+
+def add(scene: Any) -> None:
+    """Appends a shot with settings as at first, and chooses it."""
+    held = scene.splannequin
+    if not len(held.shots):
+        _copy(held, held.shots.add())
+        held.loaded_shot = 0
+    held.shots.add()
+    held.active_shot = len(held.shots) - 1  # this calls `choose`
+    choose(scene, held.active_shot)
+
+
+def choose(scene: Any, index: int) -> None:
+    """Puts the settings of a shot in place of the chosen one's, and makes its camera the scene's if it is there."""
+    held = scene.splannequin
+    if not len(held.shots):
+        return
+    index, before = min(max(index, 0), len(held.shots) - 1), held.loaded_shot
+    if index != before:
+        _copy(held, held.shots[before])
+        held.shots[before].scene_settings = scene_setup.kept(scene)
+        _copy(held.shots[index], held)
+        held.loaded_shot = index
+        scene_setup.put_back(scene, held.shots[index].scene_settings)
+        _rename(scene, {_T_STAR: _path(before), _path(index): _T_STAR})
+        folder = folder_of(held)
+        camera = made.part(scene, folder, "camera") if folder is not None else None
+        if camera is not None:
+            scene.camera = camera
+    if held.active_shot != index:
+        held.active_shot = index
+
+
+def remove(scene: Any, index: int) -> None:
+    """Takes a shot off the list, with its keys of t*; a neighbour is chosen in its place. Needs two or more."""
+    held = scene.splannequin
+    if index == held.loaded_shot:
+        choose(scene, index + 1 if index + 1 < len(held.shots) else index - 1)
+    chosen = held.loaded_shot
+    compat.remove_fcurves(scene, _path(index))
+    _rename(scene, {_path(i): _path(i - 1) for i in range(index + 1, len(held.shots))})
+    held.shots.remove(index)
+    held.loaded_shot = held.active_shot = chosen - 1 if chosen > index else chosen
+    if len(held.shots) == 1:
+        held.shots.clear()
+        held.loaded_shot = held.active_shot = 0
+
+
+def _path(index: int) -> str:
+    return f"splannequin.shots[{index}].t_star"
+
+
+def _copy(one: Any, other: Any) -> None:
+    for name in names():
+        setattr(other, name, getattr(one, name))
+
+
+def _rename(scene: Any, paths: Mapping[str, str]) -> None:
+    """Has the scene's F-curves and drivers lead elsewhere, all at once."""
+    drivers = scene.animation_data.drivers if scene.animation_data is not None else ()
+    for curve in [*compat.fcurves(scene), *drivers]:
+        if curve.data_path in paths:
+            curve.data_path = paths[curve.data_path]
+
+
+def shot_folder(scene: Any) -> Path | None:
+    """Folder of the scene's shot, of several the chosen one; None while neither it nor a clip is chosen."""
+    return folder_of(scene.splannequin)
+
+
+def scenes_of(shot: Path) -> list[Any]:
+    """Scenes of the file that work on a shot: of several, it is the chosen one."""
+    return [s for s in bpy.data.scenes if shot_folder(s) == shot]
+
+
+def scenes_with(shot: Path) -> list[Any]:
+    """Scenes of the file that have a shot, chosen or not."""
+    return [s for s in bpy.data.scenes if shot in folders(s)]
+
+
+def missing(scene: Any, state: ShotState | None) -> bool:
+    """True if the scene's shot was there before, and its folder is gone now."""
+    folder = folder_of(scene.splannequin)
+    if folder is None or (state is not None and state.info):
+        return False
+    return paths.absolute(scene.splannequin.shot_seen) == str(folder) or made.of(scene, folder) is not None
+
+
+def see(scene: Any, state: ShotState | None) -> None:
+    """Remembers that the scene's shot is there, so that it can be missed."""
+    folder, held = folder_of(scene.splannequin), scene.splannequin
+    there = folder is not None and state is not None and state.frames and state.folder == folder
+    if folder is not None and there and paths.absolute(held.shot_seen) != str(folder):
+        held.shot_seen = paths.blend_path(folder)

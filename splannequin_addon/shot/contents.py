@@ -1,0 +1,250 @@
+"""What a shot folder holds, as the panel tells it. No bpy: files in, plain values out."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ...torch_backend import contract
+from ...torch_backend.contract import ShotFolder
+from ..scene import numbered
+from . import checkpoints, kept
+from .shot_state import ShotState
+
+
+def create(folder: Path, name: str = "") -> None:
+    """Makes an empty shot folder, or checks the one that is there. ValueError on one from a newer Splannequin."""
+    path = ShotFolder(folder).info_path
+    if os.path.lexists(path):
+        _typed(_Info, path)
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    called = name or folder.name.removesuffix(contract.SHOT_SUFFIX)
+    contract.write_json(path, {"version": 1, "name": called, "created": time.time()}, parents=False)
+
+
+def read(folder: Path) -> ShotState:
+    """The state of the shot in a folder; an empty state if there is none. ValueError on a broken or newer file."""
+    state, there = ShotState(folder), ShotFolder(folder)
+    if not there.info_path.is_file():
+        return state
+    state.info = _typed(_Info, there.info_path)
+    if there.listing.is_file():
+        state.frames, state.beside = kept.of(there.listing, _listed)
+    if there.cameras.is_file():
+        state.solve = _typed(_Solve, there.solve_record)
+    state.runs = _named(_Run, there.runs, contract.SUMMARY_FILE, state.damaged["run"])
+    for name, run in state.runs.items():
+        run["extension"] = checkpoints.extension(there.runs / name)
+    for name in _names(there.runs, contract.CHECKPOINT_FILE):
+        known = name in state.runs or name in state.damaged["run"]
+        told = None if known else checkpoints.paused(there.runs / name)
+        if told is not None:
+            state.unfinished[name] = told
+    for name, run in [*state.runs.items(), *state.unfinished.items()]:
+        place = contract.RunFolder(there.runs / name)
+        run["anew"] = checkpoints.anew(place.root)
+        if run["anew"] is not None:
+            run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
+            run["anew"]["history"] = _history(contract.RunFolder(run["anew"]["folder"]).metrics)
+        run["other_cameras"] = checkpoints.other_cameras(folder, place.root)
+        run["history"] = kept.of(place.metrics, _history) if place.metrics.is_file() else []
+        run["preview"] = max(place.previews.glob("*.png"), default=None)
+    state.takes = _named(_Take, there.takes, contract.TAKE_FILE, state.damaged["take"])
+    for name, take in state.takes.items():
+        take["frame_count"] = kept.of(there.takes / name, _frame_count)
+    return state
+
+
+def stamp(folder: Path) -> tuple[float, ...]:
+    """Changes when something in the shot did: cheap to ask for on every tick."""
+    there = ShotFolder(folder)
+    parts = (there.info_path, there.listing, there.solve_record, there.runs, there.takes, there.jobs)
+    deep = [p for place in (there.runs, there.takes) if place.is_dir() for p in place.iterdir()]
+    places = (contract.RunFolder(run).next for run in deep)
+    anew = [p for place in places if place.is_dir() for p in place.iterdir()]
+    return tuple(_mtime(p) for p in [*parts, *deep, *anew])
+
+
+def plate_range(folder: Path) -> tuple[int, int] | None:
+    """First and last number of the undistorted plates, None before the solve."""
+    found = (contract.frame_number(p.stem) for p in ShotFolder(folder).frames.glob(f"*{contract.PICTURE}"))
+    numbers = [number for number in found if number is not None]
+    return (min(numbers), max(numbers)) if numbers else None
+
+
+def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
+    """Those of some frames that a take lacks."""
+    there = set(numbered.frame_numbers(ShotFolder(shot).takes / take))
+    return [n for n in frames if n not in there]
+
+
+def _listed(path: Path) -> tuple[int, str]:
+    """Of frames.json: how many frames there are, and `ShotState.beside`."""
+    told = _read_typed(path, _Listing, contract.LONGEST_JSON)
+    return len(told["frames"]), told["beside"]
+
+
+def _frame_count(take: Path) -> int:
+    with os.scandir(take) as entries:
+        return sum(1 for entry in entries if entry.name.endswith(contract.LAYERS))
+
+
+def _history(path: Path) -> list[tuple[float, float]]:
+    """(seconds, dB on frames kept out) of a run's metrics.jsonl; what cannot be read is passed over."""
+    points = []
+    try:
+        with contextlib.closing(contract.read_lines(path)) as lines:
+            for line, end in lines:
+                point = _measured(line)
+                if point is not None:
+                    points.append(point)
+                if end > _LONGEST_HISTORY:
+                    break
+    except (OSError, ValueError):
+        return []
+    return points
+
+
+def _measured(line: bytes) -> tuple[float, float] | None:
+    try:
+        told = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return contract.measured(told) if isinstance(told, dict) else None
+
+
+@dataclass
+class _Info:
+    """Of shot.json."""
+
+    name: str = ""
+    source: str = ""
+    first: int = 0
+    last: int = 0
+    fps: float = 0.0
+    width: int = 0
+    height: int = 0
+    t_star: int | None = None
+
+
+@dataclass
+class _Listing:
+    """Of frames.json."""
+
+    frames: list[Any]
+    beside: str = ""
+
+
+@dataclass
+class _Solve:
+    """Of solve.json, and of the result in it."""
+
+    quality: str = ""
+    interpolated: int = 0
+    frames: int = 0
+    result: dict[str, Any] | None = None
+
+
+@dataclass
+class _Run:
+    """Of summary.json."""
+
+    run: str = ""
+    preset: str = "preview"
+    gaussians: int = 0
+    moving_share: float | None = None
+    heldout_psnr_db: float | None = None
+    train_seconds: float | None = None
+
+
+@dataclass
+class _Take:
+    """Of take.json."""
+
+    take: str
+    run: str
+    t_star_frame: int
+    query: str
+    width: int
+    height: int
+    first: int
+    last: int
+    t_star_per_frame: dict[str, Any] = field(default_factory=dict)
+    margin: list[Any] = field(default_factory=lambda: [0, 0])
+    camera_path: str = ""
+    overscan: float = 0.0
+
+    def __post_init__(self) -> None:
+        numbers = [*self.margin, *self.t_star_per_frame.values()]
+        if len(self.margin) != 2 or any(type(v) not in (int, float) or not abs(v) < _LARGEST for v in numbers):
+            raise ValueError("margin should be two numbers, and t_star_per_frame a number per frame")
+
+
+def _typed(kind: type, path: Path) -> dict[str, Any]:
+    """A file of the shot, what the dataclass `kind` names in it checked and completed. ValueError says what is wrong.
+
+    OSError if there is none.
+    """
+    return dict(kept.of(path, _read_typed, kind))
+
+
+def _read_typed(path: Path, kind: type, longest: int = contract.SHORT_JSON) -> dict[str, Any]:
+    data = contract.read_json(path, longest)
+    contract.check_version(data, str(path))
+    try:
+        return _believed(kind, data)
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {str(error).lstrip('_')}.") from error
+
+
+def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
+    names = [one.name for one in dataclasses.fields(kind) if one.name in data]
+    values = vars(contract.from_dict(kind, {name: data[name] for name in names}))
+    for name, value in values.items():
+        if isinstance(value, (int, float)) and not abs(value) < _LARGEST:
+            raise ValueError(f"{kind.__name__}.{name} cannot be that large")
+        if isinstance(value, str) and name not in ("source", "camera_path"):
+            values[name] = contract.printable(value)
+    if isinstance(values.get("result"), dict):
+        values["result"] = _believed(_Solve, values["result"])
+    elif "result" in values:
+        del values["result"]
+    return {**data, **values}
+
+
+_LARGEST = 1 << 31
+"""Blender's whole numbers end there."""
+_LONGEST_HISTORY = 1 << 24
+"""Bytes of a run's measurements that are read; 100,000 take as much."""
+
+
+def _named(kind: type, folder: Path, file: str, damaged: dict[str, str]) -> dict[str, dict[str, Any]]:
+    """Name -> file of every folder that has it; of those that cannot be believed, in `damaged` why not."""
+    found = {}
+    for name in _names(folder, file):
+        try:
+            found[name] = _typed(kind, folder / name / file)
+        except (OSError, ValueError) as error:
+            damaged[name] = contract.printable(str(error))
+    return found
+
+
+def _names(folder: Path, file: str) -> list[str]:
+    """Folders that have the file; not one that is about to take another's place, or whose name cannot be shown."""
+    found = {p.parent.name for p in folder.glob(f"*/{file}")}
+    return sorted(name for name in found if name.isprintable() and not name.startswith("."))
+
+
+def _mtime(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0

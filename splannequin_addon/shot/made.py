@@ -1,0 +1,133 @@
+"""What was put into a scene for a shot, kept as pointers in the scene.
+
+A mark on an object would travel with its copies: what the artist duplicates would pass for ours, and be removed. A
+pointer follows the one object through renaming, undo, saving and a full copy of the scene.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.props import BoolProperty, PointerProperty, StringProperty
+
+from ...torch_backend import contract
+from ..scene import paths
+from ..scene.mark import TAG
+
+PARTS = ("root", "camera", "points")
+"""Our objects of a shot."""
+_KINDS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
+
+
+class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
+    """What there is of one shot; its name is the shot's."""
+
+    folder: StringProperty(name="Folder", description="Shot folder that it was made from", options=set())
+    root: PointerProperty(name="Root", description="Where the solve stands in the scene", type=bpy.types.Object)
+    camera: PointerProperty(name="Camera", description="The solved camera", type=bpy.types.Object)
+    points: PointerProperty(name="Points", description="The sparse points", type=bpy.types.Object)
+    plate: PointerProperty(
+        name="Plate", description="The camera that shows the clip until it is solved", type=bpy.types.Object
+    )
+    scaled: BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
+    collection: PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
+    marks: StringProperty(name="Marks", description="Markers that were put on the timeline, as JSON", options=set())
+
+
+def name_of(shot: Path) -> str:
+    """Name of a shot, from its folder."""
+    return shot.name.removesuffix(contract.SHOT_SUFFIX)
+
+
+def of(scene: Any, shot: Path) -> Any | None:
+    """What was made for a shot, None if nothing was. Never writes: drawing asks."""
+    for entry in scene.splannequin.made:
+        if entry.name != name_of(shot):
+            continue
+        folder = os.path.abspath(bpy.path.abspath(entry.folder))
+        # Of another path: another shot of the same name, unless it was moved here since.
+        if folder == os.path.abspath(shot) or not os.path.isdir(folder):
+            return entry
+    return None
+
+
+def new(scene: Any, shot: Path) -> Any:
+    """`of`, made if it is not there."""
+    entry = of(scene, shot) or scene.splannequin.made.add()
+    entry.name, entry.folder = name_of(shot), paths.blend_path(shot)
+    return entry
+
+
+def drop(scene: Any, shot: Path) -> None:
+    """Forgets a shot; what it points to stays."""
+    entry = of(scene, shot)
+    if entry is not None:
+        scene.splannequin.made.remove(list(scene.splannequin.made).index(entry))
+
+
+def part(scene: Any, shot: Path, name: str) -> Any | None:
+    """One of `PARTS`, or the plate, if the scene still has it."""
+    entry = of(scene, shot)
+    item = getattr(entry, name) if entry is not None else None
+    return item if item is not None and scene.objects.get(item.name) == item else None
+
+
+def keep_camera(scene: Any) -> None:
+    """Remembers the scene's camera, before a shot's takes its place."""
+    camera = scene.camera
+    if camera is not None and camera not in [entry.camera for entry in scene.splannequin.made]:
+        scene.splannequin.camera_before = camera
+
+
+def give_camera_back(scene: Any) -> None:
+    """Where the scene's camera went with a shot: another shot's takes its place, or the one before all of them."""
+    held = scene.splannequin
+    if scene.camera is None:
+        others = [entry.camera for entry in held.made] + [held.camera_before]
+        scene.camera = next((c for c in others if c is not None and scene.objects.get(c.name) == c), None)
+    if not len(held.made):
+        held.camera_before = None
+
+
+def tidy(scene: Any) -> None:
+    """Lets go of what the artist deleted: the pointer would keep it in the file, out of sight."""
+    before = scene.splannequin.camera_before
+    if before is not None and not before.users_scene:
+        scene.splannequin.camera_before = None
+    for entry in scene.splannequin.made:
+        for name in (*PARTS, "plate"):
+            item = getattr(entry, name)
+            if item is not None and not item.users_scene:
+                setattr(entry, name, None)
+        if entry.collection is not None and entry.collection not in scene.collection.children_recursive:
+            entry.collection = None
+
+
+def adopt(scene: Any, shot: Path) -> None:
+    """Takes over what 0.2.0 made, which marked objects instead: the one of each kind that kept its name."""
+    name = name_of(shot)
+    if scene.splannequin.made or not any(o.get(TAG) == name for o in scene.objects):
+        return
+    entry = new(scene, shot)
+    for item in [o for o in scene.objects if o.get(TAG) == name]:
+        kind = _KINDS.get(item.type, "")
+        if kind and item.name == f"{name} {kind}":
+            setattr(entry, kind, item)
+        del item[TAG]
+    for collection in [c for c in scene.collection.children_recursive if c.get(TAG) == name]:
+        entry.collection = collection
+        del collection[TAG]
+
+
+def depth_scale(scene: Any, shot: Path) -> float:
+    """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
+    root = part(scene, shot, "root")
+    return float(sum(root.matrix_world.to_scale()) / 3.0) if root else 1.0
+
+
+def is_plate(camera: Any) -> bool:
+    """True of a camera that shows a clip until it is solved, whichever shot's."""
+    return any(entry.plate == camera for scene in bpy.data.scenes for entry in scene.splannequin.made)

@@ -1,0 +1,158 @@
+"""Where clip, shot folder and what was made from it lie: a folder that is moved as a whole goes on working.
+
+The settings keep paths relative to the .blend once it is saved, as Blender keeps its own. Those of older files, which
+kept them whole, are looked for beside the .blend when it is opened. A shot folder that was here and is gone is told
+from one that is still to be made, and can be located.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ...torch_backend import contract
+from ..scene import paths
+from ..scene.mark import TAG
+from . import chosen, contents, made
+from .shot_state import ShotState
+
+_SETTINGS = ("clip", "shot_path", "cameras_path", "shot_seen")
+"""Settings of a shot that hold a path."""
+_saving: list[str] = []
+"""What `_holders` held before the file that is being saved was given its own."""
+
+
+def source_of(state: ShotState) -> str:
+    """The footage that a shot was imported from, where it is now: as it was named, or beside the shot, with which it
+    was moved. Empty if it is in neither place."""
+    named, beside = str(state.info.get("source", "")), state.beside
+    there = [Path(named), state.folder.parent / re.split(r"[\\/]", named)[-1]]
+    if beside:
+        there.insert(1, state.folder / beside)
+    return next((os.path.normpath(p) for p in there if named and _there(p)), "")
+
+
+def locate(scene: Any, folder: Path) -> None:
+    """Makes `folder` the scene's shot, in place of one that was moved or renamed: what was made from that stays.
+
+    Raises:
+        contract.JobError: there is no shot in it.
+    """
+    try:
+        state = contents.read(folder)
+    except (OSError, ValueError, KeyError) as error:
+        raise contract.JobError(f"{folder} cannot be read: {error}", "", contract.ExitCode.USAGE) from error
+    if not state.info:
+        hint = "Choose the folder that holds shot.json; its name ends with .splannequin unless it was renamed."
+        raise contract.JobError(f"{folder} is no shot folder.", hint, contract.ExitCode.USAGE)
+    held, before = scene.splannequin, chosen.folder_of(scene.splannequin)
+    entry = made.of(scene, before) if before is not None else None
+    if entry is not None and made.of(scene, folder) in (None, entry):
+        entry.name, entry.folder = made.name_of(folder), paths.blend_path(folder)
+    for image in bpy.data.images:
+        path = Path(paths.absolute(image.filepath))
+        if before is not None and image.get(TAG) and before in path.parents and not path.exists():
+            image.filepath = paths.blend_path(folder / path.relative_to(before))
+    held.shot_path = held.shot_seen = paths.blend_path(folder)
+    source = source_of(state)
+    if source and not (held.clip and _there(Path(paths.absolute(held.clip)))):
+        held.clip = paths.blend_path(Path(source))
+
+
+def _there(path: Path) -> bool:
+    """True if footage is there: a file, a folder of pictures, or a pattern in a folder that is there."""
+    return path.exists() or (("#" in path.name or "%0" in path.name) and path.parent.is_dir())
+
+
+def _holders() -> Iterator[tuple[Any, str]]:
+    """(owner, property) of every path of ours in the file."""
+    for scene in bpy.data.scenes:
+        held = scene.splannequin
+        for one in [held, *held.shots]:
+            yield from ((one, name) for name in _SETTINGS)
+        yield from ((entry, "folder") for entry in held.made)
+
+
+def _relative(path: str, base: str) -> str:
+    """`path` as a .blend in the folder `base` should hold it."""
+    try:
+        return bpy.path.relpath(path, start=base) if path and base else path
+    except ValueError:  # another drive on Windows
+        return path
+
+
+@persistent
+def _before_save(file: str = "", *_: Any) -> None:
+    """Paths become relative to where the file is being saved; with Blender's *Relative Paths* off only those that were
+    relative to where it was."""
+    _saving.clear()
+    if not isinstance(file, str) or not file:  # the startup file
+        return
+    all_of_them = bpy.context.preferences.filepaths.use_relative_paths
+    for owner, name in _holders():
+        path = getattr(owner, name)
+        _saving.append(path)
+        if path and (all_of_them or path.startswith("//")):
+            setattr(owner, name, _relative(paths.absolute(path), os.path.dirname(os.path.abspath(file))))
+
+
+@persistent
+def _after_save(file: str = "", *_: Any) -> None:
+    """A copy was saved, or nothing was: in the open file the paths stay as they were."""
+    if file and _saving and os.path.abspath(file) != bpy.data.filepath:
+        for (owner, name), path in zip(_holders(), _saving, strict=True):
+            setattr(owner, name, path)
+    _saving.clear()
+
+
+@persistent
+def _after_load(*_: Any) -> None:
+    """What an older file names by its whole path, and is not there, is looked for beside the .blend."""
+    if not bpy.data.filepath:
+        return
+    here = Path(bpy.data.filepath).parent
+    for owner, name in _holders():
+        path = getattr(owner, name)
+        if not path or path.startswith("//") or _known(Path(paths.absolute(path)), name):
+            continue
+        words = re.split(r"[\\/]+", path)
+        tails = [Path(*words[n:]) for n in range(1, len(words)) if words[n]]
+        found = next((base / tail for tail in tails for base in (here, here.parent) if _known(base / tail, name)), None)
+        if found is not None:
+            setattr(owner, name, paths.blend_path(found))
+
+
+def _known(path: Path, name: str) -> bool:
+    """True if what the setting `name` is about is there; of a clip its shot is enough."""
+    try:
+        if name in ("clip", "cameras_path"):
+            return _there(path) or (name == "clip" and contract.ShotFolder(chosen.beside(path)).info_path.is_file())
+        return contract.ShotFolder(path).info_path.is_file()
+    except OSError:
+        return False
+
+
+_HANDLERS = (
+    ("save_pre", _before_save),
+    ("save_post", _after_save),
+    ("save_post_fail", _after_save),
+    ("load_post", _after_load),
+)
+
+
+def register() -> None:
+    """Listens to saving and loading; before the supervisor, which looks at the shots of a file once it is loaded."""
+    for name, handler in _HANDLERS:
+        getattr(bpy.app.handlers, name).append(handler)
+
+
+def unregister() -> None:
+    """Undoes `register`."""
+    for name, handler in _HANDLERS:
+        getattr(bpy.app.handlers, name).remove(handler)

@@ -1,0 +1,1 @@
+"""The step Solve: where the camera was, and what moves."""

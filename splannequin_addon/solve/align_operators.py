@@ -1,0 +1,428 @@
+"""Floor, origin and scale of a shot in the scene, from points that are clicked in a 3D view.
+
+A click takes the sparse point of the solve that is seen nearest to it. Every other event is passed on, so the view can
+be turned meanwhile. The same operators take the places of selected objects, for what no point lies on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import blf
+import bpy
+import gpu
+import numpy as np
+from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty
+from gpu_extras.batch import batch_for_shader
+from mathutils import Matrix
+
+from ...torch_backend import contract
+from ..process import steps, supervisor
+from ..scene import axes
+from ..shot import chosen, made
+from ..translations import tr
+from . import alignment, cameras, points
+
+REACH_PIXELS = 18.0
+"""How far from the mouse a point may be seen, at a user interface scale of 1."""
+
+
+@dataclass
+class Picking:
+    """Points being clicked, one shot's, in one window."""
+
+    shot: Path
+    """Shot folder."""
+    xyz: np.ndarray
+    """All its points, [P, 3] float32, solve units."""
+    wanted: int
+    """How many are asked for."""
+    picked: list[int] = field(default_factory=list)
+    """Those that were clicked, indices into `xyz`."""
+    under: int = -1
+    """The one under the mouse, -1 if none."""
+    handler: Any = None
+    """Of the drawing."""
+
+
+_picking: Picking | None = None
+
+
+def picking() -> Picking | None:
+    """What is being clicked at the moment."""
+    return _picking
+
+
+def move(scene: Any, shot: Path, change: np.ndarray) -> list[str]:
+    """Moves a shot's root by a change of the world as `alignment` makes them; returns what else was changed, in words.
+
+    Args:
+        scene: the scene.
+        shot: shot folder; its root is there.
+        change: [4, 4], multiplied onto the root from the left.
+    """
+    root, before = cameras.find(scene, shot, "EMPTY"), made.depth_scale(scene, shot)
+    uniform = max(root.scale) - min(root.scale) <= 1e-5 * max(root.scale)
+    root.matrix_world = Matrix((change @ np.array(root.matrix_world, dtype=np.float64)).tolist())
+    if uniform:  # to the last bit, whatever the decomposition left
+        root.scale = [sum(root.scale) / 3.0] * 3
+    bpy.context.view_layer.update()
+    grown = made.depth_scale(scene, shot) / before
+    if abs(grown - 1.0) < 1e-6:
+        return []
+    camera = cameras.find(scene, shot, "CAMERA")
+    if camera is not None:
+        camera.data.clip_end *= grown
+        camera.data.clip_start *= grown
+    return [note for step in steps.STEPS.values() for note in step.scaled(scene, shot)]
+
+
+def _shot_of(scene: Any) -> Path:
+    """The scene's shot; `poll` has seen to it that there is one."""
+    shot = chosen.shot_folder(scene)
+    assert shot is not None
+    return shot
+
+
+def _centres(scene: Any, shot: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Where the camera was and its upward directions, [F, 3] each, world."""
+    poses = axes.poses(contract.CameraPath.load(contract.ShotFolder(shot).cameras))
+    poses = np.array(cameras.find(scene, shot, "EMPTY").matrix_world, dtype=np.float64) @ poses
+    return poses[:, :3, 3], poses[:, :3, 1]
+
+
+class _Aligns:
+    """What the three share: clicks or selected objects, then a change of the root."""
+
+    count = 0
+    asked = ""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off without the solve in the scene."""
+        shot = chosen.shot_folder(context.scene)
+        if shot is None or cameras.find(context.scene, shot, "EMPTY") is None:
+            cls.poll_message_set(tr("Load the camera of this shot first"))  # type: ignore[attr-defined]
+            return False
+        return True
+
+    @classmethod
+    def description(cls, context: Any, properties: Any) -> str:
+        """Another tooltip for the button that takes selected objects."""
+        return "The same from the places of the selected objects, such as empties" if properties.selected else ""
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Has points clicked, unless they are given or selected objects are to be taken."""
+        if self.selected or self.properties.is_property_set("places"):  # type: ignore[attr-defined]
+            return self.ready(context)
+        return self._begin(context)
+
+    def ready(self, context: Any) -> set[str]:
+        """What follows once the points are there."""
+        return self.execute(context)
+
+    def execute(self, context: Any) -> set[str]:
+        """Moves the root."""
+        scene, shot = context.scene, _shot_of(context.scene)
+        context.view_layer.update()
+        try:
+            notes = move(scene, shot, self.change(scene, shot, self._places(context, shot)))
+        except (contract.JobError, OSError, ValueError) as error:
+            told = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
+            self.report({"ERROR"}, told)  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        supervisor.watch_of(shot).notes["solve"] = notes
+        for note in notes:
+            self.report({"INFO"}, note)  # type: ignore[attr-defined]
+        return {"FINISHED"}
+
+    def change(self, scene: Any, shot: Path, places: np.ndarray) -> np.ndarray:
+        """The change [4, 4] for the points' places [count, 3], world."""
+        raise NotImplementedError
+
+    def _places(self, context: Any, shot: Path) -> np.ndarray:
+        """The points as they were clicked, else the places of the selected objects, [count, 3], world."""
+        if self.properties.is_property_set("places"):  # type: ignore[attr-defined]
+            return np.array(self.places, dtype=np.float64).reshape(self.count, 3)  # type: ignore[attr-defined]
+        ours = [cameras.find(context.scene, shot, kind) for kind in ("EMPTY", "CAMERA", "MESH")]
+        picked = [o for o in context.selected_objects if o not in ours]
+        if len(picked) != self.count:
+            raise contract.JobError(
+                f"{len(picked)} objects are selected, {self.count} are needed.",
+                "Place empties where the points should be and select them.",
+                contract.ExitCode.USAGE,
+            )
+        return np.array([o.matrix_world.translation for o in picked], dtype=np.float64)
+
+    def _begin(self, context: Any) -> set[str]:
+        global _picking
+        scene, shot = context.scene, _shot_of(context.scene)
+        cloud = cameras.find(scene, shot, "MESH")
+        xyz = points.coloured(cloud.data)[0] if cloud is not None else np.zeros((0, 3), np.float32)
+        if bpy.app.background or not len(xyz):
+            told = "There are no points to click: select objects that stand where they should be"
+            self.report({"ERROR"}, told)  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        stop()
+        _picking = self._mine = Picking(shot, xyz, self.count)
+        _picking.handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
+        context.window_manager.modal_handler_add(self)
+        self._tell(context)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: Any, event: Any) -> set[str]:
+        """A click takes a point, Backspace gives the last one back, Esc or the right button ends it."""
+        picked = _picking
+        root = cameras.find(context.scene, self._mine.shot, "EMPTY")
+        if picked is None or picked is not self._mine or root is None:  # another took over, or the shot was removed
+            if picked is self._mine:
+                self.cancel(context)
+            return {"CANCELLED"}
+        pressed = event.value in {"PRESS", "DOUBLE_CLICK"}
+        if event.type in {"ESC", "RIGHTMOUSE"} and pressed:
+            self.cancel(context)
+            return {"CANCELLED"}
+        if event.type == "BACK_SPACE" and pressed:
+            if picked.picked:
+                picked.picked.pop()
+            self._tell(context)
+            return {"RUNNING_MODAL"}
+        if event.type not in {"MOUSEMOVE", "LEFTMOUSE"} or (event.type == "LEFTMOUSE" and (not pressed or event.alt)):
+            return {"PASS_THROUGH"}
+        view = view_under(context.window, event.mouse_x, event.mouse_y)
+        under = -1
+        if view is not None:
+            region, data = view
+            at = (event.mouse_x - region.x, event.mouse_y - region.y)
+            reach = REACH_PIXELS * context.preferences.system.ui_scale
+            matrix = np.array(data.perspective_matrix @ root.matrix_world, dtype=np.float64)
+            under = alignment.nearest(at, picked.xyz, matrix, (region.width, region.height), reach)
+        if under != picked.under:
+            picked.under = under
+            _redraw(context.window)
+        if event.type == "MOUSEMOVE" or view is None:
+            return {"PASS_THROUGH"}
+        if under < 0:
+            self.report({"INFO"}, "No point of the solve is there")  # type: ignore[attr-defined]
+            return {"RUNNING_MODAL"}
+        if under not in picked.picked:
+            picked.picked.append(under)
+        if len(picked.picked) < picked.wanted:
+            self._tell(context)
+            return {"RUNNING_MODAL"}
+        matrix = np.array(root.matrix_world, dtype=np.float64)
+        places = picked.xyz[picked.picked].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        self.cancel(context)
+        self.places = places.ravel().tolist()
+        return self.picked(context)
+
+    def picked(self, context: Any) -> set[str]:
+        """What follows the last click."""
+        return self.execute(context)
+
+    def cancel(self, context: Any) -> None:
+        """Ends the clicking; Blender calls it, too, when another file is opened."""
+        if _picking is self._mine:
+            stop()
+        if context.workspace is not None:
+            context.workspace.status_text_set(None)
+
+    def _tell(self, context: Any) -> None:
+        """What to do, in the status bar."""
+        if _picking is None:
+            return
+        done = f"{len(_picking.picked)} of {_picking.wanted}"
+        context.workspace.status_text_set(f"{self.asked}: {done}.  Backspace: one back.  Esc: cancel")
+        _redraw(context.window)
+
+
+_SELECTED = BoolProperty(
+    name="Selected Objects",
+    description="Take the places of the selected objects instead of clicks",
+    default=False,
+    options={"SKIP_SAVE", "HIDDEN"},
+)
+
+
+def _places_property(count: int) -> Any:
+    return FloatVectorProperty(
+        name="Points",
+        description="Places of the points in the scene, one after the other",
+        size=3 * count,
+        options={"SKIP_SAVE", "HIDDEN"},
+    )
+
+
+class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
+    """Click three points of the floor: the solve is turned and moved until they lie at height 0, the camera above"""
+
+    bl_idname = "splannequin.align_floor"
+    bl_label = "Floor from Three Points"
+    bl_options = {"REGISTER", "UNDO"}
+    count = 3
+    asked = "Click three points of the floor"
+
+    places: _places_property(3)
+    selected: _SELECTED
+
+    def change(self, scene: Any, shot: Path, places: np.ndarray) -> np.ndarray:
+        """Lays them into z = 0."""
+        return alignment.level(places, *_centres(scene, shot))
+
+
+class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
+    """Click a point: the solve is moved until it lies at the scene's origin"""
+
+    bl_idname = "splannequin.align_origin"
+    bl_label = "Set Origin"
+    bl_options = {"REGISTER", "UNDO"}
+    count = 1
+    asked = "Click the point that is to be the origin"
+
+    places: _places_property(1)
+    selected: _SELECTED
+
+    def change(self, scene: Any, shot: Path, places: np.ndarray) -> np.ndarray:
+        """Moves it to the origin."""
+        return alignment.to_origin(places[0])
+
+
+class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
+    """Click two points and say how far apart they are: the solve is scaled about the scene's origin until it is so"""
+
+    bl_idname = "splannequin.align_scale"
+    bl_label = "Set Scale"
+    bl_options = {"REGISTER", "UNDO"}
+    count = 2
+    asked = "Click two points whose distance you know"
+
+    places: _places_property(2)
+    selected: _SELECTED
+    distance: FloatProperty(
+        name="Distance",
+        description="How far apart the two points are",
+        default=1.0,
+        min=1e-6,
+        soft_max=1000.0,
+        subtype="DISTANCE",
+        unit="LENGTH",
+        options={"SKIP_SAVE"},
+    )
+
+    def change(self, scene: Any, shot: Path, places: np.ndarray) -> np.ndarray:
+        """One factor for all axes."""
+        return alignment.scaled(places, self.distance)
+
+    def execute(self, context: Any) -> set[str]:
+        """Moves the root; from now on the scale is known."""
+        outcome = super().execute(context)
+        entry = made.of(context.scene, _shot_of(context.scene))
+        if outcome == {"FINISHED"} and entry is not None:
+            entry.scaled = True
+        return outcome
+
+    def picked(self, context: Any) -> set[str]:
+        """Asks for the distance, in a call of its own: this one is still busy with the mouse."""
+        bpy.ops.splannequin.align_scale("INVOKE_DEFAULT", places=list(self.places))
+        return {"CANCELLED"}
+
+    def ready(self, context: Any) -> set[str]:
+        """Asks for the distance, with what it is now."""
+        try:
+            one, other = self._places(context, _shot_of(context.scene))
+        except contract.JobError as error:
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
+            return {"CANCELLED"}
+        self.places = np.concatenate([one, other]).tolist()
+        self.distance = float(np.linalg.norm(other - one))
+        return context.window_manager.invoke_props_dialog(self)
+
+
+def scaled(scene: Any, shot: Path) -> bool:
+    """True if somebody gave a shot its scale: by Set Scale, or by hand on its root."""
+    entry = made.of(scene, shot)
+    return (entry is not None and entry.scaled) or abs(made.depth_scale(scene, shot) - 1.0) > 1e-5
+
+
+def view_under(window: Any, x: int, y: int) -> tuple[Any, Any] | None:
+    """(region, RegionView3D) of the 3D view under a place of a window in pixels; None beside it or over its sidebar."""
+    for area in window.screen.areas:
+        if area.type != "VIEW_3D":
+            continue
+        over = [r for r in area.regions if 0 <= x - r.x < r.width and 0 <= y - r.y < r.height and r.width > 1]
+        if any(r.type != "WINDOW" for r in over):
+            return None
+        for region in over:
+            return region, region.data
+    return None
+
+
+def stop() -> None:
+    """Ends the clicking and its drawing."""
+    global _picking
+    if _picking is not None and _picking.handler is not None:
+        bpy.types.SpaceView3D.draw_handler_remove(_picking.handler, "WINDOW")
+    _picking = None
+
+
+def _redraw(window: Any) -> None:
+    for area in window.screen.areas:
+        if area.type == "VIEW_3D":
+            area.tag_redraw()
+
+
+def _draw() -> None:
+    """The points that were clicked, with their numbers, and the one under the mouse; in one region of a 3D view."""
+    context = bpy.context
+    root = cameras.find(context.scene, _picking.shot, "EMPTY") if _picking is not None else None
+    if _picking is None or root is None or context.region_data is None:
+        return
+    scale = context.preferences.system.ui_scale
+    matrix = np.array(context.region_data.perspective_matrix @ root.matrix_world, dtype=np.float64)
+    size = (context.region.width, context.region.height)
+    gpu.state.blend_set("ALPHA")
+    for numbers, colour in (([_picking.under], (1.0, 1.0, 1.0, 1.0)), (_picking.picked, (1.0, 0.6, 0.1, 1.0))):
+        at, before = alignment.seen(_picking.xyz[[i for i in numbers if i >= 0]], matrix, size)
+        for number, (x, y) in enumerate(at[before], start=1):
+            _dot((float(x), float(y)), 6.0 * scale, (0.0, 0.0, 0.0, 0.8))
+            _dot((float(x), float(y)), 4.5 * scale, colour)
+            if numbers is _picking.picked:
+                blf.size(0, 14.0 * scale)
+                blf.color(0, *colour)
+                blf.position(0, float(x) + 9.0 * scale, float(y) + 5.0 * scale, 0.0)
+                blf.draw(0, str(number))
+    gpu.state.blend_set("NONE")
+
+
+def _dot(at: tuple[float, float], radius: float, colour: tuple[float, float, float, float]) -> None:
+    """A disc: large points are not drawn alike everywhere."""
+    turns = np.linspace(0.0, 2.0 * np.pi, 17)
+    rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) * radius + at
+    corners = np.concatenate([np.insert(rim[i : i + 2], 0, at, axis=0) for i in range(16)])
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    batch = batch_for_shader(shader, "TRIS", {"pos": corners.astype(np.float32)})
+    shader.uniform_float("color", colour)
+    batch.draw(shader)
+
+
+def draw(layout: Any) -> None:
+    """The three buttons; beside each the one that takes selected objects."""
+    column = layout.column(align=True)
+    for operator in ("align_floor", "align_origin", "align_scale"):
+        row = column.row(align=True)
+        row.operator(f"splannequin.{operator}")
+        row.operator(f"splannequin.{operator}", text="", icon="RESTRICT_SELECT_OFF").selected = True
+
+
+def register() -> None:
+    """Nothing is being clicked yet."""
+
+
+def unregister() -> None:
+    """Ends the clicking."""
+    stop()
+
+
+CLASSES = (SPLANNEQUIN_OT_align_floor, SPLANNEQUIN_OT_align_origin, SPLANNEQUIN_OT_align_scale)

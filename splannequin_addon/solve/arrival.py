@@ -1,0 +1,22 @@
+"""What a finished solve changes in the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ..footage import arrival, plate
+from ..scene import intact
+from ..shot import chosen, contents
+from . import cameras
+
+
+def load_camera(scene: Any, shot: Path) -> list[str]:
+    """Brings the solve into the scene. FileNotFoundError if there is none."""
+    state = contents.read(shot)
+    chosen.see(scene, state)
+    with intact.scene_of(scene):
+        camera = cameras.build(scene, shot)
+        changes = arrival.fit(scene, state, force_k=True)
+    plate.remove(scene, shot)
+    return [f"{camera.name} is the scene's camera, with the plate behind it.", *changes]

@@ -1,0 +1,287 @@
+"""The solve in Blender: an animated camera with the plate behind it, and points.
+
+They arrive under one Empty that carries the solve-to-scene transform: moving it moves camera and points together, and
+depth is brought to scene units through it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Quaternion
+
+from ...torch_backend import contract
+from .. import compat
+from ..scene import axes, intact, sequences
+from ..shot import contents, made
+from . import alignment, guesses
+
+_PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
+"""Kind of our objects -> which of `made.PARTS` it is, and last word of the name it is made with."""
+
+
+def scene_from_solve(
+    path: contract.CameraPath, points: np.ndarray, floor: tuple[Sequence[float], float] | None = None
+) -> np.ndarray:
+    """A first guess of the solve-to-scene transform: floor at z = 0, cameras upright, shot around the origin.
+
+    Without a floor the cameras' mean up is taken for up, and what is lowest for the floor.
+
+    Args:
+        path: the solved cameras, solve units.
+        points: sparse points, [P, 3], solve units.
+        floor: (normal, height) of the points x of the floor: normal . x = height; None if it is not known.
+
+    Returns:
+        [4, 4] float64, rotation and translation, no scale.
+    """
+    matrices = axes.poses(path)
+    up = matrices[:, :3, 1].mean(axis=0)
+    forward = -matrices[:, :3, 2].mean(axis=0)
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    up = up if floor is None else np.array(floor[0], dtype=np.float64)
+    ahead = forward - up * float(forward @ up)
+    if np.linalg.norm(ahead) < 1e-6:  # looking straight up or down
+        ahead = np.cross(up, np.roll(up, 1))
+    ahead = ahead / np.linalg.norm(ahead)
+    rotation = np.stack([np.cross(ahead, up), ahead, up])  # scene x, y, z in solve coordinates
+    seen = (points if len(points) else matrices[:, :3, 3]) @ rotation.T
+    centre = alignment.middle(seen)
+    centre[2] = np.sort(seen[:, 2])[len(seen) // 50] if floor is None else floor[1]
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, -centre
+    return result
+
+
+def build(scene: Any, shot: Path) -> Any:
+    """Brings the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
+
+    What an earlier call made for the same shot is replaced; the root's transform, which the artist may have set, stays.
+
+    Args:
+        scene: the scene to build in; its camera is set, nothing else of it is changed.
+        shot: shot folder with a finished solve.
+
+    Returns:
+        The camera object.
+
+    Raises:
+        FileNotFoundError: there is no solve.
+        ValueError: a file of it is broken, or Blender cannot show the plate. The scene is then as it was.
+    """
+    path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
+    xyz, rgb = _points(shot)
+    floor, unsolved = _floor(shot), guesses.ranges(path, guesses.solved(shot, path))
+    with intact.scene_of(scene):
+        # All that can fail comes before what was there is taken away.
+        camera, cloud = _new_camera(shot, path), _new_points(shot, xyz, rgb)
+        _place(scene, shot, camera, cloud, scene_from_solve(path, xyz, floor), _extent(path))
+        camera.data.clip_start, camera.data.clip_end = (v * made.depth_scale(scene, shot) for v in _clip(path, xyz))
+        guesses.mark(scene, shot, unsolved)
+        made.keep_camera(scene)
+        scene.camera = camera
+    return camera
+
+
+def _place(scene: Any, shot: Path, camera: Any, cloud: Any, stands: np.ndarray, size: float) -> None:
+    """Puts a new camera and new points of a shot into the scene, in place of those that are there.
+
+    Args:
+        scene: the scene.
+        shot: shot folder.
+        camera: not in any scene yet.
+        cloud: the points, alike.
+        stands: where the root is put if there is none, [4, 4].
+        size: of that root.
+    """
+    name = made.name_of(shot)
+    _clear(scene, shot, but=("root",))  # what the artist hung on the root, and where it stands, stays
+    entry = made.new(scene, shot)
+    collection = entry.collection
+    if collection is None or collection not in scene.collection.children_recursive:
+        collection = entry.collection = bpy.data.collections.new(f"Splannequin {name}")
+        scene.collection.children.link(collection)
+
+    root = made.part(scene, shot, "root")
+    if root is None:
+        root = entry.root = bpy.data.objects.new(f"{name} root", None)
+        root.empty_display_type = "ARROWS"
+        root.matrix_world = Matrix(stands.tolist())
+        root.empty_display_size = size
+        collection.objects.link(root)
+    entry.camera, entry.points = camera, cloud
+    for item, kind in ((camera, "camera"), (cloud, "points")):
+        collection.objects.link(item)
+        item.parent = root
+        item.hide_select = item is cloud
+        for block in (item, item.data):  # now that the names are free
+            block.name = f"{name} {kind}"
+            if block.animation_data is not None and block.animation_data.action is not None:
+                block.animation_data.action.name = f"{block.name}Action"
+
+
+def _new_camera(shot: Path, path: contract.CameraPath) -> Any:
+    """The solved camera with its keys and the plate behind it, in no scene yet."""
+    name = made.name_of(shot)
+    data = bpy.data.cameras.new(f"{name} camera")
+    camera = bpy.data.objects.new(f"{name} camera", data)
+    data.display_size = max(_extent(path) * 0.5, 0.05)
+    _animate(camera, path)
+    _show_plate(data, shot, name)
+    return camera
+
+
+def _new_points(shot: Path, xyz: np.ndarray, rgb: np.ndarray) -> Any:
+    """The sparse points as an object, in no scene yet."""
+    name = f"{made.name_of(shot)} points"
+    cloud = bpy.data.objects.new(name, _point_mesh(name, xyz, rgb))
+    cloud.hide_render = True
+    cloud.display_type = "BOUNDS"  # Blender draws loose points black, whatever their colour: points.py draws them
+    return cloud
+
+
+def find(scene: Any, shot: Path, kind: str) -> Any | None:
+    """Our object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points). Never a copy that
+    the artist made of it."""
+    return made.part(scene, shot, _PARTS[kind])
+
+
+def remove(scene: Any, shot: Path) -> bool:
+    """Takes everything that `build` made out of the file. True if there was something.
+
+    What the artist hung on the root or put into the collection stays where it is in the scene.
+    """
+    if made.of(scene, shot) is None:
+        return False
+    was, ours = scene.camera is not None, scene.camera == made.part(scene, shot, "camera")
+    _clear(scene, shot)
+    made.drop(scene, shot)
+    if was and ours:
+        made.give_camera_back(scene)
+    return True
+
+
+def _clear(scene: Any, shot: Path, but: tuple[str, ...] = ()) -> None:
+    """Removes what was built for a shot, except for the named parts and, with them, the collection."""
+    entry = made.of(scene, shot)
+    if entry is None:
+        return
+    guesses.unmark(scene, shot)
+    for item in [getattr(entry, name) for name in made.PARTS if name not in but]:
+        if item is None or (item.users_scene and scene not in item.users_scene):
+            continue
+        for child in [c for c in item.children if c not in [getattr(entry, name) for name in made.PARTS]]:
+            stood = child.matrix_world.copy()
+            child.parent = None
+            child.matrix_world = stood
+        data, images = item.data, []
+        actions = [b.animation_data.action for b in (item, data) if b is not None and b.animation_data]
+        if item.type == "CAMERA":
+            images = [b.image for b in data.background_images]
+        bpy.data.objects.remove(item)
+        unused = [b for b in (data, *actions) if b is not None and b.users <= int(b.use_fake_user)]
+        bpy.data.batch_remove(unused)
+        bpy.data.batch_remove([i for i in images if i is not None and i.users == 0])
+    collection = entry.collection
+    if but or collection is None:
+        return
+    for item in [o for o in collection.objects if o.users_collection == (collection,)]:
+        scene.collection.objects.link(item)
+    for child in collection.children:
+        scene.collection.children.link(child)
+    bpy.data.collections.remove(collection)
+
+
+def _animate(camera: Any, path: contract.CameraPath) -> None:
+    """Keys the camera on the clip's own frame numbers, straight between keys."""
+    data = camera.data
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", axes.SENSOR_MM
+    data.sensor_height = axes.SENSOR_MM * path.height / path.width
+    camera.rotation_mode = "QUATERNION"
+    lenses = [axes.lens_from_k((f.K[0], f.K[1], f.K[2], f.K[3]), path.width, path.height) for f in path.frames]
+    varies = max(map(max, zip(*lenses))) > 0 and any(
+        max(column) - min(column) > 1e-6 * max(abs(max(column)), 1.0) for column in zip(*lenses)
+    )
+    before: Quaternion | None = None
+    places, turns = [], []
+    for matrix in axes.poses(path).tolist():
+        location, rotation, _ = Matrix(matrix).decompose()
+        if before is not None and before.dot(rotation) < 0:  # q and -q turn alike, but keys would go the long way
+            rotation.negate()
+        before = rotation
+        places.append(tuple(location))
+        turns.append(tuple(rotation))
+    frames = [frame.frame for frame in path.frames]
+    camera.location, camera.rotation_quaternion = places[-1], turns[-1]
+    data.lens, data.shift_x, data.shift_y = lenses[-1]
+    keyed = {"location": np.array(places), "rotation_quaternion": np.array(turns)}
+    compat.set_keys(camera, frames, keyed, guesses.key_types(path))
+    if varies:
+        columns = np.array(lenses).T
+        compat.set_keys(data, frames, {n: columns[i][:, None] for i, n in enumerate(("lens", "shift_x", "shift_y"))})
+
+
+def _show_plate(data: Any, shot: Path, name: str) -> None:
+    """The undistorted plate behind the camera, fitting the sensor; frame n of the scene shows file n."""
+    span = contents.plate_range(shot)
+    if span is None:
+        return
+    first, last = span
+    path = contract.ShotFolder(shot).plate(first)
+    if not path.is_file():
+        return
+    background = data.background_images.new()
+    background.image = sequences.load_sequence(path, f"Plate {name}", "srgb")
+    sequences.show_sequence(background.image_user, background.image, first, last)
+    background.frame_method = "FIT"
+    background.display_depth = "BACK"
+    background.alpha = 1.0
+    data.show_background_images = True
+
+
+def _floor(shot: Path) -> tuple[Sequence[float], float] | None:
+    """The floor that the solve found (torch_backend/solve/floor.py); None if it found none, or did not look."""
+    found = contract.read_json(contract.ShotFolder(shot).solve_record).get("floor")
+    return (found["normal"], float(found["height"])) if found else None
+
+
+def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Sparse points of the solve: xyz [P, 3] float32 in solve units, rgb [P, 3] uint8; empty without them."""
+    file = contract.ShotFolder(shot).points
+    if not file.is_file():
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    with np.load(file, allow_pickle=False) as stored:
+        return stored["xyz"].astype(np.float32), stored["rgb"].astype(np.uint8)
+
+
+def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> Any:
+    """A mesh of loose vertices with their colours in the point attribute "Col"."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(xyz))
+    mesh.vertices.foreach_set("co", np.ascontiguousarray(xyz, dtype=np.float32).ravel())
+    colour = mesh.color_attributes.new("Col", "BYTE_COLOR", "POINT")
+    rgba = np.ones((len(rgb), 4), dtype=np.float32)
+    rgba[:, :3] = rgb / 255.0
+    if len(rgb):
+        colour.data.foreach_set("color_srgb", rgba.ravel())
+    mesh.update()
+    return mesh
+
+
+def _extent(path: contract.CameraPath) -> float:
+    """Length of the diagonal of the box around the camera's path, solve units; at least 0.1."""
+    centres = axes.poses(path)[:, :3, 3]
+    return max(float(np.linalg.norm(centres.max(axis=0) - centres.min(axis=0))), 0.1)
+
+
+def _clip(path: contract.CameraPath, xyz: np.ndarray) -> tuple[float, float]:
+    """Clip distances that show every point from everywhere on the path."""
+    if not len(xyz):
+        return 0.01, 1000.0
+    reach = float(np.linalg.norm(xyz - alignment.middle(xyz), axis=1).max()) + _extent(path)
+    return max(reach * 1e-4, 1e-3), max(reach * 4.0, 100.0) if math.isfinite(reach) else 1000.0

@@ -1,0 +1,317 @@
+"""The motion matte in Blender: what the solve found to move, shown in the Image Editor, and painted over by the artist.
+
+Black stands still, white moves, grey is not known. What is painted lies in the shot, SHOT/motion_paint/NNNNNN.png, and
+goes before what the solve finds, now and after another solve.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...torch_backend import contract
+from ..process import begin, supervisor
+from ..scene import paths, sequences
+from ..shot import chosen, made
+from ..translations import tr
+from ..ui import icons
+
+_FRAME, _SHOT = "splannequin_matte", "splannequin_matte_shot"
+"""Properties of the images that are painted on: frame number, and shot folder as a .blend holds it."""
+
+
+def found_file(shot: Path, frame: int) -> Path:
+    """Where the solve keeps the matte of a frame."""
+    return contract.ShotFolder(shot).matte(frame)
+
+
+def painted_file(shot: Path, frame: int) -> Path:
+    """Where the painted one is kept."""
+    return contract.ShotFolder(shot).painted_matte(frame)
+
+
+def load_sequence(shot: Path) -> tuple[Any, int, int]:
+    """The found mattes as an image sequence, and their first and last frame. JobError if there are none."""
+    frames = sorted(int(p.stem) for p in contract.ShotFolder(shot).motion.glob("*.png") if p.stem.isdecimal())
+    if not frames:
+        raise no_matte(shot)
+    image = sequences.load_sequence(found_file(shot, frames[0]), f"Motion {made.name_of(shot)}", "srgb")
+    return image, frames[0], frames[-1]
+
+
+def no_matte(shot: Path) -> contract.JobError:
+    """The sentence for a shot that was solved before there were mattes."""
+    message = f"{made.name_of(shot)} has no motion matte here."
+    return contract.JobError(message, "Solve the camera again: its last part finds it.", contract.ExitCode.USAGE)
+
+
+def paint_image(shot: Path, frame: int) -> Any:
+    """An image to paint the matte of a frame on: the one there is, else a copy of the painted or the found matte.
+
+    JobError if the frame has neither, or a file of it cannot be read.
+    """
+    image = find_image(shot, frame)
+    if image is not None:
+        return image
+    path = next((p for p in (painted_file(shot, frame), found_file(shot, frame)) if p.is_file()), None)
+    if path is None:
+        raise contract.JobError(
+            f"Frame {frame} of {made.name_of(shot)} has no motion matte.",
+            "Go to a frame of the clip, or solve the camera again.",
+            contract.ExitCode.USAGE,
+        )
+    pixels = _pixels(path)
+    if path == painted_file(shot, frame) and found_file(shot, frame).is_file() and (pixels[..., 3] <= 0.5).any():
+        below = _pixels(found_file(shot, frame))
+        if below.shape == pixels.shape:
+            pixels = np.where(pixels[..., 3:] > 0.5, pixels, below)
+    pixels[..., 3] = 1.0
+    height, width = pixels.shape[:2]
+    image = bpy.data.images.new(f"Motion {made.name_of(shot)} {frame}", width, height)
+    image.pixels.foreach_set(pixels.ravel())
+    image.update()
+    image[_FRAME], image[_SHOT] = frame, paths.blend_path(shot)
+    return image
+
+
+def find_image(shot: Path, frame: int) -> Any | None:
+    """The image that the matte of a frame is painted on, if this file has one."""
+    return next((image for image in bpy.data.images if _of(image) == (os.path.abspath(shot), frame)), None)
+
+
+def _of(image: Any) -> tuple[str, int] | None:
+    """Shot folder and frame of an image that a matte is painted on."""
+    frame, folder = image.get(_FRAME), image.get(_SHOT)
+    if not isinstance(frame, int) or not isinstance(folder, str):
+        return None
+    return os.path.abspath(bpy.path.abspath(folder)), frame
+
+
+def save_paint(image: Any) -> Path:
+    """Writes an image of `paint_image` into its shot, whole or not at all, and makes it an image of that file.
+
+    JobError if it cannot be written.
+    """
+    known = _of(image)
+    if known is None:
+        message = f"{image.name} is no motion matte."
+        raise contract.JobError(message, "Press Paint Motion first.", contract.ExitCode.USAGE)
+    path = painted_file(Path(known[0]), known[1])
+    width, height = image.size
+    pixels = np.empty(width * height * image.channels, np.float32)
+    image.pixels.foreach_get(pixels)
+    data = packed(pixels.reshape(height, width, image.channels)[::-1])
+    try:
+        _write(path, data)
+    except OSError as error:
+        raise begin.unwritable(path, error, "Make room, or see to it that the shot's folder can be written.") from error
+    image.filepath_raw, image.file_format = paths.blend_path(path), "PNG"
+    image.source = "FILE"
+    image.reload()
+    return path
+
+
+def clear_paint(shot: Path, frame: int) -> bool:
+    """Removes the painted matte of a frame from the shot; True if there was one. The image stays in the file."""
+    path = painted_file(shot, frame)
+    if contract.is_link(path.parent) or not path.is_file():
+        return False
+    path.unlink()
+    return True
+
+
+def packed(pixels: np.ndarray) -> bytes:
+    """A PNG of [H, W, C] float32 in 0 to 1, top row first: grey, 8 bits, with alpha if any of it is transparent."""
+    height, width, channels = pixels.shape
+    planes = [pixels[..., : 3 if channels >= 3 else 1].mean(2)]
+    if channels in (2, 4) and (pixels[..., -1] < 1.0).any():
+        planes.append(pixels[..., -1])
+    rows = np.rint(np.clip(np.stack(planes, -1), 0.0, 1.0) * 255.0).astype(np.uint8).reshape(height, -1)
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 4 if len(planes) == 2 else 0, 0, 0, 0)
+    body = zlib.compress(rows.tobytes(), 2)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+def _pixels(path: Path) -> np.ndarray:
+    """A picture file as [H, W, 4] float32 as stored, bottom row first. JobError if it cannot be read."""
+    image = bpy.data.images.load(str(path))
+    try:
+        image.alpha_mode = "CHANNEL_PACKED"  # nothing is multiplied
+        width, height = image.size
+        if not (width and height):
+            raise contract.JobError(f"{path} cannot be read.", "Remove it.", contract.ExitCode.USAGE)
+        pixels = np.empty(width * height * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+        return pixels.reshape(height, width, 4)
+    finally:
+        bpy.data.images.remove(image)
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Writes beside `path`, fsyncs, renames over it. OSError, also if its folder is a link to elsewhere."""
+    if contract.is_link(path.parent):
+        raise NotADirectoryError(20, "its folder is a link", str(path))
+    path.parent.mkdir(exist_ok=True)
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    beside.unlink(missing_ok=True)
+    try:
+        with open(beside, "xb") as out:
+            out.write(data)
+            out.flush()
+            os.fsync(out.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+
+
+def _in_editor(context: Any, image: Any, mode: str) -> Any | None:
+    """Shows an image in an Image Editor, the one in this window first, else in a new window; None without windows."""
+    if bpy.app.background:
+        return None
+    windows = sorted(context.window_manager.windows, key=lambda window: window != context.window)
+    areas = [area for window in windows for area in window.screen.areas if area.type == "IMAGE_EDITOR"]
+    if not areas:
+        bpy.ops.wm.window_new()
+        areas = [context.window_manager.windows[-1].screen.areas[0]]
+        areas[0].type = "IMAGE_EDITOR"
+    space = areas[0].spaces.active
+    space.image = image
+    space.ui_mode = mode
+    return space
+
+
+class _Matte:
+    """What the operators share: off without a solve, the shot of the scene, errors in words."""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off without a solve."""
+        folder = chosen.shot_folder(context.scene)
+        state = supervisor.watch_of(folder).state if folder else None
+        if state is None or not state.solve:
+            cls.poll_message_set(tr("Solve the camera first"))  # type: ignore[attr-defined]
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Does it; a refusal is reported."""
+        shot = chosen.shot_folder(context.scene)
+        if shot is None:
+            return {"CANCELLED"}
+        try:
+            self.report({"INFO"}, tr(self.act(context, shot)))  # type: ignore[attr-defined]
+        except contract.JobError as error:
+            self.report({"ERROR"}, f"{tr(error.message)} {tr(error.hint)}".strip())  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def act(self, context: Any, shot: Path) -> str:
+        """What it does; returns what was done, for people."""
+        raise NotImplementedError
+
+
+class SPLANNEQUIN_OT_show_motion(_Matte, bpy.types.Operator):
+    """Show in an Image Editor what the solve found to move by itself: black stands still, white moves, grey is not
+    known"""
+
+    bl_idname = "splannequin.show_motion"
+    bl_label = "Show Motion"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: Any, shot: Path) -> str:
+        """Loads the mattes as a sequence."""
+        image, first, last = load_sequence(shot)
+        space = _in_editor(context, image, "VIEW")
+        if space is not None:
+            sequences.show_sequence(space.image_user, image, first, last)
+        return f"The motion matte has frames {first} to {last}."
+
+
+class SPLANNEQUIN_OT_paint_motion(_Matte, bpy.types.Operator):
+    """Paint over the motion matte of the current frame in an Image Editor: black where it stands still, white where it
+    moves"""
+
+    bl_idname = "splannequin.paint_motion"
+    bl_label = "Paint Motion"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: Any, shot: Path) -> str:
+        """Makes the image to paint on."""
+        frame = context.scene.frame_current
+        _in_editor(context, paint_image(shot, frame), "PAINT")
+        return f"Paint on frame {frame}, then press Save Paint."
+
+
+class SPLANNEQUIN_OT_save_motion(_Matte, bpy.types.Operator):
+    """Keep what was painted on the motion matte of the current frame in the shot: freezes from now on follow it"""
+
+    bl_idname = "splannequin.save_motion"
+    bl_label = "Save Motion Paint"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: Any, shot: Path) -> str:
+        """Writes the current frame's image."""
+        frame = context.scene.frame_current
+        image = find_image(shot, frame)
+        if image is None:
+            message = f"Nothing is painted on frame {frame}."
+            raise contract.JobError(message, "Press Paint Motion first.", contract.ExitCode.USAGE)
+        save_paint(image)
+        return f"Frame {frame} of the motion matte is as you painted it."
+
+
+class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
+    """Delete what was painted on the motion matte of the current frame from the shot folder on disk, after a question:
+    what the solve found holds again"""
+
+    bl_idname = "splannequin.clear_motion"
+    bl_label = "Clear Motion Paint"
+    bl_options = {"REGISTER"}
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Asks first: what is removed from disk does not come back with undo."""
+        return context.window_manager.invoke_confirm(
+            self, event, title="Delete the painted matte of this frame from disk?",
+            message="What the solve found holds again. This cannot be undone.", confirm_text="Remove", icon="WARNING",
+        )  # fmt: skip
+
+    def act(self, context: Any, shot: Path) -> str:
+        """Removes the current frame's file."""
+        frame = context.scene.frame_current
+        try:
+            gone = clear_paint(shot, frame)
+        except OSError as error:
+            raise begin.unwritable(painted_file(shot, frame), error, "Close it elsewhere, then try again.") from error
+        if not gone:
+            raise contract.JobError(f"Nothing is painted on frame {frame}.", "", contract.ExitCode.USAGE)
+        return f"Frame {frame} of the motion matte is as the solve found it."
+
+
+def draw(layout: Any) -> None:
+    """The buttons."""
+    row = layout.row(align=True)
+    for name in ("splannequin.show_motion", "splannequin.paint_motion"):
+        row.operator(name, icon=icons.of(name))
+    row = layout.row(align=True)
+    row.operator("splannequin.save_motion", text="Save Paint", icon=icons.of("splannequin.save_motion"))
+    row.operator("splannequin.clear_motion", text="Clear", icon=icons.of("splannequin.clear_motion"))
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_show_motion,
+    SPLANNEQUIN_OT_paint_motion,
+    SPLANNEQUIN_OT_save_motion,
+    SPLANNEQUIN_OT_clear_motion,
+)

@@ -1,0 +1,195 @@
+"""The button Solve, the camera in the scene, and what other programs get of a solve: cameras and ST maps."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from ...torch_backend import contract
+from ..process import children, supervisor
+from ..shot import chosen
+from ..translations import tr
+from ..ui import step_operator
+from . import arrival, exchange, stmaps
+
+FORMATS = [
+    ("colmap", "COLMAP", "Cameras, images and points3D as .bin, of the plates in the shot's folder frames"),
+    ("colmap_text", "COLMAP Text", "The same as .txt"),
+    ("nerfstudio", "nerfstudio", "A transforms.json that points to the plates, and points.ply"),
+]
+
+
+class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
+    """Write the solved cameras and points of the undistorted frames for other programs"""
+
+    bl_idname = "splannequin.export_cameras"
+    bl_label = "Export Cameras"
+    bl_options = {"REGISTER"}
+
+    directory: StringProperty(
+        name="Folder", description="Folder to write into", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
+    filter_folder: bpy.props.BoolProperty(
+        name="Folders", description="Show folders", default=True, options={"HIDDEN", "SKIP_SAVE"}
+    )
+    format: EnumProperty(name="Format", description="What to write", items=FORMATS)
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off without a solve."""
+        folder = chosen.shot_folder(context.scene)
+        state = supervisor.watch_of(folder).state if folder else None
+        if state is None or not state.solve:
+            cls.poll_message_set(tr("Solve the camera first"))
+            return False
+        return True
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Asks for a folder."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Has the backend write; in a window the panel tells when it is done."""
+        shot = chosen.shot_folder(context.scene)
+        if shot is None or not self.directory:
+            self.report({"ERROR"}, "No folder was given")
+            return {"CANCELLED"}
+        folder = Path(os.path.abspath(bpy.path.abspath(self.directory)))
+        kind, _, text = self.format.partition("_")
+        try:
+            asked = exchange.begin_export(shot, kind, folder, bool(text))
+            if bpy.app.background:
+                self.report({"INFO"}, exchange.exported(asked, folder))
+                return {"FINISHED"}
+        except contract.JobError as error:
+            self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            return {"CANCELLED"}
+        supervisor.watch_of(shot).failures.pop("solve", None)
+        supervisor.when_answered(asked, lambda: tell(shot, lambda: [exchange.exported(asked, folder)]))
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_solve_camera(step_operator.StepOperator, bpy.types.Operator):
+    """Find where the camera was on every frame, and bring it in as an animated camera with the plate behind it"""
+
+    bl_idname = "splannequin.solve_camera"
+    bl_label = "Solve Camera"
+    bl_options = {"REGISTER"}
+    step = "solve"
+
+
+class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
+    """Bring the solved camera, its plate and the points into this scene, in place of an earlier solve of this shot"""
+
+    bl_idname = "splannequin.load_camera"
+    bl_label = "Load Camera"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Builds camera and points."""
+        outcome = step_operator.edit(self, context, "solve", arrival.load_camera)
+        if outcome == {"FINISHED"} and context.window is not None:
+            supervisor.look_through_camera(context.window)
+        return outcome
+
+
+class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
+    """Write two ST maps into the shot's solve folder: one takes the original's lens distortion out, the other puts it
+    back onto what you made over the undistorted plate"""
+
+    bl_idname = "splannequin.write_stmaps"
+    bl_label = "Write ST Maps"
+    bl_options = {"REGISTER"}
+
+    width: bpy.props.IntProperty(
+        name="Width", description="Width of the maps in pixels; 0: that of the working frames", default=0, min=0
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off without a solve, while a step runs, and while the maps are being written."""
+        folder = chosen.shot_folder(context.scene)
+        watch = supervisor.watch_of(folder) if folder else None
+        if watch is None or watch.state is None or not watch.state.solve:
+            cls.poll_message_set(tr("Solve the camera first"))
+            return False
+        if watch.running():
+            cls.poll_message_set(tr("A step of this shot is running"))
+            return False
+        if folder in writing:
+            cls.poll_message_set(tr("The maps are being written"))
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Starts the backend; headless, waits for it."""
+        folder = chosen.shot_folder(context.scene)
+        if folder is None:
+            return {"CANCELLED"}
+        try:
+            asked = stmaps.begin(folder, self.width)
+        except contract.JobError as error:
+            self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            return {"CANCELLED"}
+        watch = supervisor.watch_of(folder)
+        watch.failures.pop("solve", None)
+        if not bpy.app.background:
+            watch.notes["solve"] = ["Writing the ST maps."]
+            follow_stmaps(folder, asked)
+            return {"FINISHED"}
+        asked.wait()
+        tell(folder, lambda: stmaps.sentences(stmaps.answer(asked)))
+        if "solve" in watch.failures:
+            self.report({"ERROR"}, watch.failures["solve"][0])
+            return {"CANCELLED"}
+        for line in watch.notes["solve"]:
+            self.report({"INFO"}, line)
+        return {"FINISHED"}
+
+
+writing: set[Path] = set()
+"""Shots whose ST maps are being written."""
+
+
+def follow_stmaps(shot: Path, asked: children.Question) -> None:
+    """Tells of a shot's ST maps on the panel once they are written."""
+
+    def written() -> None:
+        writing.discard(shot)
+        tell(shot, lambda: stmaps.sentences(stmaps.answer(asked)))
+
+    writing.add(shot)
+    supervisor.when_answered(asked, written)
+
+
+def tell(shot: Path, say: Callable[[], list[str]]) -> None:
+    """Puts what the backend answered, as `say` tells it or why it cannot, where the panel of the step shows it."""
+    watch = supervisor.watch_of(shot)
+    watch.notes.pop("solve", None)
+    try:
+        watch.notes["solve"] = say()
+    except (contract.JobError, ValueError, KeyError) as error:
+        watch.fail("solve", error)
+
+
+def register() -> None:
+    """Nothing is being written yet."""
+
+
+def unregister() -> None:
+    """Stops waiting. A backend that is writing finishes by itself."""
+    writing.clear()
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_solve_camera,
+    SPLANNEQUIN_OT_load_camera,
+    SPLANNEQUIN_OT_export_cameras,
+    SPLANNEQUIN_OT_write_stmaps,
+)

@@ -1,0 +1,69 @@
+"""The panel of the step Solve."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..process import steps
+from ..ui import icons, step_panel
+from ..ui.sentences import wrap
+from . import align_operators, cameras, mattes
+
+
+def can_load_camera(running: str | None) -> bool:
+    """True unless a step runs that makes another solve; the others leave this one as it is."""
+    return running not in ("import", "solve")
+
+
+class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
+    """Step 2: where the camera was"""
+
+    bl_label = "2  Solve"
+    bl_idname = "SPLANNEQUIN_PT_camera"
+    step = "solve"
+    operator = "splannequin.solve_camera"
+    folds = "camera"
+
+    def draw(self, context: Any) -> None:
+        """The step's body, and where the solve stands in the scene."""
+        super().draw(context)
+        watch = self._watch(context)
+        body = step_panel.sub_panel(self.layout, "camera_motion", "Motion Matte")  # type: ignore[attr-defined]
+        if body is not None:
+            mattes.draw(body)
+        if watch is None or cameras.find(context.scene, watch.shot, "EMPTY") is None:
+            return
+        if not align_operators.scaled(context.scene, watch.shot):
+            layout = self.layout  # type: ignore[attr-defined]
+            wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")
+            layout.operator("splannequin.align_scale", icon=icons.of("splannequin.align_scale")).selected = False
+        body = step_panel.sub_panel(self.layout, "camera_alignment", "Alignment")  # type: ignore[attr-defined]
+        if body is not None:
+            align_operators.draw(body)
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """The lens, where cameras come from, and where they go."""
+        props = context.scene.splannequin
+        layout.prop(props, "camera_model")
+        layout.prop(props, "cameras_from")
+        if props.cameras_from == "FILE":
+            layout.prop(props, "cameras_path", text="")
+        elif props.cameras_from == "TRACKING":
+            layout.prop(props, "tracking_clip", text="")
+        for name in ("splannequin.export_cameras", "splannequin.write_stmaps"):
+            layout.operator(name, icon=icons.of(name))
+
+    def _button(self, context: Any, layout: Any, view: steps.View, running: str | None) -> None:
+        watch = self._watch(context)
+        if view.done and watch and cameras.find(context.scene, watch.shot, "CAMERA") is None:
+            row = layout.row()
+            row.scale_y = 1.4
+            row.enabled = can_load_camera(running)
+            row.operator("splannequin.load_camera", icon=icons.of("splannequin.load_camera"))
+            return
+        super()._button(context, layout, view, running)
+
+
+CLASSES = (SPLANNEQUIN_PT_camera,)

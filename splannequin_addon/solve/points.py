@@ -1,0 +1,84 @@
+"""The sparse points of a solve in their own colours. Blender draws a mesh's loose points black in solid view, so the
+object shows its bounds only, and as long as its eye is open its points are drawn here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from gpu_extras.batch import batch_for_shader
+
+from ..process import children
+from ..shot import chosen, made
+
+_SIZE = 3.0
+"""Pixels of a point."""
+_handler: Any = None
+_kept: tuple[Any, ...] = ()
+"""(key of the mesh, shader, batch) of the points drawn last."""
+
+
+def coloured(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Places [P, 3] and colours [P, 4] sRGB of a cloud's mesh, float32."""
+    places = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", places)
+    colours = np.full((len(mesh.vertices), 4), 0.9, np.float32)
+    layer = mesh.color_attributes.get("Col")
+    if layer is not None and len(layer.data) == len(colours):
+        flat = np.empty(colours.size, np.float32)
+        layer.data.foreach_get("color_srgb", flat)
+        colours = flat.reshape(-1, 4)
+    return places.reshape(-1, 3), colours
+
+
+def _draw() -> None:
+    """One 3D view's part."""
+    global _kept
+    context = bpy.context
+    if context.space_data is None or not context.space_data.overlay.show_overlays:
+        return
+    shot = chosen.shot_folder(context.scene)
+    cloud = made.part(context.scene, shot, "points") if shot is not None else None
+    if cloud is None or cloud.display_type != "BOUNDS" or not cloud.visible_get() or not len(cloud.data.vertices):
+        return
+    key = (cloud.data.name, len(cloud.data.vertices), tuple(cloud.data.vertices[0].co), str(shot))
+    if not _kept or _kept[0] != key:
+        names = ("POINT_FLAT_COLOR", "FLAT_COLOR") if bpy.app.version >= (4, 5, 0) else ("FLAT_COLOR",)
+        shader = _first_shader(names)
+        places, colours = coloured(cloud.data)
+        _kept = (key, shader, batch_for_shader(shader, "POINTS", {"pos": places, "color": colours}))
+    gpu.state.depth_test_set("LESS_EQUAL")
+    gpu.state.point_size_set(_SIZE * context.preferences.system.ui_scale)
+    with gpu.matrix.push_pop():
+        gpu.matrix.multiply_matrix(cloud.matrix_world)
+        _kept[2].draw(_kept[1])
+    gpu.state.point_size_set(1.0)
+    gpu.state.depth_test_set("NONE")
+
+
+def _first_shader(names: tuple[str, ...]) -> Any:
+    for name in names[:-1]:
+        try:
+            return gpu.shader.from_builtin(name)
+        except ValueError:
+            continue
+    return gpu.shader.from_builtin(names[-1])
+
+
+def register() -> None:
+    """Draws from now on, where there is a window."""
+    global _handler
+    if not bpy.app.background:
+        _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+        children.import_beside("zipfile")  # numpy does to open a solve's points: 0.2 s from a cold disk
+
+
+def unregister() -> None:
+    """Draws no more."""
+    global _handler, _kept
+    if _handler is not None:
+        bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
+    _handler, _kept = None, ()

@@ -1,0 +1,67 @@
+"""The step Solve: what it asks the backend for, what its end changes, and what the panel says of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ...torch_backend import contract
+from ..footage import plate
+from ..process import jobs, supervisor
+from ..process.steps import Step, View
+from ..shot import chosen, made
+from ..shot.shot_state import ShotState
+from . import align_operators, arrival, cameras, exchange, guesses, mattes, operators, panel, points
+
+
+class Solve(Step):
+    """Where the camera was, and what moves."""
+
+    name = "solve"
+    label = "Solve"
+    kind = "solve"
+    button = "Solve Camera"
+    again = "Solve Again"
+    needs = "Import the clip first."
+    classes = (*operators.CLASSES, *align_operators.CLASSES, *mattes.CLASSES, *panel.CLASSES)
+    parts = (points, align_operators, operators)
+
+    def params(self, scene: Any) -> contract.SolveParams:
+        """The lens, and where cameras come from."""
+        return exchange.params(scene, chosen.shot_folder(scene))
+
+    def view(self, scene: Any, state: ShotState | None) -> View:
+        """Camera: how good the solve is."""
+        if state is None or not state.frames:
+            return View(False, False, [], self.needs)
+        if not state.solve:
+            return View(False, True, [], "Find where the camera was on every frame.")
+        told = state.solve.get("result", state.solve)
+        lines = [line for line in (told.get("quality"), guesses.told(told)) if line]
+        if cameras.find(scene, state.folder, "CAMERA") is None:
+            return View(True, True, lines, "The solve is not in this scene: load it.")
+        return View(True, True, lines, "Look through the camera, then train.")
+
+    def finish(self, scene: Any, job: jobs.Job) -> list[str]:
+        """Camera, plate and points come into the scene."""
+        return arrival.load_camera(scene, job.shot)
+
+    def look(self, window: Any, scene: Any, shot: Path) -> None:
+        """Through the solved camera."""
+        supervisor.look_through_camera(window)
+
+    def logs(self, job: jobs.Job) -> list[Path]:
+        """The job's own log, and what COLMAP said."""
+        return [*super().logs(job), contract.ShotFolder(job.shot).colmap_log]
+
+    def stands(self, scene: Any, shot: Path) -> bool:
+        """True if camera, points or plate of a shot are in the scene."""
+        return made.of(scene, shot) is not None
+
+    def remove(self, scene: Any, shot: Path, others: list[Path]) -> list[str]:
+        """Takes camera, points and plate out of the file."""
+        plate.remove(scene, shot)
+        return ["Camera and points were removed."] if cameras.remove(scene, shot) else []
+
+
+STEP = Solve()

@@ -1,0 +1,1 @@
+"""The step Train: learning the scene."""

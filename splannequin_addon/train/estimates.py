@@ -1,0 +1,56 @@
+"""What a preset costs on this machine, from what the shot's own runs took. No bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ...torch_backend import contract
+from ..shot.shot_state import ShotState
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What training with a preset comes to."""
+
+    preset: str
+    """preview, standard or final."""
+    width: int
+    """Width in pixels of the training images."""
+    steps: int
+    """Training steps."""
+    seconds: float | None
+    """How long it takes; None if nothing was timed yet."""
+    measured: bool
+    """A run of this preset was timed; else `seconds` goes by pixels and steps of another's."""
+
+
+def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
+    """The cost of every preset, and the run that it was told from, None if the shot has none that was timed."""
+    timed = sorted((r for r in state.runs.values() if _per_step(r)), key=_size) if state is not None else []
+    # Where nothing may move a step is several times as fast.
+    timed = [run for run in timed if run.get("method") != "static"] or timed
+    across = state.size[0] if state is not None else 0
+    rows = []
+    for preset, steps in contract.PRESET_STEPS.items():
+        width = min(contract.PRESET_WIDTHS[preset], across or contract.PRESET_WIDTHS[preset])
+        own = [run for run in timed if run.get("preset") == preset and run.get("width_px") == width]
+        nearest = own[-1:] or timed[-1:]
+        seconds = None
+        for run in nearest:
+            seconds = steps * _per_step(run) * (width / run["width_px"]) ** 2
+        rows.append(Cost(preset, width, steps, seconds, bool(own)))
+    return rows, timed[-1] if timed else None
+
+
+def _size(run: dict[str, Any]) -> tuple[int, int]:
+    """The larger and longer, the more a run's time tells of others'."""
+    return run["width_px"], run["iterations"]
+
+
+def _per_step(run: dict[str, Any]) -> float:
+    """Seconds a step of a run took; 0 if its figures do not tell."""
+    spent, steps, width = run.get("train_seconds"), run.get("iterations"), run.get("width_px")
+    if not all(isinstance(n, int | float) and n > 0 for n in (spent, steps, width)):
+        return 0.0
+    return float(spent) / float(steps)  # type: ignore[arg-type]

@@ -1,0 +1,65 @@
+"""The button Train, and the buttons of the list of runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.props import StringProperty
+
+from ..translations import tr
+from ..ui import pick_operators, step_operator
+from .settings import PRESETS
+
+
+class SPLANNEQUIN_OT_train(step_operator.StepOperator, bpy.types.Operator):
+    """Learn the scene and what moves in it from the clip"""
+
+    bl_idname = "splannequin.train"
+    bl_label = "Train"
+    bl_options = {"REGISTER"}
+    step = "train"
+
+
+class SPLANNEQUIN_OT_pick_run(pick_operators.Pick, bpy.types.Operator):
+    """Work with this run: it is shown, frozen from, and trained on"""
+
+    bl_idname = "splannequin.pick_run"
+    bl_label = "Pick Run"
+    bl_options = {"REGISTER", "UNDO"}
+
+    name: StringProperty(name="Run", description="Name of the run", options={"SKIP_SAVE"})
+
+    def execute(self, context: Any) -> set[str]:
+        """Sets the run's name, and the preset that it was trained with."""
+        state = pick_operators.known(context)[1]
+        run = state.runs.get(self.name) or state.unfinished.get(self.name)
+        if run is None:
+            refusal = state.damaged["run"].get(self.name) or f"This shot has no run {self.name!r}"
+            self.report({"ERROR"}, tr(refusal))
+            return {"CANCELLED"}
+        settings = context.scene.splannequin
+        settings.run_name = self.name
+        if run.get("preset") in [preset[0] for preset in PRESETS]:
+            settings.preset = run["preset"]
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_remove_run(pick_operators.Remove, bpy.types.Operator):
+    """Delete this run from the shot folder on disk, after a question. Takes that were frozen from it stay"""
+
+    bl_idname = "splannequin.remove_run"
+    bl_label = "Remove Run"
+    bl_options = {"REGISTER", "INTERNAL"}
+    kind = "run"
+    question = "Delete this training run from disk?"
+    warning = "Takes that were frozen from it stay, but cannot be completed. This cannot be undone."
+
+    name: StringProperty(name="Run", description="Name of the run to delete", options={"SKIP_SAVE"})
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_train,
+    SPLANNEQUIN_OT_pick_run,
+    SPLANNEQUIN_OT_remove_run,
+)

@@ -1,0 +1,121 @@
+"""The panel of the step Train."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..process import steps
+from ..shot.shot_state import ShotState
+from ..ui import listing, step_panel
+from ..ui.sentences import cells, wrap
+from . import estimates, pictures, training
+from .settings import PRESETS
+
+_PRESET_WIDTHS = (0.32, 0.17, 0.25, 0.26)
+
+
+class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
+    """Step 3: training"""
+
+    bl_label = "3  Train"
+    bl_idname = "SPLANNEQUIN_PT_train"
+    step = "train"
+    operator = "splannequin.train"
+    folds = "train"
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """The preset; what the button will do to the run that is there."""
+        props = context.scene.splannequin
+        watch, plan = self._watch(context), self._plan(context)
+        self._presets(context, layout, watch.state if watch is not None else None)
+        if watch is None or watch.running() is not None:
+            return
+        if plan.kind == "extend":
+            layout.prop(props, "extend_steps")
+        if plan.words:
+            wrap(layout, context, plan.words, "PAUSE" if self._paused(context) else "INFO")
+
+    def _presets(self, context: Any, layout: Any, state: ShotState | None) -> None:
+        """A button for each preset: how large, how many steps, how long on this machine."""
+        props, (rows, told) = context.scene.splannequin, estimates.costs(state)
+        column = layout.column(align=True)
+        head = cells(column.row(align=True), _PRESET_WIDTHS)
+        for place, text in zip(head, ("Preset", "Pixels", "Steps", "Time"), strict=True):
+            place.label(text=text)
+        names = {name: label for name, label, _ in PRESETS}
+        for row in rows:
+            columns = cells(column.row(align=True), _PRESET_WIDTHS)
+            columns[0].prop_enum(props, "preset", row.preset, text=names[row.preset])
+            spent = "-" if row.seconds is None else step_panel.minutes(row.seconds) + ("" if row.measured else " ?")
+            for place, text in zip(columns[1:], (str(row.width), f"{row.steps / 1000:g}k", spent), strict=True):
+                place.label(text=text, translate=False)
+        if told is None:
+            words = "Preview took 150 s on two cores without a graphics card. Times here come with the first run."
+        else:
+            where = "graphics card" if told.get("device") == "cuda" else "processor"
+            words = f"By what run {told.get('run', '')} took on the {where}. With a ?: an estimate by pixels and steps."
+        wrap(layout, context, words)
+
+    def _plan(self, context: Any) -> training.Plan:
+        props, watch = context.scene.splannequin, self._watch(context)
+        return training.plan(watch.state if watch else None, props.run_name, props.preset)
+
+    def _label(self, context: Any, view: steps.View) -> str:
+        return self._plan(context).button
+
+    def _paused(self, context: Any) -> bool:
+        return self._plan(context).kind in ("resume", "extension")
+
+    def draw(self, context: Any) -> None:
+        """The step's body, and the training in pictures."""
+        super().draw(context)
+        watch = self._watch(context)
+        if watch is None or watch.state is None:
+            return
+        self._runs(context, watch.state)
+        name, job = context.scene.splannequin.run_name, watch.jobs.get("train")
+        run = watch.state.runs.get(name) or watch.state.unfinished.get(name) or {}
+        going = job is not None and watch.running() == "train"
+        if going and job is not None:
+            picture, points = job.images.get("preview"), training.history(run, job.history)
+        elif run:
+            picture, points = run.get("preview"), run.get("history", [])
+        else:
+            return
+        body = step_panel.sub_panel(self.layout, "train_pictures", "Progress", folded=False)  # type: ignore[attr-defined]
+        if body is None:
+            return
+        icon = pictures.icon_of(Path(picture)) if picture else 0
+        if icon:
+            body.template_icon(icon_value=icon, scale=8.0)
+        icon = pictures.plot(points)
+        if icon:
+            body.template_icon(icon_value=icon, scale=5.0)
+        if points:
+            (_, first), (seconds, last) = points[0], points[-1]
+            wrap(
+                body,
+                context,
+                f"{first:.1f} to {last:.1f} dB on frames kept out, in {step_panel.minutes(seconds)}",
+                "NONE",
+            )
+
+    def _runs(self, context: Any, state: ShotState) -> None:
+        """All runs of the shot, to compare and pick."""
+        if not state.listed("run"):
+            return
+        body = step_panel.sub_panel(self.layout, "runs", "Runs")  # type: ignore[attr-defined]
+        if body is not None:
+            listing.draw(body, "run", state, context.scene.splannequin.run_name)
+            for told in state.damaged["run"].values():
+                wrap(body, context, told, "ERROR")
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """The run's name."""
+        layout.prop(context.scene.splannequin, "run_name")
+
+
+CLASSES = (SPLANNEQUIN_PT_train,)

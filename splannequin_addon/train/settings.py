@@ -1,0 +1,57 @@
+"""What the artist sets for the training."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bpy.props import EnumProperty, IntProperty, StringProperty
+
+from ...torch_backend import contract
+from ..process import supervisor
+from ..shot import chosen
+from ..translations import tr
+
+PRESETS: list[tuple[str, str, str]] = contract.panel(contract.TrainParams, "preset")["items"]
+"""(identifier, name, tooltip) of each."""
+
+
+def runs_of(props: Any) -> list[tuple[str, str]]:
+    """(name, what it is) of the runs of the shot that `props` names, for the field's list."""
+    folder = chosen.shot_folder(props.id_data)
+    state = supervisor.watch_of(folder).state if folder else None
+    runs = state.runs.items() if state is not None else ()
+    return [
+        (name, tr(f"{run.get('heldout_psnr_db') or 0:.1f} dB, {run.get('gaussians', 0):,} Gaussians"))
+        for name, run in runs
+    ]
+
+
+def _third_of(steps: int) -> int:
+    return round(steps / 3)
+
+
+def _preset_chosen(props: Any, context: Any) -> None:
+    """More steps are a third of the preset's unless the artist says otherwise."""
+    props.extend_steps = _third_of(contract.PRESET_STEPS[props.preset])
+
+
+class TrainSettings:
+    """Preset and run of a shot."""
+
+    preset: EnumProperty(
+        **contract.panel(contract.TrainParams, "preset"),
+        options=set(),
+        update=_preset_chosen,
+    )
+    extend_steps: IntProperty(
+        **contract.panel(contract.TrainParams, "extend", _third_of(contract.PRESET_STEPS["preview"])),
+        min=10,
+        soft_max=30_000,
+        options=set(),
+    )
+    run_name: StringProperty(
+        **contract.panel(contract.TrainParams, "run"),
+        options=set(),
+        search=lambda props, context, text: runs_of(props),
+        search_options={"SUGGESTION"},
+    )

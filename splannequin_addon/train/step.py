@@ -1,0 +1,56 @@
+"""The step Train: what it asks the backend for, and what the panel says of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...torch_backend import contract
+from ..process import backend, jobs
+from ..process.steps import Step, View
+from ..shot import chosen, contents
+from ..shot.shot_state import ShotState
+from . import operators, panel, pictures, training
+
+
+class Train(Step):
+    """Learning the scene and what moves in it."""
+
+    name = "train"
+    label = "Train"
+    kind = "train"
+    button = "Train"
+    again = "Train On"
+    needs = "Solve the camera first."
+    classes = (*operators.CLASSES, *panel.CLASSES)
+    parts = (pictures,)
+
+    def params(self, scene: Any) -> contract.TrainParams:
+        """The preset, or how a run that is there goes on."""
+        props, folder = scene.splannequin, chosen.shot_folder(scene)
+        state = contents.read(folder) if folder is not None else None
+        return training.params(state, props.run_name, props.preset, props.extend_steps, backend.device())
+
+    def view(self, scene: Any, state: ShotState | None) -> View:
+        """Train: how good the run is."""
+        if state is None or not state.solve:
+            return View(False, False, [], self.needs)
+        run = state.runs.get(scene.splannequin.run_name)
+        if run is None and scene.splannequin.run_name in state.unfinished:
+            return View(False, True, [], "Resume it, or pick another run.")
+        if run is None:
+            return View(False, True, [], "Learn the scene and what moves in it.")
+        psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
+        quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
+        size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % may move"
+        verdict = contract.verdict_lines(run)
+        if run.get("quality") == "Poor" and not verdict:  # trained by an older version
+            verdict = ["It is poor: take a range in which nobody walks, or solve the camera again."]
+        lines = [f"Run {scene.splannequin.run_name}: {quality}", size, *verdict]
+        return View(True, True, lines, "Next: freeze an instant.")
+
+    def began(self, job: jobs.Job) -> None:
+        """A run that is trained anew writes other pictures under the same names."""
+        pictures.forget()
+
+
+STEP = Train()

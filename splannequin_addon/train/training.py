@@ -1,0 +1,78 @@
+"""What the Train button will do: begin, go on where it was paused, add steps, or begin anew. No bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ...torch_backend import contract
+from ..shot import checkpoints
+from ..shot.shot_state import ShotState
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What pressing the button comes to."""
+
+    kind: str
+    """train, resume, extension (go on with steps that were begun to be added), extend, or anew."""
+    button: str
+    """What the button says."""
+    words: str
+    """What will happen, in a sentence; empty if that needs no saying."""
+
+
+def plan(state: ShotState | None, run: str, preset: str) -> Plan:
+    """What training the run of a name with a preset means, as the shot stands."""
+    finished = state.runs.get(run) if state is not None else None
+    paused = state.unfinished.get(run) if state is not None else None
+    told = finished or paused
+    if told is None:
+        return Plan("train", "Train", "")
+    if _goes_on(told, preset):
+        words = "Paused while the run was trained anew. The run is as it was until the new one is done."
+        return Plan("resume", "Resume", words)
+    if told.get("other_cameras"):
+        return Plan(
+            "anew", "Train Anew", "The camera was solved again: training begins anew and replaces this run when done. "
+            "Give the run another name to keep it."
+        )  # fmt: skip
+    if told.get("preset", preset) != preset:
+        return Plan(
+            "anew", "Train Anew", "This run has another preset: training begins anew and replaces it when done. "
+            "Give the run another name to keep it."
+        )  # fmt: skip
+    if finished is None:
+        return Plan("resume", "Resume", "Paused. It goes on exactly where it stopped.")
+    if finished.get("extension") is not None:
+        return Plan("extension", "Resume", "Paused while steps were added. The run is as it was until all are done.")
+    return Plan("extend", "Train On", "Adds these steps to the run. It stays as it is until all are done.")
+
+
+def _goes_on(told: dict[str, Any], preset: str) -> bool:
+    """True if a run is being trained anew with a preset, on the cameras that the shot has."""
+    anew = told.get("anew")
+    return anew is not None and anew["preset"] == preset and not anew["other_cameras"]
+
+
+def params(state: ShotState | None, run: str, preset: str, steps: int, device: str) -> contract.TrainParams:
+    """What the backend is asked for; `steps` is how many are added if the run is finished."""
+    kind = plan(state, run, preset).kind
+    if state is not None and kind == "resume":
+        # Its own settings, not the panel's: a run that was begun on the command line goes on too.
+        told = state.runs.get(run) or state.unfinished[run]
+        settings = checkpoints.params_of((told["anew"] if _goes_on(told, preset) else told)["config"])
+        return contract.TrainParams(run=run, device=device, **settings)
+    extend = 0
+    if state is not None and kind == "extension":
+        extend = int(state.runs[run]["extension"]["steps"])
+    elif kind == "extend":
+        extend = steps
+    return contract.TrainParams(run=run, preset=preset, device=device, extend=extend)
+
+
+def history(told: dict[str, Any], now: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """(seconds, dB) of a run, or of the one that will take its place, what a job measures `now` after what is known
+    from before it."""
+    before = (told.get("anew") or told).get("history", [])
+    return [point for point in before if not now or point[0] < now[0][0]] + list(now)

@@ -1,0 +1,1 @@
+"""What the steps' panels and operators share, the menu, the preferences."""

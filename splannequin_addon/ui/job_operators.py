@@ -1,0 +1,65 @@
+"""Plumbing of running jobs: cancel, see the log."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.props import StringProperty
+
+from ...torch_backend import contract
+from ..process import jobs, steps, supervisor
+from ..shot import chosen
+from ..translations import tr
+
+
+class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
+    """Stop this step. It saves what it has first, so that it can go on later; pressed again after 20 seconds, it is
+    ended by force"""
+
+    bl_idname = "splannequin.cancel"
+    bl_label = "Cancel Step"
+    bl_options = {"REGISTER"}
+
+    step: StringProperty(
+        name="Step", description="Name of the step to cancel; empty: the one that runs", options={"SKIP_SAVE"}
+    )
+
+    def execute(self, context: Any) -> set[str]:
+        """Asks the job to stop."""
+        folder = chosen.shot_folder(context.scene)
+        watch = supervisor.watch_of(folder) if folder else None
+        job = watch.jobs.get(steps.current(self.step) or watch.running() or "") if watch else None
+        if job is None or job.ended:
+            self.report({"WARNING"}, "Nothing is running")
+            return {"CANCELLED"}
+        try:
+            jobs.cancel(job)
+        except (contract.JobError, OSError) as error:
+            self.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
+    """Open the log of this step in the system's viewer"""
+
+    bl_idname = "splannequin.open_log"
+    bl_label = "Open Log"
+    bl_options = {"INTERNAL"}
+
+    step: StringProperty(name="Step", description="Name of the step", options={"SKIP_SAVE"})
+
+    def execute(self, context: Any) -> set[str]:
+        """Opens it."""
+        folder = chosen.shot_folder(context.scene)
+        job = supervisor.watch_of(folder).jobs.get(steps.current(self.step)) if folder else None
+        log = steps.STEPS[steps.current(self.step)].log(job) if job is not None else None
+        if log is None:
+            self.report({"WARNING"}, "There is no log")
+            return {"CANCELLED"}
+        bpy.ops.wm.path_open(filepath=str(log))
+        return {"FINISHED"}
+
+
+CLASSES = (SPLANNEQUIN_OT_cancel, SPLANNEQUIN_OT_open_log)

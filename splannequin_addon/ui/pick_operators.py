@@ -1,0 +1,81 @@
+"""What picking and removing runs and takes of a shot share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from ..process import jobs, steps, supervisor
+from ..shot import chosen
+from ..translations import tr
+from . import listing
+
+
+def known(context: Any) -> tuple[supervisor.Watch | None, Any]:
+    """The shot's watch and what its folder holds."""
+    folder = chosen.shot_folder(context.scene)
+    watch = supervisor.watch_of(folder) if folder else None
+    return watch, watch.state if watch else None
+
+
+class Pick:
+    """What picking a run and picking a take share."""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off while a step of this shot runs: what it works on is named by the settings."""
+        watch, state = known(context)
+        if watch is None or state is None:
+            cls.poll_message_set(tr("No shot is chosen: import a clip first"))  # type: ignore[attr-defined]
+            return False
+        if watch.running():
+            cls.poll_message_set(tr("A step of this shot is running"))  # type: ignore[attr-defined]
+            return False
+        return True
+
+
+class Remove(Pick):
+    """What removing a run and removing a take share: a question, a refusal in words, the folder gone."""
+
+    kind = ""
+    question = ""
+    warning = ""
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Asks first: what is removed from disk does not come back with undo."""
+        return context.window_manager.invoke_confirm(
+            self, event, title=self.question, message=self.warning, confirm_text="Remove", icon="WARNING"
+        )
+
+    def execute(self, context: Any) -> set[str]:
+        """Removes the folder."""
+        watch, state = known(context)
+        name: str = self.name  # type: ignore[attr-defined]
+        if watch is None or state is None:
+            return {"CANCELLED"}
+        # Only what is listed, whose names come from the folder itself: any other may lead to somewhere else.
+        folder = watch.shot / f"{self.kind}s" / name
+        there = name in state.listed(self.kind)
+        refusal = _in_use(watch.shot, folder) if there else f"This shot has no {self.kind} {name!r}"
+        if not refusal:
+            try:
+                jobs.refuse_second_writer(watch.shot)  # also one that was started from a command line
+                listing.remove(watch.shot, folder, wait=bpy.app.background)
+            except contract.JobError as error:
+                refusal = f"{error.message} {error.hint}"
+            except OSError as error:
+                refusal = f"{folder} cannot be removed: {error.strerror or error}"
+        if refusal:
+            self.report({"ERROR"}, refusal)  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        supervisor.refresh(watch)
+        supervisor.redraw()
+        return {"FINISHED"}
+
+
+def _in_use(shot: Path, folder: Path) -> str:
+    """Why a run or take cannot be removed now, as any of the steps says; empty if it can."""
+    return next(filter(None, (step.in_use(shot, folder) for step in steps.STEPS.values())), "")

@@ -1,0 +1,280 @@
+"""The add-on's preferences: the backend's environment, set up, checked, repaired and removed from here."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from ...torch_backend import contract
+from ..process import backend, children, environment, supervisor
+from ..translations import tr
+from .sentences import wrap
+
+_INSET = 150
+"""Pixels beside a sentence in the preferences: the page's margins and the boxes that it stands in."""
+_DIALOG = 640
+"""Width of the dialog in pixels."""
+_setup: environment.SetUp | None = None
+_findings: list[str] = []
+
+
+class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
+    """Shown in Edit > Preferences > Add-ons > Splannequin."""
+
+    bl_idname = backend.PACKAGE
+
+    backend_python: StringProperty(
+        name="Backend Python",
+        description="Python interpreter of a backend environment that is there already; empty: found by itself",
+        subtype="FILE_PATH",
+    )
+    backend_folder: StringProperty(
+        name="Folder",
+        description="Where Set Up Backend puts the environment; empty: a short path in your home folder",
+        subtype="DIR_PATH",
+    )
+    device: EnumProperty(
+        name="Device",
+        description="Where the backend trains and freezes",
+        items=[
+            ("auto", "Automatic", "The NVIDIA card if there is one that can be used, else the processor"),
+            ("cpu", "Processor", "Always the processor"),
+            ("cuda", "NVIDIA Card", "Only the NVIDIA card: without one, jobs end with a sentence"),
+        ],
+    )
+
+    def draw(self, context: Any) -> None:
+        """What is used, its set-up, the device."""
+        layout = self.layout
+        try:
+            there = bool(backend.python())
+            if not busy():  # a half-made one is not in use yet
+                self._say(layout, f"In use: {backend.python()}", "CHECKMARK")
+        except contract.JobError as error:
+            column = layout.column(align=True)
+            column.alert = True
+            self._say(column, error.message, "ERROR")
+            self._say(column, error.hint, "BLANK1")
+            there = False
+        for line in _findings:
+            self._say(layout, line, "DOT")
+        self._draw_setup(there)
+        layout.prop(self, "device")
+        layout.prop(self, "backend_python")
+
+    def _draw_setup(self, there: bool) -> None:
+        box = self.layout.box()
+        row = box.row()
+        row.enabled = not busy()
+        row.prop(self, "backend_folder")
+        if not self.backend_folder:
+            self._say(box, f"Without a folder it goes to {environment.default_folder()}.", "INFO")
+        row = box.row(align=True)
+        ours = backend.venv_python(backend.folder() / ".venv").is_file()
+        if busy():
+            row.operator("splannequin.cancel_setup", icon="CANCEL")
+        else:
+            row.operator("splannequin.set_up", text="Repair" if ours else "Set Up Backend", icon="IMPORT")
+            row.operator("splannequin.check_backend", icon="VIEWZOOM")
+            if ours:
+                row.operator("splannequin.remove_backend", icon="TRASH")
+        if _setup is not None:
+            for line in _setup.said if _setup.running else []:
+                self._say(box, line)
+            if _setup.failure:
+                column = box.column(align=True)
+                column.alert = True
+                self._say(column, _setup.failure, "ERROR")
+                self._say(column, "Repair goes on where it stopped.", "BLANK1")
+        elif not there:
+            self._say(box, f"Makes a Python environment of its own, {environment.SIZE}.", "INFO")
+            self._say(box, f"It installs {environment.LICENCES}.", "BLANK1")
+        if not bpy.app.online_access:
+            self._say(box, "Blender may not go online: allow it in Preferences > System > Network.", "ERROR")
+
+    def _say(self, layout: Any, text: str, icon: str = "NONE") -> None:
+        """A sentence in as many lines as the page is wide for: Blender sets it in by the boxes around it."""
+        wrap(layout, bpy.context, text, icon, margin=_INSET)
+
+
+def busy() -> bool:
+    """True while a set-up runs."""
+    return _setup is not None and _setup.running
+
+
+def running_setup() -> environment.SetUp | None:
+    """The set-up that runs."""
+    return _setup if busy() else None
+
+
+class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
+    """Download and install what the backend needs, into an environment of its own"""
+
+    bl_idname = "splannequin.set_up"
+    bl_label = "Set Up Backend"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Only where Blender may go online, and one at a time."""
+        if not bpy.app.online_access:
+            cls.poll_message_set(tr("Blender may not go online: allow it in Preferences > System > Network"))
+            return False
+        return not busy()
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Asks first."""
+        return context.window_manager.invoke_props_dialog(self, width=_DIALOG, confirm_text="Download and Install")
+
+    def draw(self, context: Any) -> None:
+        """What is asked."""
+        column = self.layout.column(align=True)
+        for text in (
+            f"Makes a Python environment in {backend.folder()}",
+            f"Needs {environment.SIZE}, downloaded from {environment.sources()}.",
+            f"Installs {environment.LICENCES}.",
+            "Nothing is changed in Blender's own Python.",
+        ):
+            wrap(column, context, text, width=_DIALOG)
+
+    def execute(self, context: Any) -> set[str]:
+        """Starts it; headless, waits for its end."""
+        global _setup
+        try:
+            _setup = environment.start(backend.folder(), sys.executable, backend.package_root())
+        except contract.JobError as error:
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
+            return {"CANCELLED"}
+        _findings.clear()
+        if not bpy.app.background:
+            supervisor.meanwhile(_follow_setup)
+            return {"FINISHED"}
+        if _setup.process is not None:
+            _setup.process.wait()
+        environment.poll(_setup)
+        if _setup.failure:
+            self.report({"ERROR"}, _setup.failure)
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_cancel_setup(bpy.types.Operator):
+    """Stop the set-up; it goes on from there when it is started again"""
+
+    bl_idname = "splannequin.cancel_setup"
+    bl_label = "Cancel"
+    bl_options = {"INTERNAL"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Asks it to end."""
+        if _setup is not None:
+            environment.cancel(_setup)
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
+    """Start the backend once and say what it can do on this machine"""
+
+    bl_idname = "splannequin.check_backend"
+    bl_label = "Check Backend"
+    bl_options = {"REGISTER"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Runs the backend's doctor beside Blender; headless, waits for it."""
+        _findings[:] = ["Checking the backend."]
+        try:
+            asked = backend.begin_doctor()
+        except contract.JobError as error:
+            _findings.clear()
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
+            return {"CANCELLED"}
+        if bpy.app.background:
+            asked.wait(120.0)
+            _take_in(asked)
+            for line in _findings:
+                self.report({"INFO"}, tr(line))
+            return {"FINISHED"}
+        _checks.append(asked)
+        supervisor.when_answered(asked, lambda: _take_in(asked))
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
+    """Delete the environment that Set Up Backend made. Shots and their runs stay"""
+
+    bl_idname = "splannequin.remove_backend"
+    bl_label = "Remove Backend"
+    bl_options = {"REGISTER"}
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Asks first."""
+        return context.window_manager.invoke_confirm(self, event)
+
+    def execute(self, context: Any) -> set[str]:
+        """Deletes it."""
+        try:
+            there = environment.remove(backend.folder())
+        except (OSError, ValueError) as error:
+            self.report({"ERROR"}, tr(f"The environment stays: {error}"))
+            return {"CANCELLED"}
+        _findings.clear()
+        self.report({"INFO"}, "The backend's environment was removed" if there else "There was nothing to remove")
+        return {"FINISHED"}
+
+
+_checks: list[children.Question] = []
+"""Doctors that were asked and have not answered."""
+
+
+def _take_in(asked: children.Question) -> None:
+    """What a doctor said is shown."""
+    if asked in _checks:
+        _checks.remove(asked)
+    try:
+        _findings[:] = environment.findings(backend.diagnosis(asked))
+    except (contract.JobError, ValueError, KeyError) as error:
+        _findings[:] = [f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()]
+    _redraw()
+
+
+def _follow_setup() -> bool:
+    """A turn of the timer while a set-up runs; one that ended well is checked."""
+    if _setup is None:
+        return False
+    if environment.poll(_setup):
+        _redraw()
+    if not _setup.running and not _setup.failure:
+        bpy.ops.splannequin.check_backend()
+    return _setup.running
+
+
+def _redraw() -> None:
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in ("PREFERENCES", "VIEW_3D"):
+                area.tag_redraw()
+
+
+_CLASSES = (
+    SPLANNEQUIN_preferences,
+    SPLANNEQUIN_OT_set_up,
+    SPLANNEQUIN_OT_cancel_setup,
+    SPLANNEQUIN_OT_check_backend,
+    SPLANNEQUIN_OT_remove_backend,
+)
+
+
+def register() -> None:
+    """Registers the preferences and their buttons."""
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    """Undoes `register`. A set-up that runs goes on."""
+    _checks.clear()
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

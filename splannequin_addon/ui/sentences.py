@@ -1,0 +1,49 @@
+"""Sentences drawn in as many lines as there is room for, and rows of a table: Blender cuts what is too long."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from typing import Any
+
+from ..translations import tr
+
+_LETTER = 6.2
+"""Pixels of a letter on average, at a user interface scale of 1."""
+_UNIT = re.compile(r"(?<=\d) (?=(%|px|dB|fps|s|min|h|[KMG]B)(?!\w))")
+_BOUND = "\N{NO-BREAK SPACE}"
+
+
+def wrap(layout: Any, context: Any, text: str, icon: str = "NONE", margin: int = 50, width: int = 0) -> None:
+    """A sentence, in the interface's language, in as many lines as it asks for.
+
+    Args:
+        layout: where it is drawn.
+        context: tells the region.
+        text: the sentence in English.
+        icon: before its first line.
+        margin: pixels beside it that are taken.
+        width: of all in pixels, 0: the region's; a dialog has its own.
+    """
+    room = (width or context.region.width / context.preferences.system.ui_scale) - margin
+    room -= 25 if icon != "NONE" else 0
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    for number, line in enumerate(lines(tr(text), max(int(room / _LETTER), 16))):
+        column.label(text=line, translate=False, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+def lines(text: str, letters: int) -> list[str]:
+    """A text in lines of at most so many letters, one at least; a figure stays with its unit."""
+    found = textwrap.wrap(_UNIT.sub(_BOUND, text), letters) or [""]
+    return [line.replace(_BOUND, " ") for line in found]
+
+
+def cells(line: Any, widths: tuple[float, ...]) -> list[Any]:
+    """Parts of a row, as wide as `widths` say, which sum to 1."""
+    parts, left = [], 1.0
+    for width in widths[:-1]:
+        line = line.split(factor=width / left, align=True)
+        parts.append(line.row(align=True))
+        left -= width
+    return [*parts, line.row(align=True)]

@@ -1,0 +1,175 @@
+"""The list of a scene's shots at the top of the tab: choose, add, remove."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.props import BoolProperty, StringProperty
+
+from ...torch_backend import contract
+from ..process import begin, supervisor
+from ..scene import paths
+from ..shot import chosen, places
+from ..translations import tr
+
+
+class SPLANNEQUIN_UL_shots(bpy.types.UIList):
+    """Shots of the scene"""
+
+    bl_idname = "SPLANNEQUIN_UL_shots"
+
+    def draw_item(
+        self, context: Any, layout: Any, data: Any, item: Any, icon: Any, active_data: Any, active: str, index: int
+    ) -> None:
+        """Name, and whether a step of it runs."""
+        one = chosen.settings(context.scene)[index]
+        folder = chosen.folder_of(one)
+        running = supervisor.watch_of(folder).running() if folder is not None else None
+        layout.label(text=chosen.label(one), icon="SORTTIME" if running else "FILE_MOVIE", translate=False)
+
+
+class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
+    """Begin another shot in this scene. The ones that are there keep their settings, cameras and frames"""
+
+    bl_idname = "splannequin.shot_add"
+    bl_label = "New Shot"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off while the chosen shot has no clip: it is a new one."""
+        if chosen.shot_folder(context.scene) is None:
+            cls.poll_message_set(tr("Choose a clip for this shot first"))
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Adds and chooses it."""
+        chosen.add(context.scene)
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
+    """Take the chosen shot off the list. Its folder on disk stays"""
+
+    bl_idname = "splannequin.shot_remove"
+    bl_label = "Remove Shot from List"
+    bl_options = {"REGISTER", "UNDO"}
+
+    things: BoolProperty(
+        name="Remove Its Things from the File",
+        description="Take its camera, points, markers and compositor group out of the file, too",
+        default=True,
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """On for one of several."""
+        if len(context.scene.splannequin.shots) < 2:
+            cls.poll_message_set(tr("This is the only shot of the scene"))
+            return False
+        return True
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Asks what is to be done with its things."""
+        return context.window_manager.invoke_props_dialog(self)
+
+    def execute(self, context: Any) -> set[str]:
+        """Removes it."""
+        scene = context.scene
+        folder = chosen.shot_folder(scene)
+        if self.things and folder is not None:
+            for note in begin.remove_all(scene, folder):
+                self.report({"INFO"}, note)
+        chosen.remove(scene, scene.splannequin.loaded_shot)
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
+    """Say where the folder of this shot is now. The camera, the points and the compositor's frames follow it"""
+
+    bl_idname = "splannequin.locate_shot"
+    bl_label = "Locate Shot Folder"
+    bl_options = {"REGISTER", "UNDO"}
+
+    directory: StringProperty(
+        name="Folder", description="Folder of the shot: the one that holds shot.json", subtype="DIR_PATH"
+    )
+    filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Has the folder chosen, beginning where it was."""
+        folder = chosen.shot_folder(context.scene)
+        if folder is not None:
+            there = next((p for p in folder.parents if p.is_dir()), None)
+            self.directory = f"{there}/" if there is not None else ""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: Any) -> set[str]:
+        """Takes it, if there is a shot in it."""
+        try:
+            places.locate(context.scene, Path(paths.absolute(self.directory)))
+        except contract.JobError as error:
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_PT_shots(bpy.types.Panel):
+    """Which shot of the scene the five steps below are about"""
+
+    bl_label = "Shots"
+    bl_idname = "SPLANNEQUIN_PT_shots"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Splannequin"
+    bl_options = {"HIDE_HEADER"}
+
+    def draw(self, context: Any) -> None:
+        """A list once there are several; before, a button."""
+        props = context.scene.splannequin
+        row = self.layout.row()
+        if len(props.shots) < 2:
+            row.label(text=chosen.label(props), icon="FILE_MOVIE", translate=False)
+            row.operator("splannequin.shot_add", icon="ADD")
+            return
+        row.template_list(
+            "SPLANNEQUIN_UL_shots", "", props, "shots", props, "active_shot", rows=min(len(props.shots), 5)
+        )
+        column = row.column(align=True)
+        column.operator("splannequin.shot_add", text="", icon="ADD")
+        column.operator("splannequin.shot_remove", text="", icon="REMOVE")
+
+
+class SPLANNEQUIN_PT_layout(bpy.types.Panel):
+    """An empty panel that comes and goes, so that Blender puts the others in their places"""
+
+    bl_label = "Splannequin"
+    bl_idname = "SPLANNEQUIN_PT_layout"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Splannequin"
+    bl_options = {"HIDE_HEADER"}
+    bl_order = 99
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Now and then."""
+        return supervisor.lay_out()
+
+    def draw(self, context: Any) -> None:
+        """Nothing."""
+
+
+CLASSES = (
+    SPLANNEQUIN_UL_shots,
+    SPLANNEQUIN_OT_shot_add,
+    SPLANNEQUIN_OT_shot_remove,
+    SPLANNEQUIN_OT_locate_shot,
+    SPLANNEQUIN_PT_shots,
+    SPLANNEQUIN_PT_layout,
+)

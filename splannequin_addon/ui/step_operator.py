@@ -1,0 +1,80 @@
+"""What the five buttons share.
+
+Headless, a button's `execute` blocks until the work is done; in a window the timer follows it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from ..process import begin, steps, supervisor
+from ..shot import chosen
+from ..translations import tr
+
+
+class StepOperator:
+    """What the five share: begin the job, then wait for it or have it followed."""
+
+    step = ""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off while a step of this shot runs."""
+        folder = chosen.shot_folder(context.scene)
+        if folder is not None and supervisor.watch_of(folder).running():
+            cls.poll_message_set(tr("A step of this shot is running"))  # type: ignore[attr-defined]
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Runs the step."""
+        scene = context.scene
+        try:
+            job = begin.begin(scene, self.step, self.params(scene))
+            supervisor.follow(self.step, job)
+            if not bpy.app.background:
+                return {"FINISHED"}
+            begin.wait(job)
+            notes = self.after(scene, job)
+        except contract.Cancelled:
+            self.report({"WARNING"}, "Cancelled: finished work is kept")  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        except (contract.JobError, ValueError, OSError, RuntimeError) as error:
+            folder = chosen.shot_folder(scene)
+            sentence = getattr(error, "message", str(error))
+            if folder is not None:
+                supervisor.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
+            self.report({"ERROR"}, tr(f"{sentence} {getattr(error, 'hint', '')}".strip()))  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        for note in notes:
+            self.report({"INFO"}, tr(note))  # type: ignore[attr-defined]
+        return {"FINISHED"}
+
+    def params(self, scene: Any) -> Any:
+        """What the job is asked for; None: what the scene's settings say."""
+        return None
+
+    def after(self, scene: Any, job: Any) -> list[str]:
+        """What follows the job when blocking; returns what changed, in words."""
+        return steps.STEPS[self.step].finish(scene, job)
+
+
+def edit(operator: Any, context: Any, step: str, change: Any) -> set[str]:
+    """Runs a change of the scene; says what was done or why not."""
+    folder = chosen.shot_folder(context.scene)
+    if folder is None:
+        operator.report({"ERROR"}, "No shot is chosen: import a clip first")
+        return {"CANCELLED"}
+    try:
+        notes = change(context.scene, folder)
+    except (contract.JobError, OSError, ValueError) as error:
+        operator.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
+        return {"CANCELLED"}
+    supervisor.watch_of(folder).notes[step] = notes
+    supervisor.redraw()
+    for note in notes:
+        operator.report({"INFO"}, tr(note))
+    return {"FINISHED"}

@@ -1,0 +1,186 @@
+"""The sidebar tab "Splannequin" in the 3D view: five steps in order, each with its state and what comes next.
+
+Drawing only reads what the supervisor keeps; it touches the disk when a shot is met for the first time.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..process import steps, supervisor
+from ..shot import chosen
+from ..translations import tr
+from . import icons
+from .sentences import wrap
+
+CATEGORY = "Splannequin"
+
+
+class StepPanel:
+    """What the five panels share. State, settings, one button, progress with Cancel, what comes next."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = CATEGORY
+    step = ""
+    operator = ""
+    folds = ""
+    """What its parts that can be folded are called in the files that keep how they stand."""
+
+    def _watch(self, context: Any) -> supervisor.Watch | None:
+        folder = chosen.shot_folder(context.scene)
+        return supervisor.watch_of(folder) if folder else None
+
+    def _view(self, context: Any) -> steps.View:
+        watch = self._watch(context)
+        if watch is not None and chosen.missing(context.scene, watch.state):
+            return steps.View(
+                False,
+                steps.STEPS[self.step].makes_shot,
+                [],
+                "" if steps.STEPS[self.step].makes_shot else "Locate the shot first.",
+            )
+        return steps.STEPS[self.step].view(context.scene, watch.state if watch else None)
+
+    def _next_done(self, context: Any) -> bool:
+        """True if the step after this one is done: what comes next need not be said any more."""
+        names = list(steps.STEPS)
+        after = names[names.index(self.step) + 1 :]
+        watch = self._watch(context)
+        return bool(after) and steps.STEPS[after[0]].view(context.scene, watch.state if watch else None).done
+
+    def draw_header(self, context: Any) -> None:
+        """An icon for the state: a tick, at work, failed, next, or not yet."""
+        watch = self._watch(context)
+        view = self._view(context)
+        job = watch.jobs.get(self.step) if watch else None
+        if watch and watch.running() == self.step:
+            icon = "SORTTIME"
+        elif watch and (self.step in watch.failures or (job and job.state == "failed")):
+            icon = "ERROR"
+        elif view.done:
+            icon = "CHECKMARK"
+        else:
+            icon = "RADIOBUT_ON" if view.ready else "RADIOBUT_OFF"
+        self.layout.label(text="", icon=icon)  # type: ignore[attr-defined]
+
+    def draw(self, context: Any) -> None:
+        """The step's body."""
+        layout = self.layout  # type: ignore[attr-defined]
+        watch, view = self._watch(context), self._view(context)
+        self.draw_trouble(context, layout)
+        for line in view.state:
+            wrap(layout, context, line)
+        running = watch.running() if watch else None
+        settings = layout.column()
+        settings.enabled = view.ready and running is None
+        self.draw_settings(context, settings)
+        self.draw_always(context, layout)
+        if watch and running == self.step:
+            self._progress(context, watch)
+        else:
+            self._button(context, layout, view, running)
+            self._outcome(context, layout, watch, view.state)
+            if running is None and view.advice and not (view.done and self._next_done(context)):
+                wrap(layout, context, view.advice, "INFO")
+        body = sub_panel(layout, f"{self.folds}_more", "Advanced")
+        if body is not None:
+            body.enabled = running is None
+            self.draw_advanced(context, body)
+
+    def draw_trouble(self, context: Any, layout: Any) -> None:
+        """What keeps the step from being done at all, with the button that helps."""
+
+    def draw_always(self, context: Any, layout: Any) -> None:
+        """What stays in reach while a step runs."""
+
+    def draw_settings(self, context: Any, layout: Any) -> None:
+        """The settings that an artist needs."""
+
+    def draw_advanced(self, context: Any, layout: Any) -> None:
+        """The settings that need no touching."""
+
+    def _button(self, context: Any, layout: Any, view: steps.View, running: str | None) -> None:
+        row = layout.row()
+        row.scale_y = 1.0 if view.done else 1.4
+        row.enabled = view.ready and running is None
+        row.operator(self.operator, text=self._label(context, view), icon=icons.of(self.operator))
+
+    def _label(self, context: Any, view: steps.View) -> str:
+        """What the button says."""
+        step = steps.STEPS[self.step]
+        return step.again if view.done else step.button
+
+    def _progress(self, context: Any, watch: supervisor.Watch) -> None:
+        layout = self.layout  # type: ignore[attr-defined]
+        work = watch.work
+        if work is not None:
+            self._own_progress(layout, context, work.progress)
+            return
+        job = watch.jobs[self.step]
+        status = job.status
+        row = layout.split(factor=0.7, align=True)
+        text = f"{status.stage.capitalize()} {100 * status.fraction:.0f} %" if status and status.stage else "Starting"
+        row.progress(factor=status.fraction if status else 0.0, type="BAR", text=tr(text))
+        stop = "Pause" if self.step == "train" else "Cancel"
+        row.operator("splannequin.cancel", text=stop, icon=icons.of("splannequin.cancel")).step = self.step
+        detail = [status.message] if status and status.message else []
+        if status and status.eta_seconds is not None:
+            detail.append(f"about {minutes(status.eta_seconds)} left")
+        wrap(layout, context, ", ".join(tr(part) for part in detail) if detail else "The backend is starting.", "INFO")
+
+    def _own_progress(self, layout: Any, context: Any, now: supervisor.Progress | None) -> None:
+        """How far work is that Blender does itself."""
+        if now is None:
+            layout.progress(factor=0.0, type="BAR", text=tr("Starting"))
+            return
+        layout.progress(factor=now.done / max(now.total, 1), type="BAR", text=tr(now.text))
+        if now.hint:
+            wrap(layout, context, now.hint, "INFO")
+
+    def _outcome(self, context: Any, layout: Any, watch: supervisor.Watch | None, said: list[str]) -> None:
+        """What went wrong, or what was changed, unless it was `said` above."""
+        if watch is None:
+            return
+        job = watch.jobs.get(self.step)
+        failure = watch.failures.get(self.step)
+        if failure is None and job is not None and job.state == "failed" and job.status is not None:
+            failure = (job.status.message, job.status.hint)
+        if failure is not None:
+            box = layout.box()
+            box.alert = True
+            wrap(box, context, failure[0], "ERROR")
+            if failure[1]:
+                wrap(box, context, failure[1], "BLANK1")
+            if job is not None and steps.STEPS[self.step].log(job) is not None:
+                box.operator("splannequin.open_log", text="Open Log", icon="TEXT").step = self.step
+            return
+        if job is not None and job.state == "cancelled" and not self._paused(context):
+            wrap(layout, context, "Cancelled. Finished work is kept: start it again to go on.", "CANCEL")
+        for line in unsaid(job.warnings if job is not None else [], said):
+            wrap(layout, context, line, "ERROR")
+        for note in watch.notes.get(self.step, []):
+            wrap(layout, context, note, "DOT")
+
+    def _paused(self, context: Any) -> bool:
+        """True if the panel says already that what was stopped can go on."""
+        return False
+
+
+def unsaid(warnings: list[tuple[str, str]], said: list[str]) -> list[str]:
+    """A job's warnings as lines, without those that the step's state tells anyway, as it does a verdict."""
+    return [f"{message} {hint}".strip() for message, hint in warnings if message not in said]
+
+
+def minutes(seconds: float) -> str:
+    """A duration for people: "45 s", "3 min", "1.5 h"."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def sub_panel(layout: Any, name: str, label: str, folded: bool = True) -> Any | None:
+    """A part of a panel that can be folded away, `folded` at first; None while it is."""
+    header, body = layout.panel(f"splannequin_{name}", default_closed=folded)
+    header.label(text=label)
+    return body
