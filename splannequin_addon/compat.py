@@ -20,6 +20,9 @@ HAS_TEXTURE_NODE = not HAS_COMPOSITING_GROUP
 CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
 """True where a Scale node that crops sets every pixel: before 4.5 a row or column at the border is left unset."""
 
+POINT_SHADERS = ("POINT_FLAT_COLOR", "FLAT_COLOR") if bpy.app.version >= (4, 5, 0) else ("FLAT_COLOR",)
+"""Built-in shaders that colour points, the best first: points have one of their own since 4.5."""
+
 PATH_OPTIONS: set[str] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
 """Options of a path property that may hold a path relative to the .blend (`//`); said aloud since 4.5."""
 

@@ -9,6 +9,7 @@ relative imports, preferences and operators are the same in both. Nothing is ins
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import sys
@@ -20,7 +21,8 @@ PACKAGE = "bl_ext.user_default.splannequin"
 
 def load_package() -> types.ModuleType:
     """The extension package under its Blender name; loaded once, not registered."""
-    import bpy  # noqa: F401  -- makes `bl_ext` where Blender has it
+    with contextlib.suppress(ImportError):  # in a Python without Blender, for modules that need none
+        import bpy  # noqa: F401  -- makes `bl_ext` where Blender has it
 
     if PACKAGE in sys.modules:
         return sys.modules[PACKAGE]

@@ -14,7 +14,8 @@ if importlib.util.find_spec("hypothesis"):
     settings.register_profile("splannequin", deadline=None, derandomize=True, max_examples=50)
     settings.load_profile("splannequin")
 
-HOSTILE = ("torch_backend", "benchmarks", "pycolmap", "numpy", "torch", "json", "venv", "pip", "ensurepip", "site")
+OURS = ("torch_backend", "launcher", "benchmarks")
+HOSTILE = (*OURS, "pycolmap", "numpy", "torch", "json", "venv", "pip", "ensurepip", "site")
 CUSTOM = ("sitecustomize", "usercustomize")
 
 

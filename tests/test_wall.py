@@ -186,7 +186,7 @@ def unplaced_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield node.lineno, ast.unparse(node)
 
 
-@pytest.mark.parametrize("folder", ["splannequin_addon", "torch_backend", "benchmarks", "splannequin.py"])
+@pytest.mark.parametrize("folder", ["splannequin_addon", "torch_backend", "benchmarks", "launcher"])
 def test_no_python_is_started_that_takes_modules_from_where_it_stands(folder: str):
     for path in sources(folder) if (ROOT / folder).is_dir() else [ROOT / folder]:
         wrong = list(unsafe_children(read(path)))
@@ -219,6 +219,21 @@ def test_the_scan_sees_a_child_that_stands_anywhere():
     assert not list(unplaced_children(ast.parse("subprocess.Popen(command, cwd=folder)")))
 
 
+def asks_the_version(tree: ast.AST) -> bool:
+    """True of a file that does one thing or another by Blender's version."""
+    return any(isinstance(n, ast.Attribute) and ast.unparse(n) == "bpy.app.version" for n in ast.walk(tree))
+
+
+def test_only_one_file_knows_how_blenders_differ():
+    knowing = [p for p in sources("splannequin_addon") if asks_the_version(read(p))]
+    assert knowing == [ROOT / "splannequin_addon" / "compat.py"]
+
+
+def test_the_scan_sees_who_asks_the_version():
+    assert asks_the_version(ast.parse("import bpy\nnew = bpy.app.version >= (5, 0, 0)"))
+    assert not asks_the_version(ast.parse("print(bpy.app.version_string)"))
+
+
 def test_no_module_of_the_addon_has_both_threads_and_bpy():
     for path in sources("splannequin_addon"):
         names = {name.split(".")[0] for _, name in imports(read(path), package_of(path))}
@@ -243,6 +258,18 @@ def test_backend_never_imports_blender(path: Path):
 def test_the_contract_imports_the_standard_library_and_itself(path: Path):
     found = imports(read(path), package_of(path))
     assert not [f"{path}:{line}: {name}" for line, name in found if not_for_the_contract(name)]
+
+
+@pytest.mark.parametrize("path", sources("launcher"), ids=lambda p: p.name)
+def test_the_launcher_imports_the_standard_library_and_what_needs_no_environment(path: Path):
+    allowed = {"torch_backend.contract", "torch_backend.shot", "torch_backend.cards"}
+    found = imports(read(path), package_of(path))
+    assert not [
+        f"{path}:{line}: {name}"
+        for line, name in found
+        if name.split(".")[0] not in {"launcher", *sys.stdlib_module_names}
+        and ".".join(name.split(".")[:2]) not in allowed
+    ]
 
 
 @pytest.mark.parametrize("path", sources("torch_backend"), ids=lambda p: str(p.relative_to(ROOT)))
@@ -396,7 +423,8 @@ def test_the_scan_counts_levels():
 
 
 def test_nothing_runs_what_a_file_says():
-    files = [ROOT / "splannequin.py", ROOT / "__init__.py", *sources("torch_backend"), *sources("splannequin_addon")]
+    files = [ROOT / "splannequin.py", ROOT / "__init__.py"]
+    files += [path for folder in ("launcher", "torch_backend", "splannequin_addon") for path in sources(folder)]
     wrong = [f"{path}:{line}: {what}" for path in files for line, what in dangers(read(path))]
     assert not wrong
 
@@ -477,7 +505,7 @@ def part_of(name: str, package: str) -> str:
     return parts[package.count(".") + 1] if name.startswith(f"{package}.") else ""
 
 
-@pytest.mark.parametrize("package", [*packages("torch_backend"), *packages("benchmarks")])
+@pytest.mark.parametrize("package", [*packages("launcher"), *packages("torch_backend"), *packages("benchmarks")])
 def test_no_files_and_folders_of_a_package_import_each_other(package: str):
     """At whatever depth, and not even for the names of types: who can name a class of the other knows it."""
     arrows: dict[str, set[str]] = {}

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from . import contract
-from .contract import DEVICES, Event, ExitCode
+from .contract import Event, ExitCode
 from .shot import SHOT_SUFFIX, Shot, path_error, write_json
 
 
@@ -97,6 +97,17 @@ def _begun(folder: str) -> Shot:
         _give_up(error, Path(folder).absolute(), "Choose another shot folder.")
 
 
+def one_step(args: argparse.Namespace, console: Console) -> int:
+    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`."""
+    ((kind, params),) = asked(args).items()
+    folder = args.clip if args.command == "freeze" else args.shot
+    shot = _begun(folder) if kind == "import" else Shot.open(folder)
+    result = run_station(shot, kind, params, console)
+    if kind in ("train", "freeze"):
+        print_verdict(result, console)
+    return ExitCode.OK
+
+
 def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     """`freeze CLIP`: import, solve, train, freeze; leaves OUTPUT/summary.json."""
     output = Path(args.output).absolute()
@@ -123,7 +134,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
     """Kind of job -> parameters that a parsed command line asks for; none of a command that starts no job."""
-    return contract.asked(args, contract.COMMANDS.get(args.command, {}), args.command)
+    return contract.asked(args)
 
 
 def _requests(args: argparse.Namespace) -> dict[str, Any]:
@@ -203,6 +214,20 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
+def run_job(args: argparse.Namespace, console: Console) -> int:
+    """`run-job FOLDER`: what the job says goes to its folder, and with --json here too."""
+    from .job import run_job
+
+    return run_job(args.folder, console if console.as_json else None)[0]
+
+
+def live(args: argparse.Namespace, console: Console) -> int:
+    """`live SHOT`: frames as they are asked for on the standard input."""
+    from .live import run_live
+
+    return run_live(args.shot, args.run, args.device)
+
+
 def status(args: argparse.Namespace, console: Console) -> int:
     """`status SHOT`: its jobs, newest last, one line each."""
     shot = Shot.open(args.shot)
@@ -210,9 +235,14 @@ def status(args: argparse.Namespace, console: Console) -> int:
         try:
             job: contract.Status = contract.from_dict(contract.Status, contract.read_json(path, contract.SHORT_JSON))
             told = f"{job.state:<9} {job.stage} {100 * job.fraction:.0f}%  {job.message}"
+            facts = dataclasses.asdict(job)
         except (OSError, ValueError) as error:
             told = f"damaged   {error}"
-        print(contract.printable(f"{path.parent.name}  {told}").rstrip())
+            facts = {"state": "damaged", "message": str(error)}
+        if console.as_json:
+            print(json.dumps({"job": path.parent.name, **facts}), file=console.stream)
+        else:
+            print(contract.printable(f"{path.parent.name}  {told}").rstrip(), file=console.stream)
     return ExitCode.OK
 
 
@@ -255,46 +285,7 @@ def _give_up(error: OSError, where: Path, hint: str = "Choose another --output f
 
 def parser() -> argparse.ArgumentParser:
     """The command line's grammar."""
-    top = argparse.ArgumentParser(
-        prog="splannequin", description="Freeze time in a handheld clip of people holding still."
-    )
-    top.add_argument("--json", action="store_true", help="print events as JSON lines instead of text")
-    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    job = commands.add_parser("run-job", help="run the job in a folder (what Blender starts)")
-    job.add_argument("folder")
-
-    live = commands.add_parser("live", help="draw frozen views as they are asked for on standard input (for Blender)")
-    live.add_argument("shot", help="shot folder")
-    live.add_argument("--run", default="main", metavar="NAME", help="name of the run")
-    live.add_argument("--device", default="auto", choices=DEVICES, help="where to draw")
-
-    whole = commands.add_parser("freeze", help="clip to frozen frames: import, solve, train, freeze")
-    contract.add_options(whole, contract.COMMANDS["freeze"], "freeze")
-    whole.add_argument("--output", default="output", metavar="DIR", help="folder for the shot and summary.json")
-    whole.add_argument("--shot-name", default="shot", metavar="NAME", help="name of the shot folder inside it")
-
-    for name, text in (
-        ("import", "footage into a shot"),
-        ("solve", "cameras"),
-        ("train", "train a run"),
-        ("take", "freeze a run"),
-    ):
-        one = commands.add_parser(name, help=f"one step on a shot folder: {text}")
-        one.add_argument("shot", help="shot folder")
-        contract.add_options(one, contract.COMMANDS[name], name)
-    maps = commands.add_parser("stmaps", help="ST maps of the lens, both ways, into the shot's solve folder")
-    maps.add_argument("shot", help="shot folder")
-    maps.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")
-    out = commands.add_parser("export", help="cameras and points of a solved shot for other programs")
-    out.add_argument("shot", help="shot folder")
-    out.add_argument("--format", default="colmap", choices=("colmap", "nerfstudio"), help="what to write")
-    out.add_argument("--text", action="store_true", help="a COLMAP model as .txt instead of .bin")
-    out.add_argument("--output", required=True, metavar="DIR", help="folder to write into")
-    state = commands.add_parser("status", help="jobs of a shot")
-    state.add_argument("shot")
-    commands.add_parser("doctor", help="what this environment can do, as JSON")
-    return top
+    return contract.command_line("splannequin", contract.BACKEND)[0]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -305,8 +296,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # a narrow Windows code page must not end a job over a file's name
             stream.reconfigure(errors="backslashreplace")
     args = parser().parse_args(argv)
-    console = Console(as_json=args.json)
+    console = Console(as_json=contract.as_json(args))
     try:
+        for note in contract.notes(args):
+            print(f"note: {note}", file=sys.stderr, flush=True)
         return int(_dispatch(args, console))
     except SystemExit as stop:
         return int(stop.code or 0)
@@ -326,21 +319,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(args: argparse.Namespace, console: Console) -> int:
-    if args.command == "run-job":
-        from .job import run_job
-
-        return run_job(args.folder)[0]
-    if args.command == "freeze":
-        return freeze_clip(args, console)
-    if args.command == "live":
-        from .live import run_live
-
-        return run_live(args.shot, args.run, args.device)
     if args.command in contract.COMMANDS:
-        ((kind, params),) = asked(args).items()
-        shot = _begun(args.shot) if kind == "import" else Shot.open(args.shot)
-        result = run_station(shot, kind, params, console)
-        if kind in ("train", "freeze"):
-            print_verdict(result, console)
-        return ExitCode.OK
-    return {"status": status, "doctor": doctor, "export": export, "stmaps": stmaps}[args.command](args, console)
+        return freeze_clip(args, console) if _is_whole(args) else one_step(args, console)
+    return _OTHERS[args.command](args, console)
+
+
+def _is_whole(args: argparse.Namespace) -> bool:
+    """True of the whole way from a clip; False of one step on a shot."""
+    return args.command == "freeze" and not contract.freezes_a_shot(args)
+
+
+_OTHERS = {"status": status, "doctor": doctor, "export": export, "stmaps": stmaps, "run-job": run_job, "live": live}
+"""Verb -> what it does, of those that start no job of a shot."""

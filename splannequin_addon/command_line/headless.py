@@ -1,6 +1,7 @@
 """The command line of the Blender side: the buttons' own code, blocking, with a console instead of a panel.
 
     blender --background [FILE.blend] --command splannequin freeze CLIP --t-star 34 --output DIR
+    blender --background --command splannequin freeze SHOT --t-star 40
     .venv-bpy-5.0/bin/python splannequin_addon/run_in_bpy.py bake --shot SHOT --take freeze --output DIR
 
 Exit codes are `contract.ExitCode`: 0 done, 2 wrong arguments, 3 footage, 4 solve, 5 train, 6 freeze, 7 bake, 8 disk,
@@ -96,7 +97,9 @@ def main(argv: Sequence[str]) -> int:
         args = parser().parse_args(list(argv))
         if getattr(args, "tied", False):
             contract.end_with_starter()
-        return int(args.does(args, Console(args.json)))
+        for note in contract.notes(args):
+            print(f"note: {note}", file=sys.stderr, flush=True)
+        return int(_DOES[args.command](args, Console(contract.as_json(args))))
     except SystemExit as stop:
         return int(stop.code or 0)
     except (contract.Cancelled, KeyboardInterrupt):
@@ -121,12 +124,12 @@ def main(argv: Sequence[str]) -> int:
 
 def import_clip(args: argparse.Namespace, console: Console) -> int:
     """`import SHOT CLIP`."""
-    return _one_step(args, console, "import")
+    return _one_step(args, console, "import", args.shot)
 
 
 def solve(args: argparse.Namespace, console: Console) -> int:
     """`solve SHOT`."""
-    return _one_step(args, console, "solve")
+    return _one_step(args, console, "solve", args.shot)
 
 
 def export(args: argparse.Namespace, console: Console) -> int:
@@ -139,11 +142,18 @@ def export(args: argparse.Namespace, console: Console) -> int:
 
 def train(args: argparse.Namespace, console: Console) -> int:
     """`train SHOT`."""
-    return _one_step(args, console, "train")
+    return _one_step(args, console, "train", args.shot)
 
 
 def freeze(args: argparse.Namespace, console: Console) -> int:
-    """`freeze CLIP`: import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
+    """`freeze SHOT`: the step alone. `freeze CLIP`: all that is missing of a shot of its own, and the bake."""
+    return (
+        _one_step(args, console, "freeze", args.clip) if contract.freezes_a_shot(args) else _freeze_clip(args, console)
+    )
+
+
+def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
+    """Import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
     began = time.perf_counter()
     output = _output(args)
     shot = output / (args.shot_name + contract.SHOT_SUFFIX)
@@ -245,10 +255,10 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
 # ------------------------------------------------------------------------------------------------- inside
 
 
-def _one_step(args: argparse.Namespace, console: Console, step: str) -> int:
+def _one_step(args: argparse.Namespace, console: Console, step: str, shot: str) -> int:
     (params,) = asked(args).values()
     scene = bpy.context.scene
-    scene.splannequin.shot_path = str(Path(args.shot).absolute())
+    scene.splannequin.shot_path = str(Path(shot).absolute())
     job = begin.begin(scene, step, params)
     result = begin.wait(job, console)
     if console.as_json:
@@ -332,8 +342,7 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
     """Kind of job -> parameters that a parsed command line asks for; none of a command that starts no job."""
-    kinds = contract.COMMANDS.get(args.command, {})
-    return contract.asked(args, kinds, args.command, {"device": backend.device()})
+    return contract.asked(args, {"device": backend.device()})
 
 
 def _device(args: argparse.Namespace) -> str:
@@ -355,65 +364,30 @@ def _output(args: argparse.Namespace) -> Path:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise begin.unwritable(output, error, "Choose another --output folder.") from error
+        raise contents.unwritable(output, error, "Choose another --output folder.") from error
     return output
 
 
+_DOES = {
+    "import": import_clip,
+    "solve": solve,
+    "train": train,
+    "freeze": freeze,
+    "bake": bake_take,
+    "stmaps": write_stmaps,
+    "export": export,
+    "status": status,
+    "doctor": doctor,
+}
+"""Verb -> what it does."""
 _UNSET = {"device": "as the preferences say"}
 """Field -> what is taken for it where a command says nothing."""
 
 
 def parser() -> argparse.ArgumentParser:
     """The grammar of the command line."""
-    codes = "exit codes: " + ", ".join(f"{c.value} {c.name.lower()}" for c in ExitCode)
-    top = argparse.ArgumentParser(
-        prog="blender --background [FILE.blend] --command splannequin",
-        description="Freeze time in a handheld clip of people holding still.",
-        epilog=codes,
+    top, verbs = contract.command_line(
+        "blender --background [FILE.blend] --command splannequin", contract.BLENDER, _UNSET
     )
-    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    def add(name: str, run: Any, text: str) -> argparse.ArgumentParser:
-        command = commands.add_parser(name, help=text, description=text, epilog=codes)
-        command.add_argument("--json", action="store_true", help="print events as JSON lines instead of text")
-        command.set_defaults(does=run)
-        return command
-
-    def on_a_shot(name: str, run: Any, text: str, shot: str = "shot folder") -> None:
-        command = add(name, run, text)
-        command.add_argument("shot", help=shot)
-        contract.add_options(command, contract.COMMANDS[name], name, _UNSET)
-
-    on_a_shot("import", import_clip, "Footage into a shot folder.", "shot folder, made if it is not there")
-    on_a_shot("solve", solve, "Cameras of a shot.")
-    on_a_shot("train", train, "Train a run of a shot.")
-    one = add("export", export, "Cameras and points of a solved shot for other programs.")
-    one.add_argument("shot", help="shot folder")
-    one.add_argument("--format", default="colmap", choices=("colmap", "nerfstudio"), help="what to write")
-    one.add_argument("--text", action="store_true", help="a COLMAP model as .txt instead of .bin")
-    one.add_argument("--output", required=True, metavar="DIR", help="folder to write into")
-    whole = add("freeze", freeze, "Clip to baked shot: import, solve, train, freeze, bake; writes OUTPUT/shot.blend.")
-    contract.add_options(whole, contract.COMMANDS["freeze"], "freeze", _UNSET)
-    whole.add_argument("--shot-name", default="shot", metavar="NAME", help="name of the shot folder in OUTPUT")
-    whole.add_argument("--output", default="output", metavar="DIR", help="folder for everything that comes out")
-    whole.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
-    one = add("bake", bake_take, "A frozen take through the compositor; writes DIR/composited and DIR/shot.blend.")
-    one.add_argument("--shot", required=True, help="shot folder")
-    one.add_argument("--take", default="freeze", help="name of the take")
-    one.add_argument("--output", required=True, metavar="DIR", help="folder for what comes out")
-    one.add_argument("--first", type=int, help="first frame to bake (default: the take's, or the .blend's range)")
-    one.add_argument("--last", type=int, help="last frame to bake, inclusive")
-    one.add_argument("--step", type=int, default=0, help="bake every n-th frame (0: the scene's step)")
-    text = "where to freeze what is missing (default: as the preferences say)"
-    one.add_argument("--device", default="", choices=contract.DEVICES, help=text)
-    one.add_argument("--blend", default="", help=".blend to insert the freeze into (default: a new scene)")
-    text = "freeze the plate that the .blend shows by the take's warp, instead of showing the take's frames"
-    one.add_argument("--as-warp", action="store_true", help=text)
-    one.add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # to the launcher, by the standard input
-    one = add("stmaps", write_stmaps, "ST maps of the lens, both ways, into SHOT/solve.")
-    one.add_argument("shot", help="shot folder")
-    one.add_argument("--width", type=int, default=0, help="width of the maps in pixels (0: the working frames')")
-    one = add("status", status, "Jobs of a shot.")
-    one.add_argument("shot", help="shot folder")
-    add("doctor", doctor, "What this Blender and its backend can do, as JSON.")
+    verbs["bake"].add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # to the launcher, by our input
     return top

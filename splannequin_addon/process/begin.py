@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 from collections.abc import Callable
@@ -31,7 +30,7 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
         job = jobs.new_job(folder, steps.STEPS[step].kind, params)
         (job.folder / contract.STEP_FILE).write_text(step, encoding="utf-8")
     except OSError as error:
-        raise unwritable(folder, error, "Choose another shot folder.") from error
+        raise contents.unwritable(folder, error, "Choose another shot folder.") from error
     try:
         backend.start(job)
     except contract.JobError:
@@ -52,12 +51,6 @@ def needed(scene: Any, step: str) -> Path:
             raise contract.JobError(message, hint, contract.ExitCode.USAGE)
         raise contract.JobError(f"{folder} is no shot folder.", steps.STEPS[step].needs, contract.ExitCode.USAGE)
     return folder
-
-
-def unwritable(folder: Path, error: OSError, hint: str) -> contract.JobError:
-    """What is said of a folder that cannot be written, with the exit code that the backend's command line gives it."""
-    code = contract.ExitCode.DISK if error.errno in (errno.ENOSPC, errno.EDQUOT) else contract.ExitCode.USAGE
-    return contract.JobError(f"Cannot write to {folder}: {error.strerror or error}.", hint, code)
 
 
 def remove_all(scene: Any, shot: Path) -> list[str]:

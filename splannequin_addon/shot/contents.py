@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import json
 import os
 import time
@@ -248,3 +249,9 @@ def _mtime(path: Path) -> float:
         return path.stat().st_mtime
     except OSError:
         return 0.0
+
+
+def unwritable(folder: Path, error: OSError, hint: str) -> contract.JobError:
+    """What is said of a folder that cannot be written, with the exit code that the backend's command line gives it."""
+    code = contract.ExitCode.DISK if error.errno in (errno.ENOSPC, errno.EDQUOT) else contract.ExitCode.USAGE
+    return contract.JobError(f"Cannot write to {folder}: {error.strerror or error}.", hint, code)

@@ -9,7 +9,7 @@ import bpy
 from ..process import steps
 from ..ui import icons, step_panel
 from ..ui.sentences import wrap
-from . import align_operators, cameras, mattes
+from . import align_operators, cameras, matte_operators
 
 
 def can_load_camera(running: str | None) -> bool:
@@ -32,7 +32,7 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
         watch = self._watch(context)
         body = step_panel.sub_panel(self.layout, "camera_motion", "Motion Matte")  # type: ignore[attr-defined]
         if body is not None:
-            mattes.draw(body)
+            matte_operators.draw(body)
         if watch is None or cameras.find(context.scene, watch.shot, "EMPTY") is None:
             return
         if not align_operators.scaled(context.scene, watch.shot):

@@ -11,6 +11,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
+from .. import compat
 from ..process import children
 from ..shot import chosen, made
 
@@ -46,8 +47,7 @@ def _draw() -> None:
         return
     key = (cloud.data.name, len(cloud.data.vertices), tuple(cloud.data.vertices[0].co), str(shot))
     if not _kept or _kept[0] != key:
-        names = ("POINT_FLAT_COLOR", "FLAT_COLOR") if bpy.app.version >= (4, 5, 0) else ("FLAT_COLOR",)
-        shader = _first_shader(names)
+        shader = _first_shader(compat.POINT_SHADERS)
         places, colours = coloured(cloud.data)
         _kept = (key, shader, batch_for_shader(shader, "POINTS", {"pos": places, "color": colours}))
     gpu.state.depth_test_set("LESS_EQUAL")

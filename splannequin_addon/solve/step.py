@@ -11,7 +11,7 @@ from ..process import jobs, supervisor
 from ..process.steps import Step, View
 from ..shot import chosen, made
 from ..shot.shot_state import ShotState
-from . import align_operators, arrival, cameras, exchange, guesses, mattes, operators, panel, points
+from . import align_operators, arrival, cameras, exchange, guesses, matte_operators, operators, panel, points
 
 
 class Solve(Step):
@@ -23,7 +23,7 @@ class Solve(Step):
     button = "Solve Camera"
     again = "Solve Again"
     needs = "Import the clip first."
-    classes = (*operators.CLASSES, *align_operators.CLASSES, *mattes.CLASSES, *panel.CLASSES)
+    classes = (*operators.CLASSES, *align_operators.CLASSES, *matte_operators.CLASSES, *panel.CLASSES)
     parts = (points, align_operators, operators)
 
     def params(self, scene: Any) -> contract.SolveParams:

@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -171,29 +172,51 @@ def test_a_bake_ends_with_the_launcher_that_started_it(shot, tmp_path, root, sta
     bake.stderr.close()
 
 
-def told_of(parser: argparse.ArgumentParser, command: str, to_the_launcher: set[str]) -> dict[str, tuple]:
-    """Option -> (help, choices, default, value) of a command; not of what only one of the two has, in words of its own:
-    the shot, and where it all goes."""
-    chosen = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[command]
+def told_of(parser: argparse.ArgumentParser) -> dict[str, dict[str, tuple]]:
+    """Verb -> option -> (help, choices, default, value, required) of what --help prints of it."""
+    verbs = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices
     return {
-        (a.option_strings or [a.dest])[0]: (a.help, a.choices and tuple(a.choices), a.default, a.metavar)
-        for a in chosen._actions
-        if not {*a.option_strings, a.dest} & to_the_launcher
+        verb: {
+            (a.option_strings or [a.dest])[0]: (
+                a.help,
+                a.choices and tuple(a.choices),
+                a.default,
+                a.metavar,
+                a.required,
+            )
+            for a in one._actions
+            if a.help != argparse.SUPPRESS
+        }
+        for verb, one in verbs.items()
     }
 
 
-@pytest.mark.parametrize("command", ["import", "solve", "train", "freeze"])
-def test_both_command_lines_print_the_same_options(addon, package, command):
+def test_both_command_lines_print_the_same_options_for_the_same_verb(addon, package):
     backend = importlib.import_module(f"{package.__name__}.torch_backend.cli")
-    ours = told_of(
-        addon("command_line.headless").parser(), command, {"shot", "--shot-name", "--output", "--json", "--blend"}
-    )
-    theirs = told_of(backend.parser(), command, {"shot", "--shot-name", "--output"})
-    if "--device" in ours:  # here the preferences are asked where nothing is said
-        said, choices, default, value = ours["--device"]
-        assert said.endswith("(default: as the preferences say)") and default == ""
-        ours["--device"] = (said.replace("as the preferences say", "auto"), choices, "auto", value)
-    assert ours == theirs
+    ours, theirs = told_of(addon("command_line.headless").parser()), told_of(backend.parser())
+    assert ours.keys() - theirs.keys() == {"bake"} and theirs.keys() - ours.keys() == {"take", "run-job", "live"}
+    for verb in ours.keys() & theirs.keys():
+        if "--device" in ours[verb]:  # here the preferences are asked where nothing is said
+            said, choices, default, *rest = ours[verb]["--device"]
+            assert said.endswith("(default: as the preferences say)") and default == ""
+            ours[verb]["--device"] = (said.replace("as the preferences say", "auto"), choices, "auto", *rest)
+        if verb == "freeze":
+            assert ours[verb].pop("--blend"), "a .blend is Blender's own"
+        assert ours[verb] == theirs[verb], verb
+
+
+def test_freeze_of_a_shot_is_the_step_alone(run, root, tmp_path):
+    shot = tmp_path / "old.splannequin"
+    shutil.copytree(root / "tests" / "data" / "v0_2" / "shot", shot)
+    words = ("--run", "tiny", "--t-star", 8, "--take", "again", "--detail", "off", "--develop", "off",
+             "--freeze-width", 32, "--device", "cpu")  # fmt: skip
+    code, said, wrong = run("freeze", shot, *words)
+    assert code == 0, wrong
+    assert json.loads((shot / "takes" / "again" / "take.json").read_text())["t_star_frame"] == 8
+    assert "Poor." in said and not list(tmp_path.rglob("shot.blend"))
+    code, _, wrong = run("freeze", shot, "--output", tmp_path / "out")
+    assert code == 2 and "--output is for a clip" in wrong and wrong.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tmp_path):

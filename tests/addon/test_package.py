@@ -34,7 +34,7 @@ def test_source_and_zip_are_valid_and_hold_what_is_needed(packager, root, tmp_pa
     with zipfile.ZipFile(target) as archive:
         names = archive.namelist()
     assert {n.partition("/")[0] for n in names} == {
-        "LICENSE", "README.md", "__init__.py", "blender_manifest.toml", "pyproject.toml", "requirements",
+        "LICENSE", "README.md", "__init__.py", "blender_manifest.toml", "launcher", "pyproject.toml", "requirements",
         "splannequin.py", "splannequin_addon", "torch_backend",
     }  # fmt: skip
     assert {"splannequin_addon/registration.py", "requirements/backend.txt"} <= set(names)

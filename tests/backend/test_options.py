@@ -1,13 +1,16 @@
 """The one table of options: every option is heard, and what it says is what both command lines and the panel say."""
 
 import argparse
+import ast
 import dataclasses
+from pathlib import Path
 
 import pytest
 
 from torch_backend import cli, contract
 from torch_backend.contract import option_table
 
+ROOT = Path(__file__).resolve().parents[2]
 NEEDED = {"import": ("s.splannequin", "a.mp4"), "freeze": ("a.mp4",)}
 """What a command cannot do without."""
 
@@ -17,8 +20,8 @@ def cases():
     for command, kinds in contract.COMMANDS.items():
         found: dict[tuple[str, ...], list[str]] = {}
         for kind, cls in kinds.items():
-            for one, told in option_table.options_of(cls):
-                if told.flag.startswith("--") and (not told.commands or command in told.commands):
+            for one, told in contract.options_for(command, cls):
+                if told.flag.startswith("--"):
                     found.setdefault(words_for(one, told), []).append(f"{kind}.{one.name}")
         for words, fields in found.items():
             yield pytest.param(command, words, fields, id=f"{command} {words[0]}")
@@ -26,7 +29,7 @@ def cases():
 
 def words_for(one, told) -> tuple[str, ...]:
     """An option with a value that is not its default."""
-    if told.turns_off:
+    if told.switch:
         return (told.flag,)
     if told.choices:
         return told.flag, next(choice for choice in told.choices if choice != one.default)
@@ -69,3 +72,110 @@ def test_every_option_says_what_it_does():
             assert not told.flag or (told.help and told.help[-1] not in ".:"), one.name
             assert bool(told.label) == bool(told.tip), one.name
             assert not told.items or set(told.items) == set(told.choices), one.name
+
+
+def read_of(files, names: tuple[str, ...]) -> set[str]:
+    """Attributes that the code of `files` reads of variables and attributes of these names."""
+    found = set()
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value).rpartition(".")[2] in names:
+                found.add(node.attr)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "station"), [("import", "footage"), ("solve", "solve"), ("train", "train"), ("freeze", "freeze")]
+)
+def test_no_parameter_of_a_step_is_passed_over_by_its_station(kind, station):
+    backend = ROOT / "torch_backend"
+    read = read_of([*(backend / station).rglob("*.py"), backend / "job.py"], ("params", "asked", "config"))
+    assert {one.name for one in dataclasses.fields(contract.PARAMS[kind])} - read == set()
+
+
+@pytest.mark.parametrize(
+    ("side", "file"),
+    [
+        (contract.BACKEND, "torch_backend/cli.py"),
+        (contract.BLENDER, "splannequin_addon/command_line/headless.py"),
+    ],
+)
+def test_no_word_of_a_verb_is_passed_over_by_its_side(side, file):
+    read = read_of([ROOT / file], ("args",))
+    for name, verb in contract.VERBS.items():
+        if side in verb.sides:
+            dests = {told.dest for _, told in contract.options_for(name, verb.words, side)}
+            assert dests - read == set(), name
+
+
+def test_the_scan_sees_what_is_read(tmp_path):
+    (tmp_path / "a.py").write_text("def f(params, self):\n    return params.one + self.params.two, other.three\n")
+    assert read_of([tmp_path / "a.py"], ("params",)) == {"one", "two"}
+
+
+def ask(*words):
+    return cli.asked(cli.parser().parse_args([str(w) for w in words]))
+
+
+def test_freeze_of_a_shot_asks_for_the_freeze_alone_and_of_a_clip_for_everything(tmp_path):
+    (tmp_path / "renamed").mkdir()
+    (tmp_path / "renamed" / "shot.json").touch()
+    (tmp_path / "pictures").mkdir()
+    for shot in ("gone.splannequin", tmp_path / "renamed"):
+        assert ask("freeze", shot, "--t-star", 3, "--run", "other") == {
+            "freeze": contract.FreezeParams(run="other", t_star=3, only_missing=True)
+        }
+    for clip in ("a.mp4", tmp_path / "pictures", "rtsp://host/a.splannequin"):
+        assert tuple(ask("freeze", clip)) == ("import", "solve", "train", "freeze")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--first", "3"), "--first is for a clip"),
+        (("--preset=preview", "--iter", "5", "--seed", "1"), "--preset, --iterations and --seed are for a clip"),
+        (("--output", "output"), "--output is for a clip"),
+        (("--restart",), "--restart is for a clip"),
+    ],
+)
+def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, capsys):
+    """Also where the value is the default, and where the option is abbreviated."""
+    assert cli.main(["freeze", "s.splannequin", *words]) == contract.ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert named in said and "s.splannequin is a shot folder" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("take", "s.splannequin"), "`take SHOT` is called `freeze SHOT` now"),
+        (("train", "s.splannequin", "--host", "mlp", "--method", "static"), "--host is passed over"),
+        (("train", "s.splannequin", "--detector", "weight"), "only with --supervision paper"),
+        (("train", "s.splannequin", "--extend", "9", "--preset", "final", "--run", "a"), "--preset: passed over"),
+        (("export", "s.splannequin", "--output", "o", "--format", "nerfstudio", "--text"), "--text is passed over"),
+    ],
+)
+def test_what_is_said_in_vain_or_in_an_old_word_is_told(words, told, capsys):
+    assert cli.main(list(words)) == contract.ExitCode.USAGE  # there is no such shot
+    first, _, rest = capsys.readouterr().err.partition("\n")
+    assert first.startswith("note: ") and told in first and rest.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("freeze", "s.splannequin", "--t-star", "3"),
+        ("train", "s", "--host", "mlp"),
+        ("train", "s", "--supervision", "paper", "--detector", "weight"),
+        ("train", "s", "--extend", "9", "--run", "a", "--device", "cpu"),
+        ("export", "s", "--output", "o", "--text"),
+    ],
+)
+def test_what_is_heeded_has_no_note(words):
+    assert contract.notes(cli.parser().parse_args(list(words))) == []
+
+
+def test_json_may_stand_before_the_verb_and_after_it(tmp_path, capsys):
+    assert contract.as_json(cli.parser().parse_args(["--json", "status", "s"]))
+    assert contract.as_json(cli.parser().parse_args(["status", "s", "--json"]))
+    assert not contract.as_json(cli.parser().parse_args(["status", "s"]))

@@ -54,6 +54,20 @@ def test_old_jobs_are_told_and_can_be_asked_for_again(shot: Shot, capsys):
     assert kinds == set(contract.PARAMS)
     assert cli.main(["status", str(shot.root)]) == 0
     assert capsys.readouterr().out.count("  done  ") == 4
+    assert cli.main(["status", str(shot.root), "--json"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["state"] for line in lines] == ["done"] * 4 and lines[0]["job"].count("-import-") == 1
+
+
+@pytest.mark.parametrize(("verb", "told"), [("freeze", ""), ("take", "`freeze SHOT` now")])
+def test_an_old_run_is_frozen_by_the_new_word_and_by_the_old_one(shot: Shot, capsys, verb: str, told: str):
+    words = ["--run", "tiny", "--t-star", "8", "--detail", "off", "--develop", "off", "--freeze-width", "32"]
+    assert cli.main([verb, str(shot.root), "--take", "again", *words]) == 0
+    captured = capsys.readouterr()
+    assert told in captured.err and bool(captured.err) == bool(told)
+    facts = contract.read_json(shot.take("again") / "take.json")
+    assert (facts["run"], facts["t_star_frame"]) == ("tiny", 8)
+    assert read_frozen_exr(shot.take("again") / "000074.exr").rgba.shape == (24, 32, 4)
 
 
 @pytest.mark.parametrize("line", LINES, ids=lambda line: " ".join(line["argv"]))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import splannequin
+from launcher import environments
 
 
 @pytest.fixture
@@ -44,16 +44,16 @@ def requirements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "requirements"
     folder.mkdir()
     (folder / "constraints.txt").write_text("")
-    monkeypatch.setattr(splannequin, "REQUIREMENTS", folder)
+    monkeypatch.setattr(environments, "REQUIREMENTS", folder)
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     return folder
 
 
 @pytest.fixture
-def environment(tmp_path: Path, requirements: Path, write_wheel) -> splannequin.Environment:
+def environment(tmp_path: Path, requirements: Path, write_wheel) -> environments.Environment:
     """An environment of one small package, not made yet."""
     (requirements / "small.txt").write_text(f"{write_wheel('smallthing', '1.0', 'value = 1')}\n")
-    return splannequin.Environment("the test", tmp_path / "home" / ".venv", ("small.txt",), "import smallthing", 0.01)
+    return environments.Environment("the test", tmp_path / "home" / ".venv", ("small.txt",), "import smallthing", 0.01)
 
 
 @pytest.fixture

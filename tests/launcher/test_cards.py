@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-import splannequin
+from launcher import doctor, environments
 from torch_backend.cards import Card, nvidia_cards, why_unused
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="the stand-in is a shell script")
@@ -18,7 +18,7 @@ CUDA, CPU_BUILD = {**ON_CPU, "torch_cuda": "13.0"}, {**ON_CPU, "torch_cuda": Non
 
 
 def told(facts: dict) -> dict[str, str]:
-    return {finding.what: finding.text for finding in splannequin.gpu_findings(facts)}
+    return {finding.what: finding.text for finding in doctor.gpu_findings(facts)}
 
 
 @pytest.mark.parametrize("facts", [CUDA, CPU_BUILD, {}])
@@ -79,9 +79,9 @@ def test_a_card_that_somebody_hid_is_not_missed(nvidia_smi, monkeypatch):
 
 def test_windows_gets_torch_with_cuda_where_a_card_can_use_it(nvidia_smi, monkeypatch):
     monkeypatch.delenv("SPLANNEQUIN_TORCH_INDEX", raising=False)
-    for row, index in ((OLD_DRIVER, ""), (OLD_CARD, ""), (GOOD, splannequin.CUDA_INDEX)):
+    for row, index in ((OLD_DRIVER, ""), (OLD_CARD, ""), (GOOD, environments.CUDA_INDEX)):
         nvidia_smi(row)
-        assert splannequin.torch_index(windows=True) == index
-        assert splannequin.torch_index(windows=False) == "", "PyPI's has CUDA"
+        assert environments.torch_index(windows=True) == index
+        assert environments.torch_index(windows=False) == "", "PyPI's has CUDA"
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "")
-    assert splannequin.torch_index(windows=True) == "", "somebody's wish"
+    assert environments.torch_index(windows=True) == "", "somebody's wish"

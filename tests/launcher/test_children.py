@@ -11,34 +11,34 @@ from pathlib import Path
 
 import pytest
 
-import splannequin
+from launcher import blender, children, environments, errors
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_exit_code_is_passed_on():
-    assert splannequin.run_child([sys.executable, "-c", "raise SystemExit(4)"]) == 4
+    assert children.run_child([sys.executable, "-c", "raise SystemExit(4)"]) == 4
 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
 @pytest.mark.parametrize(("name", "code"), [("SIGKILL", 1), ("SIGTERM", 130)])
 def test_a_killed_child_has_a_documented_exit_code(name: str, code: int):
     source = f"import os, signal; os.kill(os.getpid(), signal.{name})"
-    assert splannequin.run_child([sys.executable, "-c", source]) == code
+    assert children.run_child([sys.executable, "-c", source]) == code
 
 
 def test_a_child_sees_this_checkout_and_no_foreign_python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setenv("PYTHONHOME", str(tmp_path))
-    environ = splannequin.child_environ(SPLANNEQUIN_BACKEND_PYTHON="x")
+    environ = children.child_environ(SPLANNEQUIN_BACKEND_PYTHON="x")
     assert environ["PYTHONPATH"] == str(ROOT)
     assert "PYTHONHOME" not in environ
     assert environ["SPLANNEQUIN_BACKEND_PYTHON"] == "x"
 
 
 def test_a_program_that_cannot_be_started_is_a_sentence(tmp_path: Path):
-    with pytest.raises(splannequin.LauncherError, match="Cannot start"):
-        splannequin.run_child([str(tmp_path / "absent")])
+    with pytest.raises(errors.LauncherError, match="Cannot start"):
+        children.run_child([str(tmp_path / "absent")])
 
 
 def wait_for(path: Path) -> None:
@@ -61,9 +61,10 @@ except KeyboardInterrupt:
 """
 
 PARENT = """
-import sys, splannequin
+import sys
+from launcher import children
 try:
-    splannequin.run_child([sys.executable, "-c", sys.argv[1], sys.argv[2]])
+    children.run_child([sys.executable, "-c", sys.argv[1], sys.argv[2]])
 except KeyboardInterrupt:
     sys.exit(130)
 """
@@ -82,7 +83,7 @@ def test_ctrl_c_lets_the_child_finish_its_checkpoint(tmp_path: Path, sent: signa
 
 @pytest.mark.skipif(os.name == "nt", reason="reads POSIX process groups")
 def test_a_child_that_ignores_ctrl_c_is_ended_with_its_own_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(splannequin, "GRACE_SECONDS", 0.5)
+    monkeypatch.setattr(children, "GRACE_SECONDS", 0.5)
     grandchild = "import time; time.sleep(60)"
     stubborn = (
         "import pathlib, signal, subprocess, sys, time\n"
@@ -92,9 +93,9 @@ def test_a_child_that_ignores_ctrl_c_is_ended_with_its_own_children(tmp_path: Pa
         "pathlib.Path(sys.argv[1], 'grandchild.tmp').rename(pathlib.Path(sys.argv[1], 'grandchild'))\n"
         "time.sleep(60)"
     )
-    child = splannequin.start_child([sys.executable, "-c", stubborn, str(tmp_path)], splannequin.child_environ())
+    child = children.start_child([sys.executable, "-c", stubborn, str(tmp_path)], children.child_environ())
     wait_for(tmp_path / "grandchild")
-    splannequin.stop_child(child)
+    children.stop_child(child)
     assert child.returncode == -signal.SIGKILL
     pid = int((tmp_path / "grandchild").read_text())
     for _ in range(100):
@@ -113,7 +114,7 @@ def test_blenders_own_lines_go_to_the_log_alone(tmp_path: Path, capfd: pytest.Ca
         "Fra:1 Mem:2M",
         "Error: no. Do so.",
     ]
-    code = splannequin.run_blender([sys.executable, "-c", f"print({chr(10).join(lines)!r})"], tmp_path / "blender.log")
+    code = children.run_blender([sys.executable, "-c", f"print({chr(10).join(lines)!r})"], tmp_path / "blender.log")
     out, err = capfd.readouterr()
     assert code == 0
     assert out.splitlines() == ["  baking  4%"]
@@ -179,8 +180,12 @@ pathlib.Path(sys.argv[1], "pid.tmp").write_text(f"{child.pid}")
 pathlib.Path(sys.argv[1], "pid.tmp").rename(pathlib.Path(sys.argv[1], "started"))
 time.sleep(600)
 """
-TIED_SOURCE = "import sys, splannequin as s; s.run_child([sys.executable, '-P', '-c', *sys.argv[1:]], tied=True)"
-LAUNCHER = "import sys, splannequin; sys.exit(splannequin.main())"
+TIED_SOURCE = """
+import sys
+from launcher import children
+children.run_child([sys.executable, "-P", "-c", *sys.argv[1:]], tied=True)
+"""
+LAUNCHER = "import sys; from launcher.main import main; sys.exit(main())"
 
 
 def gone(pid: int) -> bool:
@@ -213,8 +218,8 @@ def test_what_does_not_end_with_a_killed_launcher_is_ended_with_its_children(tmp
 
 def test_a_killed_launcher_leaves_no_backend_at_work(tmp_path: Path, parent):
     """A whole freeze, killed while it imports the clip: cancelled as by Ctrl-C, which leaves no empty shot."""
-    wheels = [splannequin.bpy_environment(series) for series, _ in splannequin.choose_wheels()[:1]]
-    if not all(environment.ready() for environment in (splannequin.backend_environment(), *wheels)):
+    wheels = [environments.bpy_environment(series) for series, _ in blender.choose_wheels()[:1]]
+    if not all(environment.ready() for environment in (environments.backend_environment(), *wheels)):
         pytest.skip("the environments are not set up by the launcher")
     clip = ROOT / "examples" / "sitting.mp4"
     launcher = parent(LAUNCHER, "freeze", clip, "--output", tmp_path / "out")
@@ -231,9 +236,10 @@ def test_a_killed_launcher_leaves_no_backend_at_work(tmp_path: Path, parent):
 
 
 SETTING_UP = """
-import pathlib, sys, splannequin
-splannequin.REQUIREMENTS = pathlib.Path(sys.argv[1])
-splannequin.set_up(splannequin.Environment("x", pathlib.Path(sys.argv[2]), ("small.txt",), "", 0.01), sys.executable)
+import pathlib, sys
+from launcher import environments
+environments.REQUIREMENTS = pathlib.Path(sys.argv[1])
+environments.set_up(environments.Environment("x", pathlib.Path(sys.argv[2]), ("small.txt",), "", 0.01), sys.executable)
 """
 
 

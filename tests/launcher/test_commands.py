@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 
-import splannequin
+from launcher import commands, doctor, environments, interpreters
+from launcher.summary import failed_job
 from torch_backend.cards import Card
 
-LAUNCHER = Path(splannequin.__file__)
+ROOT = Path(__file__).resolve().parents[2]
+LAUNCHER = ROOT / "splannequin.py"
 
 
 def launch(*arguments: str | Path, python: str = sys.executable, **environ: str) -> subprocess.CompletedProcess[str]:
@@ -52,13 +54,13 @@ def test_figures_of_an_earlier_run_do_not_pass_for_this_one(tmp_path: Path):
 
 
 def test_a_benchmark_of_ones_own_scenes_needs_no_blender():
-    assert splannequin._own_scenes(["--truth", "folder"]) and splannequin._own_scenes(["--shot=x", "--seeds", "2"])
-    assert not splannequin._own_scenes(["--shot", "x", "--hard"])
-    assert not splannequin._own_scenes(["--quick"]) and not splannequin._own_scenes(["--shot", "x", "--size=tiny"])
+    assert commands._own_scenes(["--truth", "folder"]) and commands._own_scenes(["--shot=x", "--seeds", "2"])
+    assert not commands._own_scenes(["--shot", "x", "--hard"])
+    assert not commands._own_scenes(["--quick"]) and not commands._own_scenes(["--shot", "x", "--size=tiny"])
 
 
 def test_benchs_help_is_the_benchmarks_own():
-    if not splannequin.backend_environment().ready():
+    if not environments.backend_environment().ready():
         pytest.skip("the backend's environment is not set up by the launcher")
     ran = launch("bench", "--help")
     assert ran.returncode == 0 and "--reference" in ran.stdout and "--jobs" in ran.stdout
@@ -122,11 +124,29 @@ def test_a_home_on_a_disk_that_takes_nothing_is_one_sentence(tmp_path: Path):
 
 
 def test_a_folder_that_is_gone_is_one_sentence(tmp_path: Path):
-    code = f"import os, sys; os.rmdir(os.getcwd()); sys.path.insert(0, {str(LAUNCHER.parent)!r}); import splannequin"
+    code = f"import os, sys; os.rmdir(os.getcwd()); sys.path.insert(0, {str(ROOT)!r}); from launcher import main"
     (tmp_path / "here").mkdir()
-    command = [sys.executable, "-P", "-c", f"{code}; sys.exit(splannequin.main(['doctor']))"]
+    command = [sys.executable, "-P", "-c", f"{code}; sys.exit(main.main(['doctor']))"]
     ran = subprocess.run(command, cwd=tmp_path / "here", capture_output=True, text=True)
     assert ran.returncode == 2 and "change to another" in ran.stderr and "Traceback" not in ran.stderr
+
+
+def test_a_shot_that_is_frozen_anew_tells_of_the_take_that_was_named():
+    shot = ROOT / "tests" / "data" / "v0_2" / "shot"
+    for words in ([], ["--t-star", "8", "--take=freeze"]):
+        found = commands._of_a_shot(str(shot), words, 2.0)
+        assert (found["shot"], found["take"], found["t_star_frame"]) == (str(shot), "freeze", 8)
+        assert found["verdict"][0].startswith("Poor.") and found["wall_seconds_by_stage"] == {"freeze": 2.0}
+    with pytest.raises(OSError, match="other"):
+        commands._of_a_shot(str(shot), ["--take", "other"], 2.0)
+
+
+def test_what_only_a_clip_wants_is_refused_of_a_shot(tmp_path: Path):
+    if not environments.backend_environment().ready():
+        pytest.skip("the backend's environment is not set up by the launcher")
+    (tmp_path / "s.splannequin").mkdir()
+    ran = launch("freeze", tmp_path / "s.splannequin", "--preset", "final", "--output", tmp_path / "out")
+    assert ran.returncode == 2 and "--preset is for a clip" in ran.stderr and "Traceback" not in ran.stderr
 
 
 def test_a_broken_status_of_a_job_breaks_nothing(tmp_path: Path):
@@ -134,21 +154,27 @@ def test_a_broken_status_of_a_job_breaks_nothing(tmp_path: Path):
         job = tmp_path / "shot.splannequin" / "jobs" / str(number)
         job.mkdir(parents=True)
         (job / "status.json").write_text(text)
-        assert splannequin.failed_job(tmp_path) == ""
+        assert failed_job(tmp_path) == ""
     (job / "status.json").write_text('{"state": "failed", "message": "It broke.", "hint": "Mend it."}')
-    assert splannequin.failed_job(tmp_path) == "It broke. Mend it."
+    assert failed_job(tmp_path) == "It broke. Mend it."
 
 
 def test_unknown_options_of_the_launchers_own_commands_are_refused(tmp_path: Path):
     assert launch("doctor", "--bogus", "--output", tmp_path).returncode == 2
 
 
-def test_the_file_parses_under_python_3_8():
-    ast.parse(LAUNCHER.read_text(encoding="utf-8"), feature_version=(3, 8))
+OLD = ("splannequin.py", "launcher/__init__.py", "launcher/interpreters.py", "launcher/places.py")
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_what_an_old_python_reads_parses_under_python_3_8(name: str):
+    ast.parse((ROOT / name).read_text(encoding="utf-8"), feature_version=(3, 8))
 
 
 def test_an_old_python_says_which_one_is_needed(tmp_path: Path):
-    old = splannequin.find_python(lambda version: (3, 8) <= version < (3, 11), ("python3.8", "python3.9", "python3.10"))
+    old = interpreters.find_python(
+        lambda version: (3, 8) <= version < (3, 11), ("python3.8", "python3.9", "python3.10")
+    )
     if old is None:
         pytest.skip("this machine has no Python from 3.8 to 3.10")
     hidden = str(tmp_path)
@@ -159,29 +185,6 @@ def test_an_old_python_says_which_one_is_needed(tmp_path: Path):
     found = launch("doctor", "--output", tmp_path, python=old, PATH=str(Path(sys.executable).parent), PYENV_ROOT=hidden)
     assert found.returncode in (0, 9)
     assert "python" in summary(tmp_path)["findings"]
-
-
-def test_counts_come_from_pytests_own_report(tmp_path: Path):
-    (tmp_path / "test_few.py").write_text(
-        "import pytest\n"
-        "def test_a(): pass\n"
-        "def test_b(): assert False\n"
-        "@pytest.mark.skip\n"
-        "def test_c(): pass\n"
-        "@pytest.fixture\n"
-        "def broken(): raise OSError\n"
-        "def test_d(broken): pass\n"
-    )
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path / "test_few.py")]
-    leg = splannequin.Leg("few", command, tmp_path / "report.xml")
-    leg.run(sys.executable)
-    assert (leg.passed, leg.failed, leg.skipped) == (1, 2, 1)
-
-
-def test_a_test_run_that_leaves_no_report_counts_as_failed(tmp_path: Path):
-    leg = splannequin.Leg("none", [sys.executable, "-c", "raise SystemExit(3)"], tmp_path / "report.xml")
-    leg.run(sys.executable)
-    assert (leg.passed, leg.failed) == (0, 1)
 
 
 @pytest.mark.parametrize(
@@ -195,6 +198,6 @@ def test_a_test_run_that_leaves_no_report_counts_as_failed(tmp_path: Path):
     ],
 )
 def test_cards_are_held_against_what_warp_needs(driver: str, compute: str, state: str, says: str):
-    finding = splannequin.gpu_finding(Card("Some card", driver, compute))
+    finding = doctor.gpu_finding(Card("Some card", driver, compute))
     assert finding.state == state
     assert says in finding.text

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-import splannequin
-from splannequin import Environment, LauncherError, set_up
+from launcher import blender, environments, pip_output
+from launcher.environments import Environment, set_up
+from launcher.errors import LauncherError
 
 
 def value_of(environment: Environment) -> str:
@@ -142,26 +143,26 @@ def test_a_full_disk_is_said_before_anything_is_written(environment: Environment
     ],
 )
 def test_pip_in_one_line_per_package(line: str, shown: str | None):
-    assert splannequin.condense_pip(line) == shown
+    assert pip_output.condense_pip(line) == shown
 
 
 def test_every_wheel_has_pinned_requirements():
-    for series in splannequin.BPY_WHEELS:
-        lines = (splannequin.REQUIREMENTS / f"bpy-{series}.txt").read_text().splitlines()
+    for series in blender.BPY_WHEELS:
+        lines = (environments.REQUIREMENTS / f"bpy-{series}.txt").read_text().splitlines()
         assert [line for line in lines if line.startswith(f"bpy=={series}.")]
         assert [line for line in lines if line.startswith("numpy==")]
 
 
 def test_every_requirement_is_pinned_exactly():
-    for path in splannequin.REQUIREMENTS.glob("*.txt"):
+    for path in environments.REQUIREMENTS.glob("*.txt"):
         for line in path.read_text().splitlines():
             assert not line.strip() or line.startswith(("#", "-c ")) or line.count("==") == 1, f"{path.name}: {line}"
 
 
 def test_an_index_that_does_not_answer_is_not_asked_for_every_package(tmp_path: Path):
-    assert splannequin._reachable(tmp_path.as_uri())
-    assert not splannequin._reachable("https://packages.invalid/whl/cpu")
-    assert not splannequin._reachable("http://127.0.0.1:9/simple")
+    assert environments._reachable(tmp_path.as_uri())
+    assert not environments._reachable("https://packages.invalid/whl/cpu")
+    assert not environments._reachable("http://127.0.0.1:9/simple")
 
 
 @pytest.fixture
@@ -221,7 +222,7 @@ RETRYING = "WARNING: Retrying (Retry(total=0, connect=None)) after connection br
 )
 def test_what_pip_prints_in_a_sentence(environment: Environment, printed: str, says: str):
     with pytest.raises(LauncherError) as refused:
-        splannequin._refuse(environment, "installing packages", printed)
+        pip_output.refuse(environment.name, environment.log, "installing packages", printed)
     assert says in str(refused.value)
 
 

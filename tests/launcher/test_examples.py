@@ -2,19 +2,19 @@
 
 from pathlib import Path
 
-import splannequin
+from launcher import places
 
 
 def test_the_bundled_clip_carries_its_licence_and_credit():
-    credit = (splannequin.DEMO_CLIP.parent / "README.md").read_text(encoding="utf-8")
-    assert splannequin.DEMO_CLIP.stat().st_size < 6_000_000
-    for needed in (splannequin.DEMO_CLIP.name, "Creative Commons Attribution 4.0", "J. Sturm", "IROS 2012"):
+    credit = (places.DEMO_CLIP.parent / "README.md").read_text(encoding="utf-8")
+    assert places.DEMO_CLIP.stat().st_size < 6_000_000
+    for needed in (places.DEMO_CLIP.name, "Creative Commons Attribution 4.0", "J. Sturm", "IROS 2012"):
         assert needed in credit
 
 
 def test_no_other_footage_is_bundled():
     """But a small .blend that is made from the clip and holds no pictures, and the script that makes it."""
-    folder = Path(splannequin.DEMO_CLIP).parent
+    folder = Path(places.DEMO_CLIP).parent
     footage = {p.name for p in folder.iterdir() if p.suffix not in (".md", ".py") and p.is_file()}
-    assert footage == {splannequin.DEMO_CLIP.name, "sitting_frozen.blend"}
+    assert footage == {places.DEMO_CLIP.name, "sitting_frozen.blend"}
     assert (folder / "sitting_frozen.blend").stat().st_size < 1_000_000

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-import splannequin
+from launcher import children, places
 
 
 @pytest.fixture
@@ -17,14 +17,14 @@ def trap(hostile, tmp_path: Path) -> Path:
 def test_the_backend_runs_without_it(trap: Path, tmp_path: Path, capfd):
     """In the folder that the user stands in, whose relative paths it is given."""
     command = [sys.executable, "-P", "-m", "torch_backend", "freeze", "absent.mp4", "--output", "out"]
-    assert splannequin.run_child(command, cwd=splannequin.HERE) == 3
+    assert children.run_child(command, cwd=places.HERE) == 3
     assert f"{tmp_path / 'clips' / 'absent.mp4'} does not exist" in "".join(capfd.readouterr())
     assert not trap.exists(), trap.read_text()
 
 
 def test_what_a_child_starts_in_turn_is_safe_too(trap: Path):
     grandchild = f"import subprocess; raise SystemExit(subprocess.call([{sys.executable!r}, '-m', 'json.tool', '-h']))"
-    assert splannequin.run_child([sys.executable, "-P", "-c", grandchild], cwd=splannequin.HERE) == 0
+    assert children.run_child([sys.executable, "-P", "-c", grandchild], cwd=places.HERE) == 0
     assert not trap.exists(), trap.read_text()
 
 
@@ -32,7 +32,7 @@ def test_what_a_child_starts_in_turn_is_safe_too(trap: Path):
 def test_the_launcher_itself_runs_without_it(trap: Path, tmp_path: Path, flags: list[str], monkeypatch):
     """Also under -P, which leaves a script's own folder out."""
     monkeypatch.setenv("SPLANNEQUIN_HOME", str(tmp_path / "nothing yet"))
-    command = [sys.executable, *flags, splannequin.__file__, "doctor", "--output", str(tmp_path / "told")]
+    command = [sys.executable, *flags, places.ROOT / "splannequin.py", "doctor", "--output", str(tmp_path / "told")]
     ran = subprocess.run(command, capture_output=True, text=True)
     assert "Traceback" not in ran.stderr and (tmp_path / "told" / "summary.json").is_file(), ran.stderr
     assert not trap.exists(), trap.read_text()

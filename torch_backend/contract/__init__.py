@@ -1,7 +1,8 @@
 """What crosses the wall between Blender and the backend. Standard library only: both sides read this package.
 
     errors          exit codes, and the failure that an artist reads
-    options         what each step may be asked for: option_table makes command lines, panel and manual of it
+    options         what each step may be asked for: option_table makes panel and manual of it
+    verbs           the words of the command lines; command_line makes both of them of it
     jobs            a job's folder: request, status, events
     processes       children, and which process lives
     lock            one writer per shot
@@ -28,6 +29,15 @@ from .camera_path import (
 )
 from .checkpoint_header import (
     checkpoint_facts,
+)
+from .command_line import (
+    as_json,
+    asked,
+    command_line,
+    freezes_a_shot,
+    is_shot,
+    notes,
+    options_for,
 )
 from .errors import (
     Cancelled,
@@ -97,8 +107,6 @@ from .option_table import (
     SWITCH,
     Limit,
     Option,
-    add_options,
-    asked,
     default_of,
     limits_of,
     option,
@@ -108,7 +116,6 @@ from .option_table import (
 )
 from .options import (
     CAMERA_MODELS,
-    COMMANDS,
     DETECTORS,
     DEVICES,
     HOST_CONFIGS,
@@ -199,6 +206,14 @@ from .typed import (
 from .unborn import (
     discard_unborn,
 )
+from .verbs import (
+    BACKEND,
+    BLENDER,
+    COMMANDS,
+    INPUT,
+    VERBS,
+    Verb,
+)
 from .writing import (
     atomic_path,
     content_key,
@@ -215,6 +230,8 @@ from .writing import (
 )
 
 __all__ = [
+    "BACKEND",
+    "BLENDER",
     "CAMERAS_FILE",
     "CAMERA_MODELS",
     "CANCEL_FILE",
@@ -238,6 +255,7 @@ __all__ = [
     "HOSTS",
     "HOST_CONFIGS",
     "INFO_FILE",
+    "INPUT",
     "JOBS_FOLDER",
     "JOB_COMMAND",
     "LAST_FRAME",
@@ -284,6 +302,7 @@ __all__ = [
     "TAKE_PREVIEW_FOLDER",
     "TAKE_REDISTORT",
     "TAKE_STATE_FILE",
+    "VERBS",
     "VERDICT_WORDS",
     "VIDEO_FILE",
     "WARP_FOLDER",
@@ -310,9 +329,10 @@ __all__ = [
     "Status",
     "TakeFolder",
     "TrainParams",
+    "Verb",
     "Verdict",
     "Writer",
-    "add_options",
+    "as_json",
     "asked",
     "atomic_path",
     "busy",
@@ -321,6 +341,7 @@ __all__ = [
     "check_version",
     "checked_name",
     "checkpoint_facts",
+    "command_line",
     "content_key",
     "default_of",
     "discard_unborn",
@@ -328,6 +349,7 @@ __all__ = [
     "end_with_starter",
     "frame_file",
     "frame_number",
+    "freezes_a_shot",
     "from_dict",
     "gives_back",
     "gone",
@@ -335,6 +357,7 @@ __all__ = [
     "host_names",
     "is_disk_full",
     "is_link",
+    "is_shot",
     "layers_of",
     "limits_of",
     "locked",
@@ -342,8 +365,10 @@ __all__ = [
     "measured",
     "need_disk",
     "new_job",
+    "notes",
     "open_regular",
     "option",
+    "options_for",
     "options_of",
     "overscan",
     "panel",

@@ -23,7 +23,8 @@ class FrameLayer:
     content: str
     """What it holds, for the user guide."""
     part: str = ""
-    """Empty: every frame has it; grain, detail: those frames that were made with it."""
+    """Empty: every frame has it; grain, detail: those frames that were made with it. A name of its own: those whose
+    writer was handed it as `more`; it goes by this row alone."""
     output: str = ""
     """Output of the compositor group that gives it; empty: none does."""
     tip: str = ""

@@ -33,7 +33,12 @@ DEVICES = ("auto", "cpu", "cuda")
 
 _FRAMES = ((1 << 31) - 1) * 1.0
 _PRESET = {0: "the preset's"}
-_DEVICE = {"flag": "--device", "choices": DEVICES, "help": "where to train and freeze: `auto` takes an NVIDIA GPU"}
+DEVICE: dict[str, Any] = {
+    "flag": "--device",
+    "choices": DEVICES,
+    "help": "where to train and freeze: `auto` takes an NVIDIA GPU",
+}
+"""The option that several dataclasses have."""
 
 
 @dataclass
@@ -181,7 +186,13 @@ class TrainParams:
         "`hexplane` (4DGaussians), `mlp` (Deformable 3DGS), `control_points` (SC-GS)",
     )
     """auto (the host behind the gate), static, or a host whose field moves all: hexplane, mlp, control_points."""
-    host: str = option("hexplane", flag="--host", choices=HOSTS, help="which host `auto` puts behind the gate")
+    host: str = option(
+        "hexplane",
+        flag="--host",
+        choices=HOSTS,
+        help="which host `auto` puts behind the gate",
+        heeded_with=("method", ("auto",)),
+    )
     """Which host `auto` puts behind the gate."""
     host_config: str = option(
         "default",
@@ -203,6 +214,7 @@ class TrainParams:
         choices=DETECTORS,
         help="`paper` only, what tells an ill-seen one: `grad_norm` (the paper), `grad_signed` (the published code), "
         "`weight`",
+        heeded_with=("supervision", ("paper",)),
     )
     """`paper`, who is ill-supervised: weight, grad_norm, or grad_signed (the published code's signed sum)."""
     iterations: int = option(
@@ -243,9 +255,9 @@ class TrainParams:
     """Every how many frames one is kept out for testing; 0: none, -1: the preset's choice."""
     seed: int = option(0, flag="--seed", metavar="N", help="random seed", limit=Limit("random seed", 0, (1 << 53) - 1))
     """Random seed."""
-    resume: bool = option(True, flag="--restart", turns_off=True, help="do not go on from the run's checkpoint")
+    resume: bool = option(True, flag="--restart", switch=True, help="do not go on from the run's checkpoint")
     """Go on from the run's checkpoint if there is one."""
-    device: str = option("auto", **_DEVICE)
+    device: str = option("auto", **DEVICE)
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used. A run may go on on another device."""
     extend: int = option(
         0,
@@ -362,10 +374,10 @@ class FreezeParams:
     only_missing: bool = option(False, always=True)
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
     grain: bool = option(
-        True, flag="--no-grain", turns_off=True, help="leave the plate's grain out of the files: a third smaller"
+        True, flag="--no-grain", switch=True, help="leave the plate's grain out of the files: a third smaller"
     )
     """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
-    device: str = option("auto", **_DEVICE)
+    device: str = option("auto", **DEVICE)
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
 
@@ -376,14 +388,6 @@ PARAMS: dict[str, type] = {
     "freeze": FreezeParams,
 }
 """Kind of job -> the dataclass of its parameters."""
-COMMANDS: dict[str, dict[str, type]] = {
-    "import": {"import": ImportParams},
-    "solve": {"solve": SolveParams},
-    "train": {"train": TrainParams},
-    "take": {"freeze": FreezeParams},
-    "freeze": PARAMS,
-}
-"""Command of a command line -> kind of job that it starts -> the dataclass of its parameters."""
 LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.values()}
 """The numbers of each kind of parameters, by field."""
 

@@ -93,9 +93,14 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     return _result(shot, record)
 
 
+_ALWAYS_IN_THE_KEY = ("first", "last", "step", "working_height", "fps")
+"""Of what was taken; all else only where it is not its default, so that a new option leaves finished imports alone."""
+
+
 def import_key(info: SourceInfo, config: FootageConfig) -> str:
     """What tells an import from others: of which footage it is, and what was taken of it."""
-    settings = {name: value for name, value in _recorded(config).items() if name != "layer" or value}
+    plain = _recorded(type(config)())
+    settings = {n: v for n, v in _recorded(config).items() if n in _ALWAYS_IN_THE_KEY or v != plain[n]}
     return content_key(FRAMES_VERSION, info.key, settings)
 
 

@@ -16,8 +16,8 @@ import functools
 import math
 import os
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -25,7 +25,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
-from ..contract import channels_of, layers_of
+from ..contract import FRAME_LAYERS, channels_of, layers_of
 from ..shot import atomic_path
 
 CHANNELS = channels_of("")
@@ -46,6 +46,9 @@ _FORMATS, _GRAIN_FORMATS, _DETAIL_FORMATS = (
     tuple(_STORAGE[layer.stored] for layer in layers_of(part) for _ in layer.channels)
     for part in ("", "grain", "detail")
 )
+_PARTS = ("", "grain", "detail")
+"""Parts whose layers have arguments of their own here; layers of any other go by the table alone (`more`)."""
+_MORE = {layer.name: layer for layer in FRAME_LAYERS if layer.part not in _PARTS}
 _CHANNELS_OF = {"rgba": (4,), "splat": (4,), "grain": (3,)}
 _ROWS = 64
 _PLATE_STEPS = 256.0
@@ -126,6 +129,8 @@ class FrozenFrame:
     """[H,W,3] scene-linear, premultiplied: what added to `rgba` gives it the plate's grain. None: not in the file."""
     detail: DetailLayers | None = None
     """float32. None: the frame is of splats alone."""
+    more: Mapping[str, NDArray[np.float32]] = field(default_factory=dict[str, NDArray[np.float32]])
+    """Further layers of the table that are in the file, by name: [H,W], or [H,W,4] of a colour."""
 
 
 def write_frozen_exr(
@@ -138,6 +143,7 @@ def write_frozen_exr(
     margin: tuple[int, int] = (0, 0),
     grain: ArrayLike | Made | None = None,  # [H,W,3]
     detail: DetailLayers | None = None,
+    more: Mapping[str, ArrayLike | Made] | None = None,  # [H,W] or [H,W,4]
 ) -> Path:
     """Writes one frame atomically: half colour and mattes, float32 depth and `source`, ZIP. Arrays as in `FrozenFrame`.
 
@@ -154,6 +160,8 @@ def write_frozen_exr(
     inside of them. Blender 4.2 to 5.2 reads the whole data window and puts its middle in the middle of the render,
     wherever the display window lies; so margins are the same on opposite sides.
 
+    `more` are layers of the table of another part, by name. KeyError if the table has none that is called so.
+
     Layers that are `Made` are made while they are written. ValueError names the layer whose shape is wrong or that
     holds NaN or infinity; OSError if the file cannot be written (errno ENOSPC when the disk is full).
     """
@@ -166,6 +174,10 @@ def write_frozen_exr(
     if detail is not None:
         layers |= {"splat": detail.splat, "plate": detail.plate, "source": detail.source}
         names, formats = names + DETAIL_CHANNELS, formats + _DETAIL_FORMATS
+    for name, layer in (more or {}).items():
+        row = _MORE[name]
+        layers[name] = layer
+        names, formats = names + row.channels, formats + (_STORAGE[row.stored],) * len(row.channels)
     parts = [_changed(layer, _STORED[name]) if name in _STORED else layer for name, layer in _checked(layers).items()]
     spec = _spec(parts[0].shape[1], parts[0].shape[0], names, formats, metadata)
     set_margin(spec, margin)
@@ -259,7 +271,12 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
         found = pixels[..., [names.index(name) for name in DETAIL_CHANNELS]]
         detail = DetailLayers(*(np.ascontiguousarray(found[..., i]) for i in (slice(0, 4), 4, 5)))
     rgba = np.ascontiguousarray(pixels[..., order[:4]])
-    return FrozenFrame(rgba, depth, support, motion, metadata, beyond, grain, detail)
+    more: dict[str, NDArray[np.float32]] = {}
+    for name, row in _MORE.items():
+        if set(row.channels) <= set(names):
+            at = [names.index(channel) for channel in row.channels]
+            more[name] = np.ascontiguousarray(pixels[..., at if len(at) > 1 else at[0]])
+    return FrozenFrame(rgba, depth, support, motion, metadata, beyond, grain, detail, more)
 
 
 def read_key(path: str | Path) -> str | None:
@@ -318,7 +335,8 @@ def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
     if len(colour) != 3 or colour[2] != 4 or not math.prod(colour):
         raise ValueError(f"rgba should be [H,W,4], got shape {tuple(colour)}")
     for name, layer in found.items():
-        expected = (*colour[:2], *_CHANNELS_OF.get(name, ()))
+        colours = len(_MORE[name].channels) if name in _MORE else 1
+        expected = (*colour[:2], *_CHANNELS_OF.get(name, (colours,) if colours > 1 else ()))
         if tuple(layer.shape) != expected:
             raise ValueError(f"{name} should be {list(expected)} like rgba, got shape {list(layer.shape)}")
         if isinstance(layer, Made):

@@ -228,7 +228,7 @@ def _scrub(plan: dict[str, Any], work: Path) -> Iterator[float]:
     import bpy
 
     yield from press._click("splannequin.live")
-    viewport = sys.modules[press._supervisor().__name__.replace(".supervisor", ".viewport")]
+    viewport = press.addon_module("freeze.viewport")
     until = time.monotonic() + 60
     while viewport.session() is None or not viewport.session().facts:
         if viewport.failure() or time.monotonic() > until:

@@ -102,8 +102,10 @@ def _watch_calls(calls: list[tuple[str, float]]) -> None:
         return call
 
     for part in (
-        "process.steps",
+        "process.begin",
         "bake.insertion",
+        "bake.group_inside",
+        "scene.sequences",
         "solve.cameras",
         "compat",
         "bake.compositor",

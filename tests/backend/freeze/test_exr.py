@@ -7,6 +7,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from torch_backend.contract import FrameLayer
+from torch_backend.freeze import exr
 from torch_backend.freeze.exr import (
     CHANNELS,
     DETAIL_CHANNELS,
@@ -140,6 +142,26 @@ def test_a_bad_layer_of_what_a_frame_is_made_of_is_named(tmp_path, name):
     with pytest.raises(ValueError, match=rf"^{name} has \d+ NaN or infinite values, the first at \(4, 0\)"):
         write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, detail=torn, **stored)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_layer_that_is_a_row_of_the_table_needs_nothing_else_here(tmp_path, monkeypatch):
+    rows = (
+        FrameLayer("Distance", ("Distance.V",), "float", "Distance.V", "from the camera", part="distance"),
+        FrameLayer("Sky", tuple(f"Sky.{c}" for c in "RGBA"), "half", "Sky.R G B A", "what is far", part="sky"),
+    )
+    monkeypatch.setattr(exr, "_MORE", {row.name: row for row in rows})
+    stored = layers()
+    more = {"Distance": stored["depth"] * 1.5, "Sky": made(stored["rgba"])}
+    path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, detail=detail_of(stored), more=more, **stored)
+    frame = read_frozen_exr(path)
+    np.testing.assert_array_equal(frame.more["Distance"], stored["depth"] * 1.5)
+    np.testing.assert_array_equal(frame.more["Sky"], stored["rgba"].astype(np.float16).astype(np.float32))
+    np.testing.assert_array_equal(frame.detail.source, detail_of(stored).source)
+    assert read_frozen_exr(write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, **stored)).more == {}
+    with pytest.raises(ValueError, match=r"Sky should be \[7, 9, 4\] like rgba"):
+        write_frozen_exr(tmp_path / "c.exr", metadata=METADATA, more={"Sky": stored["depth"]}, **stored)
+    with pytest.raises(KeyError, match="Plate"):  # has an argument of its own
+        write_frozen_exr(tmp_path / "c.exr", metadata=METADATA, more={"Plate": stored["depth"]}, **stored)
 
 
 def test_the_key_is_read_from_the_header(tmp_path):

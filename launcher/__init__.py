@@ -1,0 +1,15 @@
+"""The launcher behind `splannequin.py`: makes the two environments the project needs, then runs it.
+
+    places          folders and systems
+    interpreters    Pythons of this machine; with `places`, all that runs under an old Python
+    errors          the one exception
+    children        processes
+    pip_output      what pip prints, in an artist's words
+    environments    the virtual environments
+    blender         a Blender for the add-on
+    summary         DIR/summary.json
+    doctor, testing, commands   what can be asked for
+    main            the command line
+
+Each imports only from those above it. Standard library, `torch_backend.contract`, `.shot` and `.cards` only.
+"""

@@ -1,0 +1,114 @@
+"""A Blender for the add-on: a bpy wheel that fits a Python of this machine, or a Blender on the PATH."""
+
+from __future__ import annotations
+
+import platform
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch_backend.contract import ExitCode, program
+
+from .children import say
+from .environments import bpy_environment, set_up
+from .errors import LauncherError
+from .interpreters import dotted, find_python
+
+BPY_WHEELS = {"5.0": (3, 11), "5.2": (3, 13), "4.5": (3, 11), "4.2": (3, 11)}
+"""Blender series with a pinned wheel in requirements/, the Python each one needs, in order of preference."""
+DEMO_WHEELS = ("5.0", "5.2", "4.5")
+OLDEST_BLENDER = (4, 2)
+
+
+@dataclass(frozen=True)
+class Blender:
+    """Something that runs the add-on's Python files: the interpreter of a bpy wheel, or a Blender on the PATH."""
+
+    label: str
+    """What messages call it."""
+    command: tuple[str, ...]
+    """The command up to the script."""
+
+    @property
+    def is_wheel(self) -> bool:
+        """True for a Python that can import bpy."""
+        return len(self.command) == 1
+
+    def running(self, script: Path, *arguments: str) -> list[str]:
+        """The command line that runs `script` with `arguments`."""
+        safe, apart = (("-P",), ()) if self.is_wheel else ((), ("--",))
+        return [*self.command, *safe, str(script), *apart, *arguments]
+
+
+def find_blender() -> tuple[str, str] | None:
+    """(path, version) of a `blender` on the PATH that is new enough."""
+    path = program("blender")
+    if path is None:
+        return None
+    try:
+        out = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=60).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    found = re.search(r"Blender (\d+)\.(\d+)(\S*)", out)
+    if not found or (int(found.group(1)), int(found.group(2))) < OLDEST_BLENDER:
+        return None
+    return path, f"{found.group(1)}.{found.group(2)}{found.group(3)}"
+
+
+def choose_wheels() -> list[tuple[str, str]]:
+    """(series, python) of the bpy wheels this machine can have: those of the Python at hand first, ready ones first."""
+    at_hand = [(s, sys.executable) for s in DEMO_WHEELS if BPY_WHEELS[s] == sys.version_info[:2]]
+    if at_hand:
+        return sorted(at_hand, key=lambda wheel: not bpy_environment(wheel[0]).ready())
+    other = []
+    for series in DEMO_WHEELS:
+        if bpy_environment(series).ready():
+            return [(series, "")]
+        python = python_for(series)
+        if python:
+            other.append((series, python))
+    return other
+
+
+def python_for(series: str) -> str | None:
+    """A Python of the machine that the bpy wheel of `series` fits."""
+    needed = BPY_WHEELS[series]
+    return find_python(lambda version: version == needed, (f"python{dotted(needed)}",))
+
+
+def get_blender(testing: bool = False) -> tuple[Blender, float]:
+    """A Blender for the add-on, set up if need be, and the seconds that took. LauncherError if none can be had."""
+    wheels = choose_wheels()
+    refused: LauncherError | None = None
+    took = 0.0
+    for series, python in wheels:
+        environment = bpy_environment(series, testing)
+        try:
+            took += set_up(environment, python or environment.python)
+        except LauncherError as error:
+            refused = error
+            say(f"  note: {error}")
+            continue
+        return Blender(f"bpy {series}", (environment.python,)), took
+    found = find_blender()
+    if found:
+        options = ("--background", "--factory-startup", "--python-exit-code", str(ExitCode.BAKE), "--python")
+        return Blender(f"Blender {found[1]}", (found[0], *options)), took
+    if refused:
+        raise refused
+    raise LauncherError(
+        f"No Blender can be had: Python {platform.python_version()} fits no bpy wheel (3.11 and 3.13 do) and there is "
+        "no `blender` 4.2 or newer on the PATH; install either and start the same command again."
+    )
+
+
+def set_up_wheel(series: str, testing: bool) -> tuple[Blender, float]:
+    """The named bpy wheel, set up with a Python that fits it."""
+    environment = bpy_environment(series, testing)
+    python = environment.python if environment.ready() else python_for(series)
+    if python is None:
+        needed = dotted(BPY_WHEELS[series])
+        raise LauncherError(f"The bpy wheel {series} needs Python {needed}, which is not on the PATH: install it.")
+    return Blender(f"bpy {series}", (environment.python,)), set_up(environment, python)

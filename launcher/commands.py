@@ -1,0 +1,151 @@
+"""The commands that make something: freeze (and demo), setup, bench."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from torch_backend.contract import (
+    BACKEND,
+    ExitCode,
+    ShotFolder,
+    TakeFolder,
+    command_line,
+    is_shot,
+    read_json,
+    verdict_lines,
+)
+from torch_backend.shot import write_json
+
+from .blender import get_blender, set_up_wheel
+from .children import run_blender, run_child, say, tied_command
+from .environments import backend_environment, bench_environment, set_up
+from .errors import LauncherError
+from .places import HERE, ROOT
+from .summary import read_summary
+
+
+def freeze(given: str, output: Path, options: Sequence[str]) -> int:
+    """A clip, or a shot folder, to frozen frames through the compositor: the backend's stations, then the bake in
+    Blender's environment. Of a shot folder the frames alone are frozen anew; see `contract.freezes_a_shot`."""
+    started = time.monotonic()
+    if "://" not in given and not any(mark in given for mark in "#%*@") and not os.path.exists(given):
+        raise LauncherError(
+            f"There is no clip at {given}: give the path of a video file, an image sequence or a shot folder.",
+            ExitCode.USAGE,
+        )
+    backend = backend_environment()
+    setting_up = set_up(backend, sys.executable)
+    blender, took = get_blender()
+    setting_up += took
+
+    say(f"Freezing {given} into {output}")
+    again = "://" not in given and is_shot(given)
+    command = tied_command(backend.python, "torch_backend", "freeze", given, *options)
+    freezing = time.monotonic()
+    code = run_child([*command, *([] if again else ["--output", str(output)])], cwd=HERE, tied=True)
+    if code:
+        return code
+    summary = _of_a_shot(given, options, time.monotonic() - freezing) if again else read_summary(output)
+    if "shot" not in summary or "take" not in summary:
+        raise LauncherError(f"The backend left no figures in {output / 'summary.json'}: see the messages above.", 1)
+    write_json(output / "summary.json", summary)
+    # The bake rewrites summary.json with what it adds; the wall time and the set-up are ours to add after it.
+    say(f"Compositing in {blender.label}")
+    baking = time.monotonic()
+    take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output), "--tied"]
+    bake = blender.running(ROOT / "splannequin_addon" / "run_in_bpy.py", "bake", *take)
+    code = run_blender(bake, output / "blender.log", SPLANNEQUIN_BACKEND_PYTHON=backend.python)
+    if code:
+        return code
+    summary = read_summary(output)
+    stages = summary.setdefault("wall_seconds_by_stage", {})
+    stages.update(setup=round(setting_up, 2), bake=round(time.monotonic() - baking, 2))
+    summary["wall_seconds"] = round(time.monotonic() - started, 2)
+    write_json(output / "summary.json", summary)
+    closing_figures(summary, output)
+    return 0
+
+
+def _of_a_shot(shot: str, options: Sequence[str], seconds: float) -> dict[str, Any]:
+    """The figures of a shot folder that was frozen alone, in `seconds`: the take, and what it is worth."""
+    parser, _ = command_line("splannequin", BACKEND)
+    args, _ = parser.parse_known_args(["freeze", shot, *options])
+    folder = ShotFolder(shot)
+    facts = read_json(TakeFolder(folder.take(args.take)).facts)
+    return {
+        "version": 1,
+        "shot": str(folder.root),
+        "take": args.take,
+        "t_star_frame": facts.get("t_star_frame"),
+        "verdict": verdict_lines(facts),
+        "wall_seconds_by_stage": {"freeze": round(seconds, 2)},
+    }
+
+
+def closing_figures(summary: dict[str, Any], output: Path) -> None:
+    """The last lines of a freeze: how good, how long, where to look."""
+    stages = summary["wall_seconds_by_stage"]
+    say(f"Figures:       {output / 'summary.json'}")
+    say("Wall seconds:  " + ", ".join(f"{name} {seconds:.0f}" for name, seconds in stages.items()))
+    if "registered" not in summary:  # a shot that was there: the backend has said how good its take is
+        say(f"{summary['wall_seconds']:.0f} s in all.")
+        return
+    psnr = summary["heldout_psnr_db"]
+    quality = f"Held-out PSNR {psnr:.2f} dB" if psnr is not None else "No held-out frames"
+    say(
+        f"{quality}; trained {summary.get('train_seconds', 0):.0f} s; {summary.get('registered')} of "
+        f"{summary.get('solved_frames', summary.get('frames'))} frames registered; "
+        f"{summary['wall_seconds']:.0f} s in all."
+    )
+    for line in summary.get("verdict", []):
+        say(line)
+
+
+def setup(series: Sequence[str], testing: bool, backend_only: bool, output: Path) -> int:
+    """Makes the environments: the backend's, and the named bpy wheels (the one that fits, if none is named)."""
+    stages = {"backend": round(set_up(backend_environment(testing), sys.executable), 2)}
+    for name in series:
+        stages[f"bpy-{name}"] = round(set_up_wheel(name, testing)[1], 2)
+    if not series and not backend_only:
+        blender, took = get_blender(testing)
+        stages[blender.label.replace(" ", "-")] = round(took, 2)
+    write_json(output / "summary.json", {"command": "setup", "exit_code": 0, "wall_seconds_by_stage": stages})
+    say("Ready: " + ", ".join(stages))
+    say(f"Backend Python, for the add-on's preferences: {backend_environment().python}")
+    return 0
+
+
+def bench(arguments: Sequence[str], output: Path) -> int:
+    """The benchmark of the method: what it does not know here goes to benchmarks/bench.py."""
+    started = time.monotonic()
+    backend = backend_environment()
+    setting_up = set_up(backend, sys.executable)
+    setting_up += set_up(bench_environment(), backend.python)
+    renderer: list[str] = []
+    if not _own_scenes(arguments):
+        blender, took = get_blender()
+        if not blender.is_wheel:
+            raise LauncherError(
+                "The benchmark's scenes are rendered by a bpy wheel, and none fits: start again with Python 3.11 or "
+                "3.13, or name scenes of your own by --truth or --shot."
+            )
+        renderer, setting_up = ["--bpy", blender.command[0]], setting_up + took
+    command = [backend.python, "-P", "-m", "benchmarks.bench", "--results", str(output), "--tied", *renderer]
+    code = run_child([*command, *arguments], cwd=HERE, tied=True)
+    summary: dict[str, Any] = {"command": "bench", "exit_code": code}
+    summary.update(wall_seconds=round(time.monotonic() - started, 2), setup_seconds=round(setting_up, 2))
+    if code == 0:
+        summary["report"] = str(output / "report" / "report.md")
+    write_json(output / "summary.json", summary)
+    return code
+
+
+def _own_scenes(arguments: Sequence[str]) -> bool:
+    """True if a benchmark's arguments ask for no synthetic scene."""
+    named = {word.partition("=")[0] for word in arguments}
+    return bool(named & {"--truth", "--shot"}) and not named & {"--size", "--quick", "--limits", "--hard"}

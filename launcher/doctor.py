@@ -1,0 +1,192 @@
+"""What this machine can do, and what to do about what is missing."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch_backend.cards import Card, nvidia_cards, why_unfit, why_unused
+from torch_backend.contract import ExitCode, python_child
+from torch_backend.shot import write_json
+
+from .blender import BPY_WHEELS, DEMO_WHEELS, choose_wheels, find_blender
+from .children import child_environ, say
+from .environments import BACKEND_DISK_GB, BPY_DISK_GB, Environment, backend_environment, bpy_environment, home
+from .places import LINUX, WINDOWS
+
+BLENDER_LIBRARIES = {
+    "libX11.so.6": "libx11-6",
+    "libXrender.so.1": "libxrender1",
+    "libXxf86vm.so.1": "libxxf86vm1",
+    "libXfixes.so.3": "libxfixes3",
+    "libXi.so.6": "libxi6",
+    "libxkbcommon.so.0": "libxkbcommon0",
+    "libSM.so.6": "libsm6",
+    "libICE.so.6": "libice6",
+    "libGL.so.1": "libgl1",
+}
+"""What Blender opens on Linux and a bare server lacks: file, Debian package."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor."""
+
+    what: str
+    """What was looked at."""
+    state: str
+    """ok, note (works without) or missing (does not)."""
+    text: str
+    """What was found, and what to do about it."""
+
+
+def doctor(output: Path) -> int:
+    """Says what this machine can do and what to do about what is missing; exit code 9 if the demo cannot run."""
+    backend = backend_environment()
+    facts: dict[str, Any] = backend_facts(backend) if backend.ready() else {}
+    findings = [*machine_findings(), *gpu_findings(facts), *backend_findings(backend, facts), *blender_findings()]
+    for finding in findings:
+        say(f"{finding.state:<8} {finding.what:<16} {finding.text}")
+    missing = [f for f in findings if f.state == "missing"]
+    code = ExitCode.ENVIRONMENT if missing else 0
+    lines = {f.what: {"state": f.state, "text": f.text} for f in findings}
+    write_json(output / "summary.json", {"command": "doctor", "exit_code": code, "findings": lines, "backend": facts})
+    say(f"{len(missing)} thing(s) missing." if missing else "This machine can run the demo.")
+    return code
+
+
+def machine_findings() -> Iterator[Finding]:
+    """Python, system, cores, memory, disk."""
+    version = platform.python_version()
+    wheels = [s for s in DEMO_WHEELS if BPY_WHEELS[s] == sys.version_info[:2]]
+    fits = f"fits bpy {' and '.join(wheels)}" if wheels else "fits no bpy wheel (3.11 and 3.13 do)"
+    yield Finding("python", "ok", f"{version} at {sys.executable}; {fits}")
+    if sys.maxsize < 2**32:
+        yield Finding("64 bit", "missing", "this Python is 32-bit: install a 64-bit one")
+    cores = os.cpu_count() or 1
+    yield Finding("cores", "ok" if cores > 1 else "note", f"{cores} on {platform.platform(terse=True)}")
+    memory = memory_gb()
+    if memory is not None:
+        enough = memory >= 6
+        yield Finding(
+            "memory", "ok" if enough else "note", f"{memory:.1f} GB{'' if enough else ': close other programs'}"
+        )
+    folder = next(p for p in (home(), *home().parents) if os.path.exists(p))
+    if not backend_environment().ready() and not (folder.is_dir() and os.access(folder, os.W_OK)):
+        yield Finding("home", "missing", f"{folder} cannot be written: name another folder in SPLANNEQUIN_HOME")
+    free = shutil.disk_usage(folder).free / 1e9
+    need = 1.0 if backend_environment().ready() else BACKEND_DISK_GB + BPY_DISK_GB
+    advice = "" if free >= need else f": {need:.0f} GB are needed, free some or set SPLANNEQUIN_HOME to another disk"
+    yield Finding("disk", "ok" if free >= need else "missing", f"{free:.0f} GB free in {folder}{advice}")
+
+
+def memory_gb() -> float | None:
+    """Physical memory in GB; None where the system does not say."""
+    if WINDOWS:
+
+        class Status(ctypes.Structure):
+            _fields_ = [
+                ("length", ctypes.c_ulong),
+                ("load", ctypes.c_ulong),
+                ("total", ctypes.c_ulonglong),
+                ("unread", ctypes.c_ulonglong * 6),
+            ]
+
+        status = Status(length=ctypes.sizeof(Status))
+        windll = getattr(ctypes, "windll")  # noqa: B009  (exists on Windows alone)
+        return status.total / 1e9 if windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status)) else None
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    except (ValueError, OSError):
+        return None
+
+
+def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
+    """NVIDIA cards: whether driver and card fit the pinned Warp and torch, and whether the backend uses them."""
+    cards, trouble = nvidia_cards()
+    if trouble:
+        advice = "restart the machine; if it stays, install the driver anew"
+        yield Finding("gpu", "note", f"the NVIDIA driver does not answer: {trouble}: {advice}")
+    elif not cards:
+        yield Finding("gpu", "note", "no NVIDIA card or driver: the CPU is used, nothing is missing")
+    yield from map(gpu_finding, cards)
+    if any(card.fits for card in cards) and facts.get("trains_on") == "cpu":
+        unseen = None if facts.get("torch_device") == "cuda" else why_unused(facts.get("torch_cuda"))
+        told = " ".join(unseen) if unseen else facts.get("cuda_refusal") or "CUDA_VISIBLE_DEVICES hides the card"
+        yield Finding("torch on gpu", "note", told)
+
+
+def gpu_finding(card: Card) -> Finding:
+    """One card against what Warp and torch need."""
+    unfit = why_unfit(card)
+    if unfit is not None:
+        return Finding("gpu", "note", " ".join(unfit).strip())
+    return Finding("gpu", "ok", f"{card.name}, driver {card.driver}, compute capability {card.compute or 'unknown'}")
+
+
+def backend_facts(backend: Environment) -> dict[str, Any]:
+    """What the backend says about its own environment."""
+    command = python_child(backend.python, "torch_backend", "doctor")
+    ran = subprocess.run(**command, capture_output=True, text=True, env=child_environ())
+    try:
+        return json.loads(ran.stdout[ran.stdout.index("{") :])
+    except ValueError:
+        return {"error": (ran.stderr.strip().splitlines() or ["no answer"])[-1]}
+
+
+def backend_findings(backend: Environment, facts: dict[str, Any]) -> Iterator[Finding]:
+    """The backend's environment: made, torch's device, the video encoder."""
+    if not facts:
+        begun = "not finished" if backend.folder.is_dir() else "not made yet"
+        yield Finding("backend", "note", f"{begun}: `python3 splannequin.py setup` makes it in {backend.folder}")
+        return
+    if "error" in facts:
+        yield Finding("backend", "missing", f"{facts['error']}: remove {backend.folder} and run setup again")
+        return
+    packages = facts["packages"]
+    yield Finding("backend", "ok", f"{backend.folder}, Python {facts['python']}, warp {packages['warp-lang']}")
+    device = facts.get("cuda_device") or facts["torch_device"]
+    yield Finding("torch", "ok", f"{packages['torch']} sees {device}; training uses the {facts['trains_on']}")
+    h264 = facts["h264"]
+    yield Finding("H.264", "ok" if h264 else "note", "libx264" if h264 else "no encoder in PyAV: reinstall .venv")
+
+
+def opens(library: str) -> bool:
+    """True if the system finds this shared library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+def blender_findings() -> Iterator[Finding]:
+    """The bpy wheels that are set up or can be, the libraries they open, and a Blender on the PATH."""
+    found = find_blender()
+    packages = [package for name, package in BLENDER_LIBRARIES.items() if not opens(name)] if LINUX else []
+    if packages:
+        advice = f"install them (Debian and Ubuntu: apt install {' '.join(packages)})"
+        state = "note" if found else "missing"
+        yield Finding("libraries", state, f"a bpy wheel opens libraries that are not here: {advice}")
+    ready = [s for s in BPY_WHEELS if bpy_environment(s).ready()]
+    if ready:
+        yield Finding("bpy", "ok", f"wheel(s) {', '.join(ready)} set up")
+    wheels = [] if ready else choose_wheels()
+    if wheels:
+        yield Finding("bpy", "note", f"not made yet: `python3 splannequin.py setup` installs bpy {wheels[0][0]}")
+    if found:
+        yield Finding("blender", "ok", f"{found[1]} at {found[0]}")
+    elif ready or wheels:
+        yield Finding("blender", "note", "none on the PATH; the bpy wheel is used")
+    else:
+        advice = "install Blender 4.2 or newer and put it on the PATH, or use Python 3.11 or 3.13"
+        yield Finding("blender", "missing", f"no bpy wheel fits and no `blender` is on the PATH: {advice}")

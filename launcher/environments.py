@@ -1,0 +1,291 @@
+"""The virtual environments: what is in them, and how they are set up."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import queue
+import shutil
+import subprocess
+import threading
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch_backend.cards import nvidia_cards
+from torch_backend.contract import ExitCode, python_child
+from torch_backend.shot import is_disk_full, locked, write_json
+
+from .children import child_environ, close_input, say, start_child, stop_child, tied_command
+from .errors import LauncherError
+from .interpreters import NEEDED_PYTHON, python_version
+from .pip_output import condense_pip, refuse
+from .places import REQUIREMENTS, ROOT, WINDOWS
+
+BACKEND_DISK_GB = 4.0
+"""Free disk that setting up the backend may need: the environment and pip's downloads (Linux, CPU build of torch)."""
+BPY_DISK_GB = 2.0
+HEARTBEAT_SECONDS = 15.0
+"""A set-up that has printed nothing for this long says that it is still at work."""
+
+TORCH_INDEX = "SPLANNEQUIN_TORCH_INDEX"
+CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
+"""Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A virtual environment and what is installed in it."""
+
+    name: str
+    """What messages call it."""
+    folder: Path
+    """Where it stands."""
+    requirements: tuple[str, ...]
+    """Requirement files in requirements/, installed together."""
+    probe: str
+    """Python source that imports what must work."""
+    disk_gb: float
+    """Free disk that setting it up may need, in GB."""
+    complete: bool = False
+    """The requirement files name every package that is needed, so nothing else is installed."""
+
+    @property
+    def python(self) -> str:
+        """Its interpreter."""
+        return str(self.folder / ("Scripts/python.exe" if WINDOWS else "bin/python"))
+
+    @property
+    def state(self) -> Path:
+        """The launcher's notes on it: the stamp, the log of the last set-up."""
+        return self.folder / ".splannequin"
+
+    @property
+    def log(self) -> Path:
+        """pip's whole output of the last set-up."""
+        return self.state / "setup.log"
+
+    @property
+    def stamp(self) -> Path:
+        """What the last finished set-up installed: JSON, hash by requirement file."""
+        return self.state / "installed.json"
+
+    @property
+    def begun(self) -> Path:
+        """A file that stands here while packages are being written."""
+        return self.state / "installing"
+
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of every file that decides what is installed."""
+        names = (*self.requirements, "constraints.txt")
+        return {name: hashlib.sha256((REQUIREMENTS / name).read_bytes()).hexdigest() for name in names}
+
+    def installed(self) -> dict[str, str]:
+        """`hashes` as of the last finished set-up, {} if none finished or the venv was made anew since."""
+        try:
+            stamp = json.loads(self.stamp.read_text(encoding="utf-8"))
+            same = stamp["venv"] == (self.folder / "pyvenv.cfg").read_text(encoding="utf-8")
+            return dict(stamp["files"]) if same and not self.begun.exists() else {}
+        except (OSError, ValueError, KeyError, TypeError):
+            return {}
+
+    def ready(self) -> bool:
+        """True if a finished set-up of exactly these requirements stands here. Starts no process."""
+        return self.hashes().items() <= self.installed().items() and os.path.exists(self.python)
+
+
+def home() -> Path:
+    """The folder that holds the environments."""
+    return Path(os.path.realpath(os.path.expanduser(os.environ.get("SPLANNEQUIN_HOME") or ROOT)))
+
+
+def backend_environment(testing: bool = False) -> Environment:
+    """The backend's environment, with the test tools on request."""
+    probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, fileseq, safetensors, scipy"
+    files = ("backend.txt", "test.txt") if testing else ("backend.txt",)
+    return Environment("the backend", home() / ".venv", files, probe, BACKEND_DISK_GB)
+
+
+def bpy_environment(series: str, testing: bool = False) -> Environment:
+    """The environment of the bpy wheel of a Blender series ("5.0"), with pytest on request."""
+    files = (f"bpy-{series}.txt", "test-bpy.txt") if testing else (f"bpy-{series}.txt",)
+    return Environment(f"Blender {series}", home() / f".venv-bpy-{series}", files, "import bpy, numpy", BPY_DISK_GB)
+
+
+def bench_environment() -> Environment:
+    """The backend's environment with the benchmark's packages in it; `backend_environment` is to be ready before."""
+    probe = "import anny, ffmpeg, flip_evaluator, imageio, matplotlib, PIL, tqdm"
+    return Environment("the benchmark's packages", home() / ".venv", ("bench.txt",), probe, 1.0, complete=True)
+
+
+def set_up(environment: Environment, python: str) -> float:
+    """Makes `environment` with `python` unless it is ready; returns the seconds it took.
+
+    Raises LauncherError with the step, the log and what to do. What an interrupted set-up left is used again, packages
+    that pip had not finished writing are installed anew.
+    """
+    started = time.monotonic()
+    if environment.ready():
+        return 0.0
+    try:
+        wait = functools.partial(say, "another set-up is at work in this folder; waiting for it")
+        with locked(environment.folder.parent / ".splannequin-setup.lock", wait):
+            if not environment.ready():
+                _make(environment, python)
+    except OSError as error:
+        where = error.filename2 or error.filename or environment.folder
+        advice = "free some disk" if is_disk_full(error) else "make it writable"
+        raise LauncherError(
+            f"{environment.name[:1].upper()}{environment.name[1:]} cannot be set up in {environment.folder.parent}: "
+            f"{where}: {error.strerror or error}; {advice}, or name another folder in SPLANNEQUIN_HOME.",
+            ExitCode.DISK if is_disk_full(error) else ExitCode.ENVIRONMENT,
+        ) from error
+    return time.monotonic() - started
+
+
+def _make(environment: Environment, python: str) -> None:
+    say(f"Setting up {environment.name} in {environment.folder} (once)")
+    usable = environment.folder.is_dir() and _has_pip(environment)
+    if not usable:
+        _make_room(environment)
+    environment.state.mkdir(parents=True, exist_ok=True)
+    environment.log.write_bytes(b"")
+    if not usable:
+        _step(environment, "making the virtual environment", tied_command(python, "venv", str(environment.folder)))
+    elif environment.begun.exists():
+        command = [environment.python, "-P", "-c", DROP_UNFINISHED]
+        _step(environment, "checking what an interrupted set-up left", command)
+    before = environment.installed()
+    environment.begun.touch()
+    pip = tied_command(environment.python, "pip", "install", "--no-input", "--progress-bar", "off")
+    pip += ["--disable-pip-version-check", "--only-binary=:all:"]
+    pip += ["--no-deps"] if environment.complete else []
+    index = torch_index() if environment.requirements[0] == "backend.txt" else ""
+    if index:
+        if _reachable(index):
+            pip += ["--extra-index-url", index]
+        else:  # pip would ask it in vain for every single package, minutes in all
+            say(f"{index} cannot be reached: torch comes from the usual index")
+    for name in environment.requirements:
+        pip += ["-r", str(REQUIREMENTS / name)]
+    _step(environment, "installing packages", pip, condense_pip)
+    _step(environment, "importing what was installed", [environment.python, "-P", "-c", environment.probe])
+    venv = (environment.folder / "pyvenv.cfg").read_text(encoding="utf-8")
+    write_json(environment.stamp, {"files": {**before, **environment.hashes()}, "venv": venv})
+    environment.begun.unlink()
+
+
+def _has_pip(environment: Environment) -> bool:
+    """True if the interpreter of the environment runs, is new enough for its packages, and has pip."""
+    version = python_version(environment.python)
+    if version is None or version < NEEDED_PYTHON:
+        return False
+    command = python_child(environment.python, "pip", "--version")
+    return subprocess.run(**command, env=child_environ(), capture_output=True).returncode == 0
+
+
+def _make_room(environment: Environment) -> None:
+    """Clears away a broken environment of ours. LauncherError if it is not ours, or the disk is too full."""
+    folder = environment.folder
+    if folder.is_dir() and any(folder.iterdir()) and not environment.state.is_dir():
+        raise LauncherError(
+            f"{folder} is no environment that works, and not one of this launcher's: "
+            "move it away, or name another folder in SPLANNEQUIN_HOME, and start again."
+        )
+    if folder.is_dir():
+        shutil.rmtree(folder)
+    free = shutil.disk_usage(folder.parent).free / 1e9
+    if free < environment.disk_gb:
+        raise LauncherError(
+            f"Setting up {environment.name} needs {environment.disk_gb:.0f} GB and {folder.parent} has {free:.1f} GB "
+            "free: free some, or name a folder on another disk in SPLANNEQUIN_HOME.",
+            ExitCode.DISK,
+        )
+
+
+DROP_UNFINISHED = """
+import importlib.metadata, pathlib, shutil
+for package in importlib.metadata.distributions():
+    folder = pathlib.Path(str(package._path))
+    if folder.name.endswith(".dist-info") and not (folder / "RECORD").is_file():
+        shutil.rmtree(folder)
+"""
+"""pip writes a package's RECORD last: without one the package is not all there, and pip must not believe it is."""
+
+
+def torch_index(windows: bool = WINDOWS) -> str:
+    """Package index, beside pip's own, that torch comes from; empty for none.
+
+    What the variable says; without it, on Windows, the one with CUDA where there is a card for it.
+    """
+    if TORCH_INDEX in os.environ:
+        return os.environ[TORCH_INDEX]
+    return CUDA_INDEX if windows and any(card.fits for card in nvidia_cards()[0]) else ""
+
+
+def _reachable(index: str) -> bool:
+    """True if a package index answers about torch within ten seconds; a folder (file:) does if it is there."""
+    try:
+        with urllib.request.urlopen(f"{index.rstrip('/')}/torch/", timeout=10.0):  # noqa: S310  (the user's own)
+            return True
+    except urllib.error.HTTPError:
+        return True  # it answers: pip tells what is wrong
+    except (OSError, ValueError):
+        return urllib.parse.urlsplit(index).scheme == "file"
+
+
+def _step(
+    environment: Environment, step: str, command: list[str], condense: Callable[[str], str | None] | None = None
+) -> None:
+    """Runs one step of a set-up, its output to the log and what `condense` makes of each line to the screen."""
+    started = time.monotonic()
+    lines: queue.Queue[str | None] = queue.Queue()
+    child = start_child(
+        command, child_environ(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+
+    def read() -> None:
+        assert child.stdout is not None  # PIPE, above
+        for raw in child.stdout:
+            lines.put(raw.decode("utf-8", "replace"))
+        lines.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    said: list[str] = []
+    spoke = started
+    try:
+        with open(environment.log, "a", encoding="utf-8") as log:
+            log.write(f"$ {subprocess.list2cmdline(command)}\n")
+            while True:
+                try:
+                    line = lines.get(timeout=0.5)
+                except queue.Empty:
+                    if time.monotonic() - spoke > HEARTBEAT_SECONDS:
+                        spoke = time.monotonic()
+                        say(f"  {spoke - started:5.0f} s  still {step}")
+                    continue
+                if line is None:
+                    break
+                log.write(line)
+                said.append(line.strip())
+                text = condense(line.strip()) if condense else None
+                if text:
+                    spoke = time.monotonic()
+                    say(f"  {spoke - started:5.0f} s  {text}")
+        code = child.wait()
+    except KeyboardInterrupt:
+        stop_child(child)
+        raise
+    finally:
+        close_input(child)
+    if code:
+        told = "\n".join([*said[:5], *said[-40:]])  # pip names its indexes first
+        refuse(environment.name, environment.log, step, told)
+    if condense is None:
+        say(f"  {time.monotonic() - started:5.0f} s  {step}: done")

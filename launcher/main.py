@@ -1,0 +1,128 @@
+"""The launcher's command line."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import signal
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch_backend.contract import INPUT, ExitCode
+from torch_backend.shot import is_disk_full, write_json
+
+from .blender import BPY_WHEELS
+from .children import run_child
+from .commands import bench, freeze, setup
+from .doctor import doctor
+from .environments import backend_environment
+from .errors import LauncherError
+from .places import DEMO_CLIP, HERE
+from .summary import failed_job, read_summary
+from .testing import run_tests
+
+
+def parser() -> argparse.ArgumentParser:
+    """The grammar. What `freeze` and `demo` do not know goes to the backend, what `test` does not, to pytest, what
+    `bench` does not, to benchmarks/bench.py."""
+    top = argparse.ArgumentParser(
+        prog="splannequin.py", description="Freeze time in a handheld clip.", allow_abbrev=False
+    )
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    helps = {
+        "demo": "freeze the bundled clip",
+        "freeze": "freeze your own clip, or a shot folder anew; other options go to the backend (--t-star N, ...)",
+        "test": "run all tests; other arguments go to pytest",
+        "bench": "the method against ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
+        "doctor": "say what this machine can do",
+        "setup": "make the environments and stop",
+    }
+    for name, text in helps.items():
+        command = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+        if name == "freeze":
+            command.add_argument("clip", metavar="INPUT", help=INPUT[1])
+        if name in ("test", "setup"):
+            command.add_argument("--bpy", choices=sorted(BPY_WHEELS), help="the bpy wheel (default: one that fits)")
+        if name == "setup":
+            command.add_argument("--tests", action="store_true", help="with what `test` needs")
+            command.add_argument("--backend", action="store_true", help="the backend alone (for the add-on)")
+        names = ("--output", "--results") if name == "bench" else ("--output",)
+        command.add_argument(*names, metavar="DIR", help="folder for summary.json and results (output/...)")
+    return top
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    module = {"freeze": ["torch_backend", "freeze"], "bench": ["benchmarks.bench"]}.get(words[0] if words else "")
+    if module and {"-h", "--help"} & set(words) and backend_environment().ready():
+        return run_child([backend_environment().python, "-P", "-m", *module, "--help"], cwd=HERE)
+    args, rest = parser().parse_known_args(words)
+    if rest and args.command in ("doctor", "setup"):
+        parser().error(f"unrecognized arguments: {' '.join(rest)}")
+    for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
+            signal.signal(getattr(signal, name), _interrupt)
+    default = re.sub(r"[^\w.-]+", "_", Path(args.clip).stem) if args.command == "freeze" else args.command
+    try:
+        output = Path(os.path.abspath(args.output or Path("output") / default))
+    except OSError:
+        print("Error: The folder that you stand in is gone: change to another and start again.", file=sys.stderr)
+        return ExitCode.USAGE
+    error = ""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        # A summary of an earlier run must not pass for this one's.
+        (output / "summary.json").unlink(missing_ok=True)
+        tempfile.TemporaryFile(dir=output).close()  # said now, not after minutes of work
+        code = dispatch(args, rest, output)
+    except LauncherError as refused:
+        error, code = str(refused), refused.exit_code
+    except KeyboardInterrupt as interrupt:
+        error, code = "Cancelled.", ExitCode.CANCELLED
+        if not interrupt.args:
+            print("Cancelled. Start the same command again to go on.", file=sys.stderr, flush=True)
+    except OSError as failed:
+        error, code = _unwritable(failed, output)
+    if code and not error:
+        error = failed_job(output) or f"{args.command} ended with exit code {code}: see what it printed."
+    elif error and code != ExitCode.CANCELLED:
+        print(f"Error: {error}", file=sys.stderr, flush=True)
+    if code:
+        with contextlib.suppress(OSError):
+            failure = {"command": args.command, "exit_code": code, "error": error}
+            write_json(output / "summary.json", {**read_summary(output), **failure})
+    return code
+
+
+def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:
+    """(sentence, exit code) of what the system refused, most often to write into the output folder."""
+    where = Path(os.fsdecode(failed.filename)) if isinstance(failed.filename, (str, bytes)) else output
+    code = ExitCode.DISK if is_disk_full(failed) else ExitCode.USAGE
+    if where != output and where not in output.parents and output not in where.parents:
+        code = ExitCode.DISK if code == ExitCode.DISK else ExitCode.ENVIRONMENT
+        return f"{failed.strerror or failed}: {where}. See `doctor`, then start the same command again.", code
+    return f"Cannot write to {output}: {failed.strerror or failed}. Choose another --output folder.", code
+
+
+def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
+    """Runs the chosen command; returns its exit code."""
+    if args.command == "demo":
+        return freeze(str(DEMO_CLIP), output, ["--preset", "preview", *rest])
+    if args.command == "freeze":
+        return freeze(args.clip, output, rest)
+    if args.command == "setup":
+        return setup([args.bpy] if args.bpy else [], args.tests, args.backend, output)
+    if args.command == "bench":
+        return bench(rest, output)
+    if args.command == "test":
+        return run_tests(rest, args.bpy, output)
+    return doctor(output)

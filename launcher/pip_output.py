@@ -1,0 +1,71 @@
+"""What pip prints, in an artist's words."""
+
+from __future__ import annotations
+
+import re
+import urllib.parse
+from pathlib import Path
+
+from torch_backend.contract import ExitCode
+
+from .errors import LauncherError
+
+
+def condense_pip(line: str) -> str | None:
+    """pip's output, one line per package: `torch 2.13.0 (190.2 MB)`. None for what an artist need not read."""
+    wheel = re.match(
+        r"(?:Downloading|Using cached|Processing) (?:\S*[/\\])?([^\s/\\]+)\.whl(?!\S)(?: (\(\d[^)]*\)))?", line
+    )
+    if wheel:
+        name, version = wheel.group(1).split("-")[:2]
+        return f"{name} {version.replace('%2B', '+')} {wheel.group(2) or ''}".rstrip()
+    found = re.match(r"Installing collected packages: (.*)", line)
+    if found:
+        return f"installing {len(found.group(1).split(','))} packages"
+    return "installed" if line.startswith("Successfully installed") else None
+
+
+BROKEN_CONNECTION = re.compile(
+    r"connection broken by|ConnectionError|Max retries exceeded|Temporary failure|Name or service|getaddrinfo|"
+    r"timed out|Network is unreachable|ProxyError|SSLError|IncompleteRead|RemoteDisconnected"
+)
+"""What pip says of an index that it cannot ask. What it says last is that no version was found."""
+
+
+def refuse(name: str, log: Path, step: str, output: str) -> None:
+    """Raises the sentence for a failed step of a set-up, from what it printed."""
+    lines = [line.strip() for line in output.splitlines() if line.strip()] or ["no output"]
+    telling = [line for line in lines if re.search(r"error|not found|cannot|No space", line, re.I)]
+    last = re.sub(r"^(ERROR: |\w*Error: )", "", (telling or lines)[-1]).rstrip(".")
+    code = ExitCode.ENVIRONMENT
+    answered = re.search(r"from versions: (?!none)", output)
+    if re.search(r"No space left|Errno 28|not enough space", output, re.I):
+        code, advice = ExitCode.DISK, "free some disk, or name a folder on another disk in SPLANNEQUIN_HOME"
+    elif BROKEN_CONNECTION.search(output) and not answered:
+        last, advice = _unreachable(output)
+    elif re.search(r"ensurepip|python3-venv", output):
+        advice = "install the venv module of this Python (Debian and Ubuntu: apt install python3-venv)"
+    elif re.search(r"No matching distribution|from versions:", output):
+        advice = "use Python 3.11 or 3.13 on 64-bit Windows, macOS or Linux, or check the package index pip is set to"
+    elif re.search(r"lib\S+\.so\S*: cannot open shared object", output):
+        advice = "install that library with the system's package manager"
+    else:
+        advice = "read the log, and start the same command again: it goes on where it stopped"
+    raise LauncherError(f"Setting up {name} failed at {step} ({last[:200]}): {advice}. Log: {log}", code)
+
+
+def _unreachable(output: str) -> tuple[str, str]:
+    """What pip could not reach, and what to do about it, from what it printed."""
+    told = re.search(r"host='([^']+)'", output)
+    listed = re.search(r"Looking in indexes: (.*)", output)
+    urls = [url.strip() for url in listed.group(1).split(",")] if listed else ["https://pypi.org/simple"]
+    hosts = [part.hostname for part in map(urllib.parse.urlsplit, urls) if part.scheme != "file" and part.hostname]
+    what = told.group(1) if told else " or ".join(dict.fromkeys(hosts)) or "the package index"
+    again = "then start the same command again: it goes on where it stopped"
+    if re.search(r"ProxyError|Cannot connect to proxy", output):
+        return f"the proxy on the way to {what} cannot be used", f"check HTTPS_PROXY and pip.conf, {again}"
+    if "SSLError" in output or "certificate" in output:
+        advice = "if a proxy signs for it, name its certificate in PIP_CERT"
+        return f"the certificate of {what} is not accepted", f"{advice}, {again}"
+    advice = "check the network; behind a firewall name a proxy (HTTPS_PROXY) or an index of your own (PIP_INDEX_URL)"
+    return f"{what} cannot be reached", f"{advice}, {again}"

@@ -1,0 +1,187 @@
+"""All tests: ruff, pyright, the backend's tests, the add-on's in a bpy wheel."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch_backend.shot import write_json
+
+from .blender import get_blender, set_up_wheel
+from .children import child_environ, close_input, exit_code_of, say, start_child, stop_children, wait_for_any
+from .environments import backend_environment, set_up
+from .errors import LauncherError
+from .places import ROOT
+
+AT_ONCE = 2
+"""Legs that run beside each other where there are as many cores. More would make the tests wait for each other: those
+of the backend and those of the add-on take nearly all of the time."""
+NEWS_SECONDS = 60.0
+"""Legs whose output is kept until they end say this often how far they are."""
+
+
+ADDON_TESTS = ("tests/addon", "tests/addon_free")
+"""Those that run in Blender. The second need none: the backend's leg runs them too."""
+
+
+class Leg:
+    """One part of the tests: its command, and what became of it."""
+
+    def __init__(self, name: str, command: list[str], report: Path | None = None) -> None:
+        self.name = name
+        self.command = command if report is None else [*command, f"--junitxml={report}"]
+        self.report = report
+        """Where pytest writes its counts; None for a checker."""
+        self.passed = self.failed = self.skipped = 0
+        self.seconds = 0.0
+
+    def run(self, backend_python: str) -> None:
+        """Runs it with our output, and counts: tests by pytest's report, a checker as one."""
+        run_legs([self], backend_python, None)
+
+    def start(self, backend_python: str, log: Path | None, **environ: str) -> subprocess.Popen[bytes]:
+        """Its process; what that prints goes to `log`, or where ours does."""
+        if self.report:
+            self.report.unlink(missing_ok=True)
+        environ = child_environ(SPLANNEQUIN_BACKEND_PYTHON=backend_python, **environ)
+        if log is None:
+            return start_child(self.command, environ, cwd=ROOT)
+        with open(log, "wb") as stream:
+            return start_child(self.command, environ, cwd=ROOT, stdout=stream, stderr=subprocess.STDOUT)
+
+    def ended(self, code: int, seconds: float) -> None:
+        """Counts, and says what came out."""
+        self.seconds = seconds
+        if self.report is None:
+            self.passed, self.failed = int(code == 0), int(code != 0)
+        else:
+            self._count(self.report)
+            picked = any(word.startswith("-k") for word in self.command)
+            if code and not (code == 5 and picked) and not self.failed:  # 5: nothing ran
+                self.failed = 1
+        say(f"=== {self.name}: {self.passed} passed, {self.failed} failed, {self.seconds:.0f} s")
+
+    def _count(self, report: Path) -> None:
+        try:
+            suites = ElementTree.parse(report).getroot().iter("testsuite")  # noqa: S314  (pytest's own, just written)
+        except (OSError, ElementTree.ParseError):
+            self.failed = 1
+            return
+        for suite in suites:
+            bad = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
+            skipped = int(suite.get("skipped", 0))
+            self.passed += int(suite.get("tests", 0)) - bad - skipped
+            self.failed += bad
+            self.skipped += skipped
+
+
+def run_legs(legs: Sequence[Leg], backend_python: str, logs: Path | None, at_once: int = 1) -> None:
+    """Runs legs in their order, up to `at_once` beside each other. On Ctrl-C all are stopped, and KeyboardInterrupt.
+
+    Args:
+        legs: each is told what came of it.
+        backend_python: the backend's interpreter, for the add-on's tests.
+        logs: folder for the output of legs that share the machine, one file each; it is printed whole when the leg
+            ends. One leg alone prints as it goes.
+        at_once: how many may run at a time. None of them then takes more than its share of the cores.
+    """
+    waiting = list(legs)
+    together = logs is not None and at_once > 1 and len(legs) > 1
+    share = {"OMP_NUM_THREADS": str(max(1, cores() // at_once))} if together else {}
+    running: dict[subprocess.Popen[bytes], tuple[Leg, Path | None, float]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < (at_once if together else 1):
+                leg = waiting.pop(0)
+                log = logs / f"{re.sub(r'[^a-z0-9.]+', '-', leg.name.lower())}.log" if together and logs else None
+                say(f"\n=== {leg.name}" + (f" (beside others; its output comes when it ends: {log})" if log else ""))
+                running[leg.start(backend_python, log, **share)] = (leg, log, time.monotonic())
+            child = wait_for_any(list(running), NEWS_SECONDS)
+            if child is None:
+                if together:
+                    say("  " + ", ".join(f"{leg.name} {progress(log)}" for leg, log, _ in running.values()))
+                continue
+            leg, log, since = running.pop(child)
+            close_input(child)
+            if log is not None:
+                say(f"\n=== {leg.name}: what it printed\n{log.read_text(encoding='utf-8', errors='replace')}")
+            leg.ended(exit_code_of(child.returncode), time.monotonic() - since)
+    except KeyboardInterrupt:
+        say("\nCancelling; Ctrl-C again stops at once.")
+        raise KeyboardInterrupt("the children have said so") from None
+    finally:
+        stop_children(list(running))
+
+
+def progress(log: Path | None) -> str:
+    """How far a leg is by what it has printed: pytest's last "[ 34%]"."""
+    shares = re.findall(r"\[ *(\d+%)\]", log.read_text(encoding="utf-8", errors="replace")) if log else []
+    return shares[-1] if shares else "at work"
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
+def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> int:
+    """ruff, pyright, the backend's tests in .venv, the add-on's in one bpy wheel; closes with `N passed, N failed`."""
+    paths = [a for a in pytest_args if not a.startswith("-") and (ROOT / a.split("::")[0]).exists()]
+    rest = [a for a in pytest_args if a not in paths]
+    if not paths:
+        paths = [*ADDON_TESTS] if series else ["tests", *ADDON_TESTS]
+    addon_paths = [p for p in paths if Path(p).as_posix().startswith("tests/addon")]
+    backend_paths = [p for p in paths if p not in addon_paths]
+    backend = backend_environment(testing=True)
+    set_up(backend, sys.executable)
+    legs: list[Leg] = []
+    if backend_paths:  # the longest first
+        command = [backend.python, "-P", "-m", "pytest", "--ignore=tests/addon", *backend_paths, *rest]
+        legs.append(Leg("backend", command, output / "junit-backend.xml"))
+    if not pytest_args and not series:
+        legs += checkers(backend.python)
+    if addon_paths:
+        blender = set_up_wheel(series, True)[0] if series else get_blender(testing=True)[0]
+        if not blender.is_wheel:
+            raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
+        command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
+        legs.append(Leg(f"add-on in {blender.label}", command, output / "junit-addon.xml"))
+    output.mkdir(parents=True, exist_ok=True)
+    run_legs(legs, backend.python, output, min(AT_ONCE, cores()))
+    return _close_tests(legs, output)
+
+
+def checkers(python: str) -> list[Leg]:
+    """ruff and pyright, of the environment of `python`."""
+    project = ["--project", str(ROOT), "--pythonpath", python]
+    return [
+        Leg("ruff", [python, "-P", "-m", "ruff", "check", str(ROOT)]),
+        Leg("ruff format", [python, "-P", "-m", "ruff", "format", "--check", str(ROOT)]),
+        Leg("pyright", [python, "-P", "-m", "pyright", *project]),
+    ]
+
+
+def _close_tests(legs: Sequence[Leg], output: Path) -> int:
+    passed, failed = sum(leg.passed for leg in legs), sum(leg.failed for leg in legs)
+    code = 1 if failed or not passed else 0
+    summary = {
+        "command": "test",
+        "exit_code": code,
+        "passed": passed,
+        "failed": failed,
+        "skipped": sum(leg.skipped for leg in legs),
+        "wall_seconds_by_stage": {leg.name: round(leg.seconds, 2) for leg in legs},
+    }
+    write_json(output / "summary.json", summary)
+    for leg in legs:
+        if leg.failed:
+            say(f"failed: {leg.name}")
+    say(f"{passed} passed, {failed} failed")
+    return code

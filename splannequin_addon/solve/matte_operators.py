@@ -1,0 +1,159 @@
+"""The buttons of the motion matte: show it, paint it, keep or clear what was painted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from ..process import supervisor
+from ..scene import sequences
+from ..shot import chosen, contents
+from ..translations import tr
+from ..ui import icons
+from . import mattes
+
+
+def _in_editor(context: Any, image: Any, mode: str) -> Any | None:
+    """Shows an image in an Image Editor, the one in this window first, else in a new window; None without windows."""
+    if bpy.app.background:
+        return None
+    windows = sorted(context.window_manager.windows, key=lambda window: window != context.window)
+    areas = [area for window in windows for area in window.screen.areas if area.type == "IMAGE_EDITOR"]
+    if not areas:
+        bpy.ops.wm.window_new()
+        areas = [context.window_manager.windows[-1].screen.areas[0]]
+        areas[0].type = "IMAGE_EDITOR"
+    space = areas[0].spaces.active
+    space.image = image
+    space.ui_mode = mode
+    return space
+
+
+class _Matte:
+    """What the operators share: off without a solve, the shot of the scene, errors in words."""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Off without a solve."""
+        folder = chosen.shot_folder(context.scene)
+        state = supervisor.watch_of(folder).state if folder else None
+        if state is None or not state.solve:
+            cls.poll_message_set(tr("Solve the camera first"))  # type: ignore[attr-defined]
+            return False
+        return True
+
+    def execute(self, context: Any) -> set[str]:
+        """Does it; a refusal is reported."""
+        shot = chosen.shot_folder(context.scene)
+        if shot is None:
+            return {"CANCELLED"}
+        try:
+            self.report({"INFO"}, tr(self.act(context, shot)))  # type: ignore[attr-defined]
+        except contract.JobError as error:
+            self.report({"ERROR"}, f"{tr(error.message)} {tr(error.hint)}".strip())  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def act(self, context: Any, shot: Path) -> str:
+        """What it does; returns what was done, for people."""
+        raise NotImplementedError
+
+
+class SPLANNEQUIN_OT_show_motion(_Matte, bpy.types.Operator):
+    """Show in an Image Editor what the solve found to move by itself: black stands still, white moves, grey is not
+    known"""
+
+    bl_idname = "splannequin.show_motion"
+    bl_label = "Show Motion"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: Any, shot: Path) -> str:
+        """Loads the mattes as a sequence."""
+        image, first, last = mattes.load_sequence(shot)
+        space = _in_editor(context, image, "VIEW")
+        if space is not None:
+            sequences.show_sequence(space.image_user, image, first, last)
+        return f"The motion matte has frames {first} to {last}."
+
+
+class SPLANNEQUIN_OT_paint_motion(_Matte, bpy.types.Operator):
+    """Paint over the motion matte of the current frame in an Image Editor: black where it stands still, white where it
+    moves"""
+
+    bl_idname = "splannequin.paint_motion"
+    bl_label = "Paint Motion"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: Any, shot: Path) -> str:
+        """Makes the image to paint on."""
+        frame = context.scene.frame_current
+        _in_editor(context, mattes.paint_image(shot, frame), "PAINT")
+        return f"Paint on frame {frame}, then press Save Paint."
+
+
+class SPLANNEQUIN_OT_save_motion(_Matte, bpy.types.Operator):
+    """Keep what was painted on the motion matte of the current frame in the shot: freezes from now on follow it"""
+
+    bl_idname = "splannequin.save_motion"
+    bl_label = "Save Motion Paint"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: Any, shot: Path) -> str:
+        """Writes the current frame's image."""
+        frame = context.scene.frame_current
+        image = mattes.find_image(shot, frame)
+        if image is None:
+            message = f"Nothing is painted on frame {frame}."
+            raise contract.JobError(message, "Press Paint Motion first.", contract.ExitCode.USAGE)
+        mattes.save_paint(image)
+        return f"Frame {frame} of the motion matte is as you painted it."
+
+
+class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
+    """Delete what was painted on the motion matte of the current frame from the shot folder on disk, after a question:
+    what the solve found holds again"""
+
+    bl_idname = "splannequin.clear_motion"
+    bl_label = "Clear Motion Paint"
+    bl_options = {"REGISTER"}
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        """Asks first: what is removed from disk does not come back with undo."""
+        return context.window_manager.invoke_confirm(
+            self, event, title="Delete the painted matte of this frame from disk?",
+            message="What the solve found holds again. This cannot be undone.", confirm_text="Remove", icon="WARNING",
+        )  # fmt: skip
+
+    def act(self, context: Any, shot: Path) -> str:
+        """Removes the current frame's file."""
+        frame = context.scene.frame_current
+        try:
+            gone = mattes.clear_paint(shot, frame)
+        except OSError as error:
+            raise contents.unwritable(
+                mattes.painted_file(shot, frame), error, "Close it elsewhere, then try again."
+            ) from error
+        if not gone:
+            raise contract.JobError(f"Nothing is painted on frame {frame}.", "", contract.ExitCode.USAGE)
+        return f"Frame {frame} of the motion matte is as the solve found it."
+
+
+def draw(layout: Any) -> None:
+    """The buttons."""
+    row = layout.row(align=True)
+    for name in ("splannequin.show_motion", "splannequin.paint_motion"):
+        row.operator(name, icon=icons.of(name))
+    row = layout.row(align=True)
+    row.operator("splannequin.save_motion", text="Save Paint", icon=icons.of("splannequin.save_motion"))
+    row.operator("splannequin.clear_motion", text="Clear", icon=icons.of("splannequin.clear_motion"))
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_show_motion,
+    SPLANNEQUIN_OT_paint_motion,
+    SPLANNEQUIN_OT_save_motion,
+    SPLANNEQUIN_OT_clear_motion,
+)

@@ -1,0 +1,106 @@
+"""The timer: work of Blender's own in turns, questions to the backend, jobs that end, renders that are followed."""
+
+import bpy
+import pytest
+
+
+@pytest.fixture
+def supervisor(addon):
+    return addon("process.supervisor")
+
+
+@pytest.fixture
+def watch(supervisor, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    return supervisor.watch_of(shot)
+
+
+def test_work_is_done_a_turn_at_a_time_and_shows_how_far_it_is(supervisor, watch, shot):
+    done = []
+
+    def turns():
+        for n in (1, 2):
+            done.append(n)
+            yield supervisor.Progress(f"Reading the camera, frame {n} of 2", n, 2)
+        done.append("end")
+
+    watch.notes["freeze"] = ["of before"]
+    supervisor.work(shot, "freeze", turns())
+    assert done == [] and watch.running() == "freeze" and "freeze" not in watch.notes
+    assert supervisor.tick() == supervisor.WORKING_SECONDS and done == [1]
+    assert (watch.work.progress.done, watch.work.progress.total) == (1, 2)
+    supervisor.tick()
+    assert done == [1, 2] and watch.running() == "freeze"
+    assert supervisor.tick() == supervisor.TICK_SECONDS
+    assert done == [1, 2, "end"] and watch.running() is None and not watch.failures
+
+
+def test_work_that_fails_says_why_and_is_over(supervisor, contract, watch, shot):
+    def turns():
+        yield None
+        raise contract.JobError("The camera is gone.", "Choose another one.")
+
+    supervisor.work(shot, "freeze", turns())
+    supervisor.tick()
+    supervisor.tick()
+    assert watch.failures == {"freeze": ("The camera is gone.", "Choose another one.")} and watch.running() is None
+
+
+def test_what_the_last_turn_begins_goes_on(supervisor, watch, shot):
+    def turns():
+        yield None
+        supervisor.watch_of(shot).work = supervisor.Work("bake", None, supervisor.Progress("Rendering", 0, 3))
+
+    supervisor.work(shot, "bake", turns())
+    supervisor.tick()
+    supervisor.tick()
+    assert watch.running() == "bake" and watch.work.turns is None, "Blender renders by itself"
+
+
+def test_one_that_breaks_does_not_end_the_timer_for_the_others(supervisor, capfd):
+    calls = []
+    supervisor.meanwhile(lambda: 1 / 0)
+    supervisor.meanwhile(lambda: len(calls) < 2 and not calls.append(len(calls)))
+    for _ in range(4):
+        supervisor.tick()
+    assert calls == [0, 1] and not supervisor._meanwhile
+    assert capfd.readouterr().err.count("ZeroDivisionError") == 1
+
+
+def test_a_bake_whose_frames_are_there_comes_in_in_turns(addon, contract, supervisor, watch, shot):
+    """Read a picture, read the next, change the compositor, render: Blender stands still in each."""
+    params = contract.FreezeParams(take="freeze")
+    job = addon("process.jobs").new_job(shot, "freeze", params)
+    job.status = contract.Status("freeze", "done", 0, 0.0, 1.0, 0.0)
+    images = len(bpy.data.images)
+    supervisor.follow("bake", job)
+    supervisor._ended(watch, "bake", job)
+    group_node, tree = addon("bake.freeze_group").group_node, addon("compat").compositor_tree
+    assert watch.running() == "bake" and len(bpy.data.images) == images
+    supervisor.tick()
+    assert len(bpy.data.images) == images + 1 and tree(bpy.context.scene) is None
+    supervisor.tick()
+    assert len(bpy.data.images) == images + 2 and tree(bpy.context.scene) is None
+    supervisor.tick()
+    assert group_node(tree(bpy.context.scene)) is not None and watch.notes["bake"]
+    assert watch.running() == "bake" and not watch.failures, "the render begins with the next turn"
+
+
+def test_a_render_is_followed_by_its_handlers(addon, watch, shot):
+    progress = addon("bake.progress")
+    progress.began(shot, 3)
+    assert watch.running() == "bake"
+    progress._on_frame()
+    progress._on_frame()
+    assert (watch.work.progress.done, watch.work.progress.text) == (2, "Rendering, frame 2 of 3") and watch.redraw
+    progress._on_end()
+    assert watch.running() is None and watch.notes["bake"] == ["2 of 3 frames rendered."]
+    progress.began(shot, 3)
+    progress.refused(shot)
+    assert watch.running() is None
+
+
+def test_another_file_ends_what_blender_itself_was_doing(supervisor, watch, shot):
+    supervisor.work(shot, "freeze", iter([None, None]))
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    assert watch.work is None

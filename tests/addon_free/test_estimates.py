@@ -1,0 +1,51 @@
+"""What the presets say of themselves before they are run."""
+
+import pytest
+
+
+def run(**figures):
+    return {"run": "main", "preset": "preview", "width_px": 320, "iterations": 3000, "train_seconds": 150.0} | figures
+
+
+@pytest.fixture
+def costs(addon, tmp_path):
+    """costs(runs, width) is {preset: cost} for a shot of that width, and the run that tells it."""
+
+    def call(runs, width=1280):
+        state = addon("shot.shot_state").ShotState(tmp_path, {"width": width, "height": 720}, runs=runs)
+        rows, told = addon("train.estimates").costs(state)
+        return {row.preset: row for row in rows}, told
+
+    return call
+
+
+def test_without_a_timed_run_nothing_is_promised(costs, addon, contract):
+    for runs in ({}, {"a": run(train_seconds=None)}, {"a": run(train_seconds="x")}, {"a": run(iterations=0)}):
+        rows, told = costs(runs)
+        assert told is None and all(row.seconds is None and not row.measured for row in rows.values())
+    assert {n: (r.steps, r.width) for n, r in rows.items()} == {
+        n: (contract.PRESET_STEPS[n], contract.PRESET_WIDTHS[n]) for n in ("preview", "standard", "final")
+    }
+    assert addon("train.estimates").costs(None)[1] is None
+
+
+def test_a_preset_that_was_run_takes_as_long_again_and_others_by_pixels_and_steps(costs):
+    rows, told = costs({"main": run(iterations=1000, train_seconds=100.0)})
+    assert told["run"] == "main"
+    assert (rows["preview"].seconds, rows["preview"].measured) == (200.0, True)
+    assert (rows["standard"].seconds, rows["standard"].measured) == (pytest.approx(200.0 * 4.5 * 4), False)
+    assert rows["final"].seconds == 200.0 * 15 * 16
+
+
+def test_a_static_run_does_not_tell_how_long_one_with_motion_takes(costs):
+    runs = {"main": run(iterations=1000, train_seconds=100.0, method="auto")}
+    runs["still"] = run(run="still", iterations=2000, train_seconds=40.0, method="static")
+    rows, told = costs(runs)
+    assert told["run"] == "main" and rows["preview"].seconds == 200.0
+    rows, told = costs({"still": runs["still"]})
+    assert told["run"] == "still" and rows["preview"].seconds == 40.0, "better than nothing"
+
+
+def test_a_small_clip_is_not_enlarged(costs):
+    rows, _ = costs({"main": run(width_px=320)}, width=640)
+    assert (rows["standard"].width, rows["final"].width) == (640, 640)

@@ -1,0 +1,48 @@
+"""Which modules of the add-on need no Blender: they can be tested in a second, and a bpy may not creep into them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FREE = (
+    "bake.node_names", "bake.take_files", "freeze.live", "process.children", "process.environment", "process.jobs",
+    "process.steps", "scene.axes", "scene.mark", "scene.numbered", "scene.scene_setup", "shot.checkpoints",
+    "shot.contents", "shot.kept", "shot.markers", "shot.shot_state", "solve.alignment", "train.estimates",
+    "train.training", "ui.icons",
+)  # fmt: skip
+IMPORTS = """
+import importlib, importlib.util, sys
+
+class NoBlender:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("bpy", "mathutils", "gpu", "blf", "bmesh", "bpy_extras"):
+            raise ImportError(f"{name} is Blender's")
+
+sys.meta_path.insert(0, NoBlender())
+spec = importlib.util.spec_from_file_location("loader", sys.argv[1])
+loader = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(loader)
+package = loader.load_package().__name__
+for name in sys.argv[2:]:
+    importlib.import_module(f"{package}.splannequin_addon.{name}")
+"""
+
+
+def imported(*names: str) -> subprocess.CompletedProcess[str]:
+    """A Python without Blender that imports modules of the add-on."""
+    command = [sys.executable, "-P", "-c", IMPORTS, str(ROOT / "splannequin_addon" / "run_in_bpy.py"), *names]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_modules_that_need_no_blender_are_imported_without_one():
+    done = imported(*FREE)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", ["compat", "shot.chosen"])
+def test_a_module_that_needs_blender_is_seen(name: str):
+    done = imported(name)
+    assert done.returncode != 0 and "is Blender's" in done.stderr

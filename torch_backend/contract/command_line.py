@@ -1,0 +1,195 @@
+"""Both command lines, made of the table of verbs: the backend's and Blender's have the same options for a verb."""
+
+from __future__ import annotations
+
+import argparse
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .errors import ExitCode, JobError
+from .option_table import Option, default_of, options_of
+from .options import FreezeParams
+from .shot_folder import INFO_FILE, SHOT_SUFFIX
+from .verbs import VERBS, Verb
+
+CODES = "exit codes: " + ", ".join(f"{code.value} {code.name.lower()}" for code in ExitCode)
+_JSON = "print events as JSON lines instead of text"
+
+
+def command_line(
+    prog: str, side: str, unset: Mapping[str, str] | None = None
+) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The grammar of one side's command line, and the parsers of its verbs.
+
+    Args:
+        prog: what starts it.
+        side: `verbs.BACKEND` or `verbs.BLENDER`.
+        unset: field -> in words, what this side takes for it where nothing is said; its value is "" then. See `asked`.
+    """
+    top = argparse.ArgumentParser(
+        prog=prog, description="Freeze time in a handheld clip of people holding still.", epilog=CODES
+    )
+    top.add_argument("--json", action="store_true", dest="json_before", help=_JSON)
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    parsers = {}
+    for name, verb in VERBS.items():
+        if side not in verb.sides:
+            continue
+        text = verb.help if not verb.now else f"old name of {verb.help}"
+        one = parsers[name] = commands.add_parser(name, help=text, description=text, epilog=CODES)
+        one.add_argument("--json", action="store_true", help=_JSON if verb.json else argparse.SUPPRESS)
+        _add_options(one, name, verb, side, unset or {})
+    return top, parsers
+
+
+def as_json(args: argparse.Namespace) -> bool:
+    """--json was said, before the verb or after it."""
+    return bool(args.json or args.json_before)
+
+
+class _Noted(argparse.Action):
+    """Stores a value, or turns a switch over, and remembers that it was said: a default says nothing."""
+
+    def __call__(
+        self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: str | None = None
+    ) -> None:
+        setattr(namespace, self.dest, True if self.nargs == 0 else values)
+        if option_string is not None:
+            namespace.said = {**getattr(namespace, "said", {}), self.dest: self.option_strings[0]}
+
+
+def options_for(name: str, cls: type, side: str = "") -> list[tuple[Any, Option]]:
+    """(field, option) of a dataclass that a verb has on a side's command line; `side` empty: on either."""
+    return [
+        (one, told)
+        for one, told in options_of(cls)
+        if told.flag and (not told.commands or name in told.commands) and (not side or told.side in ("", side))
+    ]
+
+
+def _add_options(parser: argparse.ArgumentParser, name: str, verb: Verb, side: str, unset: Mapping[str, str]) -> None:
+    """Gives a verb its options; one that several of its dataclasses have, once."""
+    there: set[str] = set()
+    for cls in (verb.words, *verb.jobs.values()):
+        hints = typing.get_type_hints(cls)
+        for one, told in options_for(name, cls, side):
+            if told.flag in there:
+                continue
+            there.add(told.flag)
+            words: dict[str, Any] = {"action": _Noted, "help": told.help}
+            if told.switch:
+                parser.add_argument(told.flag, nargs=0, default=False, required=False, **words)
+                continue
+            words.update(metavar=told.metavar, choices=told.choices or None)
+            if one.name in verb.shown:
+                words["metavar"], words["help"] = verb.shown[one.name]
+            if told.flag.startswith("--"):
+                own = unset.get(one.name)
+                words["required"] = told.required
+                words["default"] = (None if told.required else one.default) if own is None else ""
+                default = own or default_of(one, told)
+                words["help"] += f" (default: {default})" if default else ""
+            parser.add_argument(told.flag, type=_parser_of(told, hints[one.name]), **words)
+
+
+def asked(args: argparse.Namespace, unset: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Kind of job -> its parameters, as parsed arguments ask for them; none of a verb that starts no job.
+
+    Args:
+        args: parsed by a `command_line`.
+        unset: field -> value where nothing was said of what the command line was given as `unset`.
+
+    Raises:
+        JobError: an option was said that makes no sense for what the verb was given.
+    """
+    name = args.command
+    kinds = VERBS[name].jobs
+    if freezes_a_shot(args):
+        _refuse_what_a_clip_wants(args)
+        kinds = {"freeze": FreezeParams}
+    return {kind: cls(**_values(args, name, cls, unset or {})) for kind, cls in kinds.items()}
+
+
+def _values(args: argparse.Namespace, name: str, cls: type, unset: Mapping[str, Any]) -> dict[str, Any]:
+    """Field -> value of a dataclass, from parsed arguments."""
+    values = {one.name: told.always for one, told in options_of(cls) if told.always is not None}
+    for one, told in options_for(name, cls):
+        value = getattr(args, told.dest)
+        if told.switch:
+            value = one.default != value
+        elif told.is_path and value and "://" not in value:
+            value = str(Path(value).absolute())
+        values[one.name] = unset.get(one.name, value) if value == "" else value
+    return values
+
+
+def is_shot(path: str | Path) -> bool:
+    """True of a shot folder, and of what is called like one: any other folder may hold the pictures of a clip."""
+    place = Path(path)
+    return place.suffix == SHOT_SUFFIX or (place / INFO_FILE).is_file()
+
+
+def freezes_a_shot(args: argparse.Namespace) -> bool:
+    """True of `freeze SHOT`, which is the step alone; False of `freeze CLIP` and every other verb."""
+    return args.command == "freeze" and "://" not in args.clip and is_shot(args.clip)
+
+
+def _refuse_what_a_clip_wants(args: argparse.Namespace) -> None:
+    """JobError if `freeze SHOT` was told what only the steps before it can heed."""
+    known = {told.dest for _, told in options_for("freeze", FreezeParams)}
+    lost = [flag for dest, flag in getattr(args, "said", {}).items() if dest not in known]
+    if lost:
+        verb = "is" if len(lost) == 1 else "are"
+        raise JobError(
+            f"{_listed(lost)} {verb} for a clip, and {args.clip} is a shot folder, which is frozen alone.",
+            "Leave it out: the verb of its own step has it.",
+            ExitCode.USAGE,
+        )
+
+
+def notes(args: argparse.Namespace) -> list[str]:
+    """Sentences on what a command line says in vain, or in an old word."""
+    verb, said = VERBS[args.command], getattr(args, "said", {})
+    found = []
+    if verb.now:
+        found.append(f"`{args.command} SHOT` is called `{verb.now} SHOT` now: the old word goes with the next version.")
+    for cls in (verb.words, *verb.jobs.values()):
+        dests = {one.name: told.dest for one, told in options_for(args.command, cls)}
+        for one, told in options_for(args.command, cls):
+            if told.heeded_with is None or dests[one.name] not in said:
+                continue
+            field, values = told.heeded_with
+            if getattr(args, dests[field]) not in values:
+                other = _listed([f"--{field.replace('_', '-')} {value}" for value in values])
+                found.append(f"{told.flag} is passed over: it is heeded only with {other}.")
+    if "extend" in said:
+        lost = [flag for dest, flag in said.items() if dest not in ("extend", "run", "device")]
+        if lost:
+            found.append(f"{_listed(lost)}: passed over beside --extend, as a finished run keeps its settings.")
+    return found
+
+
+def _listed(words: Sequence[str]) -> str:
+    """["a", "b", "c"] as "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
+
+
+def _parser_of(told: Option, hint: Any) -> Callable[[str], Any]:
+    """What makes a value of the text on a command line."""
+    if told.parse is not None:
+        return _in_words(told.parse)
+    return next(kind for kind in (int, float, str) if kind is hint or kind in typing.get_args(hint))
+
+
+def _in_words(parse: Callable[[str], Any]) -> Callable[[str], Any]:
+    """argparse shows the sentence of one kind of error only."""
+
+    def wrapped(text: str) -> Any:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return wrapped
