@@ -234,6 +234,9 @@ def _show_results(work: Path) -> Iterator[float]:
     window.workspace = bpy.data.workspaces["Compositing"]
     yield 2.0
     area = next(a for a in window.screen.areas if a.type == "NODE_EDITOR")
+    if hasattr(area.spaces.active, "show_region_asset_shelf"):  # it would cover the lower half of the group
+        area.spaces.active.show_region_asset_shelf = False
+    yield 0.5
     region = next(r for r in area.regions if r.type == "WINDOW")
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.node.view_all()
@@ -357,6 +360,8 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
         far = status is not None and status.fraction > share and status.stage.startswith(stage)
         drawn = watch.work is not None and watch.work.progress is not None and watch.work.progress.done > 0
         if not taken and (drawn if name == "5-bake" else far):
+            if name == "3-train" and not cancel:
+                yield from _scroll_down()  # its preview and curve stand below the window's edge
             yield from _shoot(work, f"{name}-running", settle=2)
             taken = True
             if cancel:
@@ -365,6 +370,7 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
     yield 1.5
     if name == "5-bake":
         yield from _scroll_down()
+        yield from _scroll_down()  # what the bake changed is a list that is longer than the first turn of the wheel
     yield from _shoot(work, f"{name}-{'cancelled' if cancel else 'done'}")
     if cancel:
         return
