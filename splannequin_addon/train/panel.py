@@ -9,6 +9,7 @@ import bpy
 
 from ..process import steps
 from ..shot.shot_state import ShotState
+from ..translations import tr
 from ..ui import listing, step_panel
 from ..ui.sentences import cells, wrap
 from . import estimates, pictures, training
@@ -48,7 +49,8 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         names = {name: label for name, label, _ in PRESETS}
         for row in rows:
             columns = cells(column.row(align=True), _PRESET_WIDTHS)
-            columns[0].prop_enum(props, "preset", row.preset, text=names[row.preset])
+            label = tr(names[row.preset])  # ours: Blender's own word for Final is too long for the column in German
+            columns[0].prop_enum(props, "preset", row.preset, text=label, translate=False)
             spent = "-" if row.seconds is None else step_panel.minutes(row.seconds) + ("" if row.measured else " ?")
             for place, text in zip(columns[1:], (str(row.width), f"{row.steps / 1000:g}k", spent), strict=True):
                 place.label(text=text, translate=False)

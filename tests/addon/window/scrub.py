@@ -40,7 +40,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     while viewport.session() is None or not viewport.session().facts:
         if viewport.failure():
             raise RuntimeError(" ".join(viewport.failure()))
-        if time.monotonic() - since > 30:
+        if time.monotonic() - since > 120:
             yield from press._shoot(work, "8-scrub-failed")
             raise RuntimeError("the backend never was ready")
         yield 0.1
@@ -51,6 +51,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     trained = session.facts["trained"]
     scene.splannequin.t_star = trained[len(trained) // 2]
     told["detail_seconds"] = [(yield from _detailed(session))]
+    yield from press._scroll_down()  # to what the step shows while it scrubs
     yield from press._shoot(work, "8-scrub-camera")
     told["sharp_width"] = max(frame.rgba.shape[1] for frame in session.frames.values())
     told["covered"] = round(min(float(frame.rgba[..., 3].mean()) for frame in session.frames.values()), 3)
@@ -68,7 +69,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     told["sweep_size"] = min((f.rgba.shape[1], f.rgba.shape[0]) for f in session.frames.values())
     yield from _free_view(scene, work, session, told)
     scene.splannequin.live_show = "guesses"
-    yield 2.0
+    yield from _tinted(session, told["sharp_width"])
     yield from press._shoot(work, "8-scrub-guesses")
     pid = session._process.pid
     yield from press._click("splannequin.live")
@@ -100,6 +101,16 @@ def _detailed(session: Any) -> Generator[float, None, float]:
     spent = time.monotonic() - since
     yield 0.5
     return round(spent, 2)
+
+
+def _tinted(session: Any, width: int) -> Iterator[float]:
+    """Waits until the guesses are shown as sharp as the picture before them."""
+    since = time.monotonic()
+    while not any(f.asked.show == "guesses" and f.rgba.shape[1] >= width for f in session.frames.values()):
+        if time.monotonic() - since > 120:
+            raise RuntimeError("the guesses never were shown sharp")
+        yield 0.05
+    yield 0.5
 
 
 def _free_view(scene: Any, work: Path, session: Any, told: dict[str, Any]) -> Iterator[float]:
