@@ -172,6 +172,38 @@ def override(config: Any, path: str, value: Any) -> None:
 # ------------------------------------------------------------------------------------------------- the plan
 
 
+def _settings(reference: bool, ablations: bool) -> tuple[list[RunSpec], list[str]]:
+    """What `plan` runs on every scene, and sentences about what of it is missing."""
+    offered = [host for host in HOSTS if host in METHODS]
+    supervised = [s for s in ("none", "paper", "support") if s in SUPERVISIONS]
+    settings = [RunSpec("", "", host, supervision, "preview") for host in offered for supervision in supervised]
+    settings += [RunSpec("", "", "auto", "support", "preview"), RunSpec("", "", "static", "none", "preview")]
+    if reference:
+        published = {"host_config": "reference"}
+        settings += [
+            RunSpec("", "", host, supervision, "preview", "reference", training=published)
+            for host in offered
+            for supervision in supervised
+            if supervision != "support"
+        ]
+    notes = [
+        f"{name} is not in this report: the trainer has no host {host!r}."
+        for host, name in HOSTS.items()
+        if host not in METHODS
+    ]
+    if ablations:
+        for a in ABLATIONS:
+            spec = RunSpec("", "", a.host, a.supervision, "preview", a.name, query=a.query)
+            spec = dataclasses.replace(spec, overrides=dict(a.overrides), training=dict(a.training))
+            try:
+                spec.config()
+            except ValueError as error:
+                notes.append(f"The ablation {a.name!r} is not in this report: {error}.")
+            else:
+                settings.append(spec)
+    return settings, notes
+
+
 def plan(
     sources: Sequence[str],
     results: Path,
@@ -190,33 +222,7 @@ def plan(
     given, are the only values of TrainConfig.method that run. `common` goes to every `RunSpec`: iterations, width,
     max_gaussians, device.
     """
-    offered = [host for host in HOSTS if host in METHODS]
-    supervised = [s for s in ("none", "paper", "support") if s in SUPERVISIONS]
-    settings = [RunSpec("", "", host, supervision, "preview") for host in offered for supervision in supervised]
-    settings += [RunSpec("", "", "auto", "support", "preview"), RunSpec("", "", "static", "none", "preview")]
-    if reference:
-        published = {"host_config": "reference"}
-        settings += [
-            RunSpec("", "", host, supervision, "preview", "reference", training=published)
-            for host in offered
-            for supervision in supervised
-            if supervision != "support"
-        ]
-    said = [
-        f"{name} is not in this report: the trainer has no host {host!r}."
-        for host, name in HOSTS.items()
-        if host not in METHODS
-    ]
-    if ablations:
-        for a in ABLATIONS:
-            spec = RunSpec("", "", a.host, a.supervision, "preview", a.name, query=a.query)
-            spec = dataclasses.replace(spec, overrides=dict(a.overrides), training=dict(a.training))
-            try:
-                spec.config()
-            except ValueError as error:
-                said.append(f"The ablation {a.name!r} is not in this report: {error}.")
-            else:
-                settings.append(spec)
+    settings, notes = _settings(reference, ablations)
     settings = [setting for setting in settings if not methods or setting.host in methods]
     scenes = [(source, load_source(source, results)) for source in sources]
     runs = []
@@ -235,7 +241,7 @@ def plan(
                             **common,
                         )
                     )
-    return runs, said
+    return runs, notes
 
 
 def hold_out_phase(scene: TruthScene) -> int:
@@ -445,7 +451,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             size = args.size or ("quick" if args.quick else "medium")
             folder = Path(args.scenes).absolute()
             sources += make_scenes(size, args.tuning, cameras, folder, args.bpy, args.limits, args.hard)
-        runs, said = plan(
+        runs, notes = plan(
             sources,
             results,
             presets=args.preset or ("preview",),
@@ -456,14 +462,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             **{"iterations": args.iterations, "width": args.width, "max_gaussians": args.max_gaussians, **quick},
             device=args.device,
         )
-        said += run_plan(runs, results, args.jobs or default_jobs(args.device))
+        notes += run_plan(runs, results, args.jobs or default_jobs(args.device))
     except (RuntimeError, JobError, FileNotFoundError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return int(ExitCode.USAGE)
     except KeyboardInterrupt:
         print("Interrupted. The same command goes on from here.", flush=True)
         return int(ExitCode.CANCELLED)
-    path = write_report(results, results / "report", [r.run_id for r in runs], said, _command(args, argv))
+    path = write_report(results, results / "report", [r.run_id for r in runs], notes, _command(args, argv))
     print(f"Report: {path}", flush=True)
     return int(ExitCode.OK)
 

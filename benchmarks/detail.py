@@ -81,7 +81,7 @@ def judge(
                 value = mean_difference(before[0], pictures["delivered"], before[1] & still)
                 differences += [] if value is None else [255.0 * value]
             before = pictures["delivered"], still
-            print(f"[{n + 1}/{len(frames)}] frame {frame}, t* {t_star}: {_told(row)}", flush=True)
+            print(f"[{n + 1}/{len(frames)}] frame {frame}, t* {t_star}: {_line_of(row)}", flush=True)
     for t_star, of_freeze in rows.items():
         result["freezes"].append({"t_star": t_star, "frames": of_freeze, "mean": means(of_freeze)})
         if strips and worst:
@@ -98,11 +98,11 @@ def means(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    there = [value for value in values if value is not None]
-    return statistics.fmean(there) if there else None
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known else None
 
 
-def _told(row: Row) -> str:
+def _line_of(row: Row) -> str:
     return ", ".join(f"{v} {row[v]['best_90_db']:.1f}" for v in VARIANTS if v in row) + " dB best 90 %"
 
 

@@ -37,9 +37,11 @@ _FEWEST = 20
 
 def scale_of(rendered: SyntheticScene, scene: Scene) -> float:
     """Scene units per metre."""
-    there = np.stack([-m[:3, :3].T @ m[:3, 3] for m in (rendered.world_to_camera[f] for f in scene.frames)])
-    here = -torch.einsum("nji,nj->ni", scene.viewmats[:, :3, :3], scene.viewmats[:, :3, 3]).numpy()
-    return float(np.linalg.norm(here - here.mean(0)) / np.linalg.norm(there - there.mean(0)))
+    true_centres = np.stack([-m[:3, :3].T @ m[:3, 3] for m in (rendered.world_to_camera[f] for f in scene.frames)])
+    solved_centres = -torch.einsum("nji,nj->ni", scene.viewmats[:, :3, :3], scene.viewmats[:, :3, 3]).numpy()
+    return float(
+        np.linalg.norm(solved_centres - solved_centres.mean(0)) / np.linalg.norm(true_centres - true_centres.mean(0))
+    )
 
 
 def judge(rendered: SyntheticScene, truth: TruthScene, run: LoadedRun, every: int) -> list[dict[str, float]]:

@@ -140,13 +140,13 @@ class DetailClip:
         The second is that of frame t*, brought here by the frozen depth; 0 where t* does not look. Without mattes in
         the shot both are the gate's, as the frozen frame shows it.
         """
-        own, there = self.matte(frame), self.matte(t_star)
-        if own is None or there is None:
+        own, of_t_star = self.matte(frame), self.matte(t_star)
+        if own is None or of_t_star is None:
             gate = (view.image.motion >= STILL_MATTE).float()
             return gate, gate
         places, depth = induced_places(view.detailed.depth, *self.camera(frame), *self.camera(t_star))
         known = inside(places, self.width, self.height, 0.0) & (depth > 0)
-        return own, torch.where(known, sampled(there, places, nearest=True), 0.0)
+        return own, torch.where(known, sampled(of_t_star, places, nearest=True), 0.0)
 
     def still(self, frame: int, t_star: int, view: View) -> Tensor:
         """Pixels of the frame in which the frozen frame must show what the plate shows, bool [H, W]."""

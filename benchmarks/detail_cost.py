@@ -34,8 +34,8 @@ from torch_backend.contract import JobError, frame_file, from_dict, read_json
 from torch_backend.footage import FootageConfig
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.importing import import_key
+from torch_backend.footage.opening import open_source
 from torch_backend.footage.plates import Plates
-from torch_backend.footage.sources import open_source
 from torch_backend.shot import Shot, write_json
 
 THREADS = 2
@@ -74,10 +74,10 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
         nearest = min(real, key=lambda other: abs(other - frame))
         os.link(footage / frame_file(nearest, ".png"), footage / frame_file(frame, ".png"))
     record |= {"source_size": [record["width"] * factor, record["height"] * factor], "extended": False}
-    told = {**record.get("config", {}), "working_height": record["height"]}
-    config = from_dict(FootageConfig, told)
+    settings = {**record.get("config", {}), "working_height": record["height"]}
+    config = from_dict(FootageConfig, settings)
     key = import_key(open_source(str(footage), config.fps, config.layer).info, config)
-    record |= {"config": told, "key": key, "bits": 8, "beside": ""}
+    record |= {"config": settings, "key": key, "bits": 8, "beside": ""}
     write_json(copy / "frames" / "frames.json", record)
     made = Shot.open(copy)
     made.update(source=str(footage))
@@ -139,9 +139,9 @@ def _mb(rss: int) -> float:
 
 def in_child(shot: Shot, run: str, width: int, poses: Sequence[int], develop: bool = False) -> dict[str, Any]:
     """`measure` in a process of its own. RuntimeError with its last words if it fails."""
-    asked = json.dumps({"shot": str(shot.root), "run": run, "width": width, "poses": list(poses), "develop": develop})
+    work = json.dumps({"shot": str(shot.root), "run": run, "width": width, "poses": list(poses), "develop": develop})
     threads = {f"{library}_NUM_THREADS": str(THREADS) for library in ("OMP", "MKL", "OPENBLAS")}
-    command = [sys.executable, "-P", "-m", "benchmarks.detail_cost", "--work", asked]
+    command = [sys.executable, "-P", "-m", "benchmarks.detail_cost", "--work", work]
     ran = subprocess.run(command, env=child_environ(**threads), capture_output=True, text=True)
     if ran.returncode:
         raise RuntimeError(f"{width} pixels could not be measured: {(ran.stderr.strip().splitlines() or ['-'])[-1]}")

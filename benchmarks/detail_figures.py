@@ -83,9 +83,9 @@ def induced_places(
     rays = pixels @ torch.linalg.inv(from_K.double()).T
     motion = to_view.double() @ torch.linalg.inv(from_view.double())
     points = (rays * depth.double().clamp(max=1e6)[..., None]) @ motion[:3, :3].T + motion[:3, 3]
-    there = points @ to_K.double().T
-    behind = there[..., 2:] <= 1e-6
-    places = torch.where(behind, -1e6, there[..., :2] / torch.where(behind, 1.0, there[..., 2:]))
+    projected = points @ to_K.double().T
+    behind = projected[..., 2:] <= 1e-6
+    places = torch.where(behind, -1e6, projected[..., :2] / torch.where(behind, 1.0, projected[..., 2:]))
     return places.float(), points[..., 2].float()
 
 
@@ -107,12 +107,12 @@ def inside(places: Tensor, width: int, height: int, border: float = 1.0) -> Tens
     return (x > border) & (x < width - border) & (y > border) & (y < height - border)
 
 
-def seen_again(places: Tensor, there: Tensor, depth: Tensor) -> Tensor:
-    """Which points, at `places` and depths `there` of another view, are what that view sees: its depth [H, W]."""
+def seen_again(places: Tensor, expected: Tensor, depth: Tensor) -> Tensor:
+    """Which points, at `places` and depths `expected` of another view, are what that view sees: its depth [H, W]."""
     height, width = depth.shape
     found = sampled(depth, places, nearest=True)
-    near = (there - found).abs() <= SAME_DEPTH * torch.maximum(there, found).clamp_min(1e-6)
-    return inside(places, width, height) & (there > 0) & near
+    near = (expected - found).abs() <= SAME_DEPTH * torch.maximum(expected, found).clamp_min(1e-6)
+    return inside(places, width, height) & (expected > 0) & near
 
 
 class Flow:

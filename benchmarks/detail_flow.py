@@ -73,7 +73,7 @@ class Shown:
     """Of each of `WHAT`."""
     own: Tensor
     """[H, W] motion matte of the frame, 0..1."""
-    there: Tensor
+    matte_t_star: Tensor
     """[H, W] that of t*, brought here."""
 
 
@@ -108,10 +108,10 @@ class Sums:
 def show(clip: DetailClip, frame: int, t_star: int) -> Shown:
     """The frame with everything that is compared."""
     view = clip.view(frame, t_star)
-    own, there = clip.mattes(frame, t_star, view)
+    own, matte_t_star = clip.mattes(frame, t_star, view)
     pictures = {"plate": clip.plate(frame), "splats": view.splats, "delivered": view.picture}
     depths = {"plate": view.detailed.depth, "splats": view.image.depth, "delivered": view.detailed.depth}
-    return Shown(frame, depths, pictures, own, there)
+    return Shown(frame, depths, pictures, own, matte_t_star)
 
 
 @dataclass
@@ -132,9 +132,9 @@ def lay_over(clip: DetailClip, a: Shown, b: Shown, what: str) -> Pair:
     """Frames a and b as a `Pair`, by the depth of one of `WHAT`."""
     places, depth = induced_places(a.depths[what], *clip.camera(a.frame), *clip.camera(b.frame))
     both = seen_again(places, depth, b.depths[what]) & inside(places, clip.width, clip.height, 4.0)
-    own_b, there_b = (sampled(matte, places, nearest=True) for matte in (b.own, b.there))
+    own_b, matte_t_star_b = (sampled(matte, places, nearest=True) for matte in (b.own, b.matte_t_star))
     matte = torch.stack([a.own, own_b]).amax(0)
-    mover = torch.stack([a.there, there_b]).amax(0) > MOVER_MATTE
+    mover = torch.stack([a.matte_t_star, matte_t_star_b]).amax(0) > MOVER_MATTE
     inner = ~widened(~both, HIDDEN_MARGIN)
     return Pair(places, both, inner & ((matte > MOVER_MATTE) | mover), inner & still_pixels(matte, mover))
 
@@ -168,8 +168,8 @@ def judge_flow(clip: DetailClip, t_star: int, pairs: Sequence[tuple[int, int]]) 
         a = last if last is not None and last.frame == first else show(clip, first, t_star)
         last = show(clip, second, t_star)
         rows.append(judge_pair(flow, clip, a, last, sums))
-        told = ", ".join(f"{w} {_px(rows[-1][w]['moving'])} / {_px(rows[-1][w]['still'])}" for w in WHAT)
-        print(f"[{n + 1}/{len(pairs)}] t* {t_star}, frames {first}, {second}: {told} px moving / still", flush=True)
+        figures = ", ".join(f"{w} {_px(rows[-1][w]['moving'])} / {_px(rows[-1][w]['still'])}" for w in WHAT)
+        print(f"[{n + 1}/{len(pairs)}] t* {t_star}, frames {first}, {second}: {figures} px moving / still", flush=True)
     return {"t_star": t_star, "clip": {what: total.figures() for what, total in sums.items()}, "frames": rows}
 
 
@@ -179,8 +179,8 @@ def _px(value: float | None) -> str:
 
 def worst_frames(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
     """The frames whose moving regions read most above still ones, worst first."""
-    told = [row for row in rows if row["delivered"]["excess"] is not None]
-    return sorted(told, key=lambda row: -row["delivered"]["excess"])[:count]
+    judged = [row for row in rows if row["delivered"]["excess"] is not None]
+    return sorted(judged, key=lambda row: -row["delivered"]["excess"])[:count]
 
 
 def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: int) -> None:
@@ -195,12 +195,12 @@ def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: in
         a, b = (show(clip, row[name], freeze["t_star"]) for name in ("frame", "next"))
         pair, one, two = lay_over(clip, a, b, "delivered"), a.pictures["delivered"], b.pictures["delivered"]
         left = unexplained_flow(flow, one, two, pair.places, pair.both) * (textured(one) & (pair.moving | pair.still))
-        told = torch.stack([pair.moving, pair.still, torch.zeros_like(pair.still)], dim=2) * 0.5
+        overlay = torch.stack([pair.moving, pair.still, torch.zeros_like(pair.still)], dim=2) * 0.5
         strip = [
             one,
             torch.where(pair.both[..., None], sampled(two, pair.places), one),
             (left / 2.0)[..., None].expand(-1, -1, 3),
-            one * 0.5 + told,
+            one * 0.5 + overlay,
         ]
         name = f"t{freeze['t_star']:06d}_{100 * row['delivered']['excess']:05.0f}_{row['frame']:06d}.png"
         save_strip(folder / name, strip)
@@ -231,21 +231,22 @@ def excesses(freeze: dict[str, Any], what: str) -> list[float]:
 
 def verdicts(freezes: Sequence[dict[str, Any]]) -> list[str]:
     """Sentences: whether each freeze is as still, and as steady, as acceptance asks."""
-    said = []
+    sentences = []
     for freeze in freezes:
         delivered, plate = freeze["clip"]["delivered"], freeze["clip"]["plate"]
         more = excesses(freeze, "delivered")
         if not more:
-            said.append(f"t* {freeze['t_star']}: nothing moves in these frames, or nothing is still.")
+            sentences.append(f"t* {freeze['t_star']}: nothing moves in these frames, or nothing is still.")
             continue
         mean, together = statistics.fmean(more), delivered["excess_px"]
         steady = delivered["moving"]["unsteady_255"] <= plate["still"]["unsteady_255"]
-        told = f"{mean:+.2f} px against still pixels of the same frame ({together:+.2f} over all frames together)"
-        said.append(
-            f"t* {freeze['t_star']}: what moved reads {told}, which is {'within' if mean <= ALLOWED else 'more than'} "
-            f"{ALLOWED} px; it is {'no less' if steady else 'less'} steady than the plate's still pixels."
+        reading = f"{mean:+.2f} px against still pixels of the same frame ({together:+.2f} over all frames together)"
+        sentences.append(
+            f"t* {freeze['t_star']}: what moved reads {reading}, which is "
+            f"{'within' if mean <= ALLOWED else 'more than'} {ALLOWED} px; it is "
+            f"{'no less' if steady else 'less'} steady than the plate's still pixels."
         )
-    return said
+    return sentences
 
 
 def pairs_of(clip: DetailClip, args: argparse.Namespace) -> list[tuple[int, int]]:

@@ -33,9 +33,9 @@ from torch_backend.shot import write_json
 from torch_backend.train import load_run
 
 VARIANTS = (SPLATS, DEVELOPED, WITHHELD, DELIVERED)
-WANTED = {WHOLE: 4.0, "never_seen": 3.0, "moving": 1.5}
+GOALS = {WHOLE: 4.0, "never_seen": 3.0, "moving": 1.5}
 """Region -> dB that delivered frames should gain over splats."""
-WITHHELD_WANTED = 2.0
+WITHHELD_GOAL = 2.0
 """dB that the whole frame should gain with the plate of its pose withheld."""
 
 
@@ -67,7 +67,7 @@ def judge(
             target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
             row: dict[str, Any] = {"t_star": t_star, "pose": pose}
             rows.append(row | {v: psnr_by_region(frozen.view(pose, v), target, regions) for v in VARIANTS})
-        print(f"{truth.name}, t* {t_star}: {told(means(rows)[WHOLE])} dB whole so far", flush=True)
+        print(f"{truth.name}, t* {t_star}: {gains_text(means(rows)[WHOLE])} dB whole so far", flush=True)
     return rows
 
 
@@ -75,13 +75,13 @@ def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """{region: {variant: mean dB over the poses in which the region is not empty}}; regions that never are."""
     found = {}
     for region in (WHOLE, *REGIONS):
-        there = [row for row in rows if row[SPLATS].get(region) is not None]
-        if there:
-            found[region] = {v: statistics.fmean(row[v][region] for row in there) for v in VARIANTS}
+        known = [row for row in rows if row[SPLATS].get(region) is not None]
+        if known:
+            found[region] = {v: statistics.fmean(row[v][region] for row in known) for v in VARIANTS}
     return found
 
 
-def told(of: dict[str, float]) -> str:
+def gains_text(of: dict[str, float]) -> str:
     """Each of `VARIANTS`."""
     return " -> ".join(f"{of[v]:.2f}" for v in VARIANTS)
 
@@ -95,24 +95,24 @@ def table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     for scene, regions in found.items():
         for region, of in regions.items():
             gains = [f"{of[v] - of[SPLATS]:+.2f}" for v in VARIANTS[1:]]
-            lines.append(f"| {scene} | {region} | {told(of)} | {' | '.join(gains)} |")
+            lines.append(f"| {scene} | {region} | {gains_text(of)} | {' | '.join(gains)} |")
     return lines
 
 
 def shortfalls(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     """Sentences: regions that got worse, and gains that are less than wanted."""
-    said = []
+    sentences = []
     for scene, regions in found.items():
         for region, of in regions.items():
             for v in VARIANTS[1:]:
                 gain = of[v] - of[SPLATS]
-                wanted = WANTED.get(region) if v == DELIVERED else None
-                wanted = WITHHELD_WANTED if (v, region) == (WITHHELD, WHOLE) else wanted
+                goal = GOALS.get(region) if v == DELIVERED else None
+                goal = WITHHELD_GOAL if (v, region) == (WITHHELD, WHOLE) else goal
                 if gain < 0:
-                    said.append(f"WORSE: {scene}, {region}, {v}: {gain:+.2f} dB.")
-                elif wanted is not None and gain < wanted:
-                    said.append(f"short: {scene}, {region}, {v}: {gain:+.2f} dB, wanted {wanted:+.1f}.")
-    return said
+                    sentences.append(f"WORSE: {scene}, {region}, {v}: {gain:+.2f} dB.")
+                elif goal is not None and gain < goal:
+                    sentences.append(f"short: {scene}, {region}, {v}: {gain:+.2f} dB, wanted {goal:+.1f}.")
+    return sentences
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -50,7 +50,7 @@ def trained(shot: Shot, method: str, supervision: str, args: argparse.Namespace)
     return trainer, 1e3 * (time.perf_counter() - since) / trainer.iteration
 
 
-def told(name: str, values: list[float]) -> None:
+def print_summary(name: str, values: list[float]) -> None:
     """One line: median and range."""
     print(f"{name}: {statistics.median(values):.2f} [{min(values):.2f}, {max(values):.2f}]", flush=True)
 
@@ -90,9 +90,9 @@ def main() -> None:
                     render_frozen(frozen[name], t.scene.viewmats[i], Ks[i], t.width, t.height, t.model.exposure, 0.5)
                 views[name].append(1e3 * (time.perf_counter() - since) / 10)
     for name in runs:
-        told(f"step, ms, {name}", steps[name])
-        told(f"frozen view, ms, {name}", views[name])
-    told("step, open / gate", [a / b for a, b in zip(steps["open"], steps["gate"], strict=True)])
+        print_summary(f"step, ms, {name}", steps[name])
+        print_summary(f"frozen view, ms, {name}", views[name])
+    print_summary("step, open / gate", [a / b for a, b in zip(steps["open"], steps["gate"], strict=True)])
 
 
 if __name__ == "__main__":

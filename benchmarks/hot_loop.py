@@ -22,7 +22,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
@@ -30,12 +29,10 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 import numpy as np
 import torch
 
+from benchmarks.workload import WORKLOADS, Workload, room
 from torch_backend import native
 from torch_backend.raster import RasterSettings, cpu, rasterize
 from torch_backend.raster import cpu_source as source
-
-if TYPE_CHECKING:
-    from benchmarks.raster import Workload
 
 CHANNELS = 3
 """Channels of the limit and of the workloads."""
@@ -188,7 +185,7 @@ def limits(repeats: int = 60) -> HotLoop:
 class _Frames:
     """One workload as tensors; colours and their gradient, the outputs of a training step."""
 
-    def __init__(self, work: "Workload", threads: int):
+    def __init__(self, work: Workload, threads: int):
         values = (
             work.means,
             work.quats,
@@ -249,7 +246,7 @@ def count_rows(frames: _Frames) -> list[int]:
     return counts.tolist()
 
 
-def blend_times(work: "Workload", threads: int, rounds: int = 15) -> BlendTimes:
+def blend_times(work: Workload, threads: int, rounds: int = 15) -> BlendTimes:
     """Time the blending stages of `rounds` forward and backward passes of `work` (three colours), and count rows."""
     rows, rows_back = count_rows(_Frames(work, 1))
     frames = _Frames(work, threads)
@@ -279,8 +276,6 @@ def blend_times(work: "Workload", threads: int, rounds: int = 15) -> BlendTimes:
 
 
 def main() -> None:
-    from benchmarks.raster import WORKLOADS, room
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workloads", nargs="*", default=["W1", "W2", "W3"], metavar="W", help="W0 to W3")
     parser.add_argument("--rounds", type=int, default=15)

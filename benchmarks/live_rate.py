@@ -39,11 +39,11 @@ def main() -> None:
         about = {"view": 1, "seq": 0, "viewmat": camera.viewmat, "K": k, "t_star": float(t_star)}
         return {"kind": "view", **about, "width": SIZE[0], "height": SIZE[1]}
 
-    def sweep(name: str, asked: Callable[[int], dict[str, Any]], count: int = 200) -> None:
+    def sweep(name: str, request_of: Callable[[int], dict[str, Any]], count: int = 200) -> None:
         spent = []
         for n in range(count):
             since = time.perf_counter()
-            write_message(requests, asked(n))
+            write_message(requests, request_of(n))
             answer = read_message(answers)
             if answer is None or answer[0]["kind"] != "frame":
                 raise SystemExit(f"no frame came: {answer and answer[0]}")

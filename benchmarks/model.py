@@ -122,7 +122,7 @@ class Judge:
 
     def frozen(self, frozen: FrozenGaussians, t_star: int) -> list[dict[str, Any]]:
         """`OF_FROZEN` with time at the delivered frame of index `t_star`, a row per held-out frame far enough away."""
-        views, there, rows = self.trainer.viewmats, self.matte(t_star), []
+        views, matte_t_star, rows = self.trainer.viewmats, self.matte(t_star), []
         for index, plate in self.images.items():
             if abs(index - t_star) < len(self.scene.frames) / 4:
                 continue
@@ -130,7 +130,7 @@ class Judge:
             cameras = views[index], self.Ks[index], views[t_star], self.Ks[t_star]
             places, depth = induced_places(image.depth, *cameras)
             known = inside(places, self.width, self.height, 0.0) & (depth > 0)
-            mover = torch.where(known, sampled(there, places, nearest=True), 0.0) > 0.75
+            mover = torch.where(known, sampled(matte_t_star, places, nearest=True), 0.0) > 0.75
             shown = over_grey(image)
             rows.append({
                 "frame": self.scene.frames[index],
@@ -324,9 +324,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"Error: {error}", file=sys.stderr)
         return 1
     write_json(args.results / f"{args.name}.json", result)
-    told = " ".join(f"{n} {v:.2f}" if v is not None else f"{n} -" for n, v in result["figures"].items())
+    figures = " ".join(f"{n} {v:.2f}" if v is not None else f"{n} -" for n, v in result["figures"].items())
     facts = f"{result['gaussians']} Gaussians, {result['open']} open, SH {result['sh_degree']}"
-    print(f"{args.name}: {told}; {result['cpu_seconds']:.0f} s, {result['iterations']} steps, {facts}", flush=True)
+    print(f"{args.name}: {figures}; {result['cpu_seconds']:.0f} s, {result['iterations']} steps, {facts}", flush=True)
     return 0
 
 

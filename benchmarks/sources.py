@@ -132,9 +132,9 @@ def make_scenes(
     with subprocess.Popen(
         command, env=child_environ(), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
-        said = child.stderr.read() if child.stderr else ""
+        errors = child.stderr.read() if child.stderr else ""
     if child.returncode:
-        last = said.strip().splitlines()[-1:] or ["no output"]
+        last = errors.strip().splitlines()[-1:] or ["no output"]
         raise RuntimeError(f"the synthetic scenes could not be made: {last[0]}")
     return [f"{c}:{folder / size / scene_name(seed, kind)}" for c in cameras for kind in kinds for seed in seeds]
 

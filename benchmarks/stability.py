@@ -55,7 +55,7 @@ class Outcome:
     """Of every random draw."""
     psnr_db: float | None
     """Mean over the held-out frames at their own times; None if the run ended early."""
-    left_out: int
+    skipped_steps: int
     """Steps that changed nothing because they were not finite."""
     warnings: list[str]
     """What the run warned of."""
@@ -90,11 +90,11 @@ class _Listener:
 class Watched(Trainer):
     """A trainer on the CPU that counts the steps left out."""
 
-    left_out = 0
+    skipped_steps = 0
 
     def step(self) -> torch.Tensor:
         loss = super().step()
-        self.left_out += not bool(self.optimizer.applied)
+        self.skipped_steps += not bool(self.optimizer.applied)
         return loss
 
 
@@ -125,7 +125,7 @@ def train_once(scene: Scene, config: TrainConfig) -> Outcome:
         config.method,
         config.seed,
         None if value is None else round(value, 3),
-        trainer.left_out,
+        trainer.skipped_steps,
         listener.warnings,
         all(bool(torch.isfinite(p).all()) for p in named),
         len(trainer.model.gaussians),
@@ -149,7 +149,7 @@ def table(outcomes: Sequence[Outcome]) -> list[str]:
         lines.append(
             f"| {method} | {len(runs)} | {statistics.fmean(ended or [middle]):.2f} | {spread:.2f} | "
             f"{min(ended, default=middle):.2f} | {max(ended, default=middle):.2f} | {diverged} | "
-            f"{sum(not run.finite for run in runs)} | {sum(run.left_out for run in runs)} | "
+            f"{sum(not run.finite for run in runs)} | {sum(run.skipped_steps for run in runs)} | "
             f"{sum(len(run.warnings) for run in runs)} | {statistics.fmean(run.seconds for run in runs):.1f} |"
         )
     return lines

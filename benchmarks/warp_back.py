@@ -47,13 +47,13 @@ def main() -> int:
         ask = {"shot": str(work / "shot.splannequin"), "take": args.take, "frames": frames, "work": name}
         for python in args.bpy:
             subprocess.run([python, __file__, _INSIDE, json.dumps(ask)], check=True, cwd=ROOT)
-            told = _compare(frames, work)
-            held = held and max(told["delivered_relative"], told["graded_relative"]) < 1e-3
-            print(json.dumps({"bpy": (work / "version").read_text(), "frames": frames, **told}), flush=True)
+            errors = _compare(frames, work)
+            held = held and max(errors["delivered_relative"], errors["graded_relative"]) < 1e-3
+            print(json.dumps({"bpy": (work / "version").read_text(), "frames": frames, **errors}), flush=True)
     return 0 if held else 1
 
 
-def _prepare(folder: Path, take: str, asked: str, work: Path) -> list[int]:
+def _prepare(folder: Path, take: str, frame_list: str, work: Path) -> list[int]:
     """A light copy of the shot, plates and what is expected of them, under `work`; returns the frame numbers."""
     from torch_backend.footage.plates import Plates
     from torch_backend.freeze.exr import read_frozen_exr
@@ -64,10 +64,12 @@ def _prepare(folder: Path, take: str, asked: str, work: Path) -> list[int]:
     shutil.copytree(folder, work / "shot.splannequin", ignore=unused)
     shot = Shot(folder)
     place, plates = shot.take(take), Plates(shot)
-    there = sorted(int(file.stem) for file in (place / "warp").glob("*.exr"))
-    if not there:
+    on_disk = sorted(int(file.stem) for file in (place / "warp").glob("*.exr"))
+    if not on_disk:
         raise FileNotFoundError(f"{place} has no warp: freeze the clip's poses with detail")
-    frames = [int(n) for n in asked.split(",")] if asked else [there[0], there[len(there) // 2], there[-1]]
+    frames = (
+        [int(n) for n in frame_list.split(",")] if frame_list else [on_disk[0], on_disk[len(on_disk) // 2], on_disk[-1]]
+    )
     for frame in frames:
         warp = read_warp(place / "warp" / f"{frame:06d}.exr")
         linear = torch.as_tensor(plates.linear(warp.metadata.leading)).float()
@@ -102,15 +104,15 @@ def _compare(frames: list[int], work: Path) -> dict[str, float]:
     """The largest differences over the frames: as a share of the value, and in 255ths of what is shown."""
     from torch_backend.footage.color import linear_to_srgb
 
-    told: dict[str, float] = {}
+    errors: dict[str, float] = {}
     for name in ("delivered", "graded"):
         pairs = [(np.load(work / f"{name}-{n}.npy"), np.load(work / f"{name}-{n}-expected.npy")) for n in frames]
         share = max(float((np.abs(a - b) / np.maximum(np.abs(b), LEAST)).max()) for a, b in pairs)
         shown = max(float(np.abs(linear_to_srgb(a) - linear_to_srgb(b)).max()) for a, b in pairs)
-        told |= {f"{name}_relative": share, f"{name}_255": round(255.0 * shown, 3)}
-        told |= {f"{name}_least": min(float(a.min()) for a, _ in pairs),
+        errors |= {f"{name}_relative": share, f"{name}_255": round(255.0 * shown, 3)}
+        errors |= {f"{name}_least": min(float(a.min()) for a, _ in pairs),
                  f"{name}_most": max(float(a.max()) for a, _ in pairs)}  # fmt: skip
-    return told
+    return errors
 
 
 # ----------------------------------------------------------------------------------------------------- inside bpy

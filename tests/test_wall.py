@@ -1,6 +1,7 @@
 """The wall between Blender and the backend, and what no file of the project may do: read from the source."""
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -83,6 +84,7 @@ def station_of(parts: Sequence[str]) -> str:
     return whole if whole in STATIONS else parts[0]
 
 
+@functools.cache
 def read(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
@@ -317,10 +319,6 @@ def test_the_scan_sees_a_name_of_the_layout(source: str, spelled: int):
     assert len(list(layout_names(ast.parse(source)))) == spelled
 
 
-CIRCLE_FREE = ("deformation", "gaussians", "raster", "solve", "supervision", "train")
-"""Folders of the backend."""
-
-
 def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
     """Groups of modules that import each other, however indirectly; `arrows`: module -> those it imports."""
 
@@ -335,19 +333,6 @@ def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
     beyond = {name: reached(name) for name in arrows}
     groups = {frozenset(other for other in beyond[name] if name in beyond[other]) for name in arrows}
     return sorted(sorted(group) for group in groups if group)
-
-
-@pytest.mark.parametrize("folder", ["launcher", *(f"torch_backend/{name}" for name in CIRCLE_FREE)])
-def test_no_modules_of_a_folder_import_each_other(folder: str):
-    """Not even for the names of types: who can name a class of the other knows it."""
-    paths = {path.stem: path for path in sources(folder) if path.stem != "__init__"}
-    package = folder.split("/")
-    arrows = {}
-    for stem, path in paths.items():
-        names = [name.split(".") for _, name in imports(read(path), package_of(path))]
-        below = [name[len(package) :] for name in names if name[: len(package)] == package]
-        arrows[stem] = {rest[0] for rest in below if rest and rest[0] in paths} - {stem}
-    assert circles(arrows) == []
 
 
 def test_the_scan_sees_a_circle():
@@ -504,3 +489,45 @@ def test_the_scan_sees_code_that_runs_files(source: str):
 def test_the_scan_lets_the_contract_through():
     source = "from ..torch_backend import contract\nfrom ..torch_backend.contract import Event\nimport bpy, numpy, json"
     assert not [name for _, name in imports(ast.parse(source), ["splannequin_addon"]) if not_for_the_addon(name)]
+
+
+def packages(top: str) -> list[str]:
+    """Folders of Python files from `top` on, dotted."""
+    found = {path.parent for path in sources(top)}
+    return sorted(".".join(folder.relative_to(ROOT).parts) for folder in found)
+
+
+def part_of(name: str, package: str) -> str:
+    """The file or folder of a package that a dotted name lies in; "" beyond it. The late station is one by itself."""
+    parts = name.split(".")
+    if parts[:3] == ["torch_backend", "footage", "plates"] and package == "torch_backend":
+        return "footage.plates"
+    return parts[package.count(".") + 1] if name.startswith(f"{package}.") else ""
+
+
+@pytest.mark.parametrize("package", [*packages("launcher"), *packages("torch_backend"), *packages("benchmarks")])
+def test_no_files_and_folders_of_a_package_import_each_other(package: str):
+    """At whatever depth, and not even for the names of types: who can name a class of the other knows it."""
+    arrows: dict[str, set[str]] = {}
+    for path in sources(package.replace(".", "/")):
+        module = [*package_of(path), *([] if path.stem == "__init__" else [path.stem])]
+        own = part_of(".".join(module), package)
+        if own:
+            names = (part_of(name, package) for _, name in imports(read(path), package_of(path)))
+            arrows.setdefault(own, set()).update(names)
+    arrows = {own: {name for name in names if name in arrows and name != own} for own, names in arrows.items()}
+    assert circles(arrows) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "part"),
+    [
+        ("torch_backend.train.model.render", "torch_backend.train", "model"),
+        ("torch_backend.train.model.render", "torch_backend", "train"),
+        ("torch_backend.footage.plates.Plates", "torch_backend", "footage.plates"),
+        ("torch_backend.footage.plates.Plates", "torch_backend.footage", "plates"),
+        ("torch_backend.train.model.render", "torch_backend.freeze", ""),
+    ],
+)
+def test_a_name_lies_in_a_part_of_its_package(name: str, package: str, part: str):
+    assert part_of(name, package) == part

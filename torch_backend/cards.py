@@ -60,21 +60,21 @@ def nvidia_cards() -> tuple[list[Card], str]:
 
 @functools.cache
 def _listed(tool: str) -> tuple[list[Card], str]:
-    said = ""
+    output = ""
     for fields in ("name,driver_version,compute_cap", "name,driver_version"):  # old drivers do not know the third
         command = [tool, f"--query-gpu={fields}", "--format=csv,noheader"]
         try:
             ran = subprocess.run(command, capture_output=True, text=True, timeout=_ANSWER_SECONDS)
         except (OSError, subprocess.TimeoutExpired) as error:
             return [], str(error)
-        said = ran.stdout.strip() or ran.stderr.strip()
+        output = ran.stdout.strip() or ran.stderr.strip()
         count = fields.count(",")
         rows = [row.rsplit(",", count) for row in ran.stdout.splitlines() if row.count(",") >= count]
         if ran.returncode == 0:
             return [Card(*(field.strip() for field in [*row, ""][:3])) for row in rows], ""
-        if "compute_cap" not in said:
+        if "compute_cap" not in output:
             break
-    return [], "" if "No devices were found" in said else (said.splitlines() or ["it gave no reason"])[0].strip()
+    return [], "" if "No devices were found" in output else (output.splitlines() or ["it gave no reason"])[0].strip()
 
 
 def why_unused(torch_cuda: str | None) -> tuple[str, str] | None:
@@ -116,8 +116,8 @@ def why_unfit(card: Card) -> tuple[str, str] | None:
             needed = f"{NEEDED_COMPUTE} (Turing) or newer is needed"
             return f"{card.name} has compute capability {card.compute}, and {needed}.", "The processor is used."
         if card.old_driver:
-            told = f"{card.name} has driver {card.driver}, and R{NEEDED_DRIVER} or newer is needed."
-            return told, "Update the NVIDIA driver and restart the machine."
+            message = f"{card.name} has driver {card.driver}, and R{NEEDED_DRIVER} or newer is needed."
+            return message, "Update the NVIDIA driver and restart the machine."
     except ValueError:
         return f"{card.name} with driver {card.driver} and compute capability {card.compute} is not understood.", ""
     return None

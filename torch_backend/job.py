@@ -206,13 +206,21 @@ def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack 
         _log(reporter.folder, traceback.format_exc())
     except Exception as error:
         _log(reporter.folder, traceback.format_exc())
-        told, text = _about_a_path(error, request.shot), str(error).lower()
-        state, code = "failed", told.exit_code if told else int(ExitCode.INTERNAL)
+        path_problem, text = _about_a_path(error, request.shot), str(error).lower()
+        state, code = "failed", path_problem.exit_code if path_problem else int(ExitCode.INTERNAL)
         if isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
             message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."
         else:
-            message = told.message if told else f"The {request.kind} step broke: {type(error).__name__}: {error}"
-            hint = told.hint if told else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
+            message = (
+                path_problem.message
+                if path_problem
+                else f"The {request.kind} step broke: {type(error).__name__}: {error}"
+            )
+            hint = (
+                path_problem.hint
+                if path_problem
+                else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
+            )
     reporter.finish(state, code, message, hint, result)
     if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
         print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log goes with the shot's folder, the status does not
@@ -227,14 +235,14 @@ def _kept_in_place(shot: Shot, kind: str) -> Generator[None]:
     except (Cancelled, KeyboardInterrupt):
         raise
     except Exception as error:
-        if not _there(shot):
+        if not _exists(shot):
             raise contract.gone(shot.root, kind) from error
         raise
-    if not _there(shot):
+    if not _exists(shot):
         raise contract.gone(shot.root, kind)
 
 
-def _there(shot: Shot) -> bool:
+def _exists(shot: Shot) -> bool:
     try:
         os.lstat(shot.info_path)
     except (FileNotFoundError, NotADirectoryError):

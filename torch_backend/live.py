@@ -294,17 +294,17 @@ def serve(session: LiveSession, requests: BinaryIO, answers: BinaryIO) -> None:
     threading.Thread(target=waiting.read, args=(requests,), name="live requests", daemon=True).start()
     try:
         write_message(answers, session.facts())
-        while (asked := waiting.next()) is not None:
-            if isinstance(asked, dict):
-                write_message(answers, asked)
+        while (request := waiting.next()) is not None:
+            if isinstance(request, dict):
+                write_message(answers, request)
                 continue
             try:
-                header, body = session.draw(asked, functools.partial(waiting.better_than, asked))
+                header, body = session.draw(request, functools.partial(waiting.better_than, request))
             except Superseded:
-                waiting.put_back(asked)
+                waiting.put_back(request)
                 continue
             except (JobError, RuntimeError, ValueError) as error:
-                header, body = {"kind": "error", "seq": asked.seq, "message": str(error), "hint": ""}, b""
+                header, body = {"kind": "error", "seq": request.seq, "message": str(error), "hint": ""}, b""
             write_message(answers, header, body)
     except BrokenPipeError:
         pass  # Blender is gone

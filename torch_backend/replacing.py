@@ -4,7 +4,7 @@ Until all of the new solve is written, nothing of the old one is touched. Then o
 `solve/next`, says that the new one holds, and its files are moved to where readers look for them. Between the first of
 these renames and the last (a millisecond for a clip of 75 frames) a reader may see new frames with old cameras; a
 process that is killed just there leaves `solve/next`, and whoever opens the shot next moves what remains. That is why
-this stands beside `shot` and not in the solve's own folder.
+this stands below `shot` and not in the solve's own folder.
 """
 
 from __future__ import annotations
@@ -15,8 +15,17 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 
-from .contract import CAMERAS_FILE, COLMAP_FOLDER, FRAMES_FOLDER, POINTS_FILE, SOLVE_FILE, SOLVE_FOLDER
-from .shot import Shot, make_folder, replace_file
+from .contract import (
+    CAMERAS_FILE,
+    COLMAP_FOLDER,
+    FRAMES_FOLDER,
+    POINTS_FILE,
+    SOLVE_FILE,
+    SOLVE_FOLDER,
+    ShotFolder,
+    make_folder,
+    replace_file,
+)
 
 _NEXT, _PARTIAL = "next", "next.partial"
 _LAST = (SOLVE_FILE, CAMERAS_FILE, POINTS_FILE)
@@ -36,7 +45,7 @@ class Staged:
 
 
 @contextlib.contextmanager
-def replacing_solve(shot: Shot) -> Generator[Staged]:
+def replacing_solve(shot: ShotFolder) -> Generator[Staged]:
     """Yields folders for the files of a whole new solve, which take the place of the old one's if the block ends well.
 
     If it fails or is killed, the old solve stays as it was. OSError if a file cannot be moved (on Windows: it is held
@@ -57,7 +66,7 @@ def replacing_solve(shot: Shot) -> Generator[Staged]:
     settle_solve(shot)
 
 
-def settle_solve(shot: Shot) -> None:
+def settle_solve(shot: ShotFolder) -> None:
     """Moves what `replacing_solve` had finished, but not moved, to its place. Does nothing if there is none.
 
     Two processes may do so at once: each file is moved by one of them. Nothing is moved through a link: a folder from

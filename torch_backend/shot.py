@@ -35,6 +35,7 @@ from .contract import (
     write_atomic,
     write_json,
 )
+from .replacing import settle_solve
 
 __all__ = [
     "SHOT_SUFFIX", "Shot", "ShotInfo", "atomic_path", "checked_name", "content_key", "disk_error", "is_disk_full",
@@ -82,8 +83,6 @@ class Shot(ShotFolder):
     @classmethod
     def open(cls, root: str | Path) -> Shot:
         """An existing shot. FileNotFoundError if there is none, ValueError if it is from a newer version."""
-        from .replacing import settle_solve  # it stands on this module
-
         shot = cls(root)
         if not shot.info_path.is_file():
             raise FileNotFoundError(f"{shot.root} is not a shot folder: it has no shot.json")
@@ -106,18 +105,18 @@ class Shot(ShotFolder):
 
         JobError if it is no folder, or if it or a folder on the way to it is a link: what lies behind is not ours.
         """
-        there = self.root
+        path = self.root
         for part in folder.relative_to(self.root).parts:
-            there = there / part
-            if is_link(there):
+            path = path / part
+            if is_link(path):
                 raise JobError(
-                    f"{there} is a link to {os.path.realpath(there)}: what lies there is not this shot's to replace.",
+                    f"{path} is a link to {os.path.realpath(path)}: what lies there is not this shot's to replace.",
                     "Remove the link, or put a folder of that name in its place, then start again.",
                     ExitCode.USAGE,
                 )
-            if os.path.lexists(there) and not there.is_dir():
+            if os.path.lexists(path) and not path.is_dir():
                 raise JobError(
-                    f"{there} is not a folder.", "Move it away: the shot keeps its files there.", ExitCode.USAGE
+                    f"{path} is not a folder.", "Move it away: the shot keeps its files there.", ExitCode.USAGE
                 )
         return folder
 

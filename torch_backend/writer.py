@@ -52,7 +52,7 @@ def _take(root: Path, mine: Writer) -> None:
     path, until = contract.ShotFolder(root).lock, time.monotonic() + _SECONDS
     while not _make(path, mine):
         try:
-            there = contract.read_writer(root)
+            holder = contract.read_writer(root)
         except (OSError, ValueError) as error:  # being written just now, or by no hand of ours
             if time.monotonic() > until:
                 hint = f"If nothing works on this shot, delete {path}."
@@ -60,14 +60,14 @@ def _take(root: Path, mine: Writer) -> None:
                     from error  # fmt: skip
             time.sleep(0.05)
             continue
-        if there is None:
+        if holder is None:
             continue  # given back in between
-        if there.works():
-            if not contract.gives_back(root, there) or time.monotonic() > until:
-                raise contract.busy(root, there)
+        if holder.works():
+            if not contract.gives_back(root, holder) or time.monotonic() > until:
+                raise contract.busy(root, holder)
             time.sleep(0.01)
             continue
-        if _take_over(path, there, mine):
+        if _take_over(path, holder, mine):
             return
         if time.monotonic() > until:
             what = f"{path} was left by a step that was ended, and cannot be replaced."

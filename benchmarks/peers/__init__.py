@@ -5,12 +5,11 @@ Such a module has a `NAME`, and two functions with the signatures of `Peer`. `gs
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from benchmarks.raster import Workload
+from benchmarks.workload import Workload
 
 
 @dataclass(frozen=True)
@@ -32,6 +31,6 @@ class Peer(Protocol):
         """One sentence that says what is missing to run on `device` ('cpu' or 'cuda'); None if all is there."""
         ...
 
-    def prepare(self, work: "Workload", device: str) -> Prepared:
+    def prepare(self, work: Workload, device: str) -> Prepared:
         """Put the workload on the device. Torch's number of threads is set already."""
         ...

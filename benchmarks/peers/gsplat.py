@@ -2,14 +2,12 @@
 
 import importlib
 import importlib.util
-from typing import TYPE_CHECKING
 
 import torch
 
-from . import Prepared
+from benchmarks.workload import Workload
 
-if TYPE_CHECKING:
-    from benchmarks.raster import Workload
+from . import Prepared
 
 NAME = "gsplat"
 
@@ -22,7 +20,7 @@ def missing(device: str) -> str | None:
     return None
 
 
-def prepare(work: "Workload", device: str) -> Prepared:
+def prepare(work: Workload, device: str) -> Prepared:
     rasterization = importlib.import_module("gsplat").rasterization
 
     def put(array) -> torch.Tensor:

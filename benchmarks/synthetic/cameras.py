@@ -66,14 +66,14 @@ class CameraMove:
         """[T, 4, 4] with the tremble of the hand: centimetres and half degrees, at walking pace and faster."""
         eyes, targets = self.eyes_and_targets(seconds)
         if self.move == "tripod":
-            return np.array([_look(e, t, np.zeros(3)) for e, t in zip(eyes, targets, strict=True)])
+            return np.array([_look_at(e, t, np.zeros(3)) for e, t in zip(eyes, targets, strict=True)])
         rng = stream(self.seed, "camera hand")
         eyes = eyes + 0.012 * wander(rng, seconds, 0.9, 3) + 0.002 * wander(rng, seconds, 0.25, 3)
         degrees = np.array([0.5, 0.5, 0.7]) * wander(rng, seconds, 1.1, 3) + 0.08 * wander(rng, seconds, 0.25, 3)
-        return np.array([_look(e, t, np.radians(d)) for e, t, d in zip(eyes, targets, degrees, strict=True)])
+        return np.array([_look_at(e, t, np.radians(d)) for e, t, d in zip(eyes, targets, degrees, strict=True)])
 
 
-def _look(eye: Array, target: Array, tremble: Array) -> Array:
+def _look_at(eye: Array, target: Array, tremble: Array) -> Array:
     """[4, 4] world-to-camera from `eye` to `target`, then turned by small angles about the camera's own axes."""
     z = target - eye
     z /= np.linalg.norm(z)

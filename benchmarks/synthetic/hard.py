@@ -192,13 +192,13 @@ def hair_of(folder: Path, bodies: Bodies, body: Body, seed: int, seconds: Array)
     share = np.linspace(0.0, 1.0, STRAND_STEPS + 1)
     ring = np.array([[np.cos(a), np.sin(a), 0.0] for a in 2 * np.pi * np.arange(STRAND_SIDES) / STRAND_SIDES])
     radius = STRAND_RADIUS * (1.0 - 0.7 * share)
-    rest = spines[:, :, None] + radius[None, :, None, None] * ring  # [N, S + 1, sides, 3]
-    loose = np.broadcast_to((share**2)[None, :, None, None], rest.shape).reshape(-1, 3)
+    still_vertices = spines[:, :, None] + radius[None, :, None, None] * ring  # [N, S + 1, sides, 3]
+    loose = np.broadcast_to((share**2)[None, :, None, None], still_vertices.shape).reshape(-1, 3)
     sway = 0.012 * wander(rng, seconds, 2.0, 3)
     vertices = np.empty((len(seconds), loose.shape[0], 3))
     for t in range(len(seconds)):
         rotation, moved = _rigid(start[head], body.vertices[t, head].astype(np.float64))
-        vertices[t] = rest.reshape(-1, 3) @ rotation.T + moved + loose * sway[t]
+        vertices[t] = still_vertices.reshape(-1, 3) @ rotation.T + moved + loose * sway[t]
     triangles = _tubes(len(roots))
     uv = np.full((len(triangles), 3, 2), 0.5, np.float32)
     mesh = Mesh(vertices[0].astype(np.float32), triangles, uv, np.zeros(len(triangles), np.int32))

@@ -75,8 +75,8 @@ def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: C
     folder = out / size.name / scene_name(seed, kind)
     key = content_key(FORMAT_VERSION, GENERATOR_VERSION, size, seed, kind)
     for name in ("scene.json", "plan.json"):
-        there = folder / name
-        if there.is_file() and json.loads(there.read_text(encoding="utf-8"))["key"] != key:
+        record = folder / name
+        if record.is_file() and json.loads(record.read_text(encoding="utf-8"))["key"] != key:
             raise ValueError(
                 f"{folder} was made by another version of the generator: remove it or choose another --out."
             )
@@ -142,12 +142,12 @@ class _Eta:
 
     def __init__(self, say: Say, what: str, every: float = 5.0) -> None:
         self.say, self.what, self.every = say, what, every
-        self.began = self.told = time.perf_counter()
+        self.began = self.printed_at = time.perf_counter()
 
     def __call__(self, done: int, total: int) -> None:
         now = time.perf_counter()
-        if done == total or now - self.told >= self.every:
-            self.told = now
+        if done == total or now - self.printed_at >= self.every:
+            self.printed_at = now
             left = (now - self.began) / done * (total - done)
             self.say(f"{self.what} {done} of {total}" + (f", {left:.0f} s left" if done < total else ""))
 

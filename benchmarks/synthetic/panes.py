@@ -67,14 +67,14 @@ class Pane:
         """[...] metres by which points [..., 3] stand before the pane's plane."""
         return (points - self.origin) @ self.normal
 
-    def met(self, eye: Array, rays: Array) -> Array:
+    def distance_to(self, eye: Array, rays: Array) -> Array:
         """[R] lengths of the rays [R, 3] from `eye` [3] at which they meet the side that reflects; inf where not."""
         toward = rays @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.where(toward < 0, -self.above(eye) / toward, np.inf)
-        there = np.isfinite(distance) & (distance > 0)
-        there[there] = self.within(eye + rays[there] * distance[there, None])
-        return np.where(there, distance, np.inf)
+        hit = np.isfinite(distance) & (distance > 0)
+        hit[hit] = self.within(eye + rays[hit] * distance[hit, None])
+        return np.where(hit, distance, np.inf)
 
     def mirrored(self, points: Array) -> Array:
         """[..., 3] where the images of points [..., 3] stand."""

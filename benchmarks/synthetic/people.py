@@ -130,10 +130,10 @@ class Bodies:
         assert coordinates is not None and corners is not None
         self.triangles = self.model.faces.numpy().astype(np.int32)
         self.uv = coordinates.numpy()[corners.numpy()].astype(np.float32)
-        rest = self.model(phenotype_kwargs={**dict.fromkeys(self.model.phenotype_labels, 0.5), "age": 0.67})
-        self.rest: Array = rest["vertices"][0].numpy()
+        unposed = self.model(phenotype_kwargs={**dict.fromkeys(self.model.phenotype_labels, 0.5), "age": 0.67})
+        self.rest_vertices: Array = unposed["vertices"][0].numpy()
         """[V, 3] the unposed body of an adult: the space in which clothes are cut and painted."""
-        self.eye: Array = rest["bone_poses"][0, self.bones.index("eye.L"), :3, 3].numpy()
+        self.eye: Array = unposed["bone_poses"][0, self.bones.index("eye.L"), :3, 3].numpy()
         """[3] middle of its left eye."""
         self.influence = self._influence()
         self.regions = self._regions()
@@ -144,8 +144,8 @@ class Bodies:
         weights, bones = self.model.vertex_bone_weights.numpy(), self.model.vertex_bone_indices.numpy()
 
         def of(*stems: str, end: str = "") -> Array:
-            wanted = np.array([bone.startswith(stems) and bone.endswith(end) for bone in self.bones])
-            return np.where(wanted[bones], weights, 0.0).sum(axis=1)
+            chosen = np.array([bone.startswith(stems) and bone.endswith(end) for bone in self.bones])
+            return np.where(chosen[bones], weights, 0.0).sum(axis=1)
 
         return {
             "right_arm": of("upperarm", "lowerarm", "wrist", "finger", "metacarpal", end=".R"),
@@ -163,7 +163,7 @@ class Bodies:
 
     def _regions(self) -> dict[str, Array]:
         """{name: [V]} soft fields over the body: clothes and hair begin where they pass 0.5."""
-        z, y = self.rest[:, 2], self.rest[:, 1]
+        z, y = self.rest_vertices[:, 2], self.rest_vertices[:, 1]
         w = self.influence
         # The hair line falls from the forehead to the nape; the unit is half the distance of the eyes.
         unit = self.eye[0]
@@ -214,7 +214,9 @@ class Bodies:
         world = vertices @ turn(person.heading).T + np.array([*person.place, 0.0])
         seat = None
         if person.pose in SEATED:
-            under = world[:, (self.influence["hips"] + self.influence["thighs"] > 0.9) & (self.rest[:, 2] > -0.2)]
+            under = world[
+                :, (self.influence["hips"] + self.influence["thighs"] > 0.9) & (self.rest_vertices[:, 2] > -0.2)
+            ]
             x, y = under[0, :, :2].mean(axis=0)
             seat = float(x), float(y), float(under[..., 2].min())
         texture = self._texture(clothes, region, stream(seed, person.name, "colours"))
@@ -293,8 +295,8 @@ class Bodies:
             shirt, trousers = shirt + f["thighs"], np.zeros_like(trousers)
         hair = np.zeros_like(f["hair"]) if clothes.bald else f["hair"]
         fields = np.stack([np.full(len(shirt), 0.5), shirt, trousers, f["feet"], hair, f["eyes"]], axis=1)
-        folds = solid(int(rng.integers(1 << 30)), self.rest * [1.0, 1.0, 0.6], 0.06)
-        strands = solid(int(rng.integers(1 << 30)), self.rest, 0.03)
+        folds = solid(int(rng.integers(1 << 30)), self.rest_vertices * [1.0, 1.0, 0.6], 0.06)
+        strands = solid(int(rng.integers(1 << 30)), self.rest_vertices, 0.03)
         soft = np.clip(4.0 * (fields - 0.5), 0.0, 1.0)
         thickness = soft[:, SHIRT] * (0.007 + 0.012 * folds) + soft[:, TROUSERS] * (0.008 + 0.013 * folds)
         thickness += soft[:, SHOES] * 0.008 + soft[:, HAIR] * (0.012 + 0.02 * strands)
@@ -314,7 +316,7 @@ class Bodies:
         face, weights, nearest = self.texels
         used = np.flatnonzero(face >= 0)
         corner = self.triangles[face[used]]
-        at = np.einsum("nk,nkd->nd", weights[used], self.rest[corner])
+        at = np.einsum("nk,nkd->nd", weights[used], self.rest_vertices[corner])
         soft = np.einsum("nk,nkr->nr", weights[used], fields[corner])
         region = soft.argmax(axis=1)
         rgb = np.zeros((len(used), 3))

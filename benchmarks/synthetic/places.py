@@ -87,7 +87,7 @@ class Furnisher:
         self.ahead = ahead
         self.rng = stream(seed, "furniture")
         self.path = path
-        self.taken = list(people)
+        self.occupied = list(people)
         self.place = Place()
         self.scales: list[float] = []
         self.build = Builder(self.scales)
@@ -105,9 +105,9 @@ class Furnisher:
         """Takes the disc if nothing has it, and says whether it did."""
         if np.hypot(self.path[:, 0] - x, self.path[:, 1] - y).min() < radius + from_path:
             return False
-        if any(np.hypot(t.x - x, t.y - y) < t.radius + radius for t in self.taken):
+        if any(np.hypot(t.x - x, t.y - y) < t.radius + radius for t in self.occupied):
             return False
-        self.taken.append(Keepout(x, y, radius))
+        self.occupied.append(Keepout(x, y, radius))
         return True
 
     # ------------------------------------------------------------------------------------------------- furniture
@@ -214,17 +214,19 @@ class Furnisher:
         self.build.cylinder([x, y, 0.03], 0.015, 1.45, self.material("concrete", False), 10)
         self.build.cylinder([x, y, 1.4], 0.2, 0.28, self.material("fabric"), 20)
 
-    def posters(self, origin: Array, along: Array, length: float, spots: int, taken: list[tuple[float, float]]) -> None:
-        """Framed pictures on a wall from `origin` along the unit vector `along`, clear of the spans `taken`."""
+    def posters(
+        self, origin: Array, along: Array, length: float, spots: int, occupied: list[tuple[float, float]]
+    ) -> None:
+        """Framed pictures on a wall from `origin` along the unit vector `along`, clear of the spans `occupied`."""
         normal = np.array([along[1], -along[0], 0.0])
         for _ in range(4 * spots):
             if spots == 0:
                 return
             width, height = self.rng.uniform(0.5, 1.1), self.rng.uniform(0.5, 1.0)
             start, z = self.rng.uniform(0.2, length - width - 0.2), self.rng.uniform(1.15, 1.55)
-            if any(start < b + 0.1 and start + width > a - 0.1 for a, b in taken):
+            if any(start < b + 0.1 and start + width > a - 0.1 for a, b in occupied):
                 continue
-            taken.append((start, start + width))
+            occupied.append((start, start + width))
             spots -= 1
             corner = origin + along * start + normal * 0.025 + [0, 0, z]
             self.build.rect(corner, along * width, [0, 0, height], self.material("poster"))
@@ -289,10 +291,10 @@ class Furnisher:
                 centre = origin + along * middle - inward * 0.05 + [0, 0, 1.55]
                 place.lights.append(_portal(centre, inward, width, 1.4))
             self.wall(origin, along, length, height, window)
-            taken = [window] if window else []
+            occupied = [window] if window else []
             if self.ahead and index == 0:
-                taken += self._panes(self.ahead, origin, half)
-            self.posters(origin, along, length, 4 if index < 3 else 2, taken)
+                occupied += self._panes(self.ahead, origin, half)
+            self.posters(origin, along, length, 4 if index < 3 else 2, occupied)
         for x, y in ((-0.45 * half, -2.2), (0.45 * half, -2.2), (-0.45 * half, 1.6), (0.45 * half, 1.6)):
             place.lights.append(_panel([x, y, height - 0.06], 1.3, 0.5, 75.0))
             self.build.box([x, y, height - 0.025], [1.36, 0.56, 0.05], self.material("plaster", False, 6.0))
@@ -301,7 +303,7 @@ class Furnisher:
             self.build.rect([-w / 2, 0.2 - d / 2, 0.006], [w, 0, 0], [0, d, 0], self.material("rug"))
         if self.ahead:
             for x in (self.ahead.window_x, self.ahead.mirror_x):
-                self.taken += [Keepout(x + dx, back - 0.4, 0.3) for dx in (-0.7, 0.0, 0.7)] if x is not None else []
+                self.occupied += [Keepout(x + dx, back - 0.4, 0.3) for dx in (-0.7, 0.0, 0.7)] if x is not None else []
         self._against_walls(half, back)
         self._in_the_middle(half, back, height)
         if self.ahead and self.ahead.garden:

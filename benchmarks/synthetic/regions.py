@@ -131,12 +131,10 @@ def write_regions(folder: Path, seed: int, kind: str, size: Size, progress: Call
     instants = set(size.t_star_indices())
     todo: dict[int, list[tuple[int | None, Path]]] = {}
     for index in range(size.frames):
-        wanted: list[tuple[int | None, Path]] = [(None, folder / "masks" / frame_name(index))]
+        files: list[tuple[int | None, Path]] = [(None, folder / "masks" / frame_name(index))]
         if index in instants:
-            wanted += [
-                (p, folder / "truth" / f"{frame_number(index):06d}" / frame_name(p)) for p in size.pose_indices()
-            ]
-        missing = [(pose, path.with_suffix(".npz")) for pose, path in wanted if not path.with_suffix(".npz").exists()]
+            files += [(p, folder / "truth" / f"{frame_number(index):06d}" / frame_name(p)) for p in size.pose_indices()]
+        missing = [(pose, path.with_suffix(".npz")) for pose, path in files if not path.with_suffix(".npz").exists()]
         if missing:
             todo[index] = missing
     if not todo:
@@ -176,19 +174,19 @@ def region_maps(geometry: Geometry, scene: RayScene, index: int, view: View, own
     depth = np.where(sky, 0.0, np.clip(np.round(hits.distance * DEPTH_STEPS_PER_METRE), 1, 65535))
     points = eye + rays * np.where(sky, 1.0, hits.distance)[:, None]
     seen = np.zeros(len(rays), bool)
-    there = ~sky
-    pixels, z = own.project(points[there])
-    seen[there] = own.shows(pixels, z) & scene.sees(own.eye, points[there])
+    solid = ~sky
+    pixels, z = own.project(points[solid])
+    seen[solid] = own.shows(pixels, z) & scene.sees(own.eye, points[solid])
     if sky.any():
         pixels, z = own.project(rays[sky], at_infinity=True)
         seen[sky] = own.shows(pixels, z) & scene.escapes(own.eye, rays[sky])
     moving = _moving(geometry, hits, index, view.project)
     shown = [show_pane(geometry, scene, pane, hits, index, view, own) for pane in geometry.panes]
-    for pane, there in zip(geometry.panes, shown, strict=True):
-        moving[there.rays] |= there.moving
+    for pane, pane_view in zip(geometry.panes, shown, strict=True):
+        moving[pane_view.rays] |= pane_view.moving
         if pane.kind == MIRROR:
-            depth[there.rays] = np.round(there.distance * DEPTH_STEPS_PER_METRE)
-            moving[there.rays], seen[there.rays] = there.moving, there.seen
+            depth[pane_view.rays] = np.round(pane_view.distance * DEPTH_STEPS_PER_METRE)
+            moving[pane_view.rays], seen[pane_view.rays] = pane_view.moving, pane_view.seen
     things = _things(geometry, scene, hits, view, moving, shown)
     maps = {"depth_mm": depth.astype(np.uint16), "moving": moving, "seen": seen}
     maps |= {THING + name: mask for name, mask in things.items()}
@@ -212,28 +210,28 @@ class Shown:
 def show_pane(geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index: int, view: View, own: View) -> Shown:
     """What a pane reflects in a view of frame `index`, where nothing stands before it; `hits` are the view's own."""
     rays = view.rays()
-    distance = pane.met(view.eye, rays)
+    distance = pane.distance_to(view.eye, rays)
     which = np.flatnonzero(distance < hits.distance)
     at = view.eye + rays[which] * distance[which, None]
     back = pane.turned_back(rays[which])
     reflected = scene.cast(at + NUDGE * pane.normal, back)
-    met = reflected.face >= 0
+    hit = reflected.face >= 0
 
     def image(points: Array) -> tuple[Array, Array]:
         return view.project(pane.mirrored(points))
 
-    points = at + back * np.where(met, reflected.distance, 0.0)[:, None]
+    points = at + back * np.where(hit, reflected.distance, 0.0)[:, None]
     seen = np.zeros(len(which), bool)
-    if met.any():
+    if hit.any():
         # From the own eye: the image of the point, if the line to it passes the pane and nothing is in its way.
-        images = pane.mirrored(points[met])
+        images = pane.mirrored(points[hit])
         away = images - own.eye
-        through = own.eye + away * pane.met(own.eye, away)[:, None].clip(max=1.0)
+        through = own.eye + away * pane.distance_to(own.eye, away)[:, None].clip(max=1.0)
         pixels, z = own.project(images)
-        open_way = own.shows(pixels, z) & (pane.met(own.eye, away) < 1.0)
+        open_way = own.shows(pixels, z) & (pane.distance_to(own.eye, away) < 1.0)
         open_way &= scene.sees(own.eye, through)
-        open_way &= scene.clear(through + NUDGE * pane.normal, points[met])
-        seen[met] = open_way
+        open_way &= scene.clear(through + NUDGE * pane.normal, points[hit])
+        seen[hit] = open_way
     return Shown(which, distance[which], _moving(geometry, reflected, index, image), seen)
 
 
@@ -243,9 +241,9 @@ def _things(
     """Masks [R] of what a hard scene is about, see the module."""
     masks: dict[str, NDArray[np.bool_]] = {}
     of_panes = np.zeros(len(hits.face), bool)
-    for pane, there in zip(geometry.panes, shown, strict=True):
-        masks.setdefault(pane.kind, np.zeros(len(hits.face), bool))[there.rays] = ~moving[there.rays]
-        of_panes[there.rays] = True
+    for pane, pane_view in zip(geometry.panes, shown, strict=True):
+        masks.setdefault(pane.kind, np.zeros(len(hits.face), bool))[pane_view.rays] = ~moving[pane_view.rays]
+        of_panes[pane_view.rays] = True
     if geometry.panes:
         still = (hits.face >= 0) & ~moving & ~of_panes
         points = view.eye + view.rays() * np.where(still, hits.distance, 0.0)[:, None]
@@ -280,9 +278,9 @@ def _moving(
     def project(time: int) -> Array:
         return show(np.einsum("nk,nkd->nd", weights, geometry.moving[time][corners].astype(np.float64)))[0]
 
-    here = project(index)
+    now = project(index)
     farthest = np.zeros(len(which))
     for time in range(len(geometry.moving)):
-        farthest = np.maximum(farthest, np.linalg.norm(project(time) - here, axis=1))
+        farthest = np.maximum(farthest, np.linalg.norm(project(time) - now, axis=1))
     moving[which] = farthest > MOVING_PX
     return moving

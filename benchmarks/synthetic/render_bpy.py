@@ -248,21 +248,21 @@ class Stage:
         world.cycles.sampling_method = "MANUAL"
         world.cycles.sample_map_resolution = 512
 
-    def _light(self, wanted: dict[str, Any]) -> None:
-        light = bpy.data.lights.new(wanted["type"].lower(), wanted["type"])
-        light.energy, light.color = wanted["energy"], wanted["color"]
-        if wanted["type"] == "AREA":
+    def _light(self, spec: dict[str, Any]) -> None:
+        light = bpy.data.lights.new(spec["type"].lower(), spec["type"])
+        light.energy, light.color = spec["energy"], spec["color"]
+        if spec["type"] == "AREA":
             light.shape = "RECTANGLE"
-            light.size, light.size_y = wanted["size"]
-            light.cycles.is_portal = wanted["portal"]
-        elif wanted["type"] == "SUN":
-            light.angle = wanted["size"][0]
+            light.size, light.size_y = spec["size"]
+            light.cycles.is_portal = spec["portal"]
+        elif spec["type"] == "SUN":
+            light.angle = spec["size"][0]
         else:
-            light.shadow_soft_size, light.spot_size = wanted["size"]
+            light.shadow_soft_size, light.spot_size = spec["size"]
             light.spot_blend = 0.3
         made = bpy.data.objects.new(light.name, light)
-        made.location = wanted["location"]
-        made.rotation_euler = Vector(wanted["direction"]).to_track_quat("-Z", "Y").to_euler()
+        made.location = spec["location"]
+        made.rotation_euler = Vector(spec["direction"]).to_track_quat("-Z", "Y").to_euler()
         made.visible_camera = False
         if self.plan.get("panes"):
             made.visible_glossy = False
@@ -321,7 +321,7 @@ class Stage:
             mesh.update()
         self.time = moment
 
-    def _look(self, world_to_camera: list[list[float]]) -> None:
+    def _place_camera(self, world_to_camera: list[list[float]]) -> None:
         # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
         self.camera.matrix_world = Matrix(world_to_camera).inverted() @ Matrix.Diagonal((1, -1, -1, 1))
 
@@ -360,7 +360,7 @@ class Stage:
     def _light_of(self, band: dict[str, Any]) -> np.ndarray:
         """[h, w, 3] scene-linear, rows downwards: the rendered pixels averaged to those of the picture."""
         self._go_to(band["time"])
-        self._look(band["world_to_camera"])
+        self._place_camera(band["world_to_camera"])
         path = self.folder / f".render.{os.getpid()}.exr"
         self.scene.render.filepath = str(path)
         bpy.ops.render.render(write_still=True)

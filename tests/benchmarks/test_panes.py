@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.synthetic.cameras import _look, intrinsics
+from benchmarks.synthetic.cameras import _look_at, intrinsics
 from benchmarks.synthetic.geometry import Builder
 from benchmarks.synthetic.panes import GLASS, MIRROR, Pane
 from benchmarks.synthetic.regions import THING, Geometry, View, region_maps
@@ -45,7 +45,7 @@ def with_board(world: Geometry, moved: list[float]) -> Geometry:
 def view(yaw: float = 0.0, eye: np.ndarray = EYE) -> View:
     """Looks along y, turned to the right by `yaw` radians."""
     ahead = np.array([np.sin(yaw), np.cos(yaw), 0.0])
-    return View(_look(eye, eye + ahead, np.zeros(3)), intrinsics(160, 90), 160, 90)
+    return View(_look_at(eye, eye + ahead, np.zeros(3)), intrinsics(160, 90), 160, 90)
 
 
 def box(of: View, low: list[float], high: list[float]) -> np.ndarray:
@@ -59,8 +59,8 @@ def test_a_ray_is_turned_back_as_a_mirror_does():
     pane = Pane.of(MIRROR, [-1, 2, -1], [2, 0, 0], [0, 0, 2])
     assert pane.normal.tolist() == [0, -1, 0]
     rays = np.array([[0.0, 1, 0], [0.4, 1, 0], [0.6, 1, 0], [0, -1, 0], [1, 0, 0]])
-    assert pane.met(np.zeros(3), rays).tolist() == [2, 2, np.inf, np.inf, np.inf]
-    assert pane.met(np.array([0.0, 5, 0]), -rays[:1]).tolist() == [np.inf], "its back reflects nothing"
+    assert pane.distance_to(np.zeros(3), rays).tolist() == [2, 2, np.inf, np.inf, np.inf]
+    assert pane.distance_to(np.array([0.0, 5, 0]), -rays[:1]).tolist() == [np.inf], "its back reflects nothing"
     assert pane.turned_back(rays[1]).tolist() == [0.4, -1, 0]
     assert pane.mirrored(np.array([0.5, -3, 1])).tolist() == [0.5, 7, 1]
 

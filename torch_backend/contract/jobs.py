@@ -155,9 +155,9 @@ def runs_job(pid: int, started: float, folder: Path) -> bool:
     found = process(pid) if pid > 1 else None
     if found is None or not started or found.started != started:
         return False
-    _, ours, told = found.command.rpartition(f" {JOB_COMMAND} ")
+    _, ours, named_folder = found.command.rpartition(f" {JOB_COMMAND} ")
     try:
-        return bool(ours) and os.path.isabs(told) and os.path.samefile(told, folder)
+        return bool(ours) and os.path.isabs(named_folder) and os.path.samefile(named_folder, folder)
     except (OSError, ValueError):
         return False
 
@@ -172,11 +172,11 @@ def new_job(shot: ShotFolder | Path, kind: str, params: Any) -> Path:
     """
     if not isinstance(params, (PARAMS[kind], dict)):
         raise ValueError(f"a {kind} job takes {PARAMS[kind].__name__}, not {type(params).__name__}")
-    there = shot if isinstance(shot, ShotFolder) else ShotFolder(shot)
-    folder = there.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
-    there.jobs.mkdir(exist_ok=True)
+    shot_folder = shot if isinstance(shot, ShotFolder) else ShotFolder(shot)
+    folder = shot_folder.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
+    shot_folder.jobs.mkdir(exist_ok=True)
     folder.mkdir()
     values: dict[str, Any] = params if isinstance(params, dict) else dataclasses.asdict(params)
-    request = JobRequest(kind=kind, shot=str(there.root), params=values)
+    request = JobRequest(kind=kind, shot=str(shot_folder.root), params=values)
     write_json(folder / REQUEST_FILE, dataclasses.asdict(request), parents=False)
     return folder

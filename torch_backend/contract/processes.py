@@ -156,8 +156,8 @@ def process_of_ps(pid: int) -> Process | None:
     environ = {"LC_ALL": "C", "TZ": "UTC0", "PATH": "/usr/bin:/bin"}
     try:
         # close_fds=False: macOS then spawns it without copying the parent, which may be a heavy Blender.
-        told = subprocess.run(command, capture_output=True, env=environ, close_fds=False, timeout=5.0, check=False)
-        state, _, month, day, clock, year, line = os.fsdecode(told.stdout).strip("\n").split(None, 6)
+        output = subprocess.run(command, capture_output=True, env=environ, close_fds=False, timeout=5.0, check=False)
+        state, _, month, day, clock, year, line = os.fsdecode(output.stdout).strip("\n").split(None, 6)
         if state.startswith("Z"):
             return None
         hours, minutes, seconds = map(int, clock.split(":"))
@@ -190,8 +190,8 @@ def _process_of_windows(pid: int) -> Process | None:
         code, times = wintypes.DWORD(), [wintypes.FILETIME() for _ in range(4)]
         if kernel.GetExitCodeProcess(handle, ctypes.byref(code)) and code.value != 259:  # STILL_ACTIVE
             return None
-        told = kernel.GetProcessTimes(handle, *(ctypes.byref(time) for time in times))
-        started = times[0].dwHighDateTime << 32 | times[0].dwLowDateTime if told else 0
+        known = kernel.GetProcessTimes(handle, *(ctypes.byref(time) for time in times))
+        started = times[0].dwHighDateTime << 32 | times[0].dwLowDateTime if known else 0
         room, needed = ctypes.create_string_buffer(1 << 17), wintypes.ULONG()
         query = ctypes.WinDLL("ntdll").NtQueryInformationProcess  # 60: ProcessCommandLineInformation
         if query(handle, 60, room, wintypes.ULONG(len(room)), ctypes.byref(needed)):

@@ -41,9 +41,9 @@ class Verdict:
         return [f"{VERDICT_WORDS[self.word]} {self.sentences[0]}", *self.sentences[1:], *self.advice]
 
 
-def verdict_of(told: Mapping[str, Any]) -> Verdict | None:
+def verdict_of(facts: Mapping[str, Any]) -> Verdict | None:
     """The verdict in a summary.json or take.json, which may come from anywhere; None if there is none to be shown."""
-    data = told.get("verdict")
+    data = facts.get("verdict")
     if not isinstance(data, dict):
         return None
     try:
@@ -57,9 +57,9 @@ def verdict_of(told: Mapping[str, Any]) -> Verdict | None:
     return Verdict(found.word, shown, found.where, advice)
 
 
-def verdict_lines(*told: Mapping[str, Any]) -> list[str]:
+def verdict_lines(*facts: Mapping[str, Any]) -> list[str]:
     """The lines of the verdicts that summaries or takes hold; none where there is no verdict."""
-    found = (verdict_of(one) for one in told)
+    found = (verdict_of(one) for one in facts)
     lines = (line for verdict in found if verdict is not None for line in verdict.lines())
     return list(dict.fromkeys(lines))  # a take repeats what its run's verdict found amiss
 

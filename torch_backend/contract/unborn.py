@@ -24,22 +24,22 @@ def discard_unborn(shot: Path) -> bool:
     A shot that has a frame, or anything else that took work, is left alone, and so are files that are not ours. Kept is
     also the log of a job that ended without a sentence of its own.
     """
-    there = ShotFolder(shot)
+    shot_folder = ShotFolder(shot)
     try:
         names = {p.name for p in shot.iterdir()}
-        frames = [p for p in there.frames.rglob("*") if not p.is_dir()] if FRAMES_FOLDER in names else []
-        jobs = list(there.jobs.iterdir()) if JOBS_FOLDER in names else []
-        if INFO_FILE not in names or frames or names & _WORK or there.jobs.is_symlink():
+        frames = [p for p in shot_folder.frames.rglob("*") if not p.is_dir()] if FRAMES_FOLDER in names else []
+        jobs = list(shot_folder.jobs.iterdir()) if JOBS_FOLDER in names else []
+        if INFO_FILE not in names or frames or names & _WORK or shot_folder.jobs.is_symlink():
             return False
-        if not all("-import-" in job.name and not job.is_symlink() and _said_why(job) for job in jobs):
+        if not all("-import-" in job.name and not job.is_symlink() and _is_explained(job) for job in jobs):
             return False
         writer = read_writer(shot)
         if writer is not None and writer.works():
             return False
         for name in _UNBORN & names - {INFO_FILE}:
             shutil.rmtree(shot / name, ignore_errors=True)  # a link is left alone
-        there.lock.unlink(missing_ok=True)
-        there.info_path.unlink()
+        shot_folder.lock.unlink(missing_ok=True)
+        shot_folder.info_path.unlink()
         with contextlib.suppress(OSError):  # it holds something of the artist's
             shot.rmdir()
     except (OSError, ValueError):
@@ -47,7 +47,7 @@ def discard_unborn(shot: Path) -> bool:
     return True
 
 
-def _said_why(job: Path) -> bool:
+def _is_explained(job: Path) -> bool:
     """True if a job ended in a sentence, or was cancelled, or never wrote a word: nobody needs its log."""
     status = from_dict(Status, read_json(job / STATUS_FILE)) if (job / STATUS_FILE).is_file() else None
     log = job / LOG_FILE

@@ -132,11 +132,11 @@ def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Itera
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+b") as lock:
-        told = False
+        warned = False
         while not try_lock(lock.fileno()):
-            if not told and waiting is not None:
+            if not warned and waiting is not None:
                 waiting()
-                told = True
+                warned = True
             time.sleep(0.2)
         yield
 
@@ -185,9 +185,9 @@ def content_key(*parts: Any) -> str:
 
 def need_disk(folder: str | Path, byte_count: float, what: str) -> None:
     """JobError if the disk of `folder` has no room for `byte_count` bytes more."""
-    there = Path(folder).absolute()
-    while not there.exists():
-        there = there.parent
-    free = shutil.disk_usage(there).free
+    existing = Path(folder).absolute()
+    while not existing.exists():
+        existing = existing.parent
+    free = shutil.disk_usage(existing).free
     if free < byte_count:
         raise disk_error(folder, f"{what} needs about {byte_count / 1e6:.0f} MB, {free / 1e6:.0f} MB are free")

@@ -39,8 +39,8 @@ class Deltas(NamedTuple):
 
     def detached(self) -> Deltas:
         """The same values without gradient."""
-        rest = (None if delta is None else delta.detach() for delta in self[1:])
-        return Deltas(self.means.detach(), *rest)
+        deltas = (None if delta is None else delta.detach() for delta in self[1:])
+        return Deltas(self.means.detach(), *deltas)
 
 
 def split_deltas(deltas: Deltas, first: int) -> tuple[Deltas, Deltas]:

@@ -68,8 +68,8 @@ def measure(frame: int, pixels: NDArray[Any]) -> FrameMeasures:
 def thumbnail(pixels: NDArray[Any]) -> NDArray[np.float32]:
     """[H, W, 3] to [36, 64, 3] block means in the units of the pixels; a smaller picture gives a smaller one."""
     sums = pixels.astype(np.float32)
-    for axis, wanted in ((0, THUMB_HEIGHT), (1, THUMB_WIDTH)):
-        edges = np.linspace(0, sums.shape[axis], min(wanted, sums.shape[axis]) + 1).astype(int)
+    for axis, size in ((0, THUMB_HEIGHT), (1, THUMB_WIDTH)):
+        edges = np.linspace(0, sums.shape[axis], min(size, sums.shape[axis]) + 1).astype(int)
         shape = [-1 if i == axis else 1 for i in range(3)]
         sums = np.add.reduceat(sums, edges[:-1], axis=axis) / np.diff(edges).reshape(shape)
     return sums.astype(np.float32)

@@ -194,7 +194,7 @@ class InputSpace:
     """One of `PRIMARIES`, or "" for `chromaticities`."""
     chromaticities: Chromaticities = REC709
     """Of primaries that have no name."""
-    told: bool = True
+    declared: bool = True
     """True if the footage says so, False if it was assumed."""
 
     @property
@@ -256,8 +256,8 @@ class InputSpace:
 def named_space(name: str) -> InputSpace | None:
     """The space that a file names: a colour interop id (lin_ap1_scene) or what older files say; None if unknown."""
     short = _ALIASES.get(name.lower(), name.lower())
-    transfer, _, rest = short.partition("_")
-    primaries = rest.partition("_")[0]
+    transfer, _, after_transfer = short.partition("_")
+    primaries = after_transfer.partition("_")[0]
     if transfer in TRANSFERS and primaries in PRIMARIES:
         return InputSpace(transfer, primaries)
     return None

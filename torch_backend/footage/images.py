@@ -35,7 +35,7 @@ _MADE_BY = {
 """Folder of working frames -> what makes them anew, and the exit code."""
 
 
-def told_by(source: Any = oiio) -> str:
+def error_of(source: Any = oiio) -> str:
     """The pending error of OpenImageIO or of one of its objects, which is thereby taken back."""
     try:
         return source.geterror()
@@ -54,7 +54,7 @@ def write_png(path: str | Path, pixels: NDArray[Any]) -> None:
         # OpenImageIO's writer says nothing when the disk is full.
         if not (buffer.write(str(beside)) and _has_end(beside)):
             full = shutil.disk_usage(beside.parent).free < max(_FULL_BYTES, pixels.nbytes)
-            raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot write picture: {told_by(buffer)}", str(path))
+            raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot write picture: {error_of(buffer)}", str(path))
 
 
 def _has_end(png: Path) -> bool:
@@ -73,7 +73,7 @@ def read_png(path: str | Path) -> NDArray[Any]:
     kind = oiio.UINT16 if str(buffer.spec().format) == "uint16" else oiio.UINT8
     pixels = None if buffer.has_error else buffer.get_pixels(kind)
     if pixels is None or buffer.has_error:
-        raise ValueError(f"picture {path} cannot be read: {told_by(buffer)}")
+        raise ValueError(f"picture {path} cannot be read: {error_of(buffer)}")
     pixels = np.asarray(pixels)
     return pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
 
@@ -140,30 +140,31 @@ def _weigh(pixels: NDArray[np.float32], width: int, height: int, lobes: int) -> 
     return wide
 
 
-def _weights(size: int, wanted: int, lobes: int) -> sparse.csr_array:
+def _weights(size: int, new_size: int, lobes: int) -> sparse.csr_array:
     """[wanted, size] float32 weights along one side, of a tent (1 lobe) or Lanczos's kernel; the border is repeated.
 
     Shrinking, the kernel is as much wider as pixels become fewer.
     """
-    scale = max(1.0, size / wanted)
-    centre = (np.arange(wanted) + 0.5) * (size / wanted) - 0.5
+    scale = max(1.0, size / new_size)
+    centre = (np.arange(new_size) + 0.5) * (size / new_size) - 0.5
     reach = int(np.ceil(lobes * scale))
     index = np.floor(centre).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
     at = (index - centre[:, None]) / scale
     kernel = 1.0 - np.abs(at) if lobes == 1 else np.sinc(at) * np.sinc(at / lobes)
     weights = np.where(np.abs(at) < lobes, kernel, 0.0)
     weights /= weights.sum(axis=1, keepdims=True)
-    rows = np.broadcast_to(np.arange(wanted)[:, None], index.shape).ravel()
+    rows = np.broadcast_to(np.arange(new_size)[:, None], index.shape).ravel()
     entries = weights.astype(np.float32).ravel(), (rows, index.clip(0, size - 1).ravel())
-    return sparse.csr_array(sparse.coo_array(entries, shape=(wanted, size)))
+    return sparse.csr_array(sparse.coo_array(entries, shape=(new_size, size)))
 
 
-def working_size(width: int, height: int, wanted: int, limit: int = 720) -> tuple[int, int]:
-    """Size of the working frames in pixels: `wanted` high (0: the source's height, at most `limit`), never enlarged.
+def working_size(width: int, height: int, requested_height: int, limit: int = 720) -> tuple[int, int]:
+    """Size of the working frames in pixels, `requested_height` high, never enlarged.
 
-    A size that differs from the source's has even sides, which video encoders like; an unscaled odd one is kept.
+    0 stands for the source's height, at most `limit`. A size that differs from the source's has even
+    sides, which video encoders like; an unscaled odd one is kept.
     """
-    target = min(height, wanted if wanted > 0 else limit)
+    target = min(height, requested_height if requested_height > 0 else limit)
     if target == height:
         return width, height
     target = max(2, target // 2 * 2)

@@ -27,7 +27,8 @@ from ..contract import (
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import is_whole_png, resize, working_size, write_png
-from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, SourceInfo, footage_error, frame_words, open_source
+from .opening import open_source
+from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, SourceInfo, footage_error, frame_words
 
 FRAMES_VERSION = 1
 LEAST_FRAMES = 8
@@ -98,12 +99,12 @@ _ALWAYS_IN_THE_KEY = ("first", "last", "step", "working_height", "fps")
 
 def import_key(info: SourceInfo, config: FootageConfig) -> str:
     """What tells an import from others: of which footage it is, and what was taken of it."""
-    plain = _taken(type(config)())
-    asked = {n: v for n, v in _taken(config).items() if n in _ALWAYS_IN_THE_KEY or v != plain[n]}
-    return content_key(FRAMES_VERSION, info.key, asked)
+    plain = _recorded(type(config)())
+    settings = {n: v for n, v in _recorded(config).items() if n in _ALWAYS_IN_THE_KEY or v != plain[n]}
+    return content_key(FRAMES_VERSION, info.key, settings)
 
 
-def _taken(config: FootageConfig) -> dict[str, Any]:
+def _recorded(config: FootageConfig) -> dict[str, Any]:
     """What was taken of the footage, wherever that lies by now."""
     return {name: value for name, value in asdict(config).items() if name != "source"}
 
@@ -321,7 +322,7 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "extended": info.extended,
         "start": start,
         "step": step,
-        "config": _taken(config),
+        "config": _recorded(config),
         "key": key,
         "frames": frames,
     }

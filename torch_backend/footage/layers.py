@@ -7,7 +7,7 @@ from pathlib import Path
 
 import OpenImageIO as oiio
 
-from .images import told_by
+from .images import error_of
 from .sources import footage_error
 
 BEAUTY = ("", "rgba", "rgb", "beauty", "combined", "c", "composite", "color", "colour", "final", "main", "master")
@@ -30,19 +30,19 @@ class Layer:
     """Of its alpha, if it has one."""
 
 
-def find_layer(file: Path, wanted: str = "") -> tuple[Layer, list[str]]:
-    """The layer `wanted`, or the one that is the picture itself, and the names of all layers in the file.
+def find_layer(file: Path, layer_name: str = "") -> tuple[Layer, list[str]]:
+    """The layer `layer_name`, or the one that is the picture itself, and the names of all layers in the file.
 
     JobError lists the layers if there is none of that name, or none that is sure to be the picture. OSError if the
     file cannot be read.
     """
     found, names = _layers(file)
-    if wanted:
-        named = [x for x in found if wanted.lower() in (x.name.lower(), x.name.rpartition(".")[2].lower())]
-        exact = [x for x in named if x.name.lower() == wanted.lower()]
+    if layer_name:
+        named = [x for x in found if layer_name.lower() in (x.name.lower(), x.name.rpartition(".")[2].lower())]
+        exact = [x for x in named if x.name.lower() == layer_name.lower()]
         if len(exact or named) != 1:
             raise footage_error(
-                f"{file.name} has no colour layer {wanted!r}.",
+                f"{file.name} has no colour layer {layer_name!r}.",
                 f"It has: {_listed([x.name for x in found] or names)}.",
             )
         return (exact or named)[0], names
@@ -80,7 +80,7 @@ def _layers(file: Path) -> tuple[list[Layer], list[str]]:
     """Layers with colour, and the names of all, in the order of the file."""
     image = oiio.ImageInput.open(str(file))
     if image is None:
-        raise OSError(f"{file}: {told_by()}")
+        raise OSError(f"{file}: {error_of()}")
     found: list[Layer] = []
     names: list[str] = []
     try:

@@ -23,7 +23,8 @@ from ..solve.undistort import BandUndistorter
 from . import codes
 from .images import read_frame, read_png, resize_float, working_size
 from .importing import FootageConfig, import_key, load_frames
-from .sources import Known, Source, open_source
+from .opening import open_source
+from .sources import Known, Source
 
 PLATES_VERSION = 1
 _KEPT, _KEPT_BYTES = 11, 150e6
@@ -211,15 +212,15 @@ def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
 
 
 def _config(record: dict[str, Any]) -> FootageConfig:
-    told = record.get("config") or {}
-    return FootageConfig(**{name: told[name] for name in FootageConfig.__dataclass_fields__ if name in told})
+    recorded = record.get("config") or {}
+    return FootageConfig(**{name: recorded[name] for name in FootageConfig.__dataclass_fields__ if name in recorded})
 
 
 def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
     """True if the footage is known to have the working frames' size and no values that they lack."""
-    size, told = record.get("source_size"), record.get("config") or {}
+    size, recorded = record.get("source_size"), record.get("config") or {}
     if size is None:  # imported by an earlier version
-        same = not told.get("working_height") and working[1] < _NO_LARGER
+        same = not recorded.get("working_height") and working[1] < _NO_LARGER
         return same and record.get("bits") == 8
     return tuple(size) == working and not record.get("extended", True)
 

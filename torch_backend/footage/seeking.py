@@ -11,14 +11,14 @@ import os
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import av
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from .sources import Known, footage_error
-from .video import VideoSource
 
 _THREADS = 2
 """Of the decoder; each of them holds frames of its own."""
@@ -32,10 +32,28 @@ _LEAST_GAP = 1e-5
 """Seconds between frames that can be told apart: import rounds to 1e-6."""
 
 
+class DecodedVideo(Protocol):
+    """A video whose frames are read again; `VideoSource` is one."""
+
+    path: Path
+
+    def open(self, threads: int) -> tuple[Any, Any]:
+        """Container and video stream, at the beginning, with so many threads for the decoder."""
+        ...
+
+    def decode(self, container: Any, stream: Any) -> Iterator[Any]:
+        """Frames from where the container stands, and errors in the place of what cannot be decoded."""
+        ...
+
+    def plate_of(self, frame: av.VideoFrame) -> NDArray[Any]:
+        """A decoded frame as a plate."""
+        ...
+
+
 class VideoReader:
     """See `sources.PlateReader`. Holds up to `_KEPT` frames as decoded: at most 25 MB each at 3840 x 2160, 10 bit."""
 
-    def __init__(self, source: VideoSource, known: Known) -> None:
+    def __init__(self, source: DecodedVideo, known: Known) -> None:
         self._source, self._known, self._start = source, known, known.start
         self._listed = sorted(known.seconds)
         self._seconds = [known.seconds[number] for number in self._listed]

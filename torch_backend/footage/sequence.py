@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from . import codes
 from .color import InputSpace, named_space, space_of_chromaticities
-from .images import resize, told_by
+from .images import error_of, resize
 from .layers import Layer, find_layer, shown
 from .sources import (
     FASTEST_FPS,
@@ -108,8 +108,8 @@ class SequenceSource:
             rate = rate[0] / rate[1] if rate[1] else 0.0
         rate = rate if isinstance(rate, (int, float)) and SLOWEST_FPS <= rate <= FASTEST_FPS else 0.0
         space, light = self._space, self._space.is_light
-        told = [space.name, self._layer.name, float(self._aspect), "straight"]
-        ordinary = space.as_it_stands or space == InputSpace("lin", told=space.told)
+        reading_key = [space.name, self._layer.name, float(self._aspect), "straight"]
+        ordinary = space.as_it_stands or space == InputSpace("lin", declared=space.declared)
         ordinary = ordinary and self._aspect == 1 and self._layer.alpha is None and len(names) == 1
         stats = [f.stat() for f in self._files.values()]
         self.info = SourceInfo(
@@ -124,10 +124,10 @@ class SequenceSource:
             # Without the folder: footage and shot may have been moved together. What is read otherwise than it used to
             # be is imported again.
             key=[Path(str(sequence)).name, len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)]
-            + ([] if ordinary else told),
+            + ([] if ordinary else reading_key),
             reading={
                 "colour": space.name,
-                "colour_told": space.told,
+                "colour_told": space.declared,
                 "layer": self._layer.name,
                 "layers": names,
                 "alpha": self._layer.alpha is not None,
@@ -147,10 +147,10 @@ class SequenceSource:
             self.warnings.append(
                 (f"The sequence lacks {frame_words(missing)}.", "Those frames are left out of the shot.")
             )
-        unreadable, met = [], _Met()
+        unreadable, findings = [], _Findings()
         for number in sorted(n for n in self._files if first <= n <= last):
             try:
-                pixels, clipped = self._read(self._files[number], met)
+                pixels, clipped = self._read(self._files[number], findings)
             except (OSError, UnicodeDecodeError):  # the name of a channel may be damaged too
                 unreadable.append(number)
                 continue
@@ -158,19 +158,19 @@ class SequenceSource:
         if unreadable:
             words = frame_words(unreadable).capitalize()
             self.warnings.append((f"{words} cannot be read: left out of the shot.", "Render or copy it again."))
-        if met.transparent:
+        if findings.transparent:
             self.warnings.append(
                 ("The pictures are transparent in places: their colour is taken, their alpha is not.", "")
             )
-        if met.cropped:
+        if findings.cropped:
             self.warnings.append(("Pictures fill only a part of their frame: the rest of it is black.", ""))
 
-    def _describe(self, names: list[str], wanted: str, size: tuple[int, int]) -> None:
+    def _describe(self, names: list[str], requested_layer: str, size: tuple[int, int]) -> None:
         """Warns of what is taken otherwise than it stands in the files."""
-        if len(names) > 1 and not wanted:
+        if len(names) > 1 and not requested_layer:
             others = ", ".join(shown(n) for n in names if n != self._layer.name)
-            taken = f"The pictures have {len(names)} layers: {shown(self._layer.name)} is taken."
-            self.warnings.append((taken, f"The others: {others}."))
+            message = f"The pictures have {len(names)} layers: {shown(self._layer.name)} is taken."
+            self.warnings.append((message, f"The others: {others}."))
         if self._aspect != 1:
             self.warnings.append(
                 (
@@ -182,10 +182,10 @@ class SequenceSource:
         if self._space.primaries != "rec709":
             self.warnings.append((f"The pictures are {self._space.name}: converted to Rec.709.", ""))
 
-    def _first_readable(self, wanted: str) -> tuple[Path, oiio.ImageSpec, Layer, list[str]]:
+    def _first_readable(self, requested_layer: str) -> tuple[Path, oiio.ImageSpec, Layer, list[str]]:
         for file in self._files.values():
             try:
-                layer, names = find_layer(file, wanted)
+                layer, names = find_layer(file, requested_layer)
             except OSError:
                 continue
             spec, _, failed = _open(file, layer.part)
@@ -204,7 +204,7 @@ class SequenceSource:
         """See `PlateReader.plate`."""
         if number not in self._files:
             raise footage_error(f"Frame {number} of the sequence is not there any more.", "Put it back.")
-        rgb = self._stored_pixels(self._files[number], _Met())
+        rgb = self._stored_pixels(self._files[number], _Findings())
         if self.info.extended:
             rgb = codes.half_of(rgb, self._space)
         elif self.info.deep:
@@ -214,15 +214,15 @@ class SequenceSource:
     def close(self) -> None:
         """See `PlateReader.close`: files are not kept open."""
 
-    def _read(self, file: Path, met: _Met) -> tuple[NDArray[Any], float]:
+    def _read(self, file: Path, findings: _Findings) -> tuple[NDArray[Any], float]:
         """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels. OSError if unreadable."""
-        rgb, clipped = self._stored_pixels(file, met), 0.0
+        rgb, clipped = self._stored_pixels(file, findings), 0.0
         if self.info.deep:
             rgb, clipped = self._space.to_srgb(rgb)
             rgb = np.rint(rgb * np.float32(65535.0)).astype(np.uint16)
         return resize(np.ascontiguousarray(rgb), self.info.width, self.info.height), clipped
 
-    def _stored_pixels(self, file: Path, met: _Met) -> NDArray[Any]:
+    def _stored_pixels(self, file: Path, findings: _Findings) -> NDArray[Any]:
         """[h, w, 3] of the layer, straight, in the file's space and pixels: uint8, or float32 if the source is deep."""
         (spec, buffer, failed), layer = _open(file, self._layer.part), self._layer
         if spec.channelnames != self._channels:
@@ -236,22 +236,22 @@ class SequenceSource:
                 f"{file.name} is {size[0]}x{size[1]}, the sequence began with {self._stored[0]}x{self._stored[1]}.",
                 "All pictures of a sequence need one size.",
             )
-        wanted = [*layer.channels] if layer.alpha is None else [*layer.channels, layer.alpha]
-        first, beyond = min(wanted), max(wanted) + 1
+        channels = [*layer.channels] if layer.alpha is None else [*layer.channels, layer.alpha]
+        first, beyond = min(channels), max(channels) + 1
         x, y = spec.full_x, spec.full_y
         roi = oiio.ROI(x, x + size[0], y, y + size[1], 0, 1, first, beyond)
         kind = oiio.FLOAT if self.info.deep else oiio.UINT8
         pixels = buffer.get_pixels(kind, roi)
         if pixels is None or buffer.has_error:
-            raise OSError(f"{file}: {told_by(buffer)}")
+            raise OSError(f"{file}: {error_of(buffer)}")
         pixels = np.asarray(pixels)
         rgb = pixels[..., [c - first for c in layer.channels]]
         inner = _data_window(spec)
-        met.cropped |= inner != (slice(0, size[1]), slice(0, size[0]))
+        findings.cropped |= inner != (slice(0, size[1]), slice(0, size[0]))
         if layer.alpha is not None:
             alpha = pixels[..., layer.alpha - first]
             opaque = 1.0 if self.info.deep else 255
-            met.transparent |= bool((alpha[inner] < opaque).any())
+            findings.transparent |= bool((alpha[inner] < opaque).any())
             if not spec.get_int_attribute("oiio:UnassociatedAlpha"):
                 rgb = _straight(rgb, alpha, opaque)
         return rgb
@@ -268,7 +268,7 @@ class SequenceSource:
 
 
 @dataclass
-class _Met:
+class _Findings:
     """What the pictures read so far had that is not taken."""
 
     transparent: bool = False
@@ -284,7 +284,7 @@ def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
     """Header and pixels, and what is wrong with them, if anything is."""
     buffer = oiio.ImageBuf(str(file), part, 0, _AS_STORED)
     spec = buffer.spec()
-    return spec, buffer, (told_by(buffer) or "it is damaged") if buffer.has_error else ""
+    return spec, buffer, (error_of(buffer) or "it is damaged") if buffer.has_error else ""
 
 
 def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:
@@ -332,7 +332,7 @@ def _input_space(file: Path, spec: oiio.ImageSpec, warnings: list[tuple[str, str
     if named is not None:
         return named
     is_light = str(spec.format) in ("half", "float", "double") or suffix in (".exr", ".hdr")
-    assumed = InputSpace("lin" if is_light or "lin" in name.lower() else "srgb", told=False)
+    assumed = InputSpace("lin" if is_light or "lin" in name.lower() else "srgb", declared=False)
     if name and name.lower() not in ("unknown", "data"):
         warnings.append(
             (
@@ -363,4 +363,4 @@ def _film_space(suffix: str, transfer: str, warnings: list[tuple[str, str]]) -> 
             "Convert them to scene-linear EXR if they look flat.",
         )
     )
-    return InputSpace("g24", told=False)
+    return InputSpace("g24", declared=False)

@@ -1,12 +1,10 @@
-"""Opens footage: which kind it is, what it holds, and its frames one after the other."""
+"""What footage is to an import: its facts, its frames one after the other, single ones again; and words for them."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from pathlib import Path
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -57,7 +55,7 @@ class SourceInfo:
     """True if its plates may hold values below 0 and above 1: light, floats, other primaries than Rec.709."""
     colour: str
     """srgb, or linear for pictures that hold light: scene-linear, log, HDR."""
-    key: list
+    key: list[Any]
     """What tells this footage from another: names, sizes, modification times."""
     reading: dict[str, Any] = field(default_factory=dict)
     """How it is read, and what of that was assumed: the record in frames.json says so."""
@@ -136,41 +134,3 @@ def square_size(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
     if aspect >= 1:
         return max(1, round(width * aspect)), height
     return width, max(1, round(height / aspect))
-
-
-def open_source(source: str, fps: float = 0.0, layer: str = "") -> Source:
-    """Opens a video file, a folder or file or pattern of a numbered sequence.
-
-    `fps` overrides a sequence's rate, `layer` names the layer of its pictures to take.
-
-    JobError in one sentence for what is missing, empty, or no footage at all.
-    """
-    from .sequence import PICTURES, SequenceSource, find_sequence
-    from .video import VideoSource
-
-    if not source:
-        raise footage_error(
-            "No footage was given.", "Choose a video file, a picture of a numbered sequence, or a folder."
-        )
-    path = Path(source)
-    try:
-        is_pattern = not path.exists() and any(mark in path.name for mark in ("#", "%", "@", "*"))
-        if path.is_dir():
-            os.listdir(path)
-    except (OSError, ValueError) as error:  # no permission, too long a name, a zero byte in it
-        reason = getattr(error, "strerror", None) or error
-        raise footage_error(f"The footage {source!r} cannot be opened: {reason}.", "Check the path.") from error
-    special = path.exists() and not path.is_file() and not path.is_dir()
-    if is_pattern or path.is_dir() or (path.suffix.lower() in PICTURES and not special):
-        return SequenceSource(find_sequence(path), fps, layer)
-    if special:
-        raise footage_error(f"{source} is neither a file nor a folder.", "Choose a video file or an image sequence.")
-    if not path.is_file():
-        raise footage_error(
-            f"The footage {source} does not exist.", "Check the path; a clip on a server must be mounted."
-        )
-    video = VideoSource(path)
-    for value, what, own in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
-        if value:
-            video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {own}.", ""))
-    return video

@@ -18,6 +18,7 @@ from . import codes
 from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
 from .images import resize
+from .seeking import VideoReader
 from .sources import (
     Known,
     PlateReader,
@@ -77,7 +78,7 @@ class VideoSource:
             matrix = RGB if frame.format.is_rgb else int(frame.colorspace)
             reading = {
                 "colour": self._space.name,
-                "colour_told": self._space.told,
+                "colour_told": self._space.declared,
                 "primaries": NEAR_REC709.get(int(frame.color_primaries), PRIMARIES_READ[self._space.primaries][0]),
                 "matrix": Colorspace(_matrix(frame)).name if matrix != RGB else "RGB",
                 "matrix_told": matrix in MATRICES or matrix == RGB,
@@ -139,8 +140,6 @@ class VideoSource:
 
     def plates(self, known: Known) -> PlateReader:
         """See `Source.plates`."""
-        from .seeking import VideoReader  # it stands on this module
-
         return VideoReader(self, known)
 
     def plate_of(self, frame: av.VideoFrame) -> NDArray[Any]:
@@ -186,12 +185,12 @@ class VideoSource:
         count, end = self._promise
         # Both: a clip that was trimmed without encoding it again holds frames that are never shown.
         short = count - seen.number > 1 and end - seen.seconds > 1.5 / self.info.fps + seen.gap
-        wanted = count if last is None else min(last, count)
-        if not short or seen.number >= wanted:
+        promised = count if last is None else min(last, count)
+        if not short or seen.number >= promised:
             return
         message = f"{self.path.name} breaks off after frame {seen.number}: it announces {count}."
         hint = "It is damaged or was not copied whole: copy or export it again."
-        if 2 * (seen.number - begin + 1) < wanted - begin + 1:
+        if 2 * (seen.number - begin + 1) < promised - begin + 1:
             remedy = f" To use what is there, set the last frame to {seen.number}." if seen.number > 7 else ""
             raise footage_error(message, hint + remedy)
         self.warnings.append((message, hint))
@@ -366,7 +365,7 @@ def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> Input
     known = transfer in TRANSFERS or transfer in UNSAID
     known_primaries = primaries in PRIMARIES or primaries in NEAR_REC709 or primaries in UNSAID
     known_matrix = matrix in MATRICES or matrix == RGB or matrix in UNSAID
-    for fine, what, code, taken in (
+    for fine, what, code, assumed_as in (
         (known, "transfer function", transfer, "video"),
         (known_primaries, "primaries", primaries, "Rec.709"),
         (known_matrix, "matrix", matrix, "players take clips without one"),
@@ -374,15 +373,15 @@ def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> Input
         if not fine:
             warnings.append(
                 (
-                    f"The clip's {what} (number {code} of ITU-T H.273) is not known here: taken as {taken}.",
+                    f"The clip's {what} (number {code} of ITU-T H.273) is not known here: taken as {assumed_as}.",
                     "Convert the clip to Rec.709 if the picture looks wrong.",
                 )
             )
-    told = transfer in TRANSFERS and primaries not in UNSAID
+    declared = transfer in TRANSFERS and primaries not in UNSAID
     # HDR without primaries is BT.2020 in every standard that knows it.
     assumed = "rec2020" if transfer in (16, 18) else "rec709"
     gamut = PRIMARIES.get(primaries, assumed if primaries in UNSAID else "rec709")
-    return InputSpace(TRANSFERS.get(transfer, "g24"), gamut, told=told)
+    return InputSpace(TRANSFERS.get(transfer, "g24"), gamut, declared=declared)
 
 
 def _matrix(frame: av.VideoFrame) -> Colorspace:

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ from ..solve.motion import load_motion
 from ..train import LoadedRun
 from .bands import bands, hand_back
 from .detail_config import DetailConfig
-from .fill import Fillers, Rest, fill, fillers_of
+from .fill import Fillers, Filling, fill, fillers_of
 from .instant import InstantLayer, instant_layer, join
 from .lead import leading_matte, leading_plate
 from .posed import PosedFrame, posed_frame, with_overscan
@@ -162,7 +163,7 @@ class Detailer:
             return None
         if key not in self._layers:
             folder = Shot(self.scene.folder.parent)
-            motion = lambda frame: load_motion(folder, frame)  # noqa: E731
+            motion = partial(load_motion, folder)
             self._layers[key] = instant_layer(self.run, self.scene, None, frozen, t_star, motion=motion)
             while len(self._layers) > 2:
                 self._layers.popitem(last=False)
@@ -197,12 +198,12 @@ class Detailer:
             torch.zeros(rows, columns, 3, device="cpu"),
         )  # fmt: skip
         for band in parts:
-            rest = None if fillers is None else fill(self.seen, self.config, posed, fillers, matte, band)
+            filling = None if fillers is None else fill(self.seen, self.config, posed, fillers, matte, band)
             matte[band] = (matte[band] * 1024.0).round() / 1024.0
             lead = sample(plate, st[band]) if plate is not None else None
             if gives and own:
                 lead = self._placed(leading, rows, columns, band)
-            self._mix(made, rest, lead, band)
+            self._mix(made, filling, lead, band)
         return made
 
     def _placed(self, frame: int, rows: int, columns: int, band: slice) -> Tensor:
@@ -218,7 +219,7 @@ class Detailer:
             out[first - band.start : last - band.start, left : left + width] = part
         return out
 
-    def _mix(self, made: DetailedFrame, rest: Rest | None, lead: Tensor | None, rows: slice) -> None:
+    def _mix(self, made: DetailedFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
         """Fills some rows of a frame whose `matte` is settled and whose `alpha` is the splats'.
 
         `lead` [h, W, 3] are the leading plate's pixels there, scene-linear; None where it gives nothing.
@@ -226,15 +227,15 @@ class Detailer:
         matte, alpha, fill = made.matte[rows], made.alpha[rows], made.fill[rows]
         share = matte.clone()
         source = torch.full_like(share, float(made.leading))
-        if rest is not None:
-            at = rest.y, rest.x
+        if filling is not None:
+            at = filling.y, filling.x
             left = 1.0 - matte[at]
-            alpha[at] += (1.0 - alpha[at]) * rest.share
+            alpha[at] += (1.0 - alpha[at]) * filling.share
             covered = torch.maximum(alpha, matte)[at].clamp_min(1e-4)[:, None]
-            color = rest.color if self.plates.deep else rest.color.clamp(0.0, 1.0)
+            color = filling.color if self.plates.deep else filling.color.clamp(0.0, 1.0)
             fill[at] = left[:, None] * covered * to_linear(color / covered)
-            share[at] += left * rest.share
-            source[at] = torch.where(left > 0.5, rest.source, float(made.leading))
+            share[at] += left * filling.share
+            source[at] = torch.where(left > 0.5, filling.source, float(made.leading))
         torch.maximum(alpha, matte, out=alpha)
         source[share <= 0.0] = 0.0
         made.plate[rows], made.source[rows] = share, source

@@ -45,9 +45,9 @@ class Instants:
         developed. The shot's motion mattes must have been found (`find_motion`): keys tell them apart."""
         self.shot, self.run, self.scene, self.query = shot, run, scene, query
         distinct, trained = sorted(set(t_stars)), set(run.train_frames)
-        wanted = distinct if on and len(distinct) <= MOST else []
+        to_develop = distinct if on and len(distinct) <= MOST else []
         self.config = config_for(run)
-        self.keys = {t: developed_key(shot, run, int(t), self.config, query) for t in wanted if t in trained}
+        self.keys = {t: developed_key(shot, run, int(t), self.config, query) for t in to_develop if t in trained}
         """t* -> key, of those that are developed: of trained frames, whose plates the run knows."""
         self._held: dict[float, FrozenGaussians] = {}
         self._at: tuple[float, FrozenGaussians] | None = None
@@ -101,8 +101,8 @@ class Instants:
             _save(self.shot, self.run, int(t_star), frozen, made, self.keys[t_star])
         except (OSError, JobError) as error:
             self._held[t_star] = made
-            said = error if isinstance(error, JobError) else path_error(error)
-            why = f"{error}." if said is None else said.message
+            problem = error if isinstance(error, JobError) else path_error(error)
+            why = f"{error}." if problem is None else problem.message
             report.warning(f"The developed instant is not kept: {why}", "The next freeze at this t* develops it again.")
         return made
 

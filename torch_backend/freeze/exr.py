@@ -336,9 +336,9 @@ def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
         raise ValueError(f"rgba should be [H,W,4], got shape {tuple(colour)}")
     for name, layer in found.items():
         colours = len(_MORE[name].channels) if name in _MORE else 1
-        wanted = (*colour[:2], *_CHANNELS_OF.get(name, (colours,) if colours > 1 else ()))
-        if tuple(layer.shape) != wanted:
-            raise ValueError(f"{name} should be {list(wanted)} like rgba, got shape {list(layer.shape)}")
+        expected = (*colour[:2], *_CHANNELS_OF.get(name, (colours,) if colours > 1 else ()))
+        if tuple(layer.shape) != expected:
+            raise ValueError(f"{name} should be {list(expected)} like rgba, got shape {list(layer.shape)}")
         if isinstance(layer, Made):
             found[name] = Made(layer.shape, functools.partial(_made, name, layer))
         elif isinstance(layer, np.ndarray):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..torch_types import norm
 from .bands import look_up_near
 from .detail_config import DetailConfig
 from .posed import PosedFrame, displacements, parallax
@@ -34,7 +35,7 @@ class Fillers:
 
 
 @dataclass
-class Rest:
+class Filling:
     """Pixels of some rows that the leading plate does not give, P of them."""
 
     y: Tensor
@@ -70,30 +71,30 @@ def _agreed(
         return [torch.ones_like(posed.depth) for _ in chosen]
     points = posed.points[::2, ::2]  # a quarter of the work: it is low-passed
     truth = sightings.seen(posed.t, points)
-    told = look_up(sightings.view(posed.t).picture.float(), truth.pixels)
-    out = []
+    shown_at_t = look_up(sightings.view(posed.t).picture.float(), truth.pixels)
+    out: list[Tensor] = []
     for frame, way in zip(chosen, moved, strict=True):
         if frame == posed.t:
             out.append(torch.ones_like(posed.depth))
             continue
-        there = sightings.seen(frame, points + way[::2, ::2])
-        says = look_up(sightings.view(frame).picture.float(), there.pixels)
-        both = (truth.visible * there.visible)[..., None]
-        off = sightings.difference(says * both, told * both, 0.5)
+        sighting = sightings.seen(frame, points + way[::2, ::2])
+        says = look_up(sightings.view(frame).picture.float(), sighting.pixels)
+        both = (truth.visible * sighting.visible)[..., None]
+        off = sightings.difference(says * both, shown_at_t * both, 0.5)
         out.append(resized(torch.exp(-(off / config.agreement).square()), w, h))
     return out
 
 
 def fill(
     sightings: Sightings, config: DetailConfig, posed: PosedFrame, fillers: Fillers, matte: Tensor, rows: slice
-) -> Rest:
+) -> Filling:
     """What the leading plate does not give of some rows: the splats, with what they missed from other plates."""
     at = (matte[rows] < WHOLE).nonzero()
     y, x = at[:, 0], at[:, 1]
     count = len(at)
-    rest = Rest(y, x, posed.image.color[rows][y, x], *(torch.zeros(count, device="cpu") for _ in range(2)))
+    filling = Filling(y, x, posed.image.color[rows][y, x], *(torch.zeros(count, device="cpu") for _ in range(2)))
     if not count:
-        return rest
+        return filling
     pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
     small = pixels * posed.per_pixel
     points = unproject(pixels, posed.image.depth[rows][y, x], posed.viewmat, posed.K)
@@ -102,7 +103,7 @@ def fill(
         [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
     )
     doubt = look_up(posed.doubt, small)
-    weights, places = [], []
+    weights, places = list[Tensor](), list[Tensor]()
     untold = 1.0 - unknown
     truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
     if truth is not None:  # the better plate t* shows it, the less another time is needed
@@ -117,13 +118,13 @@ def fill(
         weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway))
         places.append(sighting.pixels * larger)
     believed = torch.stack(weights)
-    rest.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]
+    filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]
     total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
-    rest.share = total / (total + config.doubt)
+    filling.share = total / (total + config.doubt)
     for n, residual in enumerate(fillers.residuals):
         carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
-    rest.color += carried * rest.share[:, None]
-    return rest
+    filling.color += carried * filling.share[:, None]
+    return filling
 
 
 def _doubted(sighting: Sighting, doubt: Tensor) -> Sighting:
@@ -134,7 +135,7 @@ def _doubted(sighting: Sighting, doubt: Tensor) -> Sighting:
 def _sway(sightings: Sightings, config: DetailConfig, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
     """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
     view = sightings.view(frame)
-    travel = (project(points, view.viewmat, view.K)[0] - sighting.pixels).norm(dim=-1)
+    travel = norm(project(points, view.viewmat, view.K)[0] - sighting.pixels, -1)
     trust = torch.exp(-travel / (config.sway * sightings.unit))
     return config.sway_trust * sighting.explained * trust
 

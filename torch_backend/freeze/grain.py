@@ -87,8 +87,8 @@ def measure(frames: Sequence[NDArray[Any]]) -> Grain:
         flat = np.zeros_like(usable)
         for c in range(3):
             for k in range(BINS):
-                here = np.flatnonzero(usable[:, c] & (level[:, c] == k))
-                flat[here, c] = _only_grain(variance[here, c], softness)
+                blocks = np.flatnonzero(usable[:, c] & (level[:, c] == k))
+                flat[blocks, c] = _only_grain(variance[blocks, c], softness)
         softness = _softness(residual, flat & (variance > 2.0 * step**2 / 12.0))
     share = _kept(softness)[0]
     deviation: NDArray[Any] = np.full((3, BINS), np.nan)

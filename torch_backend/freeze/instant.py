@@ -287,7 +287,7 @@ def _shell(
 ) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
     """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
     view, cover = bench.view, np.zeros((bench.height, bench.width), np.float32)
-    inverse, told = np.zeros_like(cover), list[Region]()
+    inverse, facts_of_regions = np.zeros_like(cover), list[Region]()
     others = bench.neighbours() if regions or things else []
     explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9)
     matte = bench.matte()
@@ -309,11 +309,11 @@ def _shell(
             facts = replace(facts, depth=swings.depth, deviation=swings.deviation)
         stronger = soft > cover
         inverse[stronger], cover[stronger] = depths[stronger], soft[stronger]
-        told.append(facts)
+        facts_of_regions.append(facts)
     colors, cover = _matted(view.picture, image.color.numpy(), cover, bench.unit)
     rows, columns = np.nonzero(cover > 0.1)
     means = view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
-    return _gaussians(bench, frozen, means, rows, columns, inverse, cover, colors), cover, told
+    return _gaussians(bench, frozen, means, rows, columns, inverse, cover, colors), cover, facts_of_regions
 
 
 def _small_things(bench: _Bench, image: FrozenImage) -> list[Track]:

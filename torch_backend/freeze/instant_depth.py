@@ -273,9 +273,9 @@ def _matches(
     line = view.project(other, high)[use] - far
     length = np.linalg.norm(line, axis=-1, keepdims=True)
     along = line / np.maximum(length, 1e-9)
-    there = view.grid()[use] + flow[use] - far
-    across = np.abs(there[:, 0] * along[:, 1] - there[:, 1] * along[:, 0])
-    return (there * along).sum(-1), across, float(np.median(length))
+    offset = view.grid()[use] + flow[use] - far
+    across = np.abs(offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0])
+    return (offset * along).sum(-1), across, float(np.median(length))
 
 
 def _parallax(

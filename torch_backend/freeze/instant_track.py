@@ -110,11 +110,11 @@ def tracks(frames: Frames, index: int, shown: NDArray[np.float32], config: Track
     for side in (-1, 1):
         open_ends = [_End(track, float(track.pixels.sum())) for track in found]
         for step in range(1, config.reach + 1):
-            there = frames(index + side * step) if open_ends else None
-            if there is None:
+            sighting = frames(index + side * step) if open_ends else None
+            if sighting is None:
                 break
             for end in open_ends:
-                _follow(end, index + side * step, side, *there, config)
+                _follow(end, index + side * step, side, *sighting, config)
             open_ends = [end for end in open_ends if end.lost < config.lost]
     return found
 
@@ -214,8 +214,8 @@ def swing(track: Track, index: int, cameras: Callable[[int], View], config: Trac
         return None
     axis = view.viewmat[2, :3]
     focal = float(view.K[0, 0])
-    told, free = 2 * len(places), 2 * len(places) - 3 * len(_terms(0.0, speed))
-    noise = max(residual * np.sqrt(told / max(free, 1)), 0.1 * unit)
+    equations, free = 2 * len(places), 2 * len(places) - 3 * len(_terms(0.0, speed))
+    noise = max(residual * np.sqrt(equations / max(free, 1)), 0.1 * unit)
     deviation = float(np.sqrt(axis @ spread @ axis)) * noise / focal / depth
     return Swing(place, depth, deviation, residual) if deviation <= config.unsure else None
 
@@ -259,14 +259,14 @@ def _fit(
     seen = np.stack([places[i] for i in order])
     flat = (seen - Ks[:, :2, 2]) / Ks[:, [0, 1], [0, 1]]
     rays = matrices[:, :2, :3] - flat[..., None] * matrices[:, 2:3, :3]  # [P, 2, 3]
-    wanted = -(matrices[:, :2, 3] - flat * matrices[:, 2:3, 3])
+    target = -(matrices[:, :2, 3] - flat * matrices[:, 2:3, 3])
     design = (terms[:, None, :, None] * rays[:, :, None, :]).reshape(len(order), 2, -1)
     weight = np.ones(len(order))
     each = np.zeros(len(order))
     rows, found = design.reshape(2 * len(order), -1), np.zeros((terms.shape[1], 3))
     for turn in range(_TURNS):
         rows = (design * weight[:, None, None]).reshape(2 * len(order), -1)
-        found = np.linalg.lstsq(rows, (wanted * weight[:, None]).ravel(), rcond=1e-10)[0].reshape(-1, 3)
+        found = np.linalg.lstsq(rows, (target * weight[:, None]).ravel(), rcond=1e-10)[0].reshape(-1, 3)
         local = np.einsum("pij,pj->pi", matrices[:, :3, :3], terms @ found) + matrices[:, :3, 3]
         shown = local[:, :2] / np.where(np.abs(local[:, 2:]) > 1e-6, local[:, 2:], 1e-6)
         each = np.linalg.norm((shown - flat) * Ks[:, [0, 1], [0, 1]], axis=-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..torch_types import norm
 from .bands import bands
 from .detail_config import DetailConfig
 from .posed import PosedFrame, displacements, parallax
@@ -22,7 +23,7 @@ def leading_plate(sightings: Sightings, output: OutputFrame, posed: PosedFrame, 
     at = torch.tensor([sightings.index[frame] for frame in usable], device="cpu")
     solid = posed.depth[posed.depth < 1e9]
     depth = float(solid.median()) if len(solid) else 1.0
-    travel = (sightings.centres[at] - posed.centre).norm(dim=1) / max(depth, 1e-6)
+    travel = norm(sightings.centres[at] - posed.centre, 1) / max(depth, 1e-6)
     turned = 1.0 - sightings.scene.viewmats[at][:, 2, :3] @ posed.viewmat[2, :3]
     return usable[int((travel + turned).argmin())]
 
@@ -176,7 +177,7 @@ def _travel(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame
     moved, points = displacements(sightings, posed, [frame], size)[0][0], posed.points[::2, ::2]
     view = sightings.view(frame)
     ends = project(points + moved, view.viewmat, view.K)[0]
-    travel = (ends - project(points, view.viewmat, view.K)[0]).norm(dim=-1) / sightings.unit
+    travel = norm(ends - project(points, view.viewmat, view.K)[0], -1) / sightings.unit
     return resized(travel, w, h)
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..scene import resize_intrinsics
+from ..torch_types import norm_of_all
 from ..train.model import render
 from .detail_config import DetailConfig
 from .query import FrozenGaussians, FrozenImage, OutputFrame
@@ -95,7 +96,7 @@ def _is_own(sightings: Sightings, output: OutputFrame, width: int, height: int) 
 
 def parallax(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, depth: Tensor) -> Tensor:
     """Pixels of 640 by which a wrong depth moves points at `depth`, against this camera, in a plate."""
-    travel = (sightings.centres[sightings.index[frame]] - posed.centre).norm()
+    travel = norm_of_all(sightings.centres[sightings.index[frame]] - posed.centre)
     focal = posed.K[0, 0] * posed.per_pixel
     return focal * travel / depth.clamp_min(1e-6) * config.depth_error / sightings.unit
 

@@ -223,5 +223,5 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     end = np.minimum(np.arange(len(times)), np.arange(len(times))[::-1])
     inner = np.minimum(end / max(1.0, _ENDS * len(times)), 1.0)
     scores = share / max(float(share.max()), 1e-6) + 0.5 * rank + 0.1 * inner
-    told = zip(scores.tolist(), share.tolist(), rank.tolist(), strict=True)
-    return [Instant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(told)]
+    figures = zip(scores.tolist(), share.tolist(), rank.tolist(), strict=True)
+    return [Instant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(figures)]

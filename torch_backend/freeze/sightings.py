@@ -170,7 +170,7 @@ class Sightings:
     def view(self, frame: int) -> PlateView:
         """Plate `frame` as the model has it."""
         if frame not in self._views:
-            self._views[frame] = self._look(frame)
+            self._views[frame] = self._make_view(frame)
             width, height = self.size
             each = 18.0 * width * height + 12.0 * len(self.rows)
             while len(self._views) > max(12, min(_VIEWS, _VIEWS_BYTES / each)):
@@ -242,11 +242,11 @@ class Sightings:
         viewmat, K = self.camera(frame, width, height)
         return frozen, render_frozen(frozen, viewmat, K, width, height, self.run.model.exposure, time)
 
-    def _look(self, frame: int) -> PlateView:
+    def _make_view(self, frame: int) -> PlateView:
         width, height = self.size
         frozen, image = self._own_render(frame, width, height)
-        told = self.moving(frame)
-        moving = image.motion if told is None else resized(told, width, height)
+        matte = self.moving(frame)
+        moving = image.motion if matte is None else resized(matte, width, height)
         # The working frame will do, and need not be decoded from 4K footage.
         plate = read_image(self.scene.image_path(self.index[frame]), width, height)
         missed = self.difference(plate, image.color)
@@ -269,11 +269,11 @@ def motion_mattes(shot: Shot) -> MovingOf:
     """The motion mattes of a shot as `MovingOf`: 0 still, `DOUBT` unknown, 1 moving."""
 
     def moving(frame: int) -> Tensor | None:
-        told = load_motion(shot, frame)
-        if told is None:
+        stored = load_motion(shot, frame)
+        if stored is None:
             return None
-        matte = torch.zeros(told.shape, device="cpu")
-        codes = from_numpy(told)
+        matte = torch.zeros(stored.shape, device="cpu")
+        codes = from_numpy(stored)
         matte[codes == UNKNOWN] = DOUBT
         matte[codes == MOVING] = 1.0
         return matte

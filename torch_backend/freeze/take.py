@@ -40,6 +40,7 @@ from ..scene import Scene, frame_table, load_scene
 from ..shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, write_json
 from ..solve.motion import find_motion, motion_key
 from ..solve.stmap import margin, write_take_map
+from ..torch_types import floats, from_numpy
 from ..train import LoadedRun, choose_device, load_run
 from ..train.anew import SUMMARY_FILE
 from .bands import bands
@@ -85,17 +86,21 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
         find_motion(shot, report)  # of shots solved before the solve looked for it
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
-    look = Look(run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail))
-    keys = {f.frame: look.key(f) for f in whole}
+    spec = FrameSpec(
+        run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail)
+    )
+    keys = {f.frame: spec.key(f) for f in whole}
     key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))
     done = _prepare(folder, keys, key, params, detail is not None)
     left = sum(f.frame not in done for f in frames)
-    each = look.whole[0] * look.whole[1] * (20.0 + (6.0 if grain else 0.0) + (24.0 if detail else 0.0))
+    each = spec.whole[0] * spec.whole[1] * (20.0 + (6.0 if grain else 0.0) + (24.0 if detail else 0.0))
     need_disk(folder, left * each, "the take")
     try:
-        shares = _render_all(folder, frames, done, scene, look, keys, report)
-        there = done | {f.frame for f in frames}
-        facts = _finish(shot, scene, params, t_star, [f for f in whole if f.frame in there], look, key, shares, report)
+        shares = _render_all(folder, frames, done, scene, spec, keys, report)
+        frames_on_disk = done | {f.frame for f in frames}
+        facts = _finish(
+            shot, scene, params, t_star, [f for f in whole if f.frame in frames_on_disk], spec, key, shares, report
+        )
     except OSError as error:
         raise (disk_error(folder) if is_disk_full(error) else error) from error
     if run.stale:
@@ -106,7 +111,7 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
 
 
 @dataclass
-class Look:
+class FrameSpec:
     """What every frame of a take has in common."""
 
     run: LoadedRun
@@ -149,8 +154,8 @@ class Look:
             None if self.grain is None else [self.grain.to_json(), self.grain_size],
             output.t_star,
             output.exposed_like,
-            output.viewmat.flatten().tolist(),
-            output.K.flatten().tolist(),
+            floats(output.viewmat.flatten()),
+            floats(output.K.flatten()),
             *([self.beyond] if any(self.beyond) else []),
             *([self.detail_key] if self.detail_key else []),
             *([self.instants.keys[output.t_star]] if output.t_star in self.instants.keys else []),
@@ -231,7 +236,7 @@ def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: in
     else:
         viewmats, Ks, numbers = scene.viewmats, scene.camera_at(width, height), scene.frames
     ramp = {int(k): float(v) for k, v in params.t_star_per_frame.items()}
-    frames = []
+    frames: list[OutputFrame] = []
     for i, n in enumerate(numbers):
         at = ramp.get(n, float(t_star))
         frames.append(OutputFrame(n, viewmats[i], Ks[i], at, at if params.camera_path else float(n)))
@@ -243,8 +248,8 @@ def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFram
     numbers = [f.frame for f in frames]
     first = numbers[0] if params.first is None else params.first
     last = numbers[-1] if params.last is None else params.last
-    asked = range(first, last + 1, max(1, params.step))
-    chosen = [f for f in frames if f.frame in asked]
+    chosen_numbers = range(first, last + 1, max(1, params.step))
+    chosen = [f for f in frames if f.frame in chosen_numbers]
     if not chosen:
         raise JobError(
             f"No frame lies between {first} and {last}.", f"The path has frames {numbers[0]} to {numbers[-1]}.",
@@ -272,8 +277,9 @@ def take_key(
     run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, beyond: tuple[int, int] = (0, 0),
     developed: Sequence[str] = (),
 ) -> str:  # fmt: skip
-    """Identifies what a take shows. The frame range is not part of it. Frames have keys of their own, see `Look.key`;
-    this one tells about frames that were rendered before they had. `developed`: keys of the instants that are."""
+    """Identifies what a take shows. The frame range is not part of it. Frames have keys of their own, see
+    `FrameSpec.key`; this one tells about frames that were rendered before they had. `developed`: keys of the instants
+    that are."""
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
         TAKE_VERSION,
@@ -306,10 +312,10 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams,
         make_folder(folder / WARPS)
     # Frames without a key of their own are of before grain, too.
     old_are_right = not params.grain and not with_warps and state.is_file() and read_json(state).get("key") == key
-    done = set()
+    done: set[int] = set()
     for n in frames_in(folder.glob("*.exr")) if params.only_missing else ():
-        told = read_key(folder / frame_file(n, ".exr"))
-        right = n in keys and (told == keys[n] or (told == "" and old_are_right))
+        stored_key = read_key(folder / frame_file(n, ".exr"))
+        right = n in keys and (stored_key == keys[n] or (stored_key == "" and old_are_right))
         warped = not with_warps or (folder / WARPS / frame_file(n, ".exr")).is_file()
         if right and warped and (folder / TAKE_PREVIEW_FOLDER / frame_file(n, ".png")).is_file():
             done.add(n)
@@ -329,29 +335,29 @@ def frames_in(paths: Iterable[Path]) -> list[int]:
 
 
 def _render_all(
-    folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, look: Look, keys: dict[int, str],
+    folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, spec: FrameSpec, keys: dict[int, str],
     report: Reporter,
 ) -> dict[int, Tensor]:  # fmt: skip
     """Renders and writes what is not done. Returns frame number -> [h, w] share of plate, small, of those rendered."""
-    run = look.run
+    run = spec.run
     shares: dict[int, Tensor] = {}
-    look.instants.prepare((f.t_star for f in frames if f.frame not in done), report)
+    spec.instants.prepare((f.t_star for f in frames if f.frame not in done), report)
     for n, output in enumerate(frames):
         report.check_cancelled()
         report.progress("freezing", n, len(frames), f"frame {output.frame}")
         if output.frame in done:
             continue
-        frozen = look.instants.at(output.t_star, report)
+        frozen = spec.instants.at(output.t_star, report)
         exposed_at = scene.time_of_frame(output.exposed_like)
         K = output.K.clone()
-        K[:2, 2] += torch.tensor(look.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
-        image = render_frozen(frozen, output.viewmat, K, *look.whole, run.model.exposure, exposed_at)
-        if look.detail is None:
-            _write_frame(folder, output, image, scene, look, keys[output.frame])
+        K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
+        image = render_frozen(frozen, output.viewmat, K, *spec.whole, run.model.exposure, exposed_at)
+        if spec.detail is None:
+            _write_frame(folder, output, image, scene, spec, keys[output.frame])
             continue
-        made = look.detail.frame(output, frozen, image, *look.size)
-        _write_warp(folder, output, made, look, keys[output.frame])
-        _write_frame(folder, output, made, scene, look, keys[output.frame])
+        made = spec.detail.frame(output, frozen, image, *spec.size)
+        _write_warp(folder, output, made, spec, keys[output.frame])
+        _write_frame(folder, output, made, scene, spec, keys[output.frame])
         shares[output.frame] = small_share(made.plate)
         del made, image  # at 4K the next frame needs their gigabyte
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
@@ -359,12 +365,12 @@ def _render_all(
 
 
 def _write_frame(
-    folder: Path, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, look: Look, key: str
+    folder: Path, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
 ) -> None:
     """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
-    write_png(folder / TAKE_PREVIEW_FOLDER / frame_file(output.frame, ".png"), _preview(image, look))
+    write_png(folder / TAKE_PREVIEW_FOLDER / frame_file(output.frame, ".png"), _preview(image, spec))
     viewmat = output.viewmat.double().clone()
-    viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ torch.from_numpy(scene.centre)
+    viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ from_numpy(scene.centre)
     size = tuple(image.alpha.shape)
     alpha = image.alpha.numpy()
 
@@ -388,15 +394,15 @@ def _write_frame(
         image.support.numpy(),
         image.motion.numpy(),
         FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy(), key=key),
-        look.beyond,
-        None if look.grain is None else _grain(look.grain, output.frame, image, look),
+        spec.beyond,
+        None if spec.grain is None else _grain(spec.grain, output.frame, image, spec),
         layers,
     )
 
 
-def _grain(grain: Grain, frame: int, image: FrozenImage | DetailedFrame, look: Look) -> Made:
+def _grain(grain: Grain, frame: int, image: FrozenImage | DetailedFrame, spec: FrameSpec) -> Made:
     """The layer of a frame's grain, [H, W, 3] scene-linear, premultiplied."""
-    brush = Brush(grain, frame, image.alpha.shape, look.whole_grain_size)
+    brush = Brush(grain, frame, image.alpha.shape, spec.whole_grain_size)
 
     def drawn(rows: slice) -> np.ndarray:
         shown = torch.cat([_display(image, rows), image.alpha[rows][..., None]], dim=2)
@@ -413,9 +419,9 @@ def _display(image: FrozenImage | DetailedFrame, rows: slice) -> Tensor:
     return to_display(image.linear[rows]) if isinstance(image, DetailedFrame) else image.color[rows]
 
 
-def _preview(image: FrozenImage | DetailedFrame, look: Look) -> np.ndarray:
+def _preview(image: FrozenImage | DetailedFrame, spec: FrameSpec) -> np.ndarray:
     """[H, W, 3] uint8 the frame without overscan as it stands over the plate; so contact sheet and video show it."""
-    (width, height), (left, top) = look.size, look.beyond
+    (width, height), (left, top) = spec.size, spec.beyond
     out = np.empty((height, width, 3), np.uint8)
     for part in bands(height, width):
         rows = slice(part.start + top, part.stop + top)
@@ -425,10 +431,10 @@ def _preview(image: FrozenImage | DetailedFrame, look: Look) -> np.ndarray:
     return out
 
 
-def _write_warp(folder: Path, output: OutputFrame, made: DetailedFrame, look: Look, key: str) -> None:
+def _write_warp(folder: Path, output: OutputFrame, made: DetailedFrame, spec: FrameSpec, key: str) -> None:
     """Before its frame: a frame that is there has its warp."""
-    assert look.detail is not None
-    plates = look.detail.plates
+    assert spec.detail is not None
+    plates = spec.detail.plates
     write_warp(
         folder / WARPS / frame_file(output.frame, ".exr"),
         made.st,
@@ -436,7 +442,7 @@ def _write_warp(folder: Path, output: OutputFrame, made: DetailedFrame, look: Lo
         made.fill,
         made.alpha,
         WarpMetadata(output.frame, made.leading, output.t_star, plates.width, plates.height, key),
-        look.beyond,
+        spec.beyond,
     )
 
 
@@ -453,7 +459,7 @@ def detail_facts(shares: dict[int, Tensor]) -> dict[str, Any]:
     `plate_share` is the mean share of plate; `invented_share` the share of pixels of which splats invented more than
     half; `regions` the same on a grid of 4 x 4, rows from the top.
     """
-    rows = []
+    rows: list[dict[str, Any]] = []
     for frame, share in sorted(shares.items()):
         invented = (share < 0.5).float()
         grid = torch.nn.functional.adaptive_avg_pool2d(invented[None, None], 4)[0, 0]
@@ -480,17 +486,17 @@ def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def _finish(
-    shot: Shot, scene: Scene, params: FreezeParams, t_star: int, frames: list[OutputFrame], look: Look, key: str,
+    shot: Shot, scene: Scene, params: FreezeParams, t_star: int, frames: list[OutputFrame], spec: FrameSpec, key: str,
     shares: dict[int, Tensor], report: Reporter,
 ) -> dict[str, Any]:  # fmt: skip
     """Contact sheet, video, PLY and take.json of all frames that the take has by now; they are on disk."""
-    folder, run, size = shot.take(params.take), look.run, look.size
+    folder, run, size = shot.take(params.take), spec.run, spec.size
     numbers = [f.frame for f in frames]
     report.progress("finishing the take", 0, 3, "contact sheet")
     previews = [folder / TAKE_PREVIEW_FOLDER / frame_file(n, ".png") for n in numbers]
-    made_of = _made_of(folder, numbers, look, shares)
-    asked = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
-    verdict = judge_take({"t_star_frame": t_star, **asked, "detail": made_of.get("detail")}, run_verdict(run))
+    made_of = _made_of(folder, numbers, spec, shares)
+    inputs = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
+    verdict = judge_take({"t_star_frame": t_star, **inputs, "detail": made_of.get("detail")}, run_verdict(run))
     info = shot.info()
     title = f"{info.name}, {Path(info.source).name}: t* = frame {t_star}, run {params.run}"
     sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
@@ -500,8 +506,8 @@ def _finish(
     if note:
         report.warning(note)
     report.progress("finishing the take", 2, 3, "PLY")
-    _write_ply(folder / PLY_FILE, look.instants.at(float(t_star), report), scene)
-    redistort = _redistort(shot, folder, size, look.beyond, intrinsics(frames), report)
+    _write_ply(folder / PLY_FILE, spec.instants.at(float(t_star), report), scene)
+    redistort = _redistort(shot, folder, size, spec.beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
         "key": key,
@@ -511,18 +517,18 @@ def _finish(
         "t_star_per_frame": params.t_star_per_frame,
         "camera_path": params.camera_path,
         "query": params.query,
-        **({"developed": look.instants.frames} if params.develop == "on" else {}),
+        **({"developed": spec.instants.frames} if params.develop == "on" else {}),
         "width": size[0],
         "height": size[1],
         "overscan": params.overscan,
-        "margin": list(look.beyond),
+        "margin": list(spec.beyond),
         "redistort": str(redistort or ""),
         "first": numbers[0],
         "last": numbers[-1],
         "frames": len(numbers),
         "fps": shot.info().fps,
         "scale": scene.scale,
-        "grain": None if look.grain is None else look.grain.to_json(),
+        "grain": None if spec.grain is None else spec.grain.to_json(),
         "exr_dir": str(folder),
         "contact_sheet": str(sheet),
         "video": str(folder / VIDEO_FILE),
@@ -545,14 +551,14 @@ def run_verdict(run: LoadedRun) -> Verdict | None:
         return None
 
 
-def _made_of(folder: Path, numbers: list[int], look: Look, shares: dict[int, Tensor]) -> dict[str, Any]:
+def _made_of(folder: Path, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]) -> dict[str, Any]:
     """What take.json says of plate detail; {} without it. `shares` are of the frames that this job rendered."""
-    if look.detail is None:
+    if spec.detail is None:
         return {}
     for n in (n for n in numbers if n not in shares):
         layers = read_frozen_exr(folder / frame_file(n, ".exr")).detail
         if layers is not None:
-            shares[n] = small_share(torch.from_numpy(np.asarray(layers.plate, np.float32)))
+            shares[n] = small_share(from_numpy(np.asarray(layers.plate, np.float32)))
     return {"detail": detail_facts(shares), "warp_dir": str(folder / WARPS)}
 
 
@@ -579,7 +585,7 @@ def _contact_sheet(
     plates = [shot.plate(n) for n in numbers]
     own_poses = not params.camera_path and all(p.is_file() for p in plates)
     path = shot.take(params.take) / CONTACT_SHEET_FILE
-    note, doubt = ("", set()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
+    note, doubt = ("", set[int]()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
     write_contact_sheet(
         path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt
     )
@@ -589,7 +595,7 @@ def _contact_sheet(
 def _write_ply(path: Path, frozen: FrozenGaussians, scene: Scene) -> None:
     """The frozen instant in solve units, as every splat viewer reads it."""
     s = {name: value.cpu() for name, value in frozen.state.items()}
-    means = s["means"].double() / scene.scale + torch.from_numpy(scene.centre)
+    means = s["means"].double() / scene.scale + from_numpy(scene.centre)
     sh = torch.cat([s["sh0"], s["shN"]], dim=1)
     write_ply(
         path, means.float().numpy(), s["quats"].numpy(), (s["log_scales"] - float(np.log(scene.scale))).numpy(),

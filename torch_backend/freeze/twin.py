@@ -64,15 +64,15 @@ def settled(
         return frozen
     plates = WorkingPlates(scene, config.width, moving, config.margin, frozen.support.device)
     movers = (plates.moving_share(frozen, t_star) > 0.5).float()
-    here = showing(run.train_frames, t_star)
-    others = [frame for frame in spread(run.train_frames, config.plates) if frame not in here]
+    shown_at_t_star = showing(run.train_frames, t_star)
+    others = [frame for frame in spread(run.train_frames, config.plates) if frame not in shown_at_t_star]
     for _ in range(config.rounds):
         left = rows[frozen.motion[rows] > 0.5]
         if not len(left):
             break
         pair = _Pair(run, plates, frozen, closed(run, frozen, left), left, movers)
         near = _nearest(frozen.state["means"][left], config.neighbours)
-        gain, harm = -pair.worse(here, near, still=False), pair.worse(others, near)
+        gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
         stays = (harm <= 0.0) | (gain > harm)
         if bool(stays.all()):
             break

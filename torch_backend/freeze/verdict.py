@@ -60,10 +60,10 @@ def judge_take(
     else:
         word = "fair" if invented > limits.good_invented or places else "good"
     plate = _percent(float(detail["plate_share"]))
-    said = [f"{plate} % of the picture is plate, {100 - plate} % is a guess."]
-    said += [f"Mostly a guess in {where_words(place)}." for place in places]
+    sentences = [f"{plate} % of the picture is plate, {100 - plate} % is a guess."]
+    sentences += [f"Mostly a guess in {where_words(place)}." for place in places]
     steady = bool(lost.any(axis=0).any()) and float(lost.mean(axis=0).max()) >= limits.steady
-    return _with_run(Verdict(word, said, places, _advice(facts, frames, places, steady, word)), run)
+    return _with_run(Verdict(word, sentences, places, _advice(facts, frames, places, steady, word)), run)
 
 
 def _with_run(take: Verdict, run: Verdict | None) -> Verdict:
@@ -72,9 +72,9 @@ def _with_run(take: Verdict, run: Verdict | None) -> Verdict:
         return take
     words = list(VERDICT_WORDS)
     word = max(take.word, run.word, key=words.index)
-    said = [sentence for sentence in run.sentences if sentence != EXPLAINED]
+    run_sentences = [sentence for sentence in run.sentences if sentence != EXPLAINED]
     advice = [*take.advice, *(line for line in run.advice if line not in take.advice)]
-    return Verdict(word, [*take.sentences, *said], [*take.where, *run.where], advice)
+    return Verdict(word, [*take.sentences, *run_sentences], [*take.where, *run.where], advice)
 
 
 def unsure(verdict: Verdict, frames: list[int]) -> set[int]:
@@ -93,25 +93,25 @@ def _advice(
     """What to do about the worst of them."""
     if not places and word == "good":
         return []
-    said: list[str] = []
+    sentences: list[str] = []
     if steady:
-        said.append("If nothing moves there, paint it black in the motion matte.")
+        sentences.append("If nothing moves there, paint it black in the motion matte.")
     worst = places[0] if places else None
     if facts.get("camera_path"):
-        said.append("Keep the camera nearer to the clip's own path there.")
+        sentences.append("Keep the camera nearer to the clip's own path there.")
     elif worst is not None and not steady:
         middle = (worst["first"] + worst["last"]) // 2
         if not facts.get("t_star_per_frame"):
-            said.append(f"Try a t* nearer to frame {middle}.")
-        span = _rest(frames, worst)
+            sentences.append(f"Try a t* nearer to frame {middle}.")
+        span = _longer_part(frames, worst)
         if span is not None:
-            said.append(f"Or deliver frames {span[0]} to {span[1]}.")
-    elif not said:
-        said.append("Try another t*, or train a larger preset.")
-    return said
+            sentences.append(f"Or deliver frames {span[0]} to {span[1]}.")
+    elif not sentences:
+        sentences.append("Try another t*, or train a larger preset.")
+    return sentences
 
 
-def _rest(frames: list[int], worst: dict[str, Any]) -> tuple[int, int] | None:
+def _longer_part(frames: list[int], worst: dict[str, Any]) -> tuple[int, int] | None:
     """The longer part of a take before or after a place, if it is half of it or more."""
     before = [n for n in frames if n < worst["first"]]
     after = [n for n in frames if n > worst["last"]]

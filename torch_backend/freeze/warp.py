@@ -124,11 +124,11 @@ def apply_warp(plate_linear: Tensor, warp: Warp) -> Tensor:
 
     ValueError if the plate has not the size that the warp was made for.
     """
-    told = warp.metadata
-    if plate_linear.shape != (told.plate_height, told.plate_width, 3):
+    metadata = warp.metadata
+    if plate_linear.shape != (metadata.plate_height, metadata.plate_width, 3):
         raise ValueError(
-            f"the warp of frame {told.frame} is for a plate of {told.plate_width} x {told.plate_height} with 3 "
-            f"channels, got shape {list(plate_linear.shape)}"
+            f"the warp of frame {metadata.frame} is for a plate of {metadata.plate_width} x "
+            f"{metadata.plate_height} with 3 channels, got shape {list(plate_linear.shape)}"
         )
     return warp.matte[..., None] * sample(plate_linear.float(), warp.st) + warp.fill
 

@@ -106,15 +106,15 @@ def read_ply(path: str | Path) -> PlyGaussians:
     path = Path(path)
     with open(path, "rb") as handle:
         count, layout = _read_header(handle, path)
-        need, there = count * layout.itemsize, os.fstat(handle.fileno()).st_size - handle.tell()
-        if there < need:
-            raise ValueError(f"{path}: cut short, {count} Gaussians need {need} bytes and {there} are there")
+        need, available = count * layout.itemsize, os.fstat(handle.fileno()).st_size - handle.tell()
+        if available < need:
+            raise ValueError(f"{path}: cut short, {count} Gaussians need {need} bytes and {available} are there")
         rows = np.fromfile(handle, dtype=layout, count=count)
     fields = rows.dtype.names or ()
-    rest = sum(name.startswith("f_rest_") for name in fields)
-    bases = rest // 3 + 1
-    if rest % 3 or bases not in SH_BASES:
-        raise ValueError(f"{path}: {rest} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45")
+    higher = sum(name.startswith("f_rest_") for name in fields)
+    bases = higher // 3 + 1
+    if higher % 3 or bases not in SH_BASES:
+        raise ValueError(f"{path}: {higher} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45")
     missing = [name for name in property_names(bases) if name not in fields and name not in ("nx", "ny", "nz")]
     if missing:
         raise ValueError(f"{path}: not a 3D Gaussian PLY, the vertices have no {', '.join(missing[:4])}")
@@ -124,8 +124,8 @@ def read_ply(path: str | Path) -> PlyGaussians:
 
     sh = np.empty((count, bases, 3), dtype=np.float32)
     sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
-    if rest:
-        sh[:, 1:] = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, bases - 1).transpose(0, 2, 1)
+    if higher:
+        sh[:, 1:] = columns(*(f"f_rest_{i}" for i in range(higher))).reshape(count, 3, bases - 1).transpose(0, 2, 1)
     gaussians = PlyGaussians(
         columns("x", "y", "z"),
         columns("rot_0", "rot_1", "rot_2", "rot_3"),

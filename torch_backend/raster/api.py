@@ -15,8 +15,8 @@ def _shape(name: str, value: Tensor, expected: tuple[int | str, ...]) -> None:
     ok = value.dim() == len(expected)
     ok = ok and all(isinstance(e, str) or e == s for e, s in zip(expected, value.shape, strict=True))
     if not ok:
-        wanted = ", ".join(str(e) for e in expected)
-        raise ValueError(f"{name} must have shape [{wanted}], not {list(value.shape)}")
+        dimensions = ", ".join(str(e) for e in expected)
+        raise ValueError(f"{name} must have shape [{dimensions}], not {list(value.shape)}")
 
 
 def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, body: str) -> None:
@@ -32,7 +32,8 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, body: s
         raise ValueError("Ks must have positive focal lengths")
 
 
-def _check_gaussians(scene: Scene) -> None:
+def _check_scene(scene: Scene) -> None:
+    """Raise ValueError for Gaussians or settings that do not fit."""
     _shape("means", scene.means, ("N", 3))
     n = scene.means.shape[0]
     _shape("quats", scene.quats, (n, 4))
@@ -46,6 +47,10 @@ def _check_gaussians(scene: Scene) -> None:
         _shape("sh", scene.sh, (n, "K", 3))
     if scene.background is not None:
         _shape("background", scene.background, (scene.channels,))
+    if not scene.settings.near > 0:
+        raise ValueError(f"settings.near must be positive, not {scene.settings.near}")
+    if scene.settings.threads < 1:
+        raise ValueError(f"settings.threads must be at least 1, not {scene.settings.threads}")
 
 
 def _sh_degree(sh: Tensor | None, degree: int | None) -> int:
@@ -77,6 +82,17 @@ def _body(backend: str, means: Tensor) -> str:
     if backend == "cpu" and device == "cuda":
         raise ValueError("backend='cpu' needs tensors on the CPU: move them there, or pass backend='auto'")
     return device if backend == "auto" else backend
+
+
+def _run(body: str, scene: Scene) -> RasterOutput:
+    """What a body makes of a scene. Warp is imported only where it is needed: it takes a while."""
+    if body == "reference":
+        return reference.rasterize(scene)
+    if body == "cuda":
+        from . import cuda
+
+        return cuda.rasterize(scene)
+    return cpu.rasterize(scene)
 
 
 def rasterize(
@@ -150,16 +166,5 @@ def rasterize(
         with_contributions=with_contributions,
         with_top=with_top,
     )
-    _check_gaussians(scene)
-    if not scene.settings.near > 0:
-        raise ValueError(f"settings.near must be positive, not {scene.settings.near}")
-    if scene.settings.threads < 1:
-        raise ValueError(f"settings.threads must be at least 1, not {scene.settings.threads}")
-    if body == "reference":
-        return reference.rasterize(scene)
-    # Warp is imported only where it is needed: it takes a while.
-    if body == "cuda":
-        from . import cuda
-
-        return cuda.rasterize(scene)
-    return cpu.rasterize(scene)
+    _check_scene(scene)
+    return _run(body, scene)

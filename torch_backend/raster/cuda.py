@@ -134,10 +134,10 @@ class _Demand:
 
     def grow(self, slots: int) -> None:
         """Room for a third more than was wanted so far; for four tiles a Gaussian before anything is known."""
-        wanted = int(self.host[0])
-        if self.capacity == 0 or wanted > 0.9 * self.capacity:
-            wanted = wanted * 4 // 3 if wanted else 4 * slots
-            self.capacity = min(-(-max(wanted, self.capacity, 1) // _HITS_STEP) * _HITS_STEP, _HITS_MAX)
+        demand = int(self.host[0])
+        if self.capacity == 0 or demand > 0.9 * self.capacity:
+            demand = demand * 4 // 3 if demand else 4 * slots
+            self.capacity = min(-(-max(demand, self.capacity, 1) // _HITS_STEP) * _HITS_STEP, _HITS_MAX)
 
     def report(self) -> None:
         """Send the maximum to the host, behind the work queued so far; whoever asks before it arrives sees the last."""
@@ -267,6 +267,26 @@ class _Images(NamedTuple):
     hits: Tensor
 
 
+def _unfilled(make: _Maker, scene: Scene) -> _Images:
+    """Room for what a call leaves. `weight_sum` is of the kernels' integer parts still, `hits` are not counted."""
+    cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
+    size, none = (cameras, scene.height, scene.width), (0,)
+    depth, top = size if scene.with_depth else none, size if scene.with_top else none
+    per_slot = (cameras, n) if scene.with_contributions else none
+    return _Images(
+        image=make.empty(*size, scene.channels + int(scene.with_depth)),
+        alpha=make.empty(*size),
+        median=make.empty(*depth),
+        radii=make.empty(cameras, n, dtype=torch.int32),
+        means2d=make.empty(cameras, n, 2),
+        weight_sum=make.zeros(*per_slot, dtype=torch.int64),
+        weight_max=make.zeros(*per_slot),
+        top_id=make.empty(*top, dtype=torch.int32),
+        top_weight=make.empty(*top),
+        hits=make.empty(0, dtype=torch.int64),
+    )
+
+
 class _Saved(NamedTuple):
     """What the backward pass needs of the forward one: the differentiable inputs, the images, the records."""
 
@@ -319,59 +339,29 @@ class _Rasterize(torch.autograd.Function):
         make, launch = _Maker(means.device), _Launcher(means.device)
         cameras, n = viewmats.shape[0], means.shape[0]
         channels, slots = scene.channels + int(scene.with_depth), cameras * n
-        size = (cameras, scene.height, scene.width)
-        none: tuple[int, ...] = (0,)
-        image, alpha = make.empty(*size, channels), make.empty(*size)
-        median = make.empty(*(size if scene.with_depth else none))
-        top = size if scene.with_top else none
-        top_id, top_weight = make.empty(*top, dtype=torch.int32), make.empty(*top)
-        radii, means2d = make.empty(cameras, n, dtype=torch.int32), make.empty(cameras, n, 2)
-        per_slot = (cameras, n) if scene.with_contributions else none
-        weight_parts, weight_max = make.zeros(*per_slot, dtype=torch.int64), make.zeros(*per_slot)
+        out = _unfilled(make, scene)
         behind = make.zeros(channels)
         if background is not None:
             behind[: scene.channels] = background
         args = _arguments(launch.wp, scene, channels)
         record, aux = make.empty(slots, args.record_stride), make.empty(slots, 2)
         hit_count, depth_key = make.empty(slots, dtype=torch.int32), make.empty(slots, dtype=torch.int32)
-        _point(
-            args,
-            means=means,
-            quats=quats,
-            log_scales=log_scales,
-            logits=logits,
-            colors=colors,
-            sh=sh,
-            viewmats=viewmats,
-            Ks=scene.Ks,
-            background=behind,
-            record=record,
-            aux=aux,
-            radii=radii,
-            means2d=means2d,
-            hit_count=hit_count,
-            depth_key=depth_key,
-        )
+        inputs = (means, quats, log_scales, logits, colors, sh, viewmats)
+        _point(args, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh)
+        _point(args, viewmats=viewmats, Ks=scene.Ks, background=behind)
+        _point(args, record=record, aux=aux, hit_count=hit_count, depth_key=depth_key)
+        _point(args, radii=out.radii, means2d=out.means2d)
         launch("raster_project", args, slots)
-        demand = _demand(scene)
-        binned = _bin(launch, args, demand, depth_key, hit_count)
-        _point(
-            args,
-            image=image,
-            alpha=alpha,
-            median=median,
-            top_id=top_id,
-            top_weight=top_weight,
-            weight_sum=weight_parts,
-            weight_max=weight_max,
-        )
+        binned = _bin(launch, args, _demand(scene), depth_key, hit_count)
+        _point(args, image=out.image, alpha=out.alpha, median=out.median, top_id=out.top_id, top_weight=out.top_weight)
+        _point(args, weight_sum=out.weight_sum, weight_max=out.weight_max)
         launch("raster_blend", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
         if any(ctx.needs_input_grad):
-            inputs = (means, quats, log_scales, logits, colors, sh, viewmats, background)
-            ctx.save_for_backward(*_Saved(*inputs, image, alpha, record, aux, hit_count, *binned))
+            saved = _Saved(*inputs, background, out.image, out.alpha, record, aux, hit_count, *binned)
+            ctx.save_for_backward(*saved)
             ctx.scene, ctx.norms, ctx.capacity = scene, norms, args.capacity
-        weight_sum = (weight_parts.double() / source.WEIGHT_SCALE).float()
-        out = _Images(image, alpha, median, radii, means2d, weight_sum, weight_max, top_id, top_weight, binned.hits)
+        weight_sum = (out.weight_sum.double() / source.WEIGHT_SCALE).float()
+        out = out._replace(weight_sum=weight_sum, hits=binned.hits)
         ctx.mark_non_differentiable(*out[2:])
         ctx.set_materialize_grads(False)
         return out

@@ -19,7 +19,7 @@ from ..footage.plates import Plates
 from ..freeze.detail import Detailer
 from ..freeze.developed import Instants
 from ..freeze.query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
-from ..scene import Scene, load_scene, read_image, split_frames
+from ..scene import Scene, evenly_spaced, load_scene, read_image, split_frames
 from ..shot import Shot
 from ..solve.motion import find_motion
 from ..train import LoadedRun, load_run
@@ -152,7 +152,7 @@ def _shown(
     rows: list[FrameScore] = []
     jod: dict[str, float | None] = {}
     for n, (t_star, at) in enumerate(frozen.items()):
-        ours, theirs = [], []
+        ours, theirs = list[Tensor](), list[Tensor]()
         poses = truth.poses(t_star, held_out)
         for m, pose in enumerate(poses):
             report.check_cancelled()
@@ -248,11 +248,11 @@ def _fps(frozen: Frozen, scene: Scene, shown: str) -> float:
     lengthens least.
     """
     most = min(40 if shown == SPLATS else 8, len(scene.frames))
-    poses = [scene.frames[i] for i in np.linspace(0, len(scene.frames) - 1, most).astype(int)]
+    poses = [scene.frames[int(i)] for i in np.linspace(0, len(scene.frames) - 1, most)]
     frozen.view(poses[0], shown)
-    rounds = []
+    rounds: list[list[float]] = []
     for _ in range(3):
-        seconds = []
+        seconds: list[float] = []
         for pose in poses:
             since = time.perf_counter()
             frozen.view(pose, shown)
@@ -285,7 +285,7 @@ class _Keeper:
     def pictures(self, rows: list[FrameScore]) -> list[Picture]:
         """The shown and the worst frames, worst first."""
         ranked = sorted(rows, key=lambda row: _rank(self._truth, row))
-        spread = np.linspace(0, len(rows) - 1, min(KEPT, len(rows))).round().astype(int) if rows else []
+        spread = evenly_spaced(len(rows), KEPT)
         picked = {(row.t_star, row.pose): row for row in [*ranked[:WORST], *(rows[i] for i in spread)]}
         return [self._picture(row) for row in ranked if (row.t_star, row.pose) in picked]
 

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .records import SPLATS, FrameScore, RunRecord
+from .setting import NONE, Setting
 from .things import RECALL_APART, RECALL_DISTANCE
 from .truth import PANES
-
-if TYPE_CHECKING:
-    from .tables import Setting
 
 LEAST_PIXELS = 6
 """A pose in which fewer pixels should show the thing says nothing by itself: it counts in the sum only."""
 RECALLED = ("swinging", "arm")
 """Things whose presence is asked for."""
-NONE = "–"
 
 
 def pane_rows(settings: Sequence[Setting]) -> list[list[str]]:
     """Per setting that saw panes: dB on them and on the wall beside, the difference, what was taken for motion."""
-    rows = []
+    rows: list[list[str]] = []
     for s in settings:
         if s.summary("psnr_db", "wall") is None:
             continue
@@ -64,7 +60,7 @@ THING_NOTE = (
 
 def thing_rows(settings: Sequence[Setting]) -> list[list[str]]:
     """Per setting that saw a small mover or hair: recall over all poses and of the worst, dB."""
-    rows = []
+    rows: list[list[str]] = []
     for s in settings:
         counts = {name: _counts(s.runs, name) for name in RECALLED}
         dB = [_decibels(s, region) for region in ("arm", "hair")]

@@ -10,10 +10,12 @@ the region's border. A metric whose package is absent is None, and `missing_metr
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,17 +39,19 @@ _MSE_FLOOR = 1e-12
 
 def missing_metrics() -> dict[str, str]:
     """Metrics that cannot be had here, each with the sentence that the report prints."""
-    said = {}
+    sentences: dict[str, str] = {}
     if stlpips.weights_path() is None:
-        said["st_lpips"] = "ST-LPIPS was not measured: stlpips-pytorch is not installed (requirements/bench.txt)."
+        sentences["st_lpips"] = "ST-LPIPS was not measured: stlpips-pytorch is not installed (requirements/bench.txt)."
     if importlib.util.find_spec("flip_evaluator") is None:
-        said["flip"] = "FLIP was not measured: flip-evaluator is not installed (requirements/bench.txt)."
+        sentences["flip"] = "FLIP was not measured: flip-evaluator is not installed (requirements/bench.txt)."
     if not colorvideovdp.available():
-        said["jod"] = "ColorVideoVDP was not measured: cvvdp is not installed (requirements/bench.txt)."
-    return said
+        sentences["jod"] = "ColorVideoVDP was not measured: cvvdp is not installed (requirements/bench.txt)."
+    return sentences
 
 
-def score(image: Tensor, truth: Tensor, regions: Mapping[str, Tensor] | None = None) -> dict[str, dict]:
+def score(
+    image: Tensor, truth: Tensor, regions: Mapping[str, Tensor] | None = None
+) -> dict[str, dict[str, float | int | None]]:
     """Scores a picture against the truth, over the whole and over regions.
 
     Args:
@@ -131,7 +135,7 @@ def flip_map(image: Tensor, truth: Tensor) -> Tensor | None:
     """LDR-FLIP at every pixel [H, W], at the package's viewing distance (67 pixels per degree); None if absent."""
     if importlib.util.find_spec("flip_evaluator") is None:
         return None
-    import flip_evaluator
+    flip_evaluator: Any = importlib.import_module("flip_evaluator")
 
     reference, test = (np.ascontiguousarray(v.cpu().numpy(), dtype=np.float32) for v in (truth, image))
     values, _, _ = flip_evaluator.evaluate(reference, test, "LDR", inputsRGB=True, applyMagma=False, parameters={})
@@ -180,14 +184,14 @@ class Summary:
 
 def summarise(values: Sequence[float | None], more_is_better: bool = True) -> Summary | None:
     """The summary of the values that are there; None if none is."""
-    there = sorted((v for v in values if v is not None), reverse=not more_is_better)
-    if not there:
+    known = sorted((v for v in values if v is not None), reverse=not more_is_better)
+    if not known:
         return None
 
     def bottom(share: float) -> float:
-        return float(np.mean(there[: max(1, math.ceil(share * len(there)))]))
+        return float(np.mean(known[: max(1, math.ceil(share * len(known)))]))
 
-    return Summary(len(there), bottom(1.0), bottom(0.75), bottom(0.5), bottom(0.25), there[0])
+    return Summary(len(known), bottom(1.0), bottom(0.75), bottom(0.5), bottom(0.25), known[0])
 
 
 Key = tuple[str, str, int, int, int]

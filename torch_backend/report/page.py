@@ -11,15 +11,20 @@ from __future__ import annotations
 
 import base64
 import html
+import importlib
 import io
 import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from .metrics import WHOLE
 from .plots import THEMES
 from .records import DELIVERED, RunRecord
-from .tables import REGION_NAMES, RIGID, WHOLE, Setting, Table
+from .setting import Setting
+from .tables import REGION_NAMES, Table
+from .truth import RIGID
 
 _JPEG_QUALITY = 92
 _SHOWN = 8
@@ -98,7 +103,7 @@ for (const slider of document.querySelectorAll(".frame input")) {
 def page(
     title: str,
     facts: Sequence[str],
-    said: Sequence[str],
+    missing: Sequence[str],
     tables: Sequence[Table],
     plots: Sequence[tuple[str, Path, Path]],
     figures: Sequence[tuple[str, Path]],
@@ -122,8 +127,8 @@ def page(
     links = [("tables", "Tables")] + [("plots", "Speed against error")] * bool(plots)
     links += [("figures", "Figures")] * bool(figures) + [("frames", "Frames")]
     parts += ["<nav>" + "".join(f'<a href="#{at}">{name}</a>' for at, name in links) + "</nav>"]
-    if said:
-        parts += ["<h2>What is missing</h2><ul>" + "".join(f"<li>{html.escape(s)}</li>" for s in said) + "</ul>"]
+    if missing:
+        parts += ["<h2>What is missing</h2><ul>" + "".join(f"<li>{html.escape(s)}</li>" for s in missing) + "</ul>"]
     parts += ['<h2 id="tables">Tables</h2>', *(_table(table) for table in tables)]
     if plots:
         parts += ['<h2 id="plots">Speed against error</h2><div class="plots">', *(_plot(*p) for p in plots), "</div>"]
@@ -151,7 +156,7 @@ def _table(table: Table) -> str:
         f'<th scope="col"{" class=word" * word}>{html.escape(name)}</th>'
         for name, word in zip(table.header, words, strict=True)
     )
-    rows = []
+    rows: list[str] = []
     for i, row in enumerate(table.rows):
         mark = f' class="{table.marks[i]}"' if i in table.marks else ""
         cells = "".join(f"<td{_word(cell)}>{html.escape(cell)}</td>" for cell in row)
@@ -192,7 +197,7 @@ def _sliders(settings: Sequence[Setting], results: Path, pictures: dict[str, str
         for run in setting.runs:
             if run.pictures:
                 by_scene.setdefault(run.scene, []).append((setting.label, run))
-    parts = []
+    parts: list[str] = []
     for scene, runs in by_scene.items():
         parts.append(f"<h3>{html.escape(scene)}</h3>")
         # What the product does by default comes first.
@@ -230,7 +235,7 @@ def _slider(run: RunRecord, index: int, results: Path, pictures: dict[str, str])
 
 def _jpeg(path: Path) -> str:
     """A picture as JPEG data URI."""
-    from PIL import Image
+    Image: Any = importlib.import_module("PIL.Image")  # of requirements/bench.txt
 
     stream = io.BytesIO()
     with Image.open(path) as picture:

@@ -1,11 +1,10 @@
 """Pictures of a report: quality against cost with Pareto fronts, strips of frames, one pose at two instants."""
 
-# Packages of requirements/bench.txt may be absent; each use says what to do then.
-# pyright: reportMissingImports=false
-
 from __future__ import annotations
 
-from collections.abc import Sequence
+import importlib
+import importlib.util
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,10 @@ from ..footage.images import read_png
 from ..shot import atomic_path
 from .metrics import pareto_front
 from .records import Picture, RunRecord
-from .tables import HOST_NAMES, Setting, pace
+from .setting import Setting
+from .tables import HOST_NAMES, pace
 
-COSTS = {
+COSTS: dict[str, tuple[str, Callable[[RunRecord], float | None]]] = {
     "seconds": ("training, seconds", lambda run: run.train_seconds),
     "frame_ms": ("rendering a frozen frame, milliseconds", lambda run: run.frozen_fps and 1000.0 / run.frozen_fps),
     "megabytes": ("model, megabytes", lambda run: run.model_bytes / 1e6),
@@ -37,15 +37,13 @@ _MARKERS = {"none": "o", "paper": "s", "support": "D"}
 
 def available() -> bool:
     """True if matplotlib is installed."""
-    import importlib.util
-
     return importlib.util.find_spec("matplotlib") is not None
 
 
 def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str, theme: str = "light") -> Path | None:
     """Mean PSNR of frozen frames against a cost in `COSTS`, one point per setting; None if no setting has both."""
     axis, read = COSTS[cost]
-    points = []
+    points: list[tuple[Setting, float, float]] = []
     for s in settings:
         psnr, price = s.summary("psnr_db", region), s.of_runs(read)
         if psnr is not None and price is not None:
@@ -79,18 +77,22 @@ def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str, t
 
 def _limits(axes: Any, prices: Sequence[float]) -> None:
     """Room beside the points, and plain numbers on a logarithmic axis."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    ticker: Any = importlib.import_module("matplotlib.ticker")
 
     low, high = min(prices), max(prices)
     axes.set_xlim(low / 1.3, high * max(1.6, (high / low) ** 0.35))
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(ticker.FuncFormatter(_plain))
+    axes.xaxis.set_minor_formatter(ticker.NullFormatter())
+
+
+def _plain(value: float, position: int) -> str:
+    return f"{value:g}"
 
 
 def _legend(figure: Any, settings: Sequence[Setting], ink: str) -> None:
     """Colours of the hosts and markers of the supervisions, under the plot."""
-    from matplotlib.lines import Line2D
+    Line2D: Any = importlib.import_module("matplotlib.lines").Line2D
 
     plain = {"color": "none", "markersize": 7}
     hosts = dict.fromkeys(s.host for s in settings)
@@ -105,7 +107,7 @@ def _legend(figure: Any, settings: Sequence[Setting], ink: str) -> None:
 
 def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
     """Names to the right of points, pushed apart where they would lie on one another; (x, y, name, colour)."""
-    from matplotlib.patheffects import withStroke
+    withStroke: Any = importlib.import_module("matplotlib.patheffects").withStroke
 
     low, high = axes.get_ylim()
     pad = 0.06 * max(high - low, 0.2)
@@ -222,12 +224,8 @@ def _grid(
 
 def _pyplot() -> Any:
     """matplotlib.pyplot without a window."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt
+    importlib.import_module("matplotlib").use("Agg")
+    return importlib.import_module("matplotlib.pyplot")
 
 
 def _figure(size: tuple[float, float], theme: str) -> tuple[Any, Any]:

@@ -38,9 +38,9 @@ class FrameScore:
     """PSNR over the best 90 % of the pixels."""
     gradient_ratio: float | None = None
     """Gradient energy over the truth's: below 1 is softer."""
-    recalled: dict[str, Any] = field(default_factory=dict)
+    recalled: dict[str, Any] = field(default_factory=dict[str, Any])
     """{thing: [pixels that show it, pixels that should]} of a hard scene, see `things.recalled`."""
-    opened: dict[str, Any] = field(default_factory=dict)
+    opened: dict[str, Any] = field(default_factory=dict[str, Any])
     """{pane: share of it that the freeze's motion matte calls moving} of a hard scene; of splats alone."""
 
     def value(self, metric: str, region: str = WHOLE) -> float | None:
@@ -75,12 +75,12 @@ class Detailed:
     """The freezes of a run made in another way, at the same instants and poses."""
 
     rows: list[FrameScore]
-    jod: dict[str, float | None] = field(default_factory=dict)
+    jod: dict[str, float | None] = field(default_factory=dict[str, float | None])
     """t* -> ColorVideoVDP of its poses as a sequence."""
     frozen_fps: float | None = None
     """Frozen frames per second, all that they are made of; None where it says nothing."""
-    pictures: list[Picture] = field(default_factory=list)
-    two_instants: list[Picture] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list[Picture])
+    two_instants: list[Picture] = field(default_factory=list[Picture])
     """One pose at two instants."""
 
 
@@ -133,18 +133,18 @@ class RunRecord:
     heldout_psnr_db: float | None
     """On frames of the clip kept out of training, each at its own time."""
     rows: list[FrameScore]
-    heldout: list[HeldOut] = field(default_factory=list)
+    heldout: list[HeldOut] = field(default_factory=list[HeldOut])
     """Those frames one by one."""
-    jod: dict[str, float | None] = field(default_factory=dict)
+    jod: dict[str, float | None] = field(default_factory=dict[str, float | None])
     """t* -> ColorVideoVDP of its poses as a sequence."""
-    pictures: list[Picture] = field(default_factory=list)
-    two_instants: list[Picture] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list[Picture])
+    two_instants: list[Picture] = field(default_factory=list[Picture])
     """One pose at two instants."""
-    plates: dict[str, str] = field(default_factory=dict)
+    plates: dict[str, str] = field(default_factory=dict[str, str])
     """Frame number -> plate on disk, of those two instants."""
-    missing: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict[str, str])
     """Metric -> sentence why it was not measured."""
-    machine: dict[str, Any] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=dict[str, Any])
     """Processor, cores, load and versions, see `machine_facts`."""
     device: str = "cpu"
     """What trained and rendered: cpu or cuda."""
@@ -152,12 +152,12 @@ class RunRecord:
     """What to type to repeat it."""
     finished: str = ""
     """Date and time, UTC."""
-    detailed: dict[str, Detailed] = field(default_factory=dict)
+    detailed: dict[str, Detailed] = field(default_factory=dict[str, Detailed])
     """`DEVELOPED`, `WITHHELD`, `DELIVERED` -> the same freezes made so; `rows` and what else is here are of splats
     alone."""
     shown: str = SPLATS
     """What the frames of this record show; on disk always splats, see `as_shown`."""
-    matte: dict[str, Any] = field(default_factory=dict)
+    matte: dict[str, Any] = field(default_factory=dict[str, Any])
     """{pane: {"moving", "unknown": share of it}} by the solve's motion matte, over all frames of a hard scene."""
     version: int = RECORD_VERSION
 
@@ -233,9 +233,9 @@ def finished(folder: str | Path, run_id: str) -> bool:
 
 def load_records(folder: str | Path, run_ids: Iterable[str] | None = None) -> list[RunRecord]:
     """The records of a folder (those of `run_ids`, if given), by name. The launcher's summary.json is none."""
-    wanted = None if run_ids is None else set(run_ids)
+    chosen = None if run_ids is None else set(run_ids)
     paths = sorted(p for p in Path(folder).glob("*.json") if p.name != "summary.json")
-    paths = [p for p in paths if wanted is None or p.stem in wanted]
+    paths = [p for p in paths if chosen is None or p.stem in chosen]
     return [load_record(path) for path in paths]
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from .hard_table import PANE_HEADER, PANE_NOTE, THING_HEADER, THING_NOTE, pane_rows, thing_rows
-from .metrics import METRICS, WHOLE, Key, Paired, Summary, paired, summarise
-from .records import DELIVERED, DEVELOPED, SPLATS, WITHHELD, FrameScore, RunRecord
+from .metrics import WHOLE, Paired
+from .records import DELIVERED, DEVELOPED, SPLATS, WITHHELD, RunRecord
+from .setting import NONE, Setting
 from .truth import REGIONS, RIGID
 
 HOST_NAMES = {
@@ -46,7 +45,6 @@ DETAIL_NOTE = (
     "truth itself, and not counted."
 )
 _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
-NONE = "–"
 
 
 @dataclass
@@ -57,70 +55,8 @@ class Table:
     header: list[str]
     rows: list[list[str]]
     note: str = ""
-    marks: dict[int, str] = field(default_factory=dict)
+    marks: dict[int, str] = field(default_factory=dict[int, str])
     """Row -> win, loss or best, which the page shows in colour beside the words."""
-
-
-@dataclass
-class Setting:
-    """All runs of one way of doing it, on one kind of scene."""
-
-    label: str
-    host: str
-    supervision: str
-    preset: str
-    variant: str
-    cameras: str
-    shown: str
-    """What its frames show: splats, withheld or delivered."""
-    runs: list[RunRecord]
-
-    def summary(self, metric: str, region: str = WHOLE) -> Summary | None:
-        """Over all frames of all runs."""
-        return self.of_frames(lambda row: row.value(metric, region), METRICS[metric])
-
-    def of_frames(self, read: Callable[[FrameScore], float | None], more_is_better: bool = True) -> Summary | None:
-        """Any figure of a frame, over all runs."""
-        return summarise([v for run in self.runs for v in run.per_frame(read)], more_is_better)
-
-    def of_runs(self, read: Callable[[RunRecord], float | None]) -> float | None:
-        """Mean of any figure of a run; None if any run lacks it."""
-        values = [read(run) for run in self.runs]
-        there = [v for v in values if v is not None]
-        return float(np.mean(there)) if there and len(there) == len(values) else None
-
-    def jod(self) -> float | None:
-        """Mean over instants of all runs."""
-        values = [v for run in self.runs for v in run.jod.values() if v is not None]
-        return float(np.mean(values)) if values else None
-
-    def of_heldout(self, region: str) -> float | None:
-        """Mean PSNR in dB over a region of the clip's held-out frames of all runs; None if none has it."""
-        values = [v for run in self.runs for v in run.heldout_values(region).values() if v is not None]
-        return float(np.mean(values)) if values else None
-
-    def against(self, other: Setting, metric: str, region: str = WHOLE) -> Paired | None:
-        """Frame by frame against another setting; `jod` instant by instant."""
-        if metric == "jod":
-            return self._against(other, RunRecord.jod_values)
-        return self._against(other, lambda run: run.values(metric, region), METRICS[metric])
-
-    def against_heldout(self, other: Setting, region: str) -> Paired | None:
-        """PSNR on the clip's held-out frames, frame by frame against another setting."""
-        return self._against(other, lambda run: run.heldout_values(region))
-
-    def _against(
-        self, other: Setting, read: Callable[[RunRecord], dict[Key, float | None]], more_is_better: bool = True
-    ) -> Paired | None:
-        mine, theirs = ({k: v for run in s.runs for k, v in read(run).items()} for s in (self, other))
-        return paired(mine, theirs, more_is_better)
-
-    def ratio(self, other: Setting, read: Callable[[RunRecord], float | None]) -> float | None:
-        """Geometric mean over scenes and seeds of a cost here over the same there; None if no run of both has it."""
-        there = {run.place: read(run) for run in other.runs}
-        pairs = [(read(run), there.get(run.place)) for run in self.runs]
-        logs = [float(np.log(a / b)) for a, b in pairs if a and b]
-        return float(np.exp(np.mean(logs))) if logs else None
 
 
 def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
@@ -142,7 +78,7 @@ def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
         made = (SPLATS, *SHOWN_NAMES).index(shown)
         return camera, preset, variant != "default", at, supervisions.index(supervision), variant, made
 
-    found = []
+    found: list[Setting] = []
     for key in sorted(groups, key=order):
         host, supervision, preset, variant, camera, shown = key
         label = _label(host, supervision, variant) + (f", {SHOWN_NAMES[shown]}" if shown != SPLATS else "")
@@ -168,7 +104,7 @@ def all_tables(records: Sequence[RunRecord]) -> list[Table]:
     """Every table that the records have figures for."""
     synthetic, real = settings_of(records, "synthetic"), settings_of(records, "real")
     main = [s for s in synthetic if s.variant in ("default", "reference")]
-    tables = []
+    tables: list[Table] = []
     if main:
         tables += [
             _who_wins(main),
@@ -196,7 +132,7 @@ def all_tables(records: Sequence[RunRecord]) -> list[Table]:
 def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
     header = ["method", "frozen", "runs", "frames", "PSNR mean", "bottom 75 %", "50 %", "25 %", "worst frame"]
     header += ["SSIM", "ST-LPIPS", "FLIP", "JOD"]
-    rows, means = [], []
+    rows, means = list[list[str]](), list[float | None]()
     for s in settings:
         psnr = s.summary("psnr_db", region)
         shares = [psnr.mean, psnr.bottom_75, psnr.bottom_50, psnr.bottom_25, psnr.worst] if psnr else [None] * 5
@@ -222,7 +158,7 @@ def _quality(settings: Sequence[Setting], region: str, title: str) -> Table:
 
 
 def _regions(settings: Sequence[Setting]) -> Table:
-    rows = []
+    rows: list[list[str]] = []
     for s in settings:
         found = [s.summary("psnr_db", region) for region in (WHOLE, *REGIONS)]
         rows.append([s.label, *(number(f and f.mean, "psnr_db") for f in found)])
@@ -246,7 +182,7 @@ def _costs(settings: Sequence[Setting]) -> Table:
         "threads × runs at once",
     ]
     header += ["steps", "step, ms", "frozen frames / s", "model, MB", "Gaussians", "moving, %"]
-    rows = []
+    rows: list[list[str]] = []
     for s in settings:
         rows.append(
             [
@@ -265,15 +201,15 @@ def _costs(settings: Sequence[Setting]) -> Table:
             ]
         )
     loads = [r.machine.get("load_1min") for s in settings for r in s.runs]
-    there = [load for load in loads if load is not None]
+    known = [load for load in loads if load is not None]
     note = (
         "Means over runs. Held-out: frames of the clip kept out of training, each at its own time: whole, on what "
         "moves, on what does not. Seconds, milliseconds and frames per second are wall time with that many threads per "
         "run and that many runs at once; a step's are those of the last third of the run, with the measurements in it. "
         "Developed and with plate detail a run is the same one, frozen otherwise."
     )
-    if there:
-        note += f" Load of the machine after the runs: {min(there):.1f} to {max(there):.1f}; wall times include it."
+    if known:
+        note += f" Load of the machine after the runs: {min(known):.1f} to {max(known):.1f}; wall times include it."
     kind = "real clips" if settings[0].runs[0].kind == "real" else "synthetic scenes"
     return Table(f"What it cost ({kind})", header, rows, note)
 
@@ -281,7 +217,7 @@ def _costs(settings: Sequence[Setting]) -> Table:
 def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
     """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static,
     developed instants and plate detail against splats alone."""
-    pairs = []
+    pairs: list[tuple[Setting, Setting]] = []
     for group in _places(settings):
         at = {(s.variant, s.host, s.supervision): s for s in group if s.shown == SPLATS}
         for variant, host in dict.fromkeys((s.variant, s.host) for s in group):
@@ -363,7 +299,7 @@ def _times(what: str, ratio: float | None) -> str:
 
 def _every_metric(settings: Sequence[Setting], regions: Sequence[str], title: str) -> Table:
     header = ["a against b", "region", *METRIC_NAMES.values(), "n"]
-    rows = []
+    rows: list[list[str]] = []
     for a, b in comparisons(settings):
         for region in regions:
             whole = region in (WHOLE, RIGID)
@@ -396,7 +332,7 @@ def _paired_cells(result: Paired) -> list[str]:
 def _ablations(ablations: Sequence[Setting], main: Sequence[Setting]) -> Table:
     header = ["ablation", "of", "region", "PSNR a - b, dB", "standard error", "independent units", "frames", "verdict"]
     rows: list[list[str]] = []
-    marks = {}
+    marks: dict[int, str] = {}
     for s in ablations:
         alone = [m for m in main if m.shown == SPLATS]
         same = [m for m in alone if (m.cameras, m.preset, m.host) == (s.cameras, s.preset, s.host)]
@@ -414,7 +350,7 @@ def _ablations(ablations: Sequence[Setting], main: Sequence[Setting]) -> Table:
 
 
 def _real_extra(settings: Sequence[Setting]) -> Table:
-    rows = []
+    rows: list[list[str]] = []
     for s in settings:
         whole, best = s.summary("psnr_db"), s.of_frames(lambda row: row.best_90_psnr_db)
         energy = s.of_frames(lambda row: row.gradient_ratio)
@@ -444,8 +380,8 @@ def pace(run: RunRecord) -> str:
 
 
 def _best(values: Sequence[float | None]) -> dict[int, str]:
-    there = [(v, i) for i, v in enumerate(values) if v is not None]
-    return {max(there)[1]: "best"} if len(there) > 1 else {}
+    known = [(v, i) for i, v in enumerate(values) if v is not None]
+    return {max(known)[1]: "best"} if len(known) > 1 else {}
 
 
 def to_be_seen(setting: Setting) -> bool:

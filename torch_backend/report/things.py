@@ -36,8 +36,8 @@ def recalled(image: Tensor, truth: Tensor, behind: Tensor, mask: Tensor) -> tupl
         mask: bool [H, W], the thing's pixels in the truth.
     """
     error, mistaken, apart = (_distance(a, b) for a, b in ((image, truth), (image, behind), (truth, behind)))
-    told = mask & (apart > RECALL_APART)
-    return int((told & (error <= RECALL_DISTANCE) & (error < mistaken)).sum()), int(told.sum())
+    counted = mask & (apart > RECALL_APART)
+    return int((counted & (error <= RECALL_DISTANCE) & (error < mistaken)).sum()), int(counted.sum())
 
 
 def _distance(a: Tensor, b: Tensor) -> Tensor:

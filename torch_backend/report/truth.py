@@ -15,11 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
 from torch import Tensor
 
 from ..contract import check_version, read_json
-from ..scene import load_scene, read_image
+from ..scene import evenly_spaced, load_scene, read_image
 from ..shot import Shot, content_key
 from ..solve.motion import motion_key
 from .real import ensure_motion, far_from, motion_shares
@@ -140,8 +139,7 @@ class RealScene:
         self._scene = load_scene(shot)
         ensure_motion(shot)
         solved = [self._scene.frames[i] for i in self._scene.solved]
-        picked = np.linspace(0, len(solved) - 1, min(instants, len(solved))).round().astype(int)
-        self.t_stars = [solved[i] for i in picked]
+        self.t_stars = [solved[i] for i in evenly_spaced(len(solved), instants)]
         self.key = content_key(read_json(shot.cameras), self.t_stars, motion_key(shot))
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:

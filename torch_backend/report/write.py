@@ -15,14 +15,15 @@ from . import plots
 from .metrics import WHOLE
 from .page import page
 from .records import DELIVERED, RunRecord, load_records, machine_facts
-from .tables import NONE, Setting, Table, all_tables, markdown, pace, settings_of, to_be_seen
+from .setting import NONE, Setting
+from .tables import Table, all_tables, markdown, pace, settings_of, to_be_seen
 from .truth import RIGID
 
 TITLE = "Frozen time: speed against error"
 
 
 def write_report(
-    results: Path, folder: Path, run_ids: Sequence[str] | None = None, said: Sequence[str] = (), command: str = ""
+    results: Path, folder: Path, run_ids: Sequence[str] | None = None, missing: Sequence[str] = (), command: str = ""
 ) -> Path:
     """Writes the report of the records in `results` (those of `run_ids`, if given) and returns its Markdown file.
 
@@ -36,7 +37,7 @@ def write_report(
     records = load_records(results, run_ids)
     if not records:
         raise ValueError(f"{results} holds no record of a finished run: there is nothing to report")
-    said = [*said, *sorted({sentence for r in records for sentence in r.missing.values()})]
+    missing = [*missing, *sorted({sentence for r in records for sentence in r.missing.values()})]
     folder.mkdir(parents=True, exist_ok=True)
     tables = all_tables(records)
     settings = [s for kind in ("synthetic", "real") for s in settings_of(records, kind)]
@@ -45,12 +46,12 @@ def write_report(
     if plots.available():
         drawn, figures = _plots(records, folder), _figures(settings, results, folder)
     else:
-        said.append("There are no plots: matplotlib is not installed (requirements/bench.txt).")
+        missing.append("There are no plots: matplotlib is not installed (requirements/bench.txt).")
     facts = _facts(records, command)
-    write_json(folder / "report.json", _json(records, tables, said, command))
-    _write(folder / "report.md", _markdown(facts, said, tables, drawn, figures, folder))
+    write_json(folder / "report.json", _json(records, tables, missing, command))
+    _write(folder / "report.md", _markdown(facts, missing, tables, drawn, figures, folder))
     if plots.available():
-        _write(folder / "report.html", page(TITLE, facts, said, tables, drawn, figures, settings, results))
+        _write(folder / "report.html", page(TITLE, facts, missing, tables, drawn, figures, settings, results))
     return folder / "report.md"
 
 
@@ -69,7 +70,7 @@ def _facts(records: Sequence[RunRecord], command: str) -> list[str]:
 
 
 def _plots(records: Sequence[RunRecord], folder: Path) -> list[tuple[str, Path, Path]]:
-    drawn = []
+    drawn: list[tuple[str, Path, Path]] = []
     for kind, region in (("synthetic", WHOLE), ("real", RIGID)):
         settings = [s for s in settings_of(records, kind) if s.variant in ("default", "reference") and to_be_seen(s)]
         for cost, (axis, _) in plots.COSTS.items():
@@ -84,7 +85,7 @@ def _plots(records: Sequence[RunRecord], folder: Path) -> list[tuple[str, Path, 
 
 def _figures(settings: Sequence[Setting], results: Path, folder: Path) -> list[tuple[str, Path]]:
     """Per scene: every method on one frame, our worst frames, one pose at two instants."""
-    figures = []
+    figures: list[tuple[str, Path]] = []
     scenes = dict.fromkeys((run.scene, run.cameras) for s in settings for run in s.runs)
     for scene, cameras in scenes:
         named = [
@@ -113,15 +114,15 @@ def _figures(settings: Sequence[Setting], results: Path, folder: Path) -> list[t
 
 def _markdown(
     facts: Sequence[str],
-    said: Sequence[str],
+    missing: Sequence[str],
     tables: Sequence[Table],
     drawn: Sequence[tuple[str, Path, Path]],
     figures: Sequence[tuple[str, Path]],
     folder: Path,
 ) -> str:
     lines = [f"# {TITLE}", "", "  \n".join(facts), ""]
-    if said:
-        lines += ["## What is missing", "", *(f"- {sentence}" for sentence in said), ""]
+    if missing:
+        lines += ["## What is missing", "", *(f"- {sentence}" for sentence in missing), ""]
     lines += ["## Tables", "", *(markdown(table) for table in tables)]
     pictures = [(name, light) for name, light, _ in drawn] + list(figures)
     if pictures:
@@ -130,13 +131,15 @@ def _markdown(
     return "\n".join(lines) + "\n"
 
 
-def _json(records: Sequence[RunRecord], tables: Sequence[Table], said: Sequence[str], command: str) -> dict[str, Any]:
+def _json(
+    records: Sequence[RunRecord], tables: Sequence[Table], missing: Sequence[str], command: str
+) -> dict[str, Any]:
     return {
         "version": 1,
         "written": time.strftime("%Y-%m-%d %H:%M", time.gmtime()),
         "command": command,
         "machine": machine_facts(),
-        "missing": list(said),
+        "missing": list(missing),
         "tables": [dataclasses.asdict(table) for table in tables],
         "runs": [dataclasses.asdict(record) for record in records],
     }

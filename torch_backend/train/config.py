@@ -13,8 +13,8 @@ from ..deformation import GateConfig, HexPlaneConfig, HostConfig, host, host_con
 from ..gaussians import DensifyConfig, InitConfig
 from ..supervision import SupervisionConfig
 from .exposure import ExposureConfig
-from .needs import NeedsConfig
 from .poses import PosesConfig
+from .stopping import StoppingConfig
 
 
 @dataclass
@@ -85,7 +85,7 @@ class TrainConfig:
     """Anchoring."""
     exposure: ExposureConfig = dataclasses.field(default_factory=ExposureConfig)
     """Brightness and tint that drift along the clip."""
-    needs: NeedsConfig = dataclasses.field(default_factory=NeedsConfig)
+    needs: StoppingConfig = dataclasses.field(default_factory=StoppingConfig)
     """When `auto` has enough: SH degree, Gaussians, time nodes, steps."""
     poses: PosesConfig = dataclasses.field(default_factory=PosesConfig)
     """Small corrections of the solve's cameras."""
@@ -184,7 +184,7 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     """Inverse of `config_to_json`; ValueError names an unknown field."""
     nested = {
         "init": InitConfig, "densify": DensifyConfig, "gate": GateConfig,
-        "supervision": SupervisionConfig, "exposure": ExposureConfig, "needs": NeedsConfig,
+        "supervision": SupervisionConfig, "exposure": ExposureConfig, "needs": StoppingConfig,
         "poses": PosesConfig,
     }  # fmt: skip
     values: dict[str, Any] = {

@@ -11,14 +11,14 @@ from ..native import initialised_warp
 _HINT = "Choose --device cpu, or auto."
 
 
-def choose_device(wanted: str) -> torch.device:
+def choose_device(requested: str) -> torch.device:
     """The device for `auto`, `cpu` or `cuda`. ValueError for another word, JobError if `cuda` cannot be had."""
-    if wanted not in DEVICES:
-        raise ValueError(f"device is {wanted!r}: it should be one of {', '.join(DEVICES)}")
-    refusal = None if wanted == "cpu" else cuda_refusal()
-    if wanted == "cuda" and refusal:
+    if requested not in DEVICES:
+        raise ValueError(f"device is {requested!r}: it should be one of {', '.join(DEVICES)}")
+    refusal = None if requested == "cpu" else cuda_refusal()
+    if requested == "cuda" and refusal:
         raise JobError(refusal, _HINT, ExitCode.TRAIN)
-    return torch.device("cpu" if wanted == "cpu" or refusal else "cuda")
+    return torch.device("cpu" if requested == "cpu" or refusal else "cuda")
 
 
 def cuda_refusal() -> str:

@@ -60,7 +60,7 @@ def moving_frames(run: RunView, share: float) -> Tensor:
     counts = torch.zeros(len(model.gaussians), dtype=torch.long, device=model.device)
     for n, index in enumerate(run.train_ids):
         movers = run.movers[n]
-        if n in run.frames_left_out or not bool(movers.any()):
+        if n in run.excluded_frames or not bool(movers.any()):
             continue
         run.report.check_cancelled()
         mask = movers.to(model.device, torch.float32)

@@ -41,7 +41,7 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
     Returns the position of the other frame; None if the draw was of no use.
     """
     other = int(torch.randint(len(run.train_ids), (1,), generator=run.generator, device="cpu"))
-    if run.times[other] == run.times[frame] or other in run.frames_left_out:
+    if run.times[other] == run.times[frame] or other in run.excluded_frames:
         return None
     supervision, model = run.config.supervision, run.model
     supervised = _supervised(run, frame, rows, state, out)

@@ -27,8 +27,8 @@ def signed_residual(run: RunView, rows: Tensor) -> tuple[Tensor, Tensor]:
     Returns (residual [I, M], weight [I, M]): mean of image - render over the pixels that a Gaussian paints, by
     alpha * T, grey, and the sum of those weights; 0 for frames that were not looked at.
     """
-    left_out = run.frames_left_out
-    frames = [n for n in range(len(run.train_ids)) if n not in left_out]
+    excluded = run.excluded_frames
+    frames = [n for n in range(len(run.train_ids)) if n not in excluded]
     if len(frames) > _LOOKED_AT:  # two stretches of neighbours: sparse frames would not show what is fast
         half = _LOOKED_AT // 2
         first, second = len(frames) // 4, 3 * len(frames) // 4

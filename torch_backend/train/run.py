@@ -207,9 +207,9 @@ def place_images(images: Tensor, device: torch.device) -> Tensor:
     return images.to(device) if images.nbytes <= free // 2 else images.pin_memory()
 
 
-def training_size(scene: Scene, wanted: int) -> tuple[int, int]:
+def training_size(scene: Scene, requested_width: int) -> tuple[int, int]:
     """(width, height) of the training images: the working frames' shape, never larger than they are."""
-    width = min(wanted, scene.width)
+    width = min(requested_width, scene.width)
     return width, max(16, round(scene.height * width / scene.width))
 
 
@@ -253,8 +253,8 @@ def trained_without(shot: Shot, run: Path, key: str) -> bool:
     return read_meta(checkpoint).get("key") == key
 
 
-def _resume(trainer: Trainer, checkpoint: Path, wanted: bool, report: Reporter) -> bool:
-    if not (wanted and checkpoint.is_file()):
+def _resume(trainer: Trainer, checkpoint: Path, resume: bool, report: Reporter) -> bool:
+    if not (resume and checkpoint.is_file()):
         return False
     if read_meta(checkpoint).get("key") != trainer.identity["key"]:
         return False

@@ -46,7 +46,7 @@ class RunView(Protocol):
         ...
 
     @property
-    def frames_left_out(self) -> set[int]:
+    def excluded_frames(self) -> set[int]:
         """Positions of the trained frames that are not trained on now: kept back, or unusable."""
         ...
 

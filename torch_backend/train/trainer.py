@@ -27,12 +27,12 @@ from .extend import Extension
 from .losses import photometric, psnr
 from .model import DynamicModel, render, restore_model
 from .movers import harden, on_trial
-from .needs import RunSchedule, StoppingPolicy
 from .optimizer import add_field, limit_harmonics, optimizer_of, schedule_rates
 from .paper import paper_step
 from .poses import Poses, corrected
 from .repair import FieldMemory, drop_offenders, repair, unstable
 from .residual import correlation_of_movers
+from .stopping import RunSchedule, StoppingPolicy
 
 _MAX_BAD_STEPS = 20
 _INSPECT_EVERY = 10
@@ -111,7 +111,7 @@ class Trainer:
         return self._bins[frame]
 
     @property
-    def frames_left_out(self) -> set[int]:
+    def excluded_frames(self) -> set[int]:
         """Positions of the trained frames that are not trained on now: kept back as probes, or unusable."""
         return self.unusable | self.policy.held
 
@@ -209,7 +209,7 @@ class Trainer:
             self._recent.extend([] if other is None else [other])
         self.optimizer.step(guard=[total])
         if self._refines_poses():
-            self.poses.fix_gauge(self.frames_left_out)
+            self.poses.fix_gauge(self.excluded_frames)
         applied = self.optimizer.applied
         if self.device.type == "cpu" and not bool(applied):
             self._skip_step(frame)
@@ -224,8 +224,8 @@ class Trainer:
             raise RuntimeError("the frame was rendered without contributions")
         radii, weight = out.radii[0], out.weight_sum[0]
         if self.device.type != "cpu":
-            left_out = ~applied
-            self._bad = torch.stack([self._bad[0] + left_out, (self._bad[1] + 1) * left_out])
+            skipped = ~applied
+            self._bad = torch.stack([self._bad[0] + skipped, (self._bad[1] + 1) * skipped])
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
         mark_seen(self.model.gaussians, self._bins[frame], weight)
@@ -382,7 +382,7 @@ class Trainer:
     def _next_frame(self) -> int:
         if not self.order:
             drawn = integers(torch.randperm(len(self.train_ids), generator=self.generator, device="cpu"))
-            out = self.frames_left_out
+            out = self.excluded_frames
             self.order = [frame for frame in drawn if frame not in out]
         self._recent.append(self.order[-1])
         return self.order.pop()
@@ -504,7 +504,7 @@ class Trainer:
     def probe_psnr(
         self, frames: list[int], *, exposure: bool = True, field: bool = True, **options: Any
     ) -> float | None:  # fmt: skip
-        """As `needs.Probe` says; `options` go to `render_frame`."""
+        """As `stopping.Probe` says; `options` go to `render_frame`."""
         if not (exposure or self.config.exposure.on) or not (field or self.model.field is not None) or not frames:
             return None
         indices, options = [self.train_ids[n] for n in frames], {**options, "exposure": exposure, "field": field}
@@ -513,7 +513,7 @@ class Trainer:
         return value if math.isfinite(value) else None
 
     def correlation_frames(self) -> float | None:
-        """As `needs.Probe` says."""
+        """As `stopping.Probe` says."""
         return correlation_of_movers(self)
 
     # ------------------------------------------------------------------ checkpoints

@@ -80,7 +80,7 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int, limits: R
     values = [one.psnr_db for one in kept or seen]
     moving = np.concatenate([one.moving for one in seen])
     whole = len(seen) * pixels / 16  # `moving` has every 16th pixel
-    by_matte = []
+    by_matte: list[float | None] = []
     for name in ("still_unexplained", "moving_unexplained"):
         known = [value for one in seen if (value := getattr(one, name)) is not None]
         by_matte.append(float(np.mean(known)) if known else None)
@@ -119,7 +119,7 @@ def _sentences(
     figures: RunFigures, limits: RunLimits, dim: bool, places: list[dict[str, Any]], walks: list[dict[str, Any]]
 ) -> list[str]:
     """What is so: how well it fits, what moves and how far, where it does not hold."""
-    width, sentences = figures.width, []
+    width, sentences = figures.width, list[str]()
     if dim:
         on = "held-out frames" if figures.held_out else "training frames"
         sentences.append(
@@ -202,13 +202,14 @@ def spans_of(
     bad = np.flatnonzero(lost.any(axis=(1, 2)))
     if not len(bad):
         return []
-    groups = np.split(bad, np.flatnonzero(np.diff(bad) > 2) + 1)  # one good frame between does not part them
-    weights = [(cells[group] * lost[group]).sum(axis=0) for group in groups]
+    gaps = np.asarray(np.diff(bad), np.int64) > 2  # one good frame between does not part them
+    groups: list[NDArray[np.int64]] = np.split(bad, np.flatnonzero(gaps) + 1)
+    weights: list[NDArray[np.float64]] = [(cells[group] * lost[group]).sum(axis=0) for group in groups]
     worst = sorted(range(len(groups)), key=lambda n: -float(weights[n].sum()))[:most]
     return [
         {
-            "first": int(frames[groups[n][0]]),
-            "last": int(frames[groups[n][-1]]),
+            "first": int(frames[int(groups[n][0])]),
+            "last": int(frames[int(groups[n][-1])]),
             "region": region_words(weights[n]),
         }
         for n in worst
@@ -224,8 +225,8 @@ def where_words(place: dict[str, Any]) -> str:
 
 def _longest_good(frames: Sequence[int], bad: NDArray[np.bool_], least: int = 4) -> tuple[int, int] | None:
     """First and last number of the longest row of good frames; None if it has fewer than `least`."""
-    groups = np.split(np.arange(len(bad)), np.flatnonzero(bad))
-    good = max(([n for n in group if not bad[n]] for group in groups), key=len)
+    groups: list[NDArray[np.int64]] = np.split(np.arange(len(bad)), np.flatnonzero(bad))
+    good = max(([int(n) for n in group if not bad[n]] for group in groups), key=len)
     return (int(frames[good[0]]), int(frames[good[-1]])) if len(good) >= least else None
 
 

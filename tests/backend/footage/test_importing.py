@@ -11,7 +11,8 @@ from torch_backend.contract import Cancelled, ExitCode, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.importing import import_key
-from torch_backend.footage.sources import SourceInfo, open_source
+from torch_backend.footage.opening import open_source
+from torch_backend.footage.sources import SourceInfo
 from torch_backend.shot import Shot, content_key
 
 

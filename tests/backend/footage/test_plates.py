@@ -11,8 +11,9 @@ from scipy.ndimage import gaussian_filter
 from torch_backend.contract import CameraFrame, CameraPath, JobError, frame_file
 from torch_backend.footage import FootageConfig, codes, import_footage, load_frames
 from torch_backend.footage.images import read_png, resize_float, write_png
+from torch_backend.footage.opening import open_source
 from torch_backend.footage.plates import Plates
-from torch_backend.footage.sources import Known, open_source
+from torch_backend.footage.sources import Known
 from torch_backend.shot import Shot, write_json
 from torch_backend.solve.plate_lens import load_plate_lenses
 from torch_backend.solve.undistort import Undistorter

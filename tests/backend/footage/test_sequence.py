@@ -8,7 +8,7 @@ import pytest
 
 from torch_backend.contract import ExitCode, JobError
 from torch_backend.footage.color import srgb_to_linear
-from torch_backend.footage.sources import open_source
+from torch_backend.footage.opening import open_source
 
 
 def spec_of(pixels, names=None, window=None, full=None, **attributes):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from torch_backend.contract import ExitCode, JobError
-from torch_backend.footage.sources import frame_words, open_source
+from torch_backend.footage.opening import open_source
+from torch_backend.footage.sources import frame_words
 
 
 def decoded(path, first=None, last=None):

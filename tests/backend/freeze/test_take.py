@@ -58,7 +58,9 @@ def test_two_instants_differ_where_the_patch_moved_and_nowhere_else(trained, tak
     moved = truth > 0.1
     still = truth < 0.002
     assert difference[moved].mean() > 0.05
-    assert difference[still].mean() < (1e-6 if detail == "on" else 0.012)
+    # A few pixels beside the patch are let go of with it: a fortieth of a step of 255, on average of all.
+    assert difference[still].mean() < (1e-4 if detail == "on" else 0.012)
+    assert np.quantile(difference[still], 0.98) == 0.0 or detail == "off"
     assert early.motion[moved].mean() > 0.35 > 0.15 > early.motion[still].mean()
 
 

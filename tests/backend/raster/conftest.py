@@ -4,8 +4,8 @@ from collections import Counter
 
 import pytest
 
-from benchmarks import numerics
-from benchmarks.numerics import Scene, workload
+from benchmarks import raster_errors
+from benchmarks.raster_errors import Scene, workload
 
 GENERATED: Counter[str] = Counter()
 
@@ -18,8 +18,8 @@ def small_room() -> Scene:
 
 @pytest.fixture(scope="session")
 def tools():
-    """Helpers, since tests cannot import this file: `benchmarks.numerics`, where Scene, cloud, single, ... live."""
-    return numerics
+    """Helpers, since tests cannot import this file: `benchmarks.raster_errors`, where Scene, cloud, ... live."""
+    return raster_errors
 
 
 @pytest.fixture

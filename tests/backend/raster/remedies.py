@@ -35,7 +35,8 @@ def without_remedy() -> list[str]:
     """Tests, file::function, that stand for a known failure or are a property of every input, but have no remedy."""
     if str(ROOT) not in sys.path:
         sys.path.insert(0, str(ROOT))
-    from benchmarks.numerics import ROWS, test_names
+    from benchmarks.known_failures import ROWS
+    from benchmarks.numerics import test_names
 
     named = {test for _, tests, _ in ROWS for test in tests}
     named |= {test for test in test_names() if test.startswith("test_properties.py::test_")}

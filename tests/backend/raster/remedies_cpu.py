@@ -371,7 +371,7 @@ REMEDIES = [
     ),
     Remedy(
         "tests are phrased so that NaN fails",
-        "rasterize",
+        "_check_scene",
         "if not scene.settings.near > 0:",
         "if scene.settings.near <= 0:",
         "test_wrong_arguments_are_named",

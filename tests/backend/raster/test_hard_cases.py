@@ -1,4 +1,4 @@
-"""Inputs that break rasterisers, on every body; the bounds against the oracle are stated in benchmarks/numerics.py.
+"""Inputs that break rasterisers, on every body; the bounds against the oracle are stated in benchmarks/raster_cases.py.
 
 `docs/numerics.md` says which test stands for which known failure of other programs, `remedies.py` what makes it fail.
 """
@@ -14,7 +14,9 @@ import pytest
 import torch
 
 from benchmarks import numerics
-from benchmarks.numerics import BODIES, CASES, PER_GAUSSIAN, ROWS, compare, size
+from benchmarks.known_failures import ROWS
+from benchmarks.raster_cases import CASES, scaled_world, size
+from benchmarks.raster_errors import BODIES, PER_GAUSSIAN, compare
 from torch_backend.raster import RasterSettings, rasterize
 from torch_backend.train import losses
 
@@ -317,9 +319,9 @@ def test_a_crop_with_the_principal_point_aside_is_the_crop_of_the_image(tools, b
 def test_scale_of_the_world_does_not_matter(tools, body):
     expected = size("world scaled by 1e-4", body)
     for factor in (17462.0, 1e-4, 1e6):
-        scene = tools.scaled_world(factor)(True)
+        scene = scaled_world(factor)(True)
         out = scene.run(body, with_depth=True)
-        unit = tools.scaled_world(1.0)(True).run(body, with_depth=True)
+        unit = scaled_world(1.0)(True).run(body, with_depth=True)
         same = (out.alphas - unit.alphas).abs() < tools.SAME_SIDE
         assert same.float().mean() > 0.98
         assert (out.colors - unit.colors)[same].abs().max() < 1e-3
@@ -510,7 +512,8 @@ def _column(tools, count, height):
 CHILD = """
 import resource, sys
 import torch
-from benchmarks.numerics import BODIES, stack, cloud, compare, size, single
+from benchmarks.raster_cases import size
+from benchmarks.raster_errors import BODIES, cloud, compare, single, stack
 body = sys.argv[1]
 _, dtype, device = BODIES[body]
 resource.setrlimit(resource.RLIMIT_AS, (24 << 30,) * 2)  # whatever asks for more is refused, not the machine swamped

@@ -13,7 +13,7 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.numerics import BODIES, PER_GAUSSIAN, SAME_SIDE, Scene, camera, compare, scalar
+from benchmarks.raster_errors import BODIES, PER_GAUSSIAN, SAME_SIDE, Scene, camera, compare, scalar
 from torch_backend.raster import RasterSettings
 from torch_backend.raster.constants import ALPHA_MIN
 

@@ -18,20 +18,20 @@ from torch_backend.train import config_from_params
 from torch_backend.train.checkpoint import load_checkpoint
 from torch_backend.train.model import restore_model
 from torch_backend.train.modelled import modelled
-from torch_backend.train.needs import (
+from torch_backend.train.optimizer import limit_harmonics
+from torch_backend.train.residual import correlation_frames
+from torch_backend.train.stopping import (
     FieldOpened,
     LimitHarmonics,
-    NeedsConfig,
     RunFacts,
     RunSchedule,
+    StoppingConfig,
     StoppingPolicy,
     growth_gain,
     lasting,
     newest_gain,
     probe_frames,
 )
-from torch_backend.train.optimizer import limit_harmonics
-from torch_backend.train.residual import correlation_frames
 from torch_backend.train.trainer import Trainer
 
 
@@ -225,7 +225,7 @@ class Numbers:
 
 
 def policy_of(**changes):
-    return StoppingPolicy(NeedsConfig(**changes), 60, RunSchedule(100, 10, 0.6, 0.7, 0.15))
+    return StoppingPolicy(StoppingConfig(**changes), 60, RunSchedule(100, 10, 0.6, 0.7, 0.15))
 
 
 def test_the_policy_yields_a_decision_and_changes_nothing_of_the_run():

@@ -35,7 +35,7 @@ _POINTS = 4
 
 
 @dataclass
-class NeedsConfig:
+class StoppingConfig:
     """What is enough. Gains are dB of mean PSNR on the probe frames, shares are of the run's length."""
 
     probes: int = 12
@@ -217,7 +217,7 @@ class RunFacts:
 class StoppingPolicy:
     """Probe frames and decisions of one run. `frames`: how many it trains on; 0: it decides nothing."""
 
-    def __init__(self, config: NeedsConfig, frames: int, schedule: RunSchedule) -> None:
+    def __init__(self, config: StoppingConfig, frames: int, schedule: RunSchedule) -> None:
         self.config, self.frames, self.schedule = config, frames, schedule
         self.probes = probe_frames(frames, config.probes, config.least)
         self.joined = not self.probes
@@ -251,9 +251,9 @@ class StoppingPolicy:
         """Positions of the trained frames that are kept back now."""
         return set() if self.joined else set(self.probes)
 
-    def sh_degree(self, wanted: int) -> int:
-        """The scheduled SH degree `wanted`, or the one that proved enough."""
-        return wanted if self.sh_limit is None else min(wanted, self.sh_limit)
+    def sh_degree(self, configured: int) -> int:
+        """The scheduled SH degree `configured`, or the one that proved enough."""
+        return configured if self.sh_limit is None else min(configured, self.sh_limit)
 
     @property
     def growing(self) -> bool:
