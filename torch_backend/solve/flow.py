@@ -50,6 +50,8 @@ class FlowConfig:
     """Pictures that differ by less show the same."""
     blurred: float = 0.25
     """Share of another picture's sharpness (mean square step) below which a picture is blurred beside it."""
+    gone_far: float = 0.5
+    """Of a match that tells of motion, what is nowhere four key frames before and after counts so much."""
     better: float = 1.5
     """By this factor the picture differs more (squared) where a still point would be seen than where it is matched."""
     haste: float = 0.3

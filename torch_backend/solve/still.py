@@ -226,7 +226,8 @@ def _counted(
             gone[after] = within & ~alike & (~found | smeared)
     for step in config.baselines[:3]:
         if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
-            off += gone[step] & gone[-step]  # behind something is so on one side as a rule.
+            far = config.gone_far if step > _NEAR else 1.0  # behind something is so on one side as a rule.
+            off += far * (gone[step] & gone[-step])
     return on, off
 
 
