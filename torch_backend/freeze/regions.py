@@ -31,11 +31,15 @@ def grown(seeds: Tensor, where: Tensor, reach: int, thin: int = 0) -> Tensor:
 
     What of `where` is narrower than 2 `thin` + 1 pixels leads nowhere.
     """
+    if not bool(where.any()):
+        return seeds
     h, w = seeds.shape
     size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work; regions are larger than its pixels
     found, inside = (resized(mask.float(), *size) > 0.4 for mask in (seeds, where))
     inside = (opened(inside, (thin + 1) // 2) | found).float()
     found = found.float()
     for _ in range((reach + 1) // 2):
-        found = torch.minimum(widened(found, 1), inside)
+        before, found = found, torch.minimum(widened(found, 1), inside)
+        if torch.equal(before, found):  # nothing is left to reach
+            break
     return seeds | (where & (resized(found, w, h) > 0.25))
