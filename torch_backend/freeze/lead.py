@@ -94,7 +94,7 @@ def _let_go(
     if truth is not None:
         contrary = torch.minimum(off, _contrary(sightings, posed, frame, truth))
         wrong = wrong | _denied(sightings, config, truth, contrary)
-    # What the model lacks at the plate's own time, too, is its fault and no motion, unless plate t* lacks it as well.
+    # What the model lacks at the plate's own time, too, is its fault and no motion.
     wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
     wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
     if contrary is not None:
