@@ -17,7 +17,7 @@ from fileseq.exceptions import FileSeqException
 from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
-from . import codes
+from . import plate_encoding
 from .color import InputSpace, named_space, space_of_chromaticities
 from .images import error_of, resize
 from .layers import Layer, find_layer, shown
@@ -208,10 +208,10 @@ class SequenceSource:
             raise footage_error(f"Frame {number} of the sequence is not there any more.", "Put it back.")
         rgb = self._stored_pixels(self._files[number], _Findings())
         if self.info.extended:
-            rgb = codes.half_of(rgb, self._space)
+            rgb = plate_encoding.half_of(rgb, self._space)
         elif self.info.deep:
             rgb = np.rint(np.clip(rgb, 0.0, 1.0) * np.float32(65535.0)).astype(np.uint16)
-        return codes.resize_plate(np.ascontiguousarray(rgb), self.info.width, self.info.height)
+        return plate_encoding.resize_plate(np.ascontiguousarray(rgb), self.info.width, self.info.height)
 
     def close(self) -> None:
         """See `PlateReader.close`: files are not kept open."""

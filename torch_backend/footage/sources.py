@@ -92,7 +92,7 @@ class PlateReader(Protocol):
     """Single frames of a source, in any order; ascending ones, and their near neighbours, are quick."""
 
     def plate(self, number: int) -> NDArray[Any]:
-        """Frame `number`, upright, with square pixels, uncut, as `codes` has it.
+        """Frame `number`, upright, with square pixels, uncut, as `plate_encoding` has it.
 
         OSError or JobError (FOOTAGE) if it cannot be read.
         """

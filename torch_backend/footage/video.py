@@ -14,7 +14,7 @@ from av.error import FFmpegError
 from av.video.reformatter import Colorspace, Interpolation
 from numpy.typing import NDArray
 
-from . import codes
+from . import plate_encoding
 from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
@@ -146,14 +146,14 @@ class VideoSource:
         return VideoReader(self, known)
 
     def plate_of(self, frame: av.VideoFrame) -> NDArray[Any]:
-        """A decoded frame as a plate, see `codes`. JobError if its size is not the clip's."""
+        """A decoded frame as a plate, see `plate_encoding`. JobError if its size is not the clip's."""
         if (frame.width, frame.height) != self._size:
             raise footage_error(f"{self.path.name} is not the clip that was imported: its size changes.")
         if self._space.as_it_stands:
             pixels = _rgb(frame, "rgb48le" if self._deep else "rgb24")
         else:
-            pixels = codes.half_of(_exact_rgb(frame), self._space)
-        pixels = codes.resize_plate(pixels, *square_size(frame.width, frame.height, self._aspect))
+            pixels = plate_encoding.half_of(_exact_rgb(frame), self._space)
+        pixels = plate_encoding.resize_plate(pixels, *square_size(frame.width, frame.height, self._aspect))
         return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
 
     def decode(self, container: Any, stream: Any) -> Iterator[Any]:
