@@ -170,7 +170,8 @@ class Sightings:
             self._views[frame] = self._make_view(frame)
             width, height = self.size
             each = 20.0 * width * height + 12.0 * len(self.rows)
-            while len(self._views) > max(12, min(_VIEWS, _VIEWS_BYTES / each)):
+            room = _VIEWS_BYTES - 24.0 * self.plates.width * self.plates.height  # frames of 4K need it more
+            while len(self._views) > max(12, min(_VIEWS, room / each)):
                 self._views.popitem(last=False)
         self._views.move_to_end(frame)
         return self._views[frame]
