@@ -211,8 +211,8 @@ def place_images(images: Tensor, device: torch.device) -> Tensor:
 
 
 def training_size(scene: Scene, requested_width: int) -> tuple[int, int]:
-    """(width, height) of the training images: the working frames' shape, never larger than they are."""
-    width = min(requested_width, scene.width)
+    """(width, height) of the training images: the working frames' shape, never larger; as large if 0 is asked for."""
+    width = min(requested_width or scene.width, scene.width)
     return width, max(16, round(scene.height * width / scene.width))
 
 
