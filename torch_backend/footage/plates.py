@@ -11,7 +11,6 @@ from collections import OrderedDict
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,6 +19,7 @@ from ..shot import Shot, content_key
 from ..solve.plate_lens import PlateLens, load_plate_lenses
 from ..solve.stored import load_cameras, load_record
 from ..solve.undistort import BandUndistorter
+from ..torch_types import from_numpy
 from . import codes
 from .images import read_frame, read_png, resize_float, working_size
 from .importing import FootageConfig, import_key, load_frames
@@ -88,11 +88,11 @@ class Plates:
 
         ValueError if the shot has no such frame; JobError (FOOTAGE, SOLVE) if its picture cannot be read any more.
         """
-        return torch.from_numpy(codes.display(self._codes(frame)))
+        return from_numpy(codes.display(self._codes(frame)))
 
     def linear(self, frame: int, rows: slice = slice(None)) -> Tensor:
         """The same in scene-linear Rec.709: all of it, or some rows, which at 4K spares 100 MB."""
-        return torch.from_numpy(codes.linear(self._codes(frame)[rows]))
+        return from_numpy(codes.linear(self._codes(frame)[rows]))
 
     @property
     def kept(self) -> int:
@@ -212,13 +212,14 @@ def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
 
 
 def _config(record: dict[str, Any]) -> FootageConfig:
-    recorded = record.get("config") or {}
+    recorded: dict[str, Any] = record.get("config") or {}
     return FootageConfig(**{name: recorded[name] for name in FootageConfig.__dataclass_fields__ if name in recorded})
 
 
 def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
     """True if the footage is known to have the working frames' size and no values that they lack."""
-    size, recorded = record.get("source_size"), record.get("config") or {}
+    size = record.get("source_size")
+    recorded: dict[str, Any] = record.get("config") or {}
     if size is None:  # imported by an earlier version
         same = not recorded.get("working_height") and working[1] < _NO_LARGER
         return same and record.get("bits") == 8

@@ -57,7 +57,7 @@ class SourceInfo:
     """srgb, or linear for pictures that hold light: scene-linear, log, HDR."""
     key: list[Any]
     """What tells this footage from another: names, sizes, modification times."""
-    reading: dict[str, Any] = field(default_factory=dict)
+    reading: dict[str, Any] = field(default_factory=dict[str, Any])
     """How it is read, and what of that was assumed: the record in frames.json says so."""
 
 
