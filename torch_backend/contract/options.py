@@ -14,8 +14,8 @@ LAST_FRAME = 1_048_574
 """Blender's last frame number: no scene reaches further."""
 PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
-PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
-"""Width in pixels of each preset's training images, never above the working frames'."""
+PRESET_WIDTHS = {"preview": 320, "standard": 960, "final": 0}
+"""Width in pixels of each preset's training images, never above the working frames'; 0: theirs."""
 CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV")
 """What `SolveParams.camera_model` may be."""
 HOSTS = host_names()
@@ -175,8 +175,8 @@ class TrainParams:
         tip="How much to spend on training",
         items={
             "preview": ("Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
-            "standard": ("Standard", "640 pixels wide, 9000 steps: for most shots"),
-            "final": ("Final", "1280 pixels wide, 30000 steps, most Gaussians: takes longest"),
+            "standard": ("Standard", "960 pixels wide, 9000 steps: for most shots"),
+            "final": ("Final", "As wide as the working frames, 30000 steps, most Gaussians: takes longest"),
         },
     )
     """preview, standard or final."""
