@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bpy
 
-from . import settings, translations
+from . import properties, settings, translations
 from .bake.step import STEP as BAKE
 from .command_line import command
 from .footage.step import STEP as IMPORT
@@ -51,6 +51,7 @@ def register() -> None:
     if registered():
         return
     _take_tooltips_from_docstrings()
+    _take_properties_from_values()
     for step in _STEPS:
         steps.add(step)
     for part in _PARTS:
@@ -80,3 +81,11 @@ def _take_tooltips_from_docstrings() -> None:
         for cls in kind.__subclasses__():
             if cls.__module__.startswith(f"{__package__}.") and cls.__doc__ and "bl_description" not in vars(cls):
                 cls.bl_description = " ".join(cls.__doc__.split())
+
+
+def _take_properties_from_values() -> None:
+    """Puts the properties of each of our classes where Blender looks for them."""
+    for kind in (bpy.types.Operator, bpy.types.PropertyGroup, bpy.types.AddonPreferences):
+        for cls in kind.__subclasses__():
+            if cls.__module__.startswith(f"{__package__}."):
+                properties.annotate(cls)

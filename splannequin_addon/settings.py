@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 
 from .access import scene_holding
 from .bake.settings import BakeSettings
 from .footage.settings import ImportSettings
 from .freeze.settings import FreezeSettings
+from .properties import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 from .shot import chosen, made
 from .solve.settings import SolveSettings
 from .train.settings import TrainSettings
@@ -26,7 +26,7 @@ class ShotSettings(ImportSettings, SolveSettings, TrainSettings, FreezeSettings)
 class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
     """Settings of a shot of the scene that is not the chosen one."""
 
-    scene_settings: StringProperty(
+    scene_settings = StringProperty(
         name="Scene Settings",
         description="Size, rate and range of the scene while this shot was chosen",
         options={"HIDDEN"},
@@ -36,32 +36,32 @@ class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
 class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, bpy.types.PropertyGroup):
     """The chosen shot of the scene, and what is the scene's own."""
 
-    set_up_scene: BoolProperty(
+    set_up_scene = BoolProperty(
         name="Fit Scene to Clip",
         description="Set resolution, frame rate and frame range of the scene to the clip's. "
         "Off: only a new scene is set up, one you have worked in is left alone",
         default=False,
         options=set(),
     )
-    shots: CollectionProperty(
+    shots = CollectionProperty(
         name="Shots",
         description="All shots of the scene if there are several",
         type=SPLANNEQUIN_PG_shot,
         options=set(),
     )
-    active_shot: IntProperty(
+    active_shot = IntProperty(
         name="Shot", description="The shot that the steps are about", default=0, min=0, options=set(), update=_chosen
     )
-    loaded_shot: IntProperty(
+    loaded_shot = IntProperty(
         name="Loaded", description="Shot of the list whose settings are the scene's", default=0, options={"HIDDEN"}
     )
-    camera_before: PointerProperty(
+    camera_before = PointerProperty(
         name="Camera Before",
         description="Camera of the scene before a shot's was put in its place",
         type=bpy.types.Object,
         options={"HIDDEN"},
     )
-    made: CollectionProperty(
+    made = CollectionProperty(
         name="Made", description="What was put into this scene, by shot", type=made.SPLANNEQUIN_PG_made, options=set()
     )
 

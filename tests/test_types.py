@@ -80,6 +80,19 @@ def test_the_count_sees_every_kind_of_parameter():
     ]
 
 
+def annotated_calls(tree: ast.AST) -> list[int]:
+    """Lines of what is annotated with a call, which is no type to a checker."""
+    found = [n for n in ast.walk(tree) if isinstance(n, ast.AnnAssign)]
+    return [n.lineno for n in found if any(isinstance(part, ast.Call) for part in ast.walk(n.annotation))]
+
+
+def test_properties_of_the_addon_are_assigned_so_that_their_type_is_known():
+    """`splannequin_addon/properties.py` says how."""
+    for path in sorted((ROOT / "splannequin_addon").rglob("*.py")):
+        assert not annotated_calls(ast.parse(path.read_text(encoding="utf-8"))), path
+    assert annotated_calls(ast.parse("class A:\n    name: StringProperty()")) == [2]
+
+
 def test_blenders_types_are_nothing_that_this_python_can_import():
     """A package of types in folders of bpy's own names would pass for Blender where there is none."""
     if importlib.util.find_spec("_bpy") is None:

@@ -32,6 +32,7 @@ STATIONS = (
 """In the order of docs/architecture.md: a station imports only stations before it. `footage/plates.py` is late."""
 ROOMS = (
     "access",
+    "properties",
     "compat",
     "translations",
     "scene",

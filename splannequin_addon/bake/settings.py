@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from bpy.props import BoolProperty, EnumProperty
+from ..properties import BoolProperty, EnumProperty
 
 
 class BakeSettings:
     """Colours, and the place in the compositor."""
 
-    keep_colours: BoolProperty(
+    keep_colours = BoolProperty(
         name="Keep Plate Colours",
         description="Set the view transform to Standard and dither to 0, so that pictures leave with the colours they "
         "came in with. Blender's default view changes them",
         default=True,
         options=set(),
     )
-    insert_at: EnumProperty(
+    insert_at = EnumProperty(
         name="Insert",
         description="Where the freeze goes in a compositor that you have built",
         items=[

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import BoolProperty, StringProperty
 
 from ..access import Outcome, layout_of, scene_in, settings_of
 from ..process import supervisor
+from ..properties import BoolProperty, StringProperty
 from ..shot import chosen
 from ..ui import icons, step_operator
 
@@ -21,9 +21,9 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
     bl_label = "Use as Splannequin Clip"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath: StringProperty(name="File", description="Video to be used", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_movie: BoolProperty(name="Movies Only", description="Show videos only", default=True, options={"HIDDEN"})
-    filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
+    filepath = StringProperty(name="File", description="Video to be used", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_movie = BoolProperty(name="Movies Only", description="Show videos only", default=True, options={"HIDDEN"})
+    filter_folder = BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """A file that was dropped is used; from a menu, one is chosen."""

@@ -70,10 +70,10 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Shot folder, which frames are solved, consent to set the scene up."""
-        layout.prop(settings_of(scene_in(context)), "shot_path", text="Folder")
-        layout.prop(settings_of(scene_in(context)), "solve_step")
-        layout.prop(settings_of(scene_in(context)), "fps")
-        layout.prop(settings_of(scene_in(context)), "set_up_scene")
+        props = settings_of(scene_in(context))
+        layout.prop(props, "shot_path", text="Folder")
+        for name in ("solve_step", "fps", "set_up_scene"):
+            layout.prop(props, name)
 
 
 CLASSES = (SPLANNEQUIN_PT_footage,)

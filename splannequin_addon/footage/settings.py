@@ -2,50 +2,49 @@
 
 from __future__ import annotations
 
-from bpy.props import BoolProperty, FloatProperty, IntProperty, StringProperty
-
 from ...torch_backend import contract
 from .. import compat
+from ..properties import BoolProperty, FloatProperty, IntProperty, StringProperty
 
 
 class ImportSettings:
     """Clip, range and folder of a shot."""
 
-    clip: StringProperty(
+    clip = StringProperty(
         **contract.panel(contract.ImportParams, "source"),
         subtype="FILE_PATH",
         options=compat.PATH_OPTIONS,
     )
-    shot_path: StringProperty(
+    shot_path = StringProperty(
         name="Shot Folder",
         description="Folder that keeps everything of this shot; empty: made beside the clip",
         subtype="DIR_PATH",
         options=compat.PATH_OPTIONS,
     )
-    shot_seen: StringProperty(
+    shot_seen = StringProperty(
         name="Shot Seen",
         description="Shot folder that was there when this file was last at work: it can be missed",
         subtype="DIR_PATH",
         options={*compat.PATH_OPTIONS, "HIDDEN"},
     )
-    use_range: BoolProperty(
+    use_range = BoolProperty(
         name="Only a Range", description="Import a part of the clip instead of all of it", default=False, options=set()
     )
-    first: IntProperty(
+    first = IntProperty(
         **contract.panel(contract.ImportParams, "first", 1),
         options=set(),
     )
-    last: IntProperty(
+    last = IntProperty(
         **contract.panel(contract.ImportParams, "last", 250),
         options=set(),
     )
-    solve_step: IntProperty(
+    solve_step = IntProperty(
         **contract.panel(contract.ImportParams, "step"),
         min=0,
         soft_max=10,
         options=set(),
     )
-    fps: FloatProperty(
+    fps = FloatProperty(
         **contract.panel(contract.ImportParams, "fps"),
         min=0.0,
         soft_max=120.0,

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import StringProperty
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in, settings_of
 from ..process import supervisor
+from ..properties import IntProperty, StringProperty
 from ..shot import chosen, markers
 from ..translations import tr
 from ..ui import pick_operators, step_operator
@@ -112,7 +112,7 @@ class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
     bl_label = "Suggested Instant"
     bl_options = {"REGISTER", "UNDO"}
 
-    step: bpy.props.IntProperty(name="Step", description="1: the next one, -1: the one before", default=1)
+    step = IntProperty(name="Step", description="1: the next one, -1: the one before", default=1)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -141,7 +141,7 @@ class SPLANNEQUIN_OT_pick_take(pick_operators.Pick, bpy.types.Operator):
     bl_label = "Pick Take"
     bl_options = {"REGISTER", "UNDO"}
 
-    name: StringProperty(name="Take", description="Name of the take", options={"SKIP_SAVE"})
+    name = StringProperty(name="Take", description="Name of the take", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Sets the take's name."""
@@ -164,7 +164,7 @@ class SPLANNEQUIN_OT_remove_take(pick_operators.Remove, bpy.types.Operator):
     question = "Delete the frozen frames of this take from disk?"
     warning = "It can be frozen again from its run. This cannot be undone."
 
-    name: StringProperty(name="Take", description="Name of the take to delete", options={"SKIP_SAVE"})
+    name = StringProperty(name="Take", description="Name of the take to delete", options={"SKIP_SAVE"})
 
 
 CLASSES = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..access import layout_of, scene_in, settings_of
+from ..access import camera_of, layout_of, present, scene_in, settings_of
 from ..process import steps
 from ..shot import markers
 from ..translations import tr
@@ -92,14 +92,10 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The take's name, what it is made of, its size, and where it is seen from."""
-        layout.prop(settings_of(scene_in(context)), "take_name")
-        layout.prop(settings_of(scene_in(context)), "detail")
-        layout.prop(settings_of(scene_in(context)), "develop")
-        layout.prop(settings_of(scene_in(context)), "freeze_width")
-        layout.prop(settings_of(scene_in(context)), "overscan")
-        layout.prop(settings_of(scene_in(context)), "path_camera")
-        camera = settings_of(scene_in(context)).path_camera
-        if camera is not None and camera.data.dof.use_dof:
+        props = settings_of(scene_in(context))
+        for name in ("take_name", "detail", "develop", "freeze_width", "overscan", "path_camera"):
+            layout.prop(props, name)
+        if props.path_camera is not None and present(camera_of(props.path_camera).dof).use_dof:
             wrap(
                 layout,
                 context,

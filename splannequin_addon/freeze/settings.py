@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
 from ..access import scene_holding
 from ..process import supervisor
+from ..properties import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 from ..shot import chosen
 from ..translations import tr
 
@@ -23,38 +23,38 @@ def takes_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
 class FreezeSettings:
     """Instant, camera and take of a shot."""
 
-    choose_t_star: BoolProperty(
+    choose_t_star = BoolProperty(
         name="Choose the Instant",
         description="Set the frame at which time stands still yourself; off: the best supported one is taken",
         default=False,
         options=set(),
     )
-    t_star: IntProperty(
+    t_star = IntProperty(
         **contract.panel(contract.FreezeParams, "t_star", 1),
         options={"ANIMATABLE"},
     )
-    path_camera: PointerProperty(
+    path_camera = PointerProperty(
         name="Camera",
         description="Animated camera to see the frozen instant from; empty: the clip's own move",
         type=bpy.types.Object,
         poll=lambda _, item: getattr(item, "type", "") == "CAMERA",
         options=set(),
     )
-    detail: BoolProperty(
+    detail = BoolProperty(
         **contract.panel(contract.FreezeParams, "detail"),
         options=set(),
     )
-    develop: BoolProperty(
+    develop = BoolProperty(
         **contract.panel(contract.FreezeParams, "develop"),
         options=set(),
     )
-    freeze_width: IntProperty(
+    freeze_width = IntProperty(
         **contract.panel(contract.FreezeParams, "width"),
         min=0,
         max=16384,
         options=set(),
     )
-    overscan: EnumProperty(
+    overscan = EnumProperty(
         name="Overscan",
         description="Picture beyond the frame, for the way back into the original's lens distortion. The compositor "
         "shows the frame as without it",
@@ -64,13 +64,13 @@ class FreezeSettings:
         ],
         options=set(),
     )
-    live_show: EnumProperty(
+    live_show = EnumProperty(
         name="Show",
         description="What is drawn over the view while scrubbing",
         items=[(name, *words) for name, words in contract.LIVE_SHOWS.items()],
         options=set(),
     )
-    take_name: StringProperty(
+    take_name = StringProperty(
         **contract.panel(contract.FreezeParams, "take"),
         options=set(),
         search=lambda props, context, text: takes_of(props),

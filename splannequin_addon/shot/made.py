@@ -10,10 +10,10 @@ import os
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
 from ..access import settings_of
+from ..properties import BoolProperty, PointerProperty, StringProperty
 from ..scene import paths
 from ..scene.mark import TAG
 
@@ -25,16 +25,16 @@ _KINDS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     """What there is of one shot; its name is the shot's."""
 
-    folder: StringProperty(name="Folder", description="Shot folder that it was made from", options=set())
-    root: PointerProperty(name="Root", description="Where the solve stands in the scene", type=bpy.types.Object)
-    camera: PointerProperty(name="Camera", description="The solved camera", type=bpy.types.Object)
-    points: PointerProperty(name="Points", description="The sparse points", type=bpy.types.Object)
-    plate: PointerProperty(
+    folder = StringProperty(name="Folder", description="Shot folder that it was made from", options=set())
+    root = PointerProperty(name="Root", description="Where the solve stands in the scene", type=bpy.types.Object)
+    camera = PointerProperty(name="Camera", description="The solved camera", type=bpy.types.Object)
+    points = PointerProperty(name="Points", description="The sparse points", type=bpy.types.Object)
+    plate = PointerProperty(
         name="Plate", description="The camera that shows the clip until it is solved", type=bpy.types.Object
     )
-    scaled: BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
-    collection: PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
-    marks: StringProperty(name="Marks", description="Markers that were put on the timeline, as JSON", options=set())
+    scaled = BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
+    collection = PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
+    marks = StringProperty(name="Marks", description="Markers that were put on the timeline, as JSON", options=set())
 
 
 def name_of(shot: Path) -> str:

@@ -6,7 +6,6 @@ be turned meanwhile. The same operators take the places of selected objects, for
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,13 +14,13 @@ import blf
 import bpy
 import gpu
 import numpy as np
-from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty
 from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
 from ...torch_backend import contract
 from ..access import OperatorBase, Outcome, camera_of, mesh_of, present, scene_in
 from ..process import steps, supervisor
+from ..properties import BoolProperty, FloatProperty, FloatVectorProperty
 from ..scene import axes
 from ..shot import chosen, made
 from ..translations import tr
@@ -103,7 +102,7 @@ class _Aligns(OperatorBase):
     count = 0
     asked = ""
     if TYPE_CHECKING:
-        places: Sequence[float]
+        places: list[float]
         selected: bool
 
     @classmethod
@@ -253,7 +252,7 @@ _SELECTED = BoolProperty(
 )
 
 
-def _places_property(count: int) -> Any:
+def _places_property(count: int) -> list[float]:
     return FloatVectorProperty(
         name="Points",
         description="Places of the points in the scene, one after the other",
@@ -271,8 +270,8 @@ class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
     count = 3
     asked = "Click three points of the floor"
 
-    places: _places_property(3)
-    selected: _SELECTED
+    places = _places_property(3)
+    selected = _SELECTED
 
     def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
         """Lays them into z = 0."""
@@ -288,8 +287,8 @@ class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
     count = 1
     asked = "Click the point that is to be the origin"
 
-    places: _places_property(1)
-    selected: _SELECTED
+    places = _places_property(1)
+    selected = _SELECTED
 
     def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
         """Moves it to the origin."""
@@ -305,9 +304,9 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
     count = 2
     asked = "Click two points whose distance you know"
 
-    places: _places_property(2)
-    selected: _SELECTED
-    distance: FloatProperty(
+    places = _places_property(2)
+    selected = _SELECTED
+    distance = FloatProperty(
         name="Distance",
         description="How far apart the two points are",
         default=1.0,

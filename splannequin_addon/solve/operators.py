@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bpy
-from bpy.props import EnumProperty, StringProperty
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in
 from ..process import children, supervisor
+from ..properties import BoolProperty, EnumProperty, IntProperty, StringProperty
 from ..shot import chosen
 from ..translations import tr
 from ..ui import step_operator
@@ -31,13 +31,13 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
     bl_label = "Export Cameras"
     bl_options = {"REGISTER"}
 
-    directory: StringProperty(
+    directory = StringProperty(
         name="Folder", description="Folder to write into", subtype="DIR_PATH", options={"SKIP_SAVE"}
     )
-    filter_folder: bpy.props.BoolProperty(
+    filter_folder = BoolProperty(
         name="Folders", description="Show folders", default=True, options={"HIDDEN", "SKIP_SAVE"}
     )
-    format: EnumProperty(name="Format", description="What to write", items=FORMATS)
+    format = EnumProperty(name="Format", description="What to write", items=FORMATS)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -107,7 +107,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
     bl_label = "Write ST Maps"
     bl_options = {"REGISTER"}
 
-    width: bpy.props.IntProperty(
+    width = IntProperty(
         name="Width", description="Width of the maps in pixels; 0: that of the working frames", default=0, min=0
     )
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import EnumProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
 from .. import compat
+from ..properties import EnumProperty, PointerProperty, StringProperty
 
 
 class SolveSettings:
     """The lens of a shot, and where its cameras come from."""
 
-    camera_model: EnumProperty(
+    camera_model = EnumProperty(
         **contract.panel(contract.SolveParams, "camera_model"),
         options=set(),
     )
-    cameras_from: EnumProperty(
+    cameras_from = EnumProperty(
         name="Cameras From",
         description="Solve the camera here, or take cameras that another program found for the same clip",
         items=[
@@ -26,12 +26,12 @@ class SolveSettings:
         ],
         options=set(),
     )
-    cameras_path: StringProperty(
+    cameras_path = StringProperty(
         **contract.panel(contract.SolveParams, "cameras"),
         subtype="FILE_PATH",
         options=compat.PATH_OPTIONS,
     )
-    tracking_clip: PointerProperty(
+    tracking_clip = PointerProperty(
         name="Tracked Clip",
         description="Movie clip whose camera is solved; it should show the same frames as the shot's clip",
         type=bpy.types.MovieClip,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import StringProperty
 
 from ..access import Outcome, scene_in, settings_of
+from ..properties import StringProperty
 from ..translations import tr
 from ..ui import pick_operators, step_operator
 from .settings import PRESETS
@@ -27,7 +27,7 @@ class SPLANNEQUIN_OT_pick_run(pick_operators.Pick, bpy.types.Operator):
     bl_label = "Pick Run"
     bl_options = {"REGISTER", "UNDO"}
 
-    name: StringProperty(name="Run", description="Name of the run", options={"SKIP_SAVE"})
+    name = StringProperty(name="Run", description="Name of the run", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Sets the run's name, and the preset that it was trained with."""
@@ -54,7 +54,7 @@ class SPLANNEQUIN_OT_remove_run(pick_operators.Remove, bpy.types.Operator):
     question = "Delete this training run from disk?"
     warning = "Takes that were frozen from it stay, but cannot be completed. This cannot be undone."
 
-    name: StringProperty(name="Run", description="Name of the run to delete", options={"SKIP_SAVE"})
+    name = StringProperty(name="Run", description="Name of the run to delete", options={"SKIP_SAVE"})
 
 
 CLASSES = (

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bpy.props import EnumProperty, IntProperty, StringProperty
-
 from ...torch_backend import contract
 from ..access import scene_holding
 from ..process import supervisor
+from ..properties import EnumProperty, IntProperty, StringProperty
 from ..shot import chosen
 from ..translations import tr
 
@@ -42,18 +41,18 @@ def _preset_chosen(props: TrainSettings, context: bpy.types.Context) -> None:
 class TrainSettings:
     """Preset and run of a shot."""
 
-    preset: EnumProperty(
+    preset = EnumProperty(
         **contract.panel(contract.TrainParams, "preset"),
         options=set(),
         update=_preset_chosen,
     )
-    extend_steps: IntProperty(
+    extend_steps = IntProperty(
         **contract.panel(contract.TrainParams, "extend", _third_of(contract.PRESET_STEPS["preview"])),
         min=10,
         soft_max=30_000,
         options=set(),
     )
-    run_name: StringProperty(
+    run_name = StringProperty(
         **contract.panel(contract.TrainParams, "run"),
         options=set(),
         search=lambda props, context, text: runs_of(props),

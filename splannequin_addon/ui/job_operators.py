@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import StringProperty
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in
 from ..process import jobs, steps, supervisor
+from ..properties import StringProperty
 from ..shot import chosen
 from ..translations import tr
 
@@ -20,7 +20,7 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
     bl_label = "Cancel Step"
     bl_options = {"REGISTER"}
 
-    step: StringProperty(
+    step = StringProperty(
         name="Step", description="Name of the step to cancel; empty: the one that runs", options={"SKIP_SAVE"}
     )
 
@@ -47,7 +47,7 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
     bl_label = "Open Log"
     bl_options = {"INTERNAL"}
 
-    step: StringProperty(name="Step", description="Name of the step", options={"SKIP_SAVE"})
+    step = StringProperty(name="Step", description="Name of the step", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Opens it."""

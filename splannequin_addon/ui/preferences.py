@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 
 import bpy
-from bpy.props import EnumProperty, StringProperty
 
 from ...torch_backend import contract
 from ..access import Icon, Outcome, layout_of
 from ..process import backend, children, environment, supervisor
+from ..properties import EnumProperty, StringProperty
 from ..translations import tr
 from .sentences import wrap
 
@@ -26,17 +26,17 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
 
     bl_idname = backend.PACKAGE
 
-    backend_python: StringProperty(
+    backend_python = StringProperty(
         name="Backend Python",
         description="Python interpreter of a backend environment that is there already; empty: found by itself",
         subtype="FILE_PATH",
     )
-    backend_folder: StringProperty(
+    backend_folder = StringProperty(
         name="Folder",
         description="Where Set Up Backend puts the environment; empty: a short path in your home folder",
         subtype="DIR_PATH",
     )
-    device: EnumProperty(
+    device = EnumProperty(
         name="Device",
         description="Where the backend trains and freezes",
         items=[

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, StringProperty
 
 from ...torch_backend import contract
 from ..access import Outcome, layout_of, scene_in, settings_of
 from ..process import begin, supervisor
+from ..properties import BoolProperty, StringProperty
 from ..scene import paths
 from ..shot import chosen, places
 from ..translations import tr
@@ -66,7 +66,7 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
     bl_label = "Remove Shot from List"
     bl_options = {"REGISTER", "UNDO"}
 
-    things: BoolProperty(
+    things = BoolProperty(
         name="Remove Its Things from the File",
         description="Take its camera, points, markers and compositor group out of the file, too",
         default=True,
@@ -103,10 +103,10 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
     bl_label = "Locate Shot Folder"
     bl_options = {"REGISTER", "UNDO"}
 
-    directory: StringProperty(
+    directory = StringProperty(
         name="Folder", description="Folder of the shot: the one that holds shot.json", subtype="DIR_PATH"
     )
-    filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
+    filter_folder = BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Has the folder chosen, beginning where it was."""
