@@ -7,11 +7,17 @@ The compositor tree moved from `scene.node_tree` (4.x, output: Composite node) t
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
 from mathutils import Color
+
+if TYPE_CHECKING:
+    from bpy.stub_internal.rna_enums import PropertyFlagItems
+
+    _Animated = bpy.types.Scene | bpy.types.Object | bpy.types.Camera
+    """What is keyed here."""
 
 HAS_COMPOSITING_GROUP = bpy.app.version >= (5, 0, 0)
 """True where the compositor is a node group of the scene (5.0 on)."""
@@ -23,35 +29,40 @@ CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
 POINT_SHADERS = ("POINT_FLAT_COLOR", "FLAT_COLOR") if bpy.app.version >= (4, 5, 0) else ("FLAT_COLOR",)
 """Built-in shaders that colour points, the best first: points have one of their own since 4.5."""
 
-PATH_OPTIONS: set[str] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+PATH_OPTIONS: set[PropertyFlagItems] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
 """Options of a path property that may hold a path relative to the .blend (`//`); said aloud since 4.5."""
 
 
-def compositor_tree(scene: Any) -> Any | None:
+def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree | None:
     """The scene's compositor tree, or None if it has none."""
-    return scene.compositing_node_group if HAS_COMPOSITING_GROUP else scene.node_tree
+    return scene.compositing_node_group if HAS_COMPOSITING_GROUP else _own_tree(scene)
 
 
-def compositor_enabled(scene: Any) -> bool:
+def _own_tree(scene: Any) -> bpy.types.NodeTree:
+    """The scene's tree until 5.0, which no newer Blender's types know of."""
+    return scene.node_tree
+
+
+def compositor_enabled(scene: bpy.types.Scene) -> bool:
     """True if rendering the scene runs its compositor tree."""
     used = HAS_COMPOSITING_GROUP or scene.use_nodes
     return bool(used and scene.render.use_compositing and compositor_tree(scene))
 
 
-def enable_compositor(scene: Any) -> None:
+def enable_compositor(scene: bpy.types.Scene) -> None:
     """Makes rendering the scene run its compositor tree."""
     scene.render.use_compositing = True
     if not HAS_COMPOSITING_GROUP:
         scene.use_nodes = True
 
 
-def compositor_switches(scene: Any) -> dict[str, bool]:
+def compositor_switches(scene: bpy.types.Scene) -> dict[str, bool]:
     """What `enable_compositor` may change, by name."""
     nodes = {} if HAS_COMPOSITING_GROUP else {"use_nodes": bool(scene.use_nodes)}
     return {"use_compositing": bool(scene.render.use_compositing), **nodes}
 
 
-def restore_compositor_switches(scene: Any, switches: Mapping[str, bool]) -> None:
+def restore_compositor_switches(scene: bpy.types.Scene, switches: Mapping[str, bool]) -> None:
     """Sets what `compositor_switches` told; other names are passed over."""
     if "use_compositing" in switches:
         scene.render.use_compositing = switches["use_compositing"]
@@ -59,37 +70,37 @@ def restore_compositor_switches(scene: Any, switches: Mapping[str, bool]) -> Non
         scene.use_nodes = switches["use_nodes"]
 
 
-def new_compositor_tree(scene: Any, name: str) -> Any:
+def new_compositor_tree(scene: bpy.types.Scene, name: str) -> bpy.types.NodeTree:
     """An empty tree with an output node, made the scene's own. Only for a scene without one."""
     if not HAS_COMPOSITING_GROUP:
         scene.use_nodes = True
-        tree = scene.node_tree
+        tree = _own_tree(scene)
         tree.nodes.clear()
         tree.nodes.new("CompositorNodeComposite")
         return tree
     tree = bpy.data.node_groups.new(name, "CompositorNodeTree")
-    tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    new_socket(tree, "Image", "OUTPUT", "NodeSocketColor")
     tree.nodes.new("NodeGroupOutput")
     scene.compositing_node_group = tree
     return tree
 
 
-def drop_compositor_tree(scene: Any) -> None:
+def drop_compositor_tree(scene: bpy.types.Scene) -> None:
     """Takes the tree that `new_compositor_tree` made away again."""
     if not HAS_COMPOSITING_GROUP:
-        scene.node_tree.nodes.clear()
+        _own_tree(scene).nodes.clear()
         scene.use_nodes = False
         return
     tree = scene.compositing_node_group
     scene.compositing_node_group = None
-    if tree.users == 0:
+    if tree is not None and tree.users == 0:
         bpy.data.node_groups.remove(tree)
 
 
-def output_socket(tree: Any) -> Any | None:
+def output_socket(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket | None:
     """The input socket through which the tree's picture leaves: of the Composite or of the group output node."""
     if HAS_COMPOSITING_GROUP:
-        nodes = [n for n in tree.nodes if n.bl_idname == "NodeGroupOutput" and n.is_active_output]
+        nodes = [n for n in tree.nodes if isinstance(n, bpy.types.NodeGroupOutput) and n.is_active_output]
         sockets = [s for n in nodes for s in n.inputs if s.type == "RGBA"]
         return sockets[0] if sockets else None
     nodes = [n for n in tree.nodes if n.bl_idname == "CompositorNodeComposite"]
@@ -98,47 +109,58 @@ def output_socket(tree: Any) -> Any | None:
     return nodes[-1].inputs["Image"] if nodes else None
 
 
-def new_output_node(tree: Any) -> Any:
+def new_output_node(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket | None:
     """Adds the missing output node to a tree; returns the socket through which the picture leaves."""
     if not HAS_COMPOSITING_GROUP:
         return tree.nodes.new("CompositorNodeComposite").inputs["Image"]
-    colours = [i for i in tree.interface.items_tree if i.item_type == "SOCKET" and i.in_out == "OUTPUT"]
-    if not any(i.socket_type == "NodeSocketColor" for i in colours):
-        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    if not any(i.in_out == "OUTPUT" and i.socket_type == "NodeSocketColor" for i in sockets_of(tree)):
+        new_socket(tree, "Image", "OUTPUT", "NodeSocketColor")
     tree.nodes.new("NodeGroupOutput")
     return output_socket(tree)
 
 
-def new_mix_node(tree: Any, blend: str = "MIX") -> tuple[Any, Any, Any, Any, Any]:
+def new_mix_node(tree: bpy.types.NodeTree, blend: str = "MIX") -> tuple[Any, Any, Any, Any, Any]:
     """A colour mix node: (node, factor socket, first colour, second colour, result). Only MIX clamps its factor."""
     if HAS_COMPOSITING_GROUP:
-        node = tree.nodes.new("ShaderNodeMix")
+        node: Any = tree.nodes.new("ShaderNodeMix")
         node.data_type = "RGBA"
         node.blend_type = blend
         node.clamp_factor = blend == "MIX"
         enabled = [s for s in node.inputs if s.enabled]
         result = next(s for s in node.outputs if s.enabled)
         return node, enabled[0], enabled[1], enabled[2], result
-    node = tree.nodes.new("CompositorNodeMixRGB")
+    node: Any = tree.nodes.new("CompositorNodeMixRGB")
     node.blend_type = blend
     return node, node.inputs[0], node.inputs[1], node.inputs[2], node.outputs[0]
 
 
-def new_math_node(tree: Any, operation: str = "MULTIPLY") -> Any:
+def sockets_of(group: bpy.types.NodeTree) -> list[bpy.types.NodeTreeInterfaceSocket]:
+    """Inputs and outputs of a group, as its nodes have them."""
+    assert group.interface is not None
+    return [i for i in group.interface.items_tree if isinstance(i, bpy.types.NodeTreeInterfaceSocket)]
+
+
+def new_socket(group: bpy.types.NodeTree, name: str, side: str, kind: str, text: str = "") -> Any:
+    """Gives a group an input or output; `side` is "INPUT" or "OUTPUT", `kind` the name of a class of sockets."""
+    face: Any = group.interface  # whose types know sockets without a kind alone
+    return face.new_socket(name, in_out=side, socket_type=kind, description=text)
+
+
+def new_math_node(tree: bpy.types.NodeTree, operation: str = "MULTIPLY") -> Any:
     """A Math node on inputs[0] and inputs[1]: MULTIPLY, LESS_THAN and so on."""
-    node = tree.nodes.new("ShaderNodeMath" if HAS_COMPOSITING_GROUP else "CompositorNodeMath")
+    node: Any = tree.nodes.new("ShaderNodeMath" if HAS_COMPOSITING_GROUP else "CompositorNodeMath")
     node.operation = operation
     return node
 
 
-def new_over_node(tree: Any) -> tuple[Any, Any, Any]:
+def new_over_node(tree: bpy.types.NodeTree) -> tuple[Any, Any, Any]:
     """An Alpha Over node of premultiplied pictures: (node, background socket, foreground socket)."""
-    node = tree.nodes.new("CompositorNodeAlphaOver")
+    node: Any = tree.nodes.new("CompositorNodeAlphaOver")
     pictures = [s for s in node.inputs if s.type == "RGBA"]
     return node, pictures[0], pictures[1]
 
 
-def new_fit_node(tree: Any, how: str = "Fit") -> Any:
+def new_fit_node(tree: bpy.types.NodeTree, how: str = "Fit") -> Any:
     """A Scale node that brings inputs[0] to the render size, and leaves what has that size as it is, bit by bit.
 
     Args:
@@ -146,7 +168,7 @@ def new_fit_node(tree: Any, how: str = "Fit") -> Any:
         how: "Fit" shows all and leaves bars, "Crop" fills the frame and cuts off what is over; both keep the shape.
             "Stretch" does not.
     """
-    node = tree.nodes.new("CompositorNodeScale")
+    node: Any = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Render Size"
         node.inputs["Frame Type"].default_value = how
@@ -158,9 +180,9 @@ def new_fit_node(tree: Any, how: str = "Fit") -> Any:
     return node
 
 
-def new_quotient(tree: Any, picture: Any, value: Any) -> Any:
+def new_quotient(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, value: bpy.types.NodeSocket) -> Any:
     """Socket of a picture whose four channels are divided by a value; 0 where that is 0. Until 4.5."""
-    node = tree.nodes.new("CompositorNodeMixRGB")
+    node: Any = tree.nodes.new("CompositorNodeMixRGB")
     node.blend_type = "DIVIDE"
     parts = tree.nodes.new("CompositorNodeSeparateColor")
     alpha = new_math_node(tree, "DIVIDE")
@@ -172,9 +194,9 @@ def new_quotient(tree: Any, picture: Any, value: Any) -> Any:
     return with_alpha(tree, node.outputs[0], alpha.outputs[0])
 
 
-def with_alpha(tree: Any, picture: Any, alpha: Any) -> Any:
+def with_alpha(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, alpha: bpy.types.NodeSocket) -> Any:
     """Socket of a picture with another alpha; its colours stay. A mix has its first picture's until 5.1, then a mix."""
-    node = tree.nodes.new("CompositorNodeSetAlpha")
+    node: Any = tree.nodes.new("CompositorNodeSetAlpha")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Replace Alpha"
     else:
@@ -184,9 +206,9 @@ def with_alpha(tree: Any, picture: Any, alpha: Any) -> Any:
     return node.outputs[0]
 
 
-def new_nearest_node(tree: Any) -> Any:
+def new_nearest_node(tree: bpy.types.NodeTree) -> Any:
     """A node whose output is the least of inputs[0] at a pixel and its eight neighbours."""
-    node = tree.nodes.new("CompositorNodeDilateErode")
+    node: Any = tree.nodes.new("CompositorNodeDilateErode")
     if "Size" in node.inputs:  # 4.5 on
         node.inputs["Size"].default_value = -1
     else:
@@ -198,9 +220,9 @@ def new_nearest_node(tree: Any) -> Any:
     return node
 
 
-def new_crop_node(tree: Any, margin: tuple[int, int], size: tuple[int, int]) -> Any:
+def new_crop_node(tree: bpy.types.NodeTree, margin: tuple[int, int], size: tuple[int, int]) -> Any:
     """A Crop node that leaves the middle, `size`, of inputs[0]: `margin` pixels are cut off each side, up and down."""
-    node = tree.nodes.new("CompositorNodeCrop")
+    node: Any = tree.nodes.new("CompositorNodeCrop")
     (left, low), (width, height) = margin, size
     if "Width" in node.inputs:  # 4.5 on
         node.inputs["Alpha Crop"].default_value = False
@@ -213,11 +235,13 @@ def new_crop_node(tree: Any, margin: tuple[int, int], size: tuple[int, int]) -> 
     return node
 
 
-def new_look_up(tree: Any, picture: Any, x: Any, y: Any) -> Any:
+def new_look_up(
+    tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, x: bpy.types.NodeSocket, y: bpy.types.NodeSocket
+) -> Any:
     """Socket of a picture's pixels at coordinates x and y, 0..1 over it, each the nearest one, as it is."""
-    place = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeCombineXYZ")
+    place: Any = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeCombineXYZ")
     place.inputs["Z"].default_value = 1.0  # 0 would be nothing
-    node = tree.nodes.new("CompositorNodeMapUV")
+    node: Any = tree.nodes.new("CompositorNodeMapUV")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Interpolation"].default_value = "Nearest"
     else:
@@ -230,21 +254,21 @@ def new_look_up(tree: Any, picture: Any, x: Any, y: Any) -> Any:
     return node.outputs[0]
 
 
-def new_coordinates(tree: Any, vector: Any) -> tuple[Any, Any]:
+def new_coordinates(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> tuple[Any, Any]:
     """Sockets of the first two values of a vector."""
-    node = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeSeparateXYZ")
+    node: Any = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeSeparateXYZ")
     tree.links.new(vector, node.inputs[0])
     return node.outputs["X"], node.outputs["Y"]
 
 
-def sized(tree: Any, picture: Any, size: tuple[int, int]) -> Any:
+def sized(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, size: tuple[int, int]) -> Any:
     """Socket of a picture brought to a size in pixels; one that has it stays as it is, bit by bit.
 
     The picture itself before 4.5, where a Scale node leaves no pixel as it is.
     """
     if not CROPS_WHOLE:
         return picture
-    node = tree.nodes.new("CompositorNodeScale")
+    node: Any = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Absolute"
         node.inputs["Extension X"].default_value = node.inputs["Extension Y"].default_value = "Extend"
@@ -255,7 +279,7 @@ def sized(tree: Any, picture: Any, size: tuple[int, int]) -> Any:
     return node.outputs[0]
 
 
-def set_png(settings: Any) -> None:
+def set_png(settings: bpy.types.ImageFormatSettings) -> None:
     """8-bit RGB PNG as a scene's output format. RGB, so that holes come out black instead of divided by alpha."""
     if hasattr(settings, "media_type"):
         settings.media_type = "IMAGE"
@@ -276,11 +300,17 @@ _spaces: dict[str, str] = {}
 """Encoding -> colour space. The configuration is chosen once, when Blender starts."""
 
 
-def set_image_colour(image: Any, encoding: str) -> None:
+def set_image_colour(image: bpy.types.Image, encoding: str) -> None:
     """States the encoding of an image's file: "linear" (Rec.709 primaries) or "srgb". ValueError as `colour_space`."""
     name = colour_space(encoding)
-    if image.colorspace_settings.name != name:
-        image.colorspace_settings.name = name
+    space = _space_of(image)
+    if space.name != name:
+        space.name = name
+
+
+def _space_of(image: bpy.types.Image) -> Any:
+    """Where an image's colour space is set. Its types list the names of one configuration, and there are others."""
+    return image.colorspace_settings
 
 
 def colour_space(encoding: str) -> str:
@@ -292,14 +322,15 @@ def colour_space(encoding: str) -> str:
         likely = _LIKELY[encoding]
         image = bpy.data.images.new("Splannequin Probe", 1, 1)
         try:
-            known = image.colorspace_settings.bl_rna.properties["name"].enum_items.keys()
-            first = [n for n in (*likely, image.colorspace_settings.name) if n in known]  # the second is a role: bytes
+            space = _space_of(image)
+            known = space.bl_rna.properties["name"].enum_items.keys()
+            first = [n for n in (*likely, space.name) if n in known]  # the second is a role: bytes
             image.pack(data=_PROBE, data_len=len(_PROBE))
             image.source = "FILE"
-            image.colorspace_settings.is_data = True
-            value = Color(image.pixels[:3])
+            space.is_data = True
+            value = Color(_first_pixel(image))
             to_scene = Color.from_rec709_linear_to_scene_linear, Color.from_srgb_to_scene_linear
-            wanted = to_scene[encoding == "srgb"](value)
+            wanted = tuple(to_scene[encoding == "srgb"](value)[:])
             found = (n for n in [*first, *known] if _reads_as(image, n, wanted))
             name = next(found, next((n for n in first if n in likely), ""))
         finally:
@@ -314,28 +345,43 @@ def colour_space(encoding: str) -> str:
     return _spaces[encoding]
 
 
-def _reads_as(image: Any, name: str, wanted: Any) -> bool:
+def _reads_as(image: bpy.types.Image, name: str, wanted: Sequence[float]) -> bool:
     """True if a picture is read as the wanted scene-linear colour in the named space. Its space is set."""
-    image.colorspace_settings.name = name
-    return max(abs(a - b) for a, b in zip(image.pixels[:3], wanted, strict=True)) < 2e-3
+    _space_of(image).name = name
+    return max(abs(a - b) for a, b in zip(_first_pixel(image), wanted, strict=True)) < 2e-3
 
 
-def fcurves(datablock: Any) -> Iterator[Any]:
+def _first_pixel(image: bpy.types.Image) -> tuple[float, float, float]:
+    """Red, green and blue of an image's first pixel."""
+    pixels: Any = image.pixels  # a single float, says its type
+    return pixels[0], pixels[1], pixels[2]
+
+
+def _enumerated(name: str) -> Mapping[str, int]:
+    """Values of a property of a key, by identifier."""
+    told: Any = bpy.types.Keyframe.bl_rna.properties[name]
+    return {item.identifier: item.value for item in told.enum_items}
+
+
+def fcurves(datablock: _Animated) -> Iterator[bpy.types.FCurve]:
     """The F-curves of a data-block's action, whether actions have layers (4.4 on) or not."""
     data = datablock.animation_data
     if data is None or data.action is None:
         return
-    if hasattr(data.action, "layers") and data.action.layers:
-        for layer in data.action.layers:
-            for strip in layer.strips:
-                bag = strip.channelbag(data.action_slot)
-                if bag is not None:
-                    yield from bag.fcurves
-    elif hasattr(data.action, "fcurves"):
-        yield from data.action.fcurves
+    for curves in _curves(data):
+        yield from curves
 
 
-def remove_fcurves(datablock: Any, data_path: str) -> None:
+def _curves(animation: bpy.types.AnimData) -> list[Any]:
+    """Collections of the F-curves of an action: one for each of its strips (4.4 on), or the one it has."""
+    action: Any = animation.action  # whose types know the strips of one Blender, and curves of another
+    if hasattr(action, "layers") and action.layers:
+        bags = [strip.channelbag(animation.action_slot) for layer in action.layers for strip in layer.strips]
+        return [bag.fcurves for bag in bags if bag is not None]
+    return [action.fcurves] if hasattr(action, "fcurves") else []
+
+
+def remove_fcurves(datablock: _Animated, data_path: str) -> None:
     """Removes the F-curves and drivers of a data-block that lead to a data path."""
     data = datablock.animation_data
     if data is None:
@@ -344,18 +390,13 @@ def remove_fcurves(datablock: Any, data_path: str) -> None:
         data.drivers.remove(driver)
     if data.action is None:
         return
-    if hasattr(data.action, "layers") and data.action.layers:
-        strips = [strip for layer in data.action.layers for strip in layer.strips]
-        held = [bag.fcurves for bag in (s.channelbag(data.action_slot) for s in strips) if bag is not None]
-    else:
-        held = [data.action.fcurves] if hasattr(data.action, "fcurves") else []
-    for curves in held:
+    for curves in _curves(data):
         for curve in [c for c in curves if c.data_path == data_path]:
             curves.remove(curve)
 
 
 def set_keys(
-    datablock: Any, frames: Sequence[int], channels: Mapping[str, np.ndarray], types: Sequence[str] = ()
+    datablock: _Animated, frames: Sequence[int], channels: Mapping[str, np.ndarray], types: Sequence[str] = ()
 ) -> None:
     """Keys channels of a data-block that has no action yet, straight between keys, all at once.
 
@@ -365,8 +406,8 @@ def set_keys(
         channels: data path -> values [F, C], a column per array index.
         types: [F] type of each key, which has a colour of its own: KEYFRAME, JITTER, EXTREME; empty: all KEYFRAME.
     """
-    known = {i.identifier: i.value for i in bpy.types.Keyframe.bl_rna.properties["type"].enum_items}
-    action = bpy.data.actions.new(f"{datablock.name}Action")
+    known = _enumerated("type")
+    action: Any = bpy.data.actions.new(f"{datablock.name}Action")
     animation = datablock.animation_data_create()
     if hasattr(action, "slots"):
         slot = action.slots.new(datablock.id_type, datablock.name)
@@ -376,9 +417,7 @@ def set_keys(
     else:
         curves = action.fcurves
         animation.action = action
-    straight = next(
-        i.value for i in bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items if i.identifier == "LINEAR"
-    )
+    straight = _enumerated("interpolation")["LINEAR"]
     for name, values in channels.items():
         for index in range(values.shape[1]):
             curve = curves.new(name, index=index)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 
+from .access import scene_holding
 from .bake.settings import BakeSettings
 from .footage.settings import ImportSettings
 from .freeze.settings import FreezeSettings
@@ -15,9 +14,9 @@ from .solve.settings import SolveSettings
 from .train.settings import TrainSettings
 
 
-def _chosen(props: Any, context: Any) -> None:
+def _chosen(props: SPLANNEQUIN_PG_scene, context: bpy.types.Context) -> None:
     """Another shot of the list was clicked."""
-    chosen.choose(props.id_data, props.active_shot)
+    chosen.choose(scene_holding(props), props.active_shot)
 
 
 class ShotSettings(ImportSettings, SolveSettings, TrainSettings, FreezeSettings):
@@ -72,12 +71,12 @@ def register() -> None:
     bpy.utils.register_class(made.SPLANNEQUIN_PG_made)
     bpy.utils.register_class(SPLANNEQUIN_PG_shot)
     bpy.utils.register_class(SPLANNEQUIN_PG_scene)
-    bpy.types.Scene.splannequin = PointerProperty(type=SPLANNEQUIN_PG_scene)
+    bpy.types.Scene.splannequin = PointerProperty(type=SPLANNEQUIN_PG_scene)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def unregister() -> None:
     """Undoes `register`."""
-    del bpy.types.Scene.splannequin
+    del bpy.types.Scene.splannequin  # pyright: ignore[reportAttributeAccessIssue]
     bpy.utils.unregister_class(SPLANNEQUIN_PG_scene)
     bpy.utils.unregister_class(SPLANNEQUIN_PG_shot)
     bpy.utils.unregister_class(made.SPLANNEQUIN_PG_made)

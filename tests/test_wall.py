@@ -31,6 +31,7 @@ STATIONS = (
 )
 """In the order of docs/architecture.md: a station imports only stations before it. `footage/plates.py` is late."""
 ROOMS = (
+    "access",
     "compat",
     "translations",
     "scene",
@@ -76,6 +77,17 @@ def imports(tree: ast.AST, package: list[str]) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, ".".join([*start, alias.name])) for alias in node.names)
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
             yield from ((node.lineno, str(a.value)) for a in node.args[:1] if isinstance(a, ast.Constant))
+
+
+class _RunTime(ast.NodeTransformer):
+    def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
+        self.generic_visit(node)
+        return node.orelse if ast.unparse(node.test) == "TYPE_CHECKING" else node
+
+
+def run_time(source: str) -> ast.AST:
+    """A file without what it imports for the type checker alone: no arrow to what has to be there before it."""
+    return _RunTime().visit(ast.parse(source))
 
 
 def station_of(parts: Sequence[str]) -> str:
@@ -236,7 +248,8 @@ def test_the_scan_sees_who_asks_the_version():
 
 def test_no_module_of_the_addon_has_both_threads_and_bpy():
     for path in sources("splannequin_addon"):
-        names = {name.split(".")[0] for _, name in imports(read(path), package_of(path))}
+        tree = run_time(path.read_text(encoding="utf-8"))
+        names = {name.split(".")[0] for _, name in imports(tree, package_of(path))}
         assert not (names & {"threading", "concurrent", "asyncio"} and names & BLENDER), path
 
 
@@ -341,6 +354,25 @@ def test_the_scan_sees_a_circle():
     assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
 
 
+def test_the_scan_knows_what_is_for_the_type_checker():
+    source = "import a\nif TYPE_CHECKING:\n    import b\nelse:\n    import c\nif other:\n    import d"
+    assert [name for _, name in imports(run_time(source), [])] == ["a", "c", "d"]
+
+
+def test_only_one_file_of_the_addon_imports_others_for_the_type_checker():
+    """Of bpy's types any file may: what a room needs to know of a later one, it asks `access`."""
+
+    def ours(tree: ast.AST, path: Path) -> set[str]:
+        return {n for _, n in imports(tree, package_of(path)) if n.split(".")[0] == "splannequin_addon"}
+
+    seen = {
+        path.name: names
+        for path in sources("splannequin_addon")
+        if (names := ours(read(path), path) - ours(run_time(path.read_text(encoding="utf-8")), path))
+    }
+    assert set(seen) == {"access.py"}
+
+
 def addon_modules() -> dict[str, set[str]]:
     """Module of the add-on, by its dotted name below the add-on -> the modules of the add-on that it imports."""
     paths = {}
@@ -349,7 +381,8 @@ def addon_modules() -> dict[str, set[str]]:
         paths[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     arrows: dict[str, set[str]] = {}
     for module, path in paths.items():
-        names = [n.split(".") for _, n in imports(read(path), package_of(path))]
+        tree = run_time(path.read_text(encoding="utf-8"))
+        names = [n.split(".") for _, n in imports(tree, package_of(path))]
         inside = [n[1:] for n in names if n[0] == "splannequin_addon"]
         targets = {".".join(n) if ".".join(n) in paths else ".".join(n[:-1]) for n in inside}
         assert targets <= paths.keys(), f"{path}: {targets - paths.keys()}"

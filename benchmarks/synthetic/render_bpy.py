@@ -1,4 +1,7 @@
-# pyright: reportMissingImports=false
+# pyright: reportMissingModuleSource=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false
+# Nodes, sockets and lights are more to Blender than their types say; the add-on, which has to be right in five
+# Blenders, is checked without these exceptions.
 """Renders the pictures that a plan.json lists: `python render_bpy.py SCENE_FOLDER`, inside a bpy wheel's Python.
 
 Cycles on the CPU, in one process per scene so that its data persist. Needs bpy, numpy and the standard library only.

@@ -18,6 +18,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
+from ..access import present, size_of
 from ..scene import numbered, sequences
 from ..scene.mark import TAG
 from . import fitting, freeze_group, group_inside, placing, warp_nodes
@@ -30,7 +31,7 @@ _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
 
 
 def insert(
-    scene: Any,
+    scene: bpy.types.Scene,
     take: Take,
     plate: Path | None = None,
     footage: Sequence[Path] = (),
@@ -84,7 +85,7 @@ def insert(
             placing.lead_past(tree, node)
             placing.lead_through(tree, node, behind)
             changes.append(f'The node group "{GROUP_NAME}" was moved.')
-        freeze_group.set_defaults(node, freeze_group.give_sockets(node.node_tree))
+        freeze_group.set_defaults(node, freeze_group.give_sockets(present(node.node_tree)))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
     changes += freeze_group.switch_warp(node, wanted, flow is not None)
     group_inside.fill(scene, node, take, frozen, flow)
@@ -94,7 +95,7 @@ def insert(
     return changes
 
 
-def _frozen_image(take: Take) -> Any:
+def _frozen_image(take: Take) -> bpy.types.Image:
     """The take's frames as a data-block. ValueError if they lack a layer."""
     image = sequences.load_sequence(
         numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear"
@@ -102,7 +103,7 @@ def _frozen_image(take: Take) -> Any:
     return _with_layers(image, take, _LAYERS)
 
 
-def _warp_image(take: Take) -> Any | None:
+def _warp_image(take: Take) -> bpy.types.Image | None:
     """The take's warp as a data-block, None if it has none. ValueError if it lacks a layer."""
     return (
         _with_layers(sequences.load_sequence(*_warp_picture(take)), take, warp_nodes.LAYERS)
@@ -111,7 +112,7 @@ def _warp_image(take: Take) -> Any | None:
     )
 
 
-def _with_layers(image: Any, take: Take, names: Sequence[str]) -> Any:
+def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bpy.types.Image:
     """A sequence of the take, once it is known to have some layers. ValueError if not."""
     group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
     try:
@@ -125,7 +126,7 @@ def _with_layers(image: Any, take: Take, names: Sequence[str]) -> Any:
     return image
 
 
-def may_combine_cg(scene: Any) -> Any:
+def may_combine_cg(scene: bpy.types.Scene) -> bpy.types.CompositorNodeGroup:
     """Our node, if the scene's render can be led into it. JobError if it is not there, or its CG is taken."""
     tree = compat.compositor_tree(scene)
     node = freeze_group.group_node(tree) if tree else None
@@ -140,13 +141,13 @@ def may_combine_cg(scene: Any) -> Any:
     return node
 
 
-def combine_cg(scene: Any) -> list[str]:
+def combine_cg(scene: bpy.types.Scene) -> list[str]:
     """Leads the scene's own render into the group, where it stands among the frozen by depth; says what was changed.
 
     The view layer must have its depth pass. JobError as `may_combine_cg`.
     """
-    node, tree = may_combine_cg(scene), compat.compositor_tree(scene)
-    layers = tree.nodes.new("CompositorNodeRLayers")
+    node, tree = may_combine_cg(scene), present(compat.compositor_tree(scene))
+    layers: Any = tree.nodes.new("CompositorNodeRLayers")
     layers[TAG] = _CG
     layers.scene = scene
     layers.name = layers.label = "CG among the frozen"
@@ -156,22 +157,22 @@ def combine_cg(scene: Any) -> list[str]:
     return ["The scene's own render was led into the freeze: objects stand among the frozen people by depth."]
 
 
-def remove(scene: Any) -> bool:
+def remove(scene: bpy.types.Scene) -> bool:
     """Takes the group out, leads the link back, deletes what only we used. True if there was one."""
     tree = compat.compositor_tree(scene)
     node = freeze_group.group_node(tree) if tree else None
     if tree is None or node is None:
         return False
-    group = node.node_tree
+    group = present(node.node_tree)
     before = json.loads(group.get(freeze_group.BEFORE, "{}"))
     placing.lead_past(tree, node)
-    images = [n.image for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image]
-    textures = [n.texture for n in group.nodes if n.bl_idname == "CompositorNodeTexture" and n.texture]
+    images = [n.image for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
+    textures = [t for n in group.nodes if n.bl_idname == "CompositorNodeTexture" and (t := getattr(n, "texture", None))]
     tree.nodes.remove(node)
     if group.users == 0:  # another scene may show it
         bpy.data.node_groups.remove(group)
     for ours in [n for n in tree.nodes if n.get(TAG)]:
-        images += [ours.image] if getattr(ours, "image", None) else []
+        images += [ours.image] if isinstance(ours, bpy.types.CompositorNodeImage) and ours.image else []
         tree.nodes.remove(ours)
     if before.get("made_tree") and not [n for n in tree.nodes if n.bl_idname not in _OUTPUTS]:
         compat.drop_compositor_tree(scene)
@@ -209,7 +210,13 @@ def _plate_name(plate: Path) -> str:
 _OUTPUTS = ("CompositorNodeComposite", "NodeGroupOutput", "NodeGroupInput")
 
 
-def _show_plate(scene: Any, tree: Any, node: Any, image: Any, take: Take) -> None:
+def _show_plate(
+    scene: bpy.types.Scene,
+    tree: bpy.types.NodeTree,
+    node: bpy.types.CompositorNodeGroup,
+    image: bpy.types.Image,
+    take: Take,
+) -> None:
     """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
     for old in [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]:
         tree.nodes.remove(old)
@@ -219,9 +226,10 @@ def _show_plate(scene: Any, tree: Any, node: Any, image: Any, take: Take) -> Non
     sequences.show_sequence(image_node, image, take.first, take.last)
     stream = image_node.outputs["Image"]
     # The tree is ours: in a row, left to right.
-    compat.output_socket(tree).node.location = (node.location.x + node.width + 60.0, node.location.y)
+    end = present(present(compat.output_socket(tree)).node)
+    end.location = (node.location.x + node.width + 60.0, node.location.y)
     image_node.location = (node.location.x - 2 * GAP, node.location.y)
-    fit = compat.new_fit_node(tree, fitting.how_it_fits(scene, tuple(image.size)))
+    fit = compat.new_fit_node(tree, fitting.how_it_fits(scene, size_of(image)))
     fit[TAG] = True
     fit.label = "Fit Plate"
     fit.location = (node.location.x - GAP, node.location.y)

@@ -8,26 +8,28 @@ import bpy
 import numpy as np
 
 from .. import compat
+from ..access import pixels_of, set_value
 from ..scene.mark import TAG
 from .node_names import GAP, GRAIN
 
 
-def across(group: Any) -> Any:
+def across(group: bpy.types.NodeTree) -> bpy.types.NodeSocket:
     """Socket of a value that rises from 0 at the frame's left to 1 at its right."""
     if compat.HAS_TEXTURE_NODE:
-        node = group.nodes.new("CompositorNodeTexture")
+        node: Any = group.nodes.new("CompositorNodeTexture")
         node.texture = _blend()
         node.label = "From left to right"
         node.location = (-2 * GAP, 330.0)
         return node.outputs["Value"]
-    ramp = group.nodes.new("CompositorNodeImage")
+    ramp: Any = group.nodes.new("CompositorNodeImage")
     ramp.image = _ramp()
     ramp.label = "From left to right"
     wide = compat.new_fit_node(group, "Stretch")
     group.links.new(ramp.outputs["Image"], wide.inputs[0])
     # A scaled picture fades out over its last pixels: those of the ramp lie outside of the frame.
     larger = group.nodes.new("CompositorNodeScale")
-    larger.inputs["X"].default_value = larger.inputs["Y"].default_value = _BEYOND
+    for name in ("X", "Y"):
+        set_value(larger.inputs[name], _BEYOND)
     group.links.new(wide.outputs[0], larger.inputs[0])
     ramp.location, wide.location = (-3 * GAP, 330.0), (-2 * GAP, 330.0)
     return larger.outputs[0]
@@ -39,7 +41,7 @@ _BEYOND = 1.1
 """How much larger than the frame the ramp is shown."""
 
 
-def _blend() -> Any:
+def _blend() -> bpy.types.Texture:
     """A texture that rises from left to right. A scaled picture would do, but 4.3 leaves its lowest row unset."""
     texture = next((t for t in bpy.data.textures if t.get(TAG) and t.type == "BLEND"), None)
     if texture is None:
@@ -48,7 +50,7 @@ def _blend() -> Any:
     return texture
 
 
-def _ramp() -> Any:
+def _ramp() -> bpy.types.Image:
     """A picture that rises from 0 at the frame's left to 1 at its right: 5.0 has no node that does."""
     image = next((i for i in bpy.data.images if i.get(TAG) and i.name.startswith(RAMP)), None)
     if image is not None:
@@ -58,15 +60,19 @@ def _ramp() -> Any:
     across = 0.5 + _BEYOND * ((np.arange(_STEPS, dtype=np.float32) + 0.5) / _STEPS - 0.5)
     row = np.repeat(across[:, None], 4, axis=1)
     row[:, 3] = 1.0
-    image.pixels.foreach_set(np.tile(row, (_ROWS, 1)).ravel())
+    pixels_of(image).foreach_set(np.tile(row, (_ROWS, 1)).ravel())
     image.update()
     image.pack()
     return image
 
 
 def fitted(
-    scene: Any, group: Any, size: tuple[int, int], margin: tuple[int, int], layers: dict[str, Any]
-) -> dict[str, Any]:
+    scene: bpy.types.Scene,
+    group: bpy.types.NodeTree,
+    size: tuple[int, int],
+    margin: tuple[int, int],
+    layers: dict[str, bpy.types.NodeSocket],
+) -> dict[str, bpy.types.NodeSocket]:
     """The layers' sockets, by name: without overscan, and scaled to the render's size, whatever it is when it renders.
 
     Frames wider than the scene's picture are cut, as the camera sees it; flatter ones leave bars.
@@ -84,7 +90,7 @@ def fitted(
         node = compat.new_fit_node(group, how)
         node.label = f"Fit {name}" if name else "Fit what there is"
         node.location = (-GAP, 150.0 - 170.0 * row)
-        group.links.new(sockets[name] if name else shown, node.inputs[0])
+        group.links.new(sockets[name] if name or shown is None else shown, node.inputs[0])
         if not name:
             coverage = node.outputs[0]
         else:
@@ -92,7 +98,7 @@ def fitted(
     return sockets
 
 
-def how_it_fits(scene: Any, size: tuple[int, int]) -> str:
+def how_it_fits(scene: bpy.types.Scene, size: tuple[int, int]) -> str:
     """How a picture of a size is brought to the scene's: its width fits, as the solved camera's does."""
     tall = scene.render.resolution_x * size[1] / (scene.render.resolution_y * size[0])
     # Of one shape but for rounding: both do; where cropping leaves a line unset, not that.
@@ -100,7 +106,7 @@ def how_it_fits(scene: Any, size: tuple[int, int]) -> str:
     return "Crop" if tall > 0.99 and not alike else "Fit"
 
 
-def _whole(group: Any, layer: Any) -> Any | None:
+def _whole(group: bpy.types.NodeTree, layer: bpy.types.NodeSocket) -> bpy.types.NodeSocket | None:
     """Socket of 1 wherever a layer has pixels; None where a scaled picture does not fade out at its border."""
     if compat.HAS_COMPOSITING_GROUP:
         return None
@@ -111,7 +117,9 @@ def _whole(group: Any, layer: Any) -> Any | None:
     return node.outputs[0]
 
 
-def _unfaded(group: Any, layer: Any, coverage: Any | None, picture: bool) -> Any:
+def _unfaded(
+    group: bpy.types.NodeTree, layer: bpy.types.NodeSocket, coverage: bpy.types.NodeSocket | None, picture: bool
+) -> bpy.types.NodeSocket:
     """Socket of a scaled layer whose outermost pixels are as strong as the others."""
     if coverage is None:
         return layer

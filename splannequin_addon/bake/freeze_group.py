@@ -11,6 +11,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
+from ..access import present, set_value, value_of
 from ..scene.mark import TAG
 from .node_names import AS_WARP, DEPTH, FROZEN, GRAIN, GROUP_NAME, INVENTED
 
@@ -18,75 +19,77 @@ BEFORE = "splannequin_before"
 _WARPS = "splannequin_warps"
 
 
-def switch_warp(node: Any, wanted: bool, possible: bool) -> list[str]:
+def switch_warp(node: bpy.types.CompositorNodeGroup, wanted: bool, possible: bool) -> list[str]:
     """Gives our node the factor of the warp, or takes it away; says what was changed. The inside is not touched."""
-    group, face, name = node.node_tree, node.node_tree.interface, AS_WARP
-    there = [i for i in face.items_tree if i.item_type == "SOCKET" and i.in_out == "INPUT" and i.name == name]
+    group, name = present(node.node_tree), AS_WARP
+    there = [i for i in compat.sockets_of(group) if i.in_out == "INPUT" and i.name == name]
     group[_WARPS] = wanted
     if wanted and possible and not there:
         text = "1: the plate that you lead in, frozen by the take's warp; 0: the take's own frames"
-        _factor(face.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat", description=text), 1.0)
-        node.inputs[name].default_value = 1.0
+        _factor(compat.new_socket(group, name, "INPUT", "NodeSocketFloat", text), 1.0)
+        set_value(node.inputs[name], 1.0)
         return ["What is led into the group is frozen by the take's warp, with its own values."]
     if there and not (wanted and possible):
-        face.remove(there[0])
+        present(group.interface).remove(there[0])
         why = "The take has no warp: its own frames are shown." if wanted else "The take's own frames are shown again."
         return [why]
     return []
 
 
-def wants_warp(scene: Any) -> bool:
+def wants_warp(scene: bpy.types.Scene) -> bool:
     """True if the scene's freeze group freezes the stream that is led into it, or would if its take had a warp."""
     tree = compat.compositor_tree(scene)
     node = group_node(tree) if tree else None
-    return node is not None and bool(node.node_tree.get(_WARPS))
+    return node is not None and bool(present(node.node_tree).get(_WARPS))
 
 
-def lacking(node: Any) -> list[str]:
+def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
     """What our node is asked for that the take does not have, in words."""
-    inside, asked = node.node_tree.nodes, []
-    if node.inputs[GRAIN].default_value and GRAIN not in inside:
+    inside, asked = present(node.node_tree).nodes, []
+    if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
         asked.append("The take has no grain to add: freeze it again.")
     frozen = inside[FROZEN].outputs
-    if (node.inputs["Splat"].default_value or node.inputs[INVENTED].default_value) and "Plate" not in frozen:
+    if (value_of(node.inputs["Splat"]) or value_of(node.inputs[INVENTED])) and "Plate" not in frozen:
         asked.append("The take does not tell plate from splats: it was frozen without detail.")
     return asked
 
 
-def shows_plate(scene: Any) -> bool:
+def shows_plate(scene: bpy.types.Scene) -> bool:
     """True if the plate is the stream of the scene's tree: one that was made here, or that `insert` would make."""
     tree = compat.compositor_tree(scene)
     if tree is None or not len(tree.nodes):
         return True
     node = group_node(tree)
-    return node is not None and bool(json.loads(node.node_tree[BEFORE])["made_tree"])
+    return node is not None and bool(json.loads(present(node.node_tree)[BEFORE])["made_tree"])
 
 
-def group_node(tree: Any) -> Any | None:
+def group_node(tree: bpy.types.NodeTree) -> bpy.types.CompositorNodeGroup | None:
     """Our group's node in a compositor tree, or None."""
-    return next((n for n in tree.nodes if n.bl_idname == "CompositorNodeGroup" and _is_ours(n.node_tree)), None)
+    groups = (n for n in tree.nodes if isinstance(n, bpy.types.CompositorNodeGroup))
+    return next((n for n in groups if _is_ours(n.node_tree)), None)
 
 
-def shown(scene: Any) -> tuple[Path, float] | None:
+def shown(scene: bpy.types.Scene) -> tuple[Path, float] | None:
     """(folder of the take that the freeze group shows, what its depth is multiplied by); None without the group."""
     tree = compat.compositor_tree(scene)
     node = group_node(tree) if tree else None
     if node is None:
         return None
-    frozen, depth = node.node_tree.nodes.get(FROZEN), node.node_tree.nodes.get(DEPTH)
-    if frozen is None or frozen.image is None or depth is None:
+    inside = present(node.node_tree).nodes
+    frozen, depth = inside.get(FROZEN), inside.get(DEPTH)
+    if not isinstance(frozen, bpy.types.CompositorNodeImage) or frozen.image is None or depth is None:
         return None
     file = Path(os.path.abspath(bpy.path.abspath(frozen.image.filepath)))
-    return file.parent, float(depth.inputs[1].default_value)
+    return file.parent, float(value_of(depth.inputs[1]))
 
 
-def set_depth_scale(scene: Any, scale: float) -> None:
+def set_depth_scale(scene: bpy.types.Scene, scale: float) -> None:
     """Has the freeze group multiply depth by another scale. Only where `shown` says that there is one."""
-    node = group_node(compat.compositor_tree(scene))
-    node.node_tree.nodes[DEPTH].inputs[1].default_value = scale
+    node = present(group_node(present(compat.compositor_tree(scene))))
+    set_value(present(node.node_tree).nodes[DEPTH].inputs[1], scale)
 
 
-def _is_ours(group: Any) -> bool:
+def _is_ours(group: bpy.types.NodeTree | None) -> bool:
     return group is not None and bool(group.get(TAG))
 
 
@@ -109,10 +112,9 @@ def _factor(socket: Any, value: float) -> None:
     socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
 
 
-def give_sockets(group: Any) -> set[str]:
+def give_sockets(group: bpy.types.NodeTree) -> set[str]:
     """Gives a group the sockets that it lacks, those of an older version stay; returns the names of new inputs."""
-    face = group.interface
-    there = {(i.in_out, i.name) for i in face.items_tree if i.item_type == "SOCKET"}
+    there = {(i.in_out, i.name) for i in compat.sockets_of(group)}
     given: set[str] = set()
 
     def new(name: str, side: str, kind: str, text: str) -> Any:
@@ -120,7 +122,7 @@ def give_sockets(group: Any) -> set[str]:
             return None
         if side == "INPUT":
             given.add(name)
-        return face.new_socket(name, in_out=side, socket_type=kind, description=text)
+        return compat.new_socket(group, name, side, kind, text)
 
     new("Image", "INPUT", "NodeSocketColor", "Your stream, up to here")
     for name, value, text in (*_FACTORS, *_LOOKS):
@@ -141,26 +143,28 @@ def give_sockets(group: Any) -> set[str]:
     return given
 
 
-def set_defaults(node: Any, names: set[str]) -> None:
+def set_defaults(node: bpy.types.CompositorNodeGroup, names: set[str]) -> None:
     """Gives the named inputs of our node their values: a node does not always take its group's."""
     for name, value, _ in (*_FACTORS, *_LOOKS):
         if name in names:
-            node.inputs[name].default_value = value
+            set_value(node.inputs[name], value)
     if GRAIN in names:
-        node.inputs[GRAIN].default_value = 0.0
+        set_value(node.inputs[GRAIN], 0.0)
     if "CG" in names:
-        node.inputs["CG"].default_value = (0.0, 0.0, 0.0, 0.0)
+        set_value(node.inputs["CG"], (0.0, 0.0, 0.0, 0.0))
     if "CG Depth" in names:
-        node.inputs["CG Depth"].default_value = contract.NO_DEPTH
+        set_value(node.inputs["CG Depth"], contract.NO_DEPTH)
 
 
-def new_node(tree: Any, before: dict[str, bool]) -> Any:
+def new_node(tree: bpy.types.NodeTree, before: dict[str, bool]) -> bpy.types.CompositorNodeGroup:
     """A node of a new group, with all its sockets and nothing inside; `before` says how the compositor was."""
     group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
+    assert isinstance(group, bpy.types.CompositorNodeTree)
     group[TAG] = True
     group[BEFORE] = json.dumps(before)
     give_sockets(group)
     node = tree.nodes.new("CompositorNodeGroup")
+    assert isinstance(node, bpy.types.CompositorNodeGroup)
     node.node_tree = group
     node.name = node.label = GROUP_NAME
     node.width = 180.0

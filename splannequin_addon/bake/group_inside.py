@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 
 from ...torch_backend import contract
 from .. import compat
+from ..access import present
 from ..scene import sequences
 from . import fitting, warp_nodes
 from .node_names import AS_WARP, DEPTH, FROZEN, GAP, GRAIN, INVENTED
@@ -20,10 +19,17 @@ _SOFT = 0.01
 frozen depth is a little uneven, and would come through what stands on it."""
 
 
-def fill(scene: Any, node: Any, take: Take, image: Any, warp: Any | None) -> None:
+def fill(
+    scene: bpy.types.Scene,
+    node: bpy.types.CompositorNodeGroup,
+    take: Take,
+    image: bpy.types.Image,
+    warp: bpy.types.Image | None,
+) -> None:
     """(Re)builds the inside of our node's group; its sockets, and so the links around it, stay."""
-    group, shown = node.node_tree, {i.name for i in (image, warp) if i is not None}
-    old = {n.image.name for n in group.nodes if n.bl_idname == "CompositorNodeImage" and n.image} - {fitting.RAMP}
+    group, shown = present(node.node_tree), {i.name for i in (image, warp) if i is not None}
+    readers = [n for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage)]
+    old = {n.image.name for n in readers if n.image} - {fitting.RAMP}
     group.nodes.clear()
     enter = group.nodes.new("NodeGroupInput")
     leave = group.nodes.new("NodeGroupOutput")
@@ -66,7 +72,9 @@ def fill(scene: Any, node: Any, take: Take, image: Any, warp: Any | None) -> Non
             bpy.data.images.remove(stale)
 
 
-def _warped(group: Any, enter: Any, own: Any, image: Any, take: Take) -> Any:
+def _warped(
+    group: bpy.types.NodeTree, enter: bpy.types.Node, own: bpy.types.NodeSocket, image: bpy.types.Image, take: Take
+) -> bpy.types.NodeSocket:
     """Socket of the frozen picture: the take's own, or what is led into the group, frozen by the take's warp."""
     reader = group.nodes.new("CompositorNodeImage")
     reader.name = reader.label = "Warp"
@@ -85,7 +93,9 @@ _TINT, _TINTED = (1.0, 0.0, 0.4, 1.0), 0.6
 """Colour that shows what is invented, and how much of it there is where nothing is plate."""
 
 
-def _looked_at(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+def _looked_at(
+    group: bpy.types.NodeTree, enter: bpy.types.Node, layers: dict[str, bpy.types.NodeSocket]
+) -> bpy.types.NodeSocket:
     """Socket of the frozen picture, or of the splats alone, with what is invented tinted as much as is asked for."""
     node, factor, first, second, chosen = compat.new_mix_node(group)
     node.label, node.location = "Splat", (-2 * GAP, 500.0)
@@ -105,7 +115,9 @@ def _looked_at(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     return tinted
 
 
-def _grainy(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+def _grainy(
+    group: bpy.types.NodeTree, enter: bpy.types.Node, layers: dict[str, bpy.types.NodeSocket]
+) -> bpy.types.NodeSocket:
     """Socket of the frozen picture with as much of its grain as is asked for; takes of before have none."""
     if GRAIN not in layers:
         return layers["Combined"]
@@ -118,7 +130,13 @@ def _grainy(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     return summed
 
 
-def _among(group: Any, enter: Any, picture: Any, nearer: Any, label: str) -> Any:
+def _among(
+    group: bpy.types.NodeTree,
+    enter: bpy.types.Node,
+    picture: bpy.types.NodeSocket,
+    nearer: bpy.types.NodeSocket,
+    label: str,
+) -> bpy.types.NodeSocket:
     """Socket of a picture with CG in front of it, as far as it is nearer, else behind, by as much as both cover."""
     front, under, over = compat.new_over_node(group)
     group.links.new(picture, under)
@@ -137,7 +155,7 @@ def _among(group: Any, enter: Any, picture: Any, nearer: Any, label: str) -> Any
     return chosen
 
 
-def _cg_depth(group: Any, enter: Any) -> Any:
+def _cg_depth(group: bpy.types.NodeTree, enter: bpy.types.Node) -> bpy.types.NodeSocket:
     """Socket of the depth of CG; where a pixel has none, the nearest of its neighbours': it may be that one's edge.
 
     A pixel that CG covers in part often tells the depth of what is behind: nothing.
@@ -161,7 +179,7 @@ def _cg_depth(group: Any, enter: Any) -> Any:
     return depth.outputs[0]
 
 
-def _nearer(group: Any, cg: Any, frozen: Any) -> Any:
+def _nearer(group: bpy.types.NodeTree, cg: bpy.types.NodeSocket, frozen: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """Socket of how much CG is in front: 1 up to the frozen depth, 0 from `_SOFT` of it behind, smooth between."""
     ratio = compat.new_math_node(group, "DIVIDE")
     group.links.new(cg, ratio.inputs[0])
@@ -184,7 +202,9 @@ def _nearer(group: Any, cg: Any, frozen: Any) -> Any:
     return smooth.outputs[0]
 
 
-def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
+def _share(
+    group: bpy.types.NodeTree, enter: bpy.types.Node, layers: dict[str, bpy.types.NodeSocket]
+) -> bpy.types.NodeSocket:
     """Socket of how much of the frozen frame shows: Mix, left of Wipe, and where the mattes let it."""
     left = compat.new_math_node(group, "LESS_THAN")
     left.label = "Left of the wipe"
@@ -206,7 +226,7 @@ def _share(group: Any, enter: Any, layers: dict[str, Any]) -> Any:
     return total
 
 
-def _product(group: Any, one: Any, other: Any) -> Any:
+def _product(group: bpy.types.NodeTree, one: bpy.types.NodeSocket, other: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     node = compat.new_math_node(group)
     node.location = (0.0, 330.0)
     group.links.new(one, node.inputs[0])

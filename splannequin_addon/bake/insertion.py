@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import bpy
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..process import supervisor
 from ..scene import intact, scene_setup
 from ..shot import contents, made
@@ -18,7 +18,7 @@ from . import compositor, freeze_group, rendering, take_files
 from .take_files import Take
 
 
-def insert(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[str]:
+def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = None) -> list[str]:
     """Puts a take into the scene's compositor, or updates it; returns what was changed, in words.
 
     Args:
@@ -34,14 +34,14 @@ def insert(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[
     if warp:
         _need_warp(shot, frozen)
     footage = _footage(scene, shot, plate)
-    changes = compositor.insert(scene, frozen, plate, footage, scene.splannequin.insert_at, warp)
+    changes = compositor.insert(scene, frozen, plate, footage, settings_of(scene).insert_at, warp)
     lacking = contents.missing_frames(shot, take, rendering.frames_of(scene))
     if lacking:
         changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
     return changes
 
 
-def read_ahead(scene: Any, shot: Path, take: str) -> Iterator[None]:
+def read_ahead(scene: bpy.types.Scene, shot: Path, take: str) -> Iterator[None]:
     """Has Blender read what `insert` will need, a picture a turn. JobError as `insert`."""
     frozen, plate = _sources(scene, shot, take)
     shown = plate if freeze_group.shows_plate(scene) else None
@@ -65,7 +65,7 @@ def _need_warp(shot: Path, take: Take) -> None:
         )
 
 
-def _sources(scene: Any, shot: Path, take: str) -> tuple[Take, Path | None]:
+def _sources(scene: bpy.types.Scene, shot: Path, take: str) -> tuple[Take, Path | None]:
     """A take, and the first picture of its plate if there is one. JobError if the take has no frames."""
     try:
         frozen = take_files.take_of(contract.ShotFolder(shot).takes / take, made.depth_scale(scene, shot))
@@ -77,20 +77,20 @@ def _sources(scene: Any, shot: Path, take: str) -> tuple[Take, Path | None]:
     return frozen, plate if plate.is_file() else None
 
 
-def _footage(scene: Any, shot: Path, plate: Path | None) -> list[Path]:
+def _footage(scene: bpy.types.Scene, shot: Path, plate: Path | None) -> list[Path]:
     """Files by which a node that shows the plate is known: the undistorted plate, the clip."""
     told = str(contents.read(shot).info.get("source", ""))
-    chosen = scene.splannequin.clip
+    chosen = settings_of(scene).clip
     files = [plate, Path(told) if told else None, Path(bpy.path.abspath(chosen)) if chosen else None]
     return [file for file in files if file is not None]
 
 
-def remove(scene: Any) -> bool:
+def remove(scene: bpy.types.Scene) -> bool:
     """Takes the freeze out of the scene's compositor. True if it was there."""
     return compositor.remove(scene)
 
 
-def fit_take(scene: Any, shot: Path, take: str, new: bool = False) -> list[str]:
+def fit_take(scene: bpy.types.Scene, shot: Path, take: str, new: bool = False) -> list[str]:
     """Gives the scene the rate and range of a take, and a size that loses no pixel of it; says what changed.
 
     Args:
@@ -123,14 +123,14 @@ def _plate_size(state: ShotState) -> tuple[int, int]:
     return path.width, path.height
 
 
-def insert_freeze(scene: Any, shot: Path, take: str, warp: bool | None = None) -> list[str]:
+def insert_freeze(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = None) -> list[str]:
     """Puts a take into the scene's compositor, or its warp, and keeps the plate's colours if the artist consents."""
     with intact.scene_of(scene):
-        changes = scene_setup.keep_plate_colours(scene) if scene.splannequin.keep_colours else []
+        changes = scene_setup.keep_plate_colours(scene) if settings_of(scene).keep_colours else []
         return insert(scene, shot, take, warp) + changes
 
 
-def combine_cg(scene: Any, shot: Path) -> list[str]:
+def combine_cg(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """Has the scene's own objects stand among the frozen. JobError if the freeze is not in the compositor."""
     compositor.may_combine_cg(scene)
     with intact.scene_of(scene):
@@ -138,7 +138,7 @@ def combine_cg(scene: Any, shot: Path) -> list[str]:
         return compositor.combine_cg(scene) + changes
 
 
-def bring_in(scene: Any, shot: Path, take: str, alone: bool = True) -> None:
+def bring_in(scene: bpy.types.Scene, shot: Path, take: str, alone: bool = True) -> None:
     """Has a take put into the compositor and rendered by the timer, in turns: Blender stands still in each.
 
     Args:
@@ -158,7 +158,7 @@ def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
         yield from read_ahead(bpy.data.scenes[scene_name], shot, take)
     seen = ""
 
-    def put_in(scene: Any) -> list[str]:
+    def put_in(scene: bpy.types.Scene) -> list[str]:
         nonlocal seen
         changes = insert_freeze(scene, shot, take)
         if supervisor.window_of(scene) is not None:
@@ -170,7 +170,8 @@ def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
     if not seen:
         return
     yield None
-    window = supervisor.window_of(bpy.data.scenes.get(seen))
+    scene = bpy.data.scenes.get(seen)
+    window = supervisor.window_of(scene) if scene is not None else None
     if window is not None:
         with bpy.context.temp_override(window=window, scene=window.scene):
-            bpy.ops.splannequin.render("INVOKE_DEFAULT")
+            bpy.ops.splannequin.render("INVOKE_DEFAULT")  # pyright: ignore[reportAttributeAccessIssue]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
 
 import bpy
 
+from ...torch_backend import contract
+from ..access import Outcome, scene_in, settings_of
 from ..freeze import own_camera, takes
-from ..process import backend, begin, supervisor
+from ..process import backend, begin, jobs, supervisor
 from ..shot import chosen
 from ..translations import tr
 from ..ui import step_operator
@@ -23,11 +25,11 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
     bl_options = {"REGISTER"}
     step = "bake"
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Bakes; a complete take needs no backend."""
-        scene = context.scene
+        scene = scene_in(context)
         folder = chosen.shot_folder(scene)
-        take = scene.splannequin.take_name
+        take = settings_of(scene).take_name
         if folder is None or backend.available() or not takes.complete(folder, take, rendering.frames_of(scene)):
             if folder is not None and not bpy.app.background and own_camera.follows_camera(scene):
                 takes.read_in_turns(scene, folder, self.step)
@@ -41,17 +43,17 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
         )
         if outcome == {"FINISHED"}:
             try:
-                bpy.ops.splannequin.render("EXEC_DEFAULT")
+                bpy.ops.splannequin.render("EXEC_DEFAULT")  # pyright: ignore[reportAttributeAccessIssue]
             except RuntimeError as error:
                 self.report({"ERROR"}, str(error).strip())
                 return {"CANCELLED"}
         return outcome
 
-    def params(self, scene: Any) -> Any:
+    def params(self, scene: bpy.types.Scene) -> contract.FreezeParams | None:
         """Reads the artist's camera again, if the take is seen from one: what moved since is stale."""
         return takes.read_camera(scene, self.step) if own_camera.follows_camera(scene) else None
 
-    def after(self, scene: Any, job: Any) -> list[str]:
+    def after(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """Inserts the freeze, then renders."""
         notes = super().after(scene, job)
         notes += rendering.choose_output(scene, job.shot, job.params["take"])
@@ -66,21 +68,21 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
     bl_label = "Render Baked Shot"
     bl_options = {"REGISTER"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Blocks until the frames are on disk."""
         return self._render(context, "EXEC_DEFAULT")
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Renders in the background of the window, as Blender's own Render Animation does."""
         return self._render(context, "INVOKE_DEFAULT")
 
-    def _render(self, context: Any, how: str) -> set[str]:
-        scene = context.scene
+    def _render(self, context: bpy.types.Context, how: str) -> Outcome:
+        scene = scene_in(context)
         folder = chosen.shot_folder(scene)
         if folder is None:
             self.report({"ERROR"}, "No shot is chosen: import a clip first")
             return {"CANCELLED"}
-        notes = rendering.choose_output(scene, folder, scene.splannequin.take_name)
+        notes = rendering.choose_output(scene, folder, settings_of(scene).take_name)
         if notes:
             supervisor.undo_step("bake")
         progress.began(folder, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
@@ -104,9 +106,9 @@ class SPLANNEQUIN_OT_insert_freeze(bpy.types.Operator):
     bl_label = "Insert Freeze in Compositor"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Inserts or updates the group."""
-        take = context.scene.splannequin.take_name
+        take = settings_of(scene_in(context)).take_name
         return step_operator.edit(self, context, "bake", lambda scene, shot: insertion.insert_freeze(scene, shot, take))
 
 
@@ -118,9 +120,9 @@ class SPLANNEQUIN_OT_freeze_as_warp(bpy.types.Operator):
     bl_label = "Freeze as Warp"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Inserts or updates the group, the other way."""
-        take, warp = context.scene.splannequin.take_name, not freeze_group.wants_warp(context.scene)
+        take, warp = settings_of(scene_in(context)).take_name, not freeze_group.wants_warp(scene_in(context))
         return step_operator.edit(
             self, context, "bake", lambda scene, shot: insertion.insert_freeze(scene, shot, take, warp)
         )
@@ -134,7 +136,7 @@ class SPLANNEQUIN_OT_combine_cg(bpy.types.Operator):
     bl_label = "Combine with Scene's Objects"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Adds one Render Layers node and two links."""
         return step_operator.edit(self, context, "bake", insertion.combine_cg)
 
@@ -147,10 +149,10 @@ class SPLANNEQUIN_OT_remove_shot(bpy.types.Operator):
     bl_label = "Remove Shot from Scene"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Removes what Splannequin put into the file."""
 
-        def remove(scene: Any, shot: Any) -> list[str]:
+        def remove(scene: bpy.types.Scene, shot: Path) -> list[str]:
             notes = begin.remove_all(scene, shot)
             supervisor.watch_of(shot).notes.clear()  # they tell of what is no longer there
             return notes

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 
+from ..access import scene_in, settings_of
 from ..ui import icons, step_panel
 
 
@@ -18,18 +17,18 @@ class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
     operator = "splannequin.bake"
     folds = "bake"
 
-    def draw_settings(self, context: Any, layout: Any) -> None:
+    def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Which take, and which of its frames: Blender's own range and step."""
-        layout.prop(context.scene.splannequin, "take_name")
+        layout.prop(settings_of(scene_in(context)), "take_name")
         row = layout.row(align=True)
-        row.prop(context.scene, "frame_start", text="First")
-        row.prop(context.scene, "frame_end", text="Last")
-        row.prop(context.scene, "frame_step", text="Step")
+        row.prop(scene_in(context), "frame_start", text="First")
+        row.prop(scene_in(context), "frame_end", text="Last")
+        row.prop(scene_in(context), "frame_step", text="Step")
 
-    def draw_advanced(self, context: Any, layout: Any) -> None:
+    def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Colours, and the parts of the step one by one."""
-        layout.prop(context.scene.splannequin, "keep_colours")
-        layout.prop(context.scene.splannequin, "insert_at")
+        layout.prop(settings_of(scene_in(context)), "keep_colours")
+        layout.prop(settings_of(scene_in(context)), "insert_at")
         name = "splannequin.insert_freeze"
         layout.operator(name, text="Insert in Compositor Only", icon=icons.of(name))
         for name in ("splannequin.freeze_as_warp", "splannequin.combine_cg", "splannequin.remove_shot"):

@@ -9,12 +9,12 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import bpy
 
 from ...torch_backend import contract
 from .. import compat
+from ..access import present, size_of
 from ..scene import scene_setup
 from ..scene.mark import TAG
 
@@ -22,38 +22,40 @@ _STANDS_IN = "splannequin_stands_in"
 _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 
 
-def lead_through(tree: Any, node: Any, behind: Any | None) -> None:
+def lead_through(
+    tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup, behind: bpy.types.NodeSocket | None
+) -> None:
     """Leads a picture through our node: all that leaves a socket, or with None what goes to the output."""
     if behind is not None:
-        source, targets, beside = behind, [link.to_socket for link in behind.links], behind.node
+        source, targets, beside = behind, [present(link.to_socket) for link in links_of(behind)], present(behind.node)
         node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 320.0)
     else:
-        end = compat.output_socket(tree) or compat.new_output_node(tree)
-        source, targets = end.links[0].from_socket if end.is_linked else None, [end]
-        node.location = (end.node.location.x - node.width - 30.0, end.node.location.y - 160.0)
+        end = present(compat.output_socket(tree) or compat.new_output_node(tree))
+        source, targets, last = links_of(end)[0].from_socket if end.is_linked else None, [end], present(end.node)
+        node.location = (last.location.x - node.width - 30.0, last.location.y - 160.0)
     for target in targets:
         tree.links.new(node.outputs["Image"], target)
     if source is not None:
         tree.links.new(source, node.inputs["Image"])
-    node.node_tree[_STANDS_IN] = behind is not None
+    present(node.node_tree)[_STANDS_IN] = behind is not None
 
 
-def lead_past(tree: Any, node: Any) -> None:
+def lead_past(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> None:
     """Leads what goes through our node past it again."""
-    sources = [link.from_socket for link in node.inputs["Image"].links]
-    for target in [link.to_socket for link in node.outputs["Image"].links]:
+    sources = [present(link.from_socket) for link in links_of(node.inputs["Image"])]
+    for target in [present(link.to_socket) for link in links_of(node.outputs["Image"])]:
         if sources:
             tree.links.new(sources[0], target)
-    for link in list(node.inputs["Image"].links):
+    for link in links_of(node.inputs["Image"]):
         tree.links.remove(link)
 
 
-def stands_in(node: Any) -> bool:
+def stands_in(node: bpy.types.CompositorNodeGroup) -> bool:
     """True if our node stands behind the plate, not before the output."""
-    return bool(node.node_tree.get(_STANDS_IN))
+    return bool(present(node.node_tree).get(_STANDS_IN))
 
 
-def place_of(scene: Any, footage: Sequence[Path], where: str) -> Any | None:
+def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy.types.NodeSocket | None:
     """Socket that the group goes behind: the plate's, in the artist's tree; None for before the output.
 
     A plate that is undistorted or brought to the render's size first is taken after that, as the frozen frames are.
@@ -75,39 +77,56 @@ def place_of(scene: Any, footage: Sequence[Path], where: str) -> Any | None:
             )
         return None
     socket = _picture(found[0])
-    while len(socket.links) == 1 and _conforms(scene, socket.links[0].to_node, found[0]):
-        following = socket.links[0].to_node.outputs[0]
+    while True:
+        links = links_of(socket)
+        behind = links[0].to_node if len(links) == 1 else None
+        if behind is None or not _conforms(scene, behind, found[0]):
+            break
+        following = behind.outputs[0]
         if not following.is_linked:
             break
         socket = following
     return socket
 
 
-def _picture(node: Any) -> Any:
+def links_of(socket: bpy.types.NodeSocket) -> list[bpy.types.NodeLink]:
+    """The links that begin or end at a socket, as they are now: moving one changes what the socket tells."""
+    return list(present(socket.links))
+
+
+def _picture(node: bpy.types.Node) -> bpy.types.NodeSocket:
     """Output of an Image or Movie Clip node that the picture leaves through."""
     return next(s for s in node.outputs if s.enabled and s.type == "RGBA")
 
 
-def _upstream(tree: Any) -> list[Any]:
+def _upstream(tree: bpy.types.NodeTree) -> list[bpy.types.Node]:
     """Nodes whose picture gets to the tree's output."""
     end = compat.output_socket(tree)
-    waiting, found = [end.node] if end is not None else [], []
+    waiting: list[bpy.types.Node | None] = [end.node] if end is not None else []
+    found: list[bpy.types.Node] = []
     while waiting:
         node = waiting.pop()
-        if node not in found:
+        if node is not None and node not in found:
             found.append(node)
-            waiting += [link.from_node for socket in node.inputs for link in socket.links]
+            waiting += [link.from_node for socket in node.inputs for link in links_of(socket)]
     return found
 
 
-def _shows(node: Any, footage: Sequence[Path]) -> bool:
+def _shows(node: bpy.types.Node, footage: Sequence[Path]) -> bool:
     """True if an Image or Movie Clip node shows one of these files, or another of the sequence that it belongs to."""
-    data = node.image if node.bl_idname == _PICTURES[0] else node.clip
+    data = _shown(node)
     if data is None or not data.filepath:
         return False
     numbered = data.source == "SEQUENCE"
     path = _footage_key(Path(bpy.path.abspath(data.filepath)), numbered)
     return any(path == _footage_key(known, numbered) for known in footage)
+
+
+def _shown(node: bpy.types.Node) -> bpy.types.Image | bpy.types.MovieClip | None:
+    """The footage of an Image or Movie Clip node."""
+    if isinstance(node, bpy.types.CompositorNodeImage):
+        return node.image
+    return node.clip if isinstance(node, bpy.types.CompositorNodeMovieClip) else None
 
 
 def _footage_key(path: Path, numbered: bool) -> tuple[str, str]:
@@ -116,9 +135,8 @@ def _footage_key(path: Path, numbered: bool) -> tuple[str, str]:
     return os.path.normcase(folder), re.sub(r"\d+|#+", "#", name) if numbered else os.path.normcase(name)
 
 
-def _conforms(scene: Any, node: Any, plate: Any) -> bool:
+def _conforms(scene: bpy.types.Scene, node: bpy.types.Node, plate: bpy.types.Node) -> bool:
     """True if a node only undistorts the plate, or brings one of another size to the render's."""
     if node.mute or node.bl_idname == "CompositorNodeMovieDistortion":
         return not node.mute
-    data = plate.image if plate.bl_idname == _PICTURES[0] else plate.clip
-    return node.bl_idname == "CompositorNodeScale" and tuple(data.size) != scene_setup.render_size(scene)
+    return node.bl_idname == "CompositorNodeScale" and size_of(present(_shown(plate))) != scene_setup.render_size(scene)

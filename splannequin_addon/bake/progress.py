@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import bpy
 from bpy.app.handlers import persistent
@@ -33,14 +32,14 @@ def _renders() -> list[tuple[Watch, Progress]]:
 
 
 @persistent
-def _on_frame(*_: Any) -> None:
+def _on_frame(*_: object) -> None:
     for watch, now in _renders():
         watch.work = Work("bake", None, _progress(now.done + 1, now.total))
         watch.redraw = True
 
 
 @persistent
-def _on_end(*_: Any) -> None:
+def _on_end(*_: object) -> None:
     for watch, now in _renders():
         watch.work = None
         watch.redraw = True

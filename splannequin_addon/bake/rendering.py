@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import bpy
 
@@ -16,7 +15,7 @@ DIGITS = "######"
 _DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (what Blender gives a new file)
 
 
-def frames_of(scene: Any) -> range:
+def frames_of(scene: bpy.types.Scene) -> range:
     """Frames that a bake is about: the scene's range and step, as Blender renders them."""
     return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
 
@@ -26,7 +25,7 @@ def default_output(shot: Path, take: str) -> Path:
     return shot / "bake" / take
 
 
-def choose_output(scene: Any, shot: Path, take: str) -> list[str]:
+def choose_output(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
     """Gives the scene an output path if it still has Blender's default; returns what was changed, in words."""
     if scene.render.filepath not in _DEFAULT_OUTPUTS:
         return []
@@ -36,7 +35,7 @@ def choose_output(scene: Any, shot: Path, take: str) -> list[str]:
 
 
 def render(
-    scene: Any,
+    scene: bpy.types.Scene,
     folder: Path,
     png: bool = True,
     on_frame: Callable[[int, int], None] | None = None,
@@ -65,7 +64,7 @@ def render(
     done: list[int] = []
     stopped: list[BaseException] = []
 
-    def count(rendered: Any, *_: Any) -> None:
+    def count(rendered: bpy.types.Scene, *_: object) -> None:
         try:
             done.append(rendered.frame_current)
             if on_frame:

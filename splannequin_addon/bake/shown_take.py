@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
 from ..shot import made
 from . import freeze_group
 
+if TYPE_CHECKING:
+    import bpy
 
-def shown(scene: Any, shot: Path) -> str:
+
+def shown(scene: bpy.types.Scene, shot: Path) -> str:
     """Name of the take of this shot that the scene's compositor shows; empty if there is none, or another shot's."""
     there = freeze_group.shown(scene)
     return there[0].name if there is not None and there[0].parent == contract.ShotFolder(shot).takes else ""
 
 
-def stale_scale(scene: Any, shot: Path) -> bool:
+def stale_scale(scene: bpy.types.Scene, shot: Path) -> bool:
     """True if the shot was scaled since its take was put into the compositor: its depth does not fit the scene's."""
     there = freeze_group.shown(scene)
     if there is None or not shown(scene, shot):
@@ -25,7 +28,7 @@ def stale_scale(scene: Any, shot: Path) -> bool:
     return abs(there[1] - scale) > 1e-4 * scale
 
 
-def follow_scale(scene: Any, shot: Path) -> list[str]:
+def follow_scale(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """Brings the depth of a take in the compositor to the shot's scale; returns what was changed, in words."""
     if not stale_scale(scene, shot):
         return []

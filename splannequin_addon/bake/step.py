@@ -10,6 +10,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
+from ..access import present, settings_of
 from ..freeze import takes
 from ..process import backend, jobs
 from ..process.steps import Step, View
@@ -31,9 +32,9 @@ class Bake(Step):
     classes = (*operators.CLASSES, *panel.CLASSES)
     parts = (progress,)
 
-    def params(self, scene: Any) -> contract.FreezeParams:
+    def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:
         """What the take was asked for with, for the frames of the scene's range."""
-        props, folder = scene.splannequin, chosen.shot_folder(scene)
+        props, folder = settings_of(scene), chosen.shot_folder(scene)
         params = takes.params_of(scene)
         if folder is None:
             return params
@@ -45,30 +46,32 @@ class Bake(Step):
         params.first, params.last, params.step = scene.frame_start, scene.frame_end, scene.frame_step
         return params
 
-    def view(self, scene: Any, state: ShotState | None) -> View:
+    def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Bake: whether the freeze is in the scene's compositor."""
-        if state is None or scene.splannequin.take_name not in state.takes:
+        if state is None or settings_of(scene).take_name not in state.takes:
             return View(False, False, [], self.needs)
         tree = compat.compositor_tree(scene)
         if tree is None or freeze_group.group_node(tree) is None:
             return View(False, True, [], "Put the freeze before your compositor's output and render.")
         there, take = freeze_group.shown(scene), shown_take.shown(scene, state.folder)
-        if there is not None and take != scene.splannequin.take_name:
+        if there is not None and take != settings_of(scene).take_name:
             shown = f"take {take}" if take else f"another shot, {made.name_of(there[0].parent.parent)}"
             lines = [f"Your compositor shows {shown}: the one that was baked last."]
             return View(False, True, lines, "Baking puts this take in its place.")
-        lines = ["The freeze is in your compositor.", *unsure(state.takes[scene.splannequin.take_name])]
+        lines = ["The freeze is in your compositor.", *unsure(state.takes[settings_of(scene).take_name])]
         if shown_take.stale_scale(scene, state.folder):
             lines.append("The shot was scaled since: its depth is stale until you bake again.")
         if not scene_setup.keeps_plate_colours(scene):
-            lines.append(f"The view transform {scene.view_settings.view_transform} changes the plate's colours.")
+            lines.append(
+                f"The view transform {present(scene.view_settings).view_transform} changes the plate's colours."
+            )
         return View(True, True, lines, f"Frames go to {scene.render.filepath}")
 
-    def finish(self, scene: Any, job: jobs.Job) -> list[str]:
+    def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """The take comes into the compositor."""
         return insertion.insert_freeze(scene, job.shot, job.params["take"])
 
-    def arrive(self, scene: Any, job: jobs.Job) -> bool:
+    def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
         """In turns: Blender reads pictures, compositor and render."""
         insertion.bring_in(scene, job.shot, str(job.params["take"]), alone=False)
         return True
@@ -83,21 +86,21 @@ class Bake(Step):
             return "The compositor shows this take: bake another one, or remove the shot from the scene, first"
         return ""
 
-    def stands(self, scene: Any, shot: Path) -> bool:
+    def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
         """True if the compositor shows a take of the shot."""
         return _baked(scene) == shot
 
-    def remove(self, scene: Any, shot: Path, others: list[Path]) -> list[str]:
+    def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
         """Takes the freeze out of the compositor, unless it is another shot's."""
         gone = _baked(scene) not in others and insertion.remove(scene)
         return ["The freeze left the compositor."] if gone else []
 
-    def scaled(self, scene: Any, shot: Path) -> list[str]:
+    def scaled(self, scene: bpy.types.Scene, shot: Path) -> list[str]:
         """Depth in the compositor is in scene units."""
         return shown_take.follow_scale(scene, shot)
 
 
-def _baked(scene: Any) -> Path | None:
+def _baked(scene: bpy.types.Scene) -> Path | None:
     """The shot whose take the compositor shows."""
     there = freeze_group.shown(scene)
     return there[0].parent.parent if there is not None else None

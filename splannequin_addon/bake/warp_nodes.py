@@ -7,9 +7,13 @@ four pixels around a place are looked up as they are, and blended by how far the
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from .. import compat
+from ..access import set_value
+
+if TYPE_CHECKING:
+    import bpy
 
 LAYERS = ("Combined", "Alpha", "ST", "Matte")
 """Of a warp: the fill, how opaque the frozen frame is, coordinates, and how much the plate gives."""
@@ -17,7 +21,9 @@ _STEPS = 256.0
 _WIDE = 180.0
 
 
-def frozen(tree: Any, plate: Any, warp: Any, size: tuple[int, int]) -> Any:
+def frozen(
+    tree: bpy.types.NodeTree, plate: bpy.types.NodeSocket, warp: bpy.types.NodeOutputs, size: tuple[int, int]
+) -> bpy.types.NodeSocket:
     """Socket of a plate frozen by a warp, as large as the warp.
 
     Args:
@@ -30,11 +36,11 @@ def frozen(tree: Any, plate: Any, warp: Any, size: tuple[int, int]) -> Any:
     plate = compat.sized(tree, plate, size)
     s, t = compat.new_coordinates(tree, warp["ST"])
     (left, right, across), (low, high, up) = (_between(tree, v, n) for v, n in zip((s, t), size, strict=True))
-    rows = [
+    below, above = (
         _mixed(tree, across, compat.new_look_up(tree, plate, left, y), compat.new_look_up(tree, plate, right, y))
         for y in (low, high)
-    ]
-    shown = _mixed(tree, up, *rows)
+    )
+    shown = _mixed(tree, up, below, above)
     whole = _mixed(tree, 1.0, _mixed(tree, 1.0, shown, warp["Matte"], "MULTIPLY"), warp["Combined"], "ADD")
     whole = compat.with_alpha(tree, whole, warp["Alpha"])
     for column, node in enumerate(n for n in tree.nodes if n.name not in there):
@@ -42,14 +48,16 @@ def frozen(tree: Any, plate: Any, warp: Any, size: tuple[int, int]) -> Any:
     return whole
 
 
-def _between(tree: Any, share: Any, size: int) -> tuple[Any, Any, Any]:
+def _between(
+    tree: bpy.types.NodeTree, share: bpy.types.NodeSocket, size: int
+) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
     """Two neighbouring pixels of a row of `size`, 0..1 over it, and how far towards the second one a place lies."""
 
-    def on(source: Any, operation: str, *values: float) -> Any:
+    def on(source: bpy.types.NodeSocket, operation: str, *values: float) -> bpy.types.NodeSocket:
         node = compat.new_math_node(tree, operation)
         tree.links.new(source, node.inputs[0])
         for socket, value in zip(node.inputs[1:], values, strict=False):
-            socket.default_value = value
+            set_value(socket, value)
         return node.outputs[0]
 
     steps = on(on(share, "MULTIPLY_ADD", _STEPS * size, -0.5 * _STEPS), "ROUND")
@@ -64,10 +72,16 @@ def _between(tree: Any, share: Any, size: int) -> tuple[Any, Any, Any]:
     return at[0], at[1], rest.outputs[0]
 
 
-def _mixed(tree: Any, amount: Any, one: Any, other: Any, blend: str = "MIX") -> Any:
+def _mixed(
+    tree: bpy.types.NodeTree,
+    amount: bpy.types.NodeSocket | float,
+    one: bpy.types.NodeSocket,
+    other: bpy.types.NodeSocket,
+    blend: str = "MIX",
+) -> bpy.types.NodeSocket:
     """Socket of two pictures, or a picture and a value, mixed."""
     _, factor, first, second, result = compat.new_mix_node(tree, blend)
-    if isinstance(amount, float):
+    if isinstance(amount, (float, int)):
         factor.default_value = amount
     else:
         tree.links.new(amount, factor)

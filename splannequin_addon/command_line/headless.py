@@ -24,6 +24,7 @@ import bpy
 
 from ...torch_backend import contract
 from ...torch_backend.contract import ExitCode
+from ..access import scene_in, settings_of
 from ..bake import insertion, rendering
 from ..freeze import takes
 from ..process import backend, begin, jobs, steps
@@ -74,7 +75,7 @@ _interrupts: list[int] = []
 """Signals that asked this command to stop."""
 
 
-def _interrupt(number: int, frame: Any) -> None:
+def _interrupt(number: int, frame: object) -> None:
     """Remembered, because Blender swallows what is raised in a handler of its own while it renders."""
     _interrupts.append(number)
     raise KeyboardInterrupt
@@ -158,7 +159,7 @@ def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
     output = _output(args)
     shot = output / (args.shot_name + contract.SHOT_SUFFIX)
     scene, fresh = _scene(args.blend)
-    scene.splannequin.shot_path = str(shot)
+    settings_of(scene).shot_path = str(shot)
     requests = asked(args)
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
@@ -188,7 +189,7 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
     shot = _shot(args)
     output = _output(args)
     scene, fresh = _scene(args.blend)
-    scene.splannequin.shot_path = str(shot)
+    settings_of(scene).shot_path = str(shot)
     if fresh:  # else the range is the artist's, like everything else in the file
         _fit_range(scene, shot, args.take)
     first = scene.frame_start if args.first is None else args.first
@@ -257,8 +258,8 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
 
 def _one_step(args: argparse.Namespace, console: Console, step: str, shot: str) -> int:
     (params,) = asked(args).values()
-    scene = bpy.context.scene
-    scene.splannequin.shot_path = str(Path(shot).absolute())
+    scene = scene_in(bpy.context)
+    settings_of(scene).shot_path = str(Path(shot).absolute())
     job = begin.begin(scene, step, params)
     result = begin.wait(job, console)
     if console.as_json:
@@ -277,12 +278,12 @@ def _scene(blend: str) -> tuple[Any, bool]:
             raise FileNotFoundError(f"{path} does not exist: --blend names a .blend file")
         bpy.ops.wm.open_mainfile(filepath=str(path))
     if bpy.data.filepath:
-        return bpy.context.scene, False
+        return scene_in(bpy.context), False
     bpy.ops.wm.read_homefile(use_empty=True)
-    return bpy.context.scene, True
+    return scene_in(bpy.context), True
 
 
-def _fit_range(scene: Any, shot: Path, take: str) -> None:
+def _fit_range(scene: bpy.types.Scene, shot: Path, take: str) -> None:
     """A new scene's range: the take's, or the clip's before there is a take."""
     state = contents.read(shot)
     facts = state.takes.get(take)
@@ -290,7 +291,7 @@ def _fit_range(scene: Any, shot: Path, take: str) -> None:
 
 
 def _bake(
-    scene: Any,
+    scene: bpy.types.Scene,
     fresh: bool,
     shot: Path,
     take: str,
@@ -320,7 +321,7 @@ def _bake(
     }
 
 
-def _save(scene: Any, blend: Path, frames: Path) -> None:
+def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
     """Saves the file with paths relative to it, so that its folder can be moved and rendered elsewhere."""
     files = bpy.context.preferences.filepaths
     backups = files.save_version
@@ -328,7 +329,7 @@ def _save(scene: Any, blend: Path, frames: Path) -> None:
         # The first save gives the file its place; what is relative to it is only known then.
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
         files.save_version = 0
-        scene = bpy.context.scene
+        scene = scene_in(bpy.context)
         sequences.relative_images()
         scene.render.filepath = paths.blend_path(frames / rendering.DIGITS)
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..scene import scene_setup
 from ..shot import chosen, contents
 from ..shot.shot_state import ShotState
 from . import plate
 
+if TYPE_CHECKING:
+    import bpy
 
-def imported(scene: Any, shot: Path) -> list[str]:
+
+def imported(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """After the import: the scene takes the clip's size, rate and range if it is new or the artist consents."""
     state = contents.read(shot)
-    props = scene.splannequin
+    props = settings_of(scene)
     chosen.see(scene, state)
     first, last = state.frame_range
     if not first <= props.t_star <= last:
@@ -26,9 +30,9 @@ def imported(scene: Any, shot: Path) -> list[str]:
     return changes
 
 
-def fit(scene: Any, state: ShotState, force_k: bool = False) -> list[str]:
+def fit(scene: bpy.types.Scene, state: ShotState, force_k: bool = False) -> list[str]:
     """Size, rate and range of the scene as the clip's, if the artist consents; with `force_k` as the solved plates'."""
-    props = scene.splannequin
+    props = settings_of(scene)
     if not (props.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
         return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]
     size, k = state.size, None

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
+from ..access import Outcome, layout_of, scene_in, settings_of
 from ..process import supervisor
 from ..shot import chosen
 from ..ui import icons, step_operator
@@ -26,27 +25,27 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
     filter_movie: BoolProperty(name="Movies Only", description="Show videos only", default=True, options={"HIDDEN"})
     filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """A file that was dropped is used; from a menu, one is chosen."""
         if self.filepath:
             return self.execute(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Sets the clip; another clip than before begins with a shot of its own, beside one that was imported."""
-        props = context.scene.splannequin
+        props = settings_of(scene_in(context))
         if not self.filepath:
             self.report({"ERROR"}, "No file was given")
             return {"CANCELLED"}
-        known = [i for i, one in enumerate(chosen.settings(context.scene)) if one.clip == self.filepath]
+        known = [i for i, one in enumerate(chosen.settings(scene_in(context))) if one.clip == self.filepath]
         if known and len(props.shots):
-            chosen.choose(context.scene, known[0])
+            chosen.choose(scene_in(context), known[0])
         elif props.clip != self.filepath:
-            folder = chosen.shot_folder(context.scene)
+            folder = chosen.shot_folder(scene_in(context))
             state = supervisor.watch_of(folder).state if folder is not None else None
             if state is not None and state.frames:
-                chosen.add(context.scene)
+                chosen.add(scene_in(context))
             props.clip, props.shot_path = self.filepath, ""
         self.report({"INFO"}, "Clip chosen: press Import Clip in the Splannequin tab")
         return {"FINISHED"}
@@ -60,13 +59,13 @@ class SPLANNEQUIN_OT_use_movie_clip(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """On where a clip is shown."""
         return getattr(context.space_data, "clip", None) is not None
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Hands its file on."""
-        return bpy.ops.splannequin.use_clip(filepath=bpy.path.abspath(context.space_data.clip.filepath))
+        return bpy.ops.splannequin.use_clip(filepath=bpy.path.abspath(context.space_data.clip.filepath))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class SPLANNEQUIN_PT_movie_clip(bpy.types.Panel):
@@ -78,10 +77,10 @@ class SPLANNEQUIN_PT_movie_clip(bpy.types.Panel):
     bl_region_type = "UI"
     bl_category = "Splannequin"
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """One button; the five steps are in the 3D view."""
-        self.layout.operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
-        self.layout.label(text="Then see the 3D view's sidebar.", icon="INFO")
+        layout_of(self).operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
+        layout_of(self).label(text="Then see the 3D view's sidebar.", icon="INFO")
 
 
 class SPLANNEQUIN_FH_video(bpy.types.FileHandler):
@@ -93,7 +92,7 @@ class SPLANNEQUIN_FH_video(bpy.types.FileHandler):
     bl_file_extensions = VIDEO
 
     @classmethod
-    def poll_drop(cls, context: Any) -> bool:
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
         """Only over the 3D view."""
         return context.area is not None and context.area.type == "VIEW_3D"
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 
+from ..access import scene_in, settings_of
 from ..process import backend, steps, supervisor
 from ..shot import chosen
 from ..ui import icons, preferences, step_panel
@@ -21,9 +20,9 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
     operator = "splannequin.import_clip"
     folds = "footage"
 
-    def draw_settings(self, context: Any, layout: Any) -> None:
+    def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Clip, range, shot folder."""
-        props = context.scene.splannequin
+        props = settings_of(scene_in(context))
         layout.prop(props, "clip", text="")
         row = layout.row(heading="Range")
         row.prop(props, "use_range", text="")
@@ -32,11 +31,11 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
         span.prop(props, "first", text="")
         span.prop(props, "last", text="")
 
-    def draw_trouble(self, context: Any, layout: Any) -> None:
+    def draw_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """No backend, no shot folder: what to do about it."""
         self._backend_trouble(context, layout)
         watch = self._watch(context)
-        if watch is not None and chosen.missing(context.scene, watch.state):
+        if watch is not None and chosen.missing(scene_in(context), watch.state):
             box = layout.box()
             column = box.column(align=True)
             column.alert = True
@@ -44,7 +43,7 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
             wrap(column, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
             box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
 
-    def _backend_trouble(self, context: Any, layout: Any) -> None:
+    def _backend_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """No backend, or one that is being set up."""
         trouble, setup = supervisor.backend_trouble(), preferences.running_setup()
         if setup is not None:
@@ -64,17 +63,17 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
             box.operator("splannequin.set_up", icon=icons.of("splannequin.set_up"))
             box.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = backend.PACKAGE
 
-    def _label(self, context: Any, view: steps.View) -> str:
+    def _label(self, context: bpy.types.Context, view: steps.View) -> str:
         watch = self._watch(context)
-        gone = watch is not None and chosen.missing(context.scene, watch.state)
+        gone = watch is not None and chosen.missing(scene_in(context), watch.state)
         return "Import Anew" if gone else super()._label(context, view)
 
-    def draw_advanced(self, context: Any, layout: Any) -> None:
+    def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Shot folder, which frames are solved, consent to set the scene up."""
-        layout.prop(context.scene.splannequin, "shot_path", text="Folder")
-        layout.prop(context.scene.splannequin, "solve_step")
-        layout.prop(context.scene.splannequin, "fps")
-        layout.prop(context.scene.splannequin, "set_up_scene")
+        layout.prop(settings_of(scene_in(context)), "shot_path", text="Folder")
+        layout.prop(settings_of(scene_in(context)), "solve_step")
+        layout.prop(settings_of(scene_in(context)), "fps")
+        layout.prop(settings_of(scene_in(context)), "set_up_scene")
 
 
 CLASSES = (SPLANNEQUIN_PT_footage,)

@@ -4,11 +4,11 @@ once. Neither the scene's own camera nor anything else of the artist's is touche
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import bpy
 
 from ...torch_backend import contract
+from ..access import camera_of
 from ..scene import sequences
 from ..shot import made
 
@@ -16,7 +16,7 @@ _REACH = 1e-2
 """How far the camera sees, in scene units: the plate alone, nothing of the scene stands before it."""
 
 
-def show(scene: Any, shot: Path) -> Any | None:
+def show(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object | None:
     """Makes the camera, in place of an earlier one of the shot; None if the import's frames are not there.
 
     Args:
@@ -32,8 +32,8 @@ def show(scene: Any, shot: Path) -> Any | None:
     data = bpy.data.cameras.new(name)
     data.clip_start, data.clip_end = 0.1 * _REACH, _REACH
     background = data.background_images.new()
-    background.image = sequences.load_sequence(path, f"Clip {made.name_of(shot)}", "srgb")
-    sequences.show_sequence(background.image_user, background.image, first, last)
+    background.image = image = sequences.load_sequence(path, f"Clip {made.name_of(shot)}", "srgb")
+    sequences.show_sequence(background.image_user, image, first, last)
     background.frame_method, background.display_depth, background.alpha = "FIT", "BACK", 1.0
     data.show_background_images = True
     camera = made.new(scene, shot).plate = bpy.data.objects.new(name, data)
@@ -41,17 +41,18 @@ def show(scene: Any, shot: Path) -> Any | None:
     return camera
 
 
-def find(scene: Any, shot: Path) -> Any | None:
+def find(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object | None:
     """The camera, if the scene still has it."""
     return made.part(scene, shot, "plate")
 
 
-def remove(scene: Any, shot: Path) -> bool:
+def remove(scene: bpy.types.Scene, shot: Path) -> bool:
     """Takes the camera out of the file. True if it was there."""
     camera = find(scene, shot)
     if camera is None:
         return False
-    data, images = camera.data, [b.image for b in camera.data.background_images]
+    data = camera_of(camera)
+    images = [b.image for b in data.background_images]
     bpy.data.objects.remove(camera)
     if not data.users:
         bpy.data.cameras.remove(data)

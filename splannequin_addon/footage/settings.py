@@ -26,7 +26,7 @@ class ImportSettings:
         name="Shot Seen",
         description="Shot folder that was there when this file was last at work: it can be missed",
         subtype="DIR_PATH",
-        options=compat.PATH_OPTIONS | {"HIDDEN"},
+        options={*compat.PATH_OPTIONS, "HIDDEN"},
     )
     use_range: BoolProperty(
         name="Only a Range", description="Import a part of the clip instead of all of it", default=False, options=set()

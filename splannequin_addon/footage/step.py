@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..process import jobs, supervisor
 from ..process.steps import Step, View
 from ..scene import paths
 from ..shot.shot_state import ShotState
 from . import arrival, operators, panel, plate
+
+if TYPE_CHECKING:
+    import bpy
 
 
 class Import(Step):
@@ -24,24 +28,24 @@ class Import(Step):
     makes_shot = True
     classes = (*operators.CLASSES, *panel.CLASSES)
 
-    def params(self, scene: Any) -> contract.ImportParams:
+    def params(self, scene: bpy.types.Scene) -> contract.ImportParams:
         """The clip and its range. JobError without a clip."""
-        props = scene.splannequin
+        props = settings_of(scene)
         if not props.clip:
             raise contract.JobError("No clip is chosen.", "Choose a video or image sequence.", contract.ExitCode.USAGE)
         span = (props.first, props.last) if props.use_range else (None, None)
         return contract.ImportParams(paths.absolute(props.clip), *span, step=props.solve_step, fps=props.fps)
 
-    def view(self, scene: Any, state: ShotState | None) -> View:
+    def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Footage: what was imported."""
         if state is None or not state.frames:
-            chosen = bool(scene.splannequin.clip)
+            chosen = bool(settings_of(scene).clip)
             return View(False, True, [], "Import the clip." if chosen else "Choose a clip of people holding still.")
         (width, height), (first, last) = state.size, state.frame_range
         lines = [f"{state.frames} frames, {first} to {last}", f"{width} x {height}, {state.info.get('fps', 0):g} fps"]
         return View(True, True, lines, "Next: solve the camera.")
 
-    def finish(self, scene: Any, job: jobs.Job) -> list[str]:
+    def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """The scene is fitted to the clip, which shows behind a camera."""
         return arrival.imported(scene, job.shot)
 
@@ -50,7 +54,7 @@ class Import(Step):
         if job.state != "done":
             contract.discard_unborn(job.shot)
 
-    def look(self, window: Any, scene: Any, shot: Path) -> None:
+    def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
         """Through the camera that shows the clip."""
         camera = plate.find(scene, shot)
         if camera is not None:

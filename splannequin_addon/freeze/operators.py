@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 from bpy.props import StringProperty
 
 from ...torch_backend import contract
+from ..access import Outcome, scene_in, settings_of
 from ..process import supervisor
 from ..shot import chosen, markers
 from ..translations import tr
@@ -23,16 +22,16 @@ class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
     bl_options = {"REGISTER"}
     step = "freeze"
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Runs the step. In a window a camera of the artist's is read a few frames per turn of the timer."""
-        scene = context.scene
+        scene = scene_in(context)
         folder = chosen.shot_folder(scene)
         if not own_camera.name_of(scene) or folder is None or bpy.app.background:
             return super().execute(context)
         takes.read_in_turns(scene, folder, self.step)
         return {"FINISHED"}
 
-    def params(self, scene: Any) -> Any:
+    def params(self, scene: bpy.types.Scene) -> contract.FreezeParams | None:
         """Reads the artist's camera, if one is chosen, all at once."""
         return takes.read_camera(scene, self.step)
 
@@ -44,17 +43,17 @@ class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
     bl_label = "Set t* from Current Frame"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Takes the current frame, held within the clip's range."""
-        scene = context.scene
+        scene = scene_in(context)
         folder = chosen.shot_folder(scene)
         frame = scene.frame_current
         state = supervisor.watch_of(folder).state if folder else None
         if state is not None and state.frames:
             first, last = state.frame_range
             frame = min(max(frame, first), last)
-        scene.splannequin.t_star = frame
-        scene.splannequin.choose_t_star = True
+        settings_of(scene).t_star = frame
+        settings_of(scene).choose_t_star = True
         return {"FINISHED"}
 
 
@@ -65,9 +64,9 @@ class SPLANNEQUIN_OT_t_star_marker(bpy.types.Operator):
     bl_label = "Marker for t*"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Adds or removes the marker."""
-        markers.toggle(context.scene)
+        markers.toggle(scene_in(context))
         return {"FINISHED"}
 
 
@@ -79,27 +78,27 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a trained run, and where there is no view."""
         if viewport.session() is not None:
             return True  # it can be stopped, whatever became of the run
         if bpy.app.background:
             cls.poll_message_set(tr("There is no 3D view"))
             return False
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         state = supervisor.watch_of(folder).state if folder else None
-        if state is None or context.scene.splannequin.run_name not in state.runs:
+        if state is None or settings_of(scene_in(context)).run_name not in state.runs:
             cls.poll_message_set(tr("Train first"))
             return False
         return True
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Starts or stops the session."""
         if viewport.session() is not None:
             viewport.end()
             return {"FINISHED"}
         try:
-            viewport.begin(context.scene)
+            viewport.begin(scene_in(context))
         except contract.JobError as error:
             self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}
@@ -116,18 +115,18 @@ class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
     step: bpy.props.IntProperty(name="Step", description="1: the next one, -1: the one before", default=1)
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """On while scrubbing: the backend ranks the instants."""
         if not viewport.suggestions():
             cls.poll_message_set(tr("Suggestions come with Scrub in View"))
             return False
         return True
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Takes the nearest suggestion on that side; at the end, the first on the other."""
-        props = context.scene.splannequin
+        props = settings_of(scene_in(context))
         frames = sorted(s["frame"] for s in viewport.suggestions())
-        now = viewport.instant(context.scene)
+        now = viewport.instant(scene_in(context))
         beyond = [f for f in frames if now is None or (f - now) * self.step > 0]
         ordered = beyond or frames
         props.t_star = ordered[0] if self.step > 0 else ordered[-1]
@@ -144,14 +143,14 @@ class SPLANNEQUIN_OT_pick_take(pick_operators.Pick, bpy.types.Operator):
 
     name: StringProperty(name="Take", description="Name of the take", options={"SKIP_SAVE"})
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Sets the take's name."""
         state = pick_operators.known(context)[1]
         if self.name not in state.takes:
             refusal = state.damaged["take"].get(self.name) or f"This shot has no take {self.name!r}"
             self.report({"ERROR"}, tr(refusal))
             return {"CANCELLED"}
-        context.scene.splannequin.take_name = self.name
+        settings_of(scene_in(context)).take_name = self.name
         return {"FINISHED"}
 
 

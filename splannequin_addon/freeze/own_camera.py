@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..scene import axes, scene_setup
 from ..shot import chosen, contents, made
 
 
 def in_solve(
-    scene: Any, shot: Path, view_matrix: Any, window_matrix: Any, width: int, height: int
+    scene: bpy.types.Scene, shot: Path, view_matrix: Matrix, window_matrix: Matrix, width: int, height: int
 ) -> tuple[list[float], list[float]]:
     """(viewmat, K) in solve units of what a view of the scene shows.
 
@@ -37,7 +37,7 @@ def in_solve(
     return axes.in_solve(view_matrix, window_matrix, placed, made.depth_scale(scene, shot), (width, height))
 
 
-def sample_path(scene: Any, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:
+def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:
     """Reads an animated camera over the scene's range, a frame per turn; yields frames done, returns the CameraPath.
 
     Nothing of bpy is kept between two turns. The scene's current frame is put back at the end.
@@ -88,17 +88,17 @@ def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[in
     return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size), "blender")
 
 
-def name_of(scene: Any) -> str:
+def name_of(scene: bpy.types.Scene) -> str:
     """Name of the artist's camera to freeze from; empty for the clip's own move."""
-    camera, folder = scene.splannequin.path_camera, chosen.shot_folder(scene)
+    camera, folder = settings_of(scene).path_camera, chosen.shot_folder(scene)
     if camera is None or folder is None or camera == made.part(scene, folder, "camera"):
         return ""
     return str(camera.name)
 
 
-def follows_camera(scene: Any) -> bool:
+def follows_camera(scene: bpy.types.Scene) -> bool:
     """True if a bake has to look at the artist's camera again: the take was seen from one, and one is chosen."""
     folder = chosen.shot_folder(scene)
     if folder is None or not name_of(scene):
         return False
-    return bool(contents.read(folder).takes.get(scene.splannequin.take_name, {}).get("camera_path"))
+    return bool(contents.read(folder).takes.get(settings_of(scene).take_name, {}).get("camera_path"))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 
+from ..access import layout_of, scene_in, settings_of
 from ..process import steps
 from ..shot import markers
 from ..translations import tr
@@ -28,9 +27,9 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
     operator = "splannequin.freeze"
     folds = "freeze"
 
-    def draw_settings(self, context: Any, layout: Any) -> None:
+    def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The instant."""
-        props = context.scene.splannequin
+        props = settings_of(scene_in(context))
         row = layout.row()
         if props.choose_t_star:
             row.prop(props, "choose_t_star", text="t*")
@@ -40,37 +39,41 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
             words = tr(f"t*: {at}, suggested") if at is not None else tr("t* as suggested")
             row.prop(props, "choose_t_star", text=words, translate=False)
         row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
-        shown = context.scene.timeline_markers.get(markers.NAME) is not None
+        shown = scene_in(context).timeline_markers.get(markers.NAME) is not None
         row.operator("splannequin.t_star_marker", text="", icon="MARKER_HLT" if shown else "MARKER", depress=shown)
 
-    def _suggested(self, context: Any) -> int | None:
+    def _suggested(self, context: bpy.types.Context) -> int | None:
         """The instant that is taken while none is chosen, once it is known: scrubbing asks for it, so does Freeze."""
-        session, watch, props = viewport.session(), self._watch(context), context.scene.splannequin
-        at = viewport.instant(context.scene) if session is not None and watch and session.shot == watch.shot else None
+        session, watch, props = viewport.session(), self._watch(context), settings_of(scene_in(context))
+        at = (
+            viewport.instant(scene_in(context))
+            if session is not None and watch and session.shot == watch.shot
+            else None
+        )
         if at is not None:
             return round(at)
         take = watch.state.takes.get(props.take_name) if watch is not None and watch.state is not None else None
         return props.t_star if take is not None and take["t_star_frame"] == props.t_star else None
 
-    def draw_always(self, context: Any, layout: Any) -> None:
+    def draw_always(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Scrubbing: it can be stopped whatever runs, and whatever became of the shot."""
         watch, live = self._watch(context), layout.column()
         live.enabled = can_scrub(self._view(context), watch.running() if watch else None)
         self._live(context, live)
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """The step's body, and the takes to compare."""
         super().draw(context)
         watch = self._watch(context)
         if watch is None or watch.state is None or not watch.state.listed("take"):
             return
-        body = step_panel.sub_panel(self.layout, "takes", "Takes")  # type: ignore[attr-defined]
+        body = step_panel.sub_panel(layout_of(self), "takes", "Takes")
         if body is not None:
-            listing.draw(body, "take", watch.state, context.scene.splannequin.take_name)
+            listing.draw(body, "take", watch.state, settings_of(scene_in(context)).take_name)
             for told in watch.state.damaged["take"].values():
                 wrap(body, context, told, "ERROR")
 
-    def _live(self, context: Any, layout: Any) -> None:
+    def _live(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Scrubbing: on or off, what is shown, suggestions and why."""
         session = viewport.session()
         row = layout.row(align=True)
@@ -84,18 +87,18 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
             return
         row.operator("splannequin.suggested_instant", text="", icon="TRIA_LEFT").step = -1
         row.operator("splannequin.suggested_instant", text="", icon="TRIA_RIGHT").step = 1
-        layout.row().prop(context.scene.splannequin, "live_show", expand=True)
-        wrap(layout, context, viewport.reason(context.scene), "INFO")
+        layout.row().prop(settings_of(scene_in(context)), "live_show", expand=True)
+        wrap(layout, context, viewport.reason(scene_in(context)), "INFO")
 
-    def draw_advanced(self, context: Any, layout: Any) -> None:
+    def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The take's name, what it is made of, its size, and where it is seen from."""
-        layout.prop(context.scene.splannequin, "take_name")
-        layout.prop(context.scene.splannequin, "detail")
-        layout.prop(context.scene.splannequin, "develop")
-        layout.prop(context.scene.splannequin, "freeze_width")
-        layout.prop(context.scene.splannequin, "overscan")
-        layout.prop(context.scene.splannequin, "path_camera")
-        camera = context.scene.splannequin.path_camera
+        layout.prop(settings_of(scene_in(context)), "take_name")
+        layout.prop(settings_of(scene_in(context)), "detail")
+        layout.prop(settings_of(scene_in(context)), "develop")
+        layout.prop(settings_of(scene_in(context)), "freeze_width")
+        layout.prop(settings_of(scene_in(context)), "overscan")
+        layout.prop(settings_of(scene_in(context)), "path_camera")
+        camera = settings_of(scene_in(context)).path_camera
         if camera is not None and camera.data.dof.use_dof:
             wrap(
                 layout,

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
+from ..access import scene_holding
 from ..process import supervisor
 from ..shot import chosen
 from ..translations import tr
 
 
-def takes_of(props: Any) -> list[tuple[str, str]]:
+def takes_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
     """(name, what it is) of the takes of the shot that `props` names, for the field's list."""
-    folder = chosen.shot_folder(props.id_data)
+    folder = chosen.shot_folder(scene_holding(props))
     state = supervisor.watch_of(folder).state if folder else None
     takes = state.takes.items() if state is not None else ()
     return [(name, tr(f"t* {take['t_star_frame']}, run {take['run']}")) for name, take in takes]
@@ -38,7 +37,7 @@ class FreezeSettings:
         name="Camera",
         description="Animated camera to see the frozen instant from; empty: the clip's own move",
         type=bpy.types.Object,
-        poll=lambda _, item: item.type == "CAMERA",
+        poll=lambda _, item: getattr(item, "type", "") == "CAMERA",
         options=set(),
     )
     detail: BoolProperty(

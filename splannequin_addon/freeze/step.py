@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..process import jobs
 from ..process.steps import Step, View
 from ..shot.shot_state import ShotState
 from . import operators, panel, takes, viewport
+
+if TYPE_CHECKING:
+    import bpy
 
 
 class Freeze(Step):
@@ -24,15 +28,15 @@ class Freeze(Step):
     classes = (*operators.CLASSES, *panel.CLASSES)
     parts = (viewport,)
 
-    def params(self, scene: Any) -> contract.FreezeParams:
+    def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:
         """The instant, and what the frames are made of."""
         return takes.params_of(scene)
 
-    def view(self, scene: Any, state: ShotState | None) -> View:
+    def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Freeze: which frames there are."""
-        if state is None or scene.splannequin.run_name not in state.runs:
+        if state is None or settings_of(scene).run_name not in state.runs:
             return View(False, False, [], self.needs)
-        take = state.takes.get(scene.splannequin.take_name)
+        take = state.takes.get(settings_of(scene).take_name)
         if take is None:
             return View(False, True, [], "Render the clip's move with time standing still.")
         frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
@@ -42,10 +46,10 @@ class Freeze(Step):
         lines = [frames, *beyond, instant, *contract.verdict_lines(take)]
         return View(True, True, lines, "Next: bake it into your compositor.")
 
-    def finish(self, scene: Any, job: jobs.Job) -> list[str]:
+    def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """An instant that nobody chose is the one that was taken."""
-        if not scene.splannequin.choose_t_star:
-            scene.splannequin.t_star = int(job.result["t_star_frame"])
+        if not settings_of(scene).choose_t_star:
+            settings_of(scene).t_star = int(job.result["t_star_frame"])
         return []
 
     def in_use(self, shot: Path, folder: Path) -> str:

@@ -12,6 +12,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
+from ..access import settings_of
 from ..process import backend, begin, steps, supervisor
 from ..shot import chosen, contents
 from . import own_camera
@@ -20,9 +21,9 @@ READING_SECONDS = 0.02
 """Of a turn of the timer, spent on reading a camera; one frame of a heavy scene may take longer."""
 
 
-def params_of(scene: Any) -> contract.FreezeParams:
+def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
     """What a take is asked for with, from what the artist set."""
-    props = scene.splannequin
+    props = settings_of(scene)
     return contract.FreezeParams(
         run=props.run_name,
         take=props.take_name,
@@ -37,10 +38,10 @@ def params_of(scene: Any) -> contract.FreezeParams:
     )
 
 
-def keyed_instants(scene: Any) -> dict[str, float]:
+def keyed_instants(scene: bpy.types.Scene) -> dict[str, float]:
     """Frame -> t* of a keyed t*, for every frame of the clip and of the scene's range; empty if it is not keyed."""
     curve = next((c for c in compat.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
-    if curve is None or not scene.splannequin.choose_t_star:
+    if curve is None or not settings_of(scene).choose_t_star:
         return {}
     folder = chosen.shot_folder(scene)
     first, last = contents.read(folder).frame_range if folder else (scene.frame_start, scene.frame_end)
@@ -48,18 +49,25 @@ def keyed_instants(scene: Any) -> dict[str, float]:
     return {str(n): min(max(float(curve.evaluate(n)), first), last) for n in range(low, high + 1)}
 
 
-def freeze_from(scene: Any, path: contract.CameraPath, step: str = "freeze") -> contract.FreezeParams:
+def freeze_from(scene: bpy.types.Scene, path: contract.CameraPath, step: str = "freeze") -> contract.FreezeParams:
     """Parameters of a take from a camera path, which is written into the shot. OSError if it cannot be.
 
     A bake is about a part of the take: where the camera was not looked at now, it stays as it was.
     """
     folder = begin.needed(scene, step)
-    file = contract.ShotFolder(folder).camera_path(scene.splannequin.take_name)
+    file = contract.ShotFolder(folder).camera_path(settings_of(scene).take_name)
     if step == "bake" and file.is_file():
         path = _with_rest(path, contract.CameraPath.load(file))
     contract.write_json(file, path.to_json(), parents=False)
-    params = steps.STEPS[step].params(scene)
+    params = _asked(scene, step)
     params.camera_path, params.width = str(file), path.width
+    return params
+
+
+def _asked(scene: bpy.types.Scene, step: str) -> contract.FreezeParams:
+    """What the step freeze or bake asks for by the settings."""
+    params = steps.STEPS[step].params(scene)
+    assert isinstance(params, contract.FreezeParams)
     return params
 
 
@@ -139,12 +147,12 @@ def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
     return set(range(first, last + 1))
 
 
-def read_camera(scene: Any, step: str) -> contract.FreezeParams | None:
+def read_camera(scene: bpy.types.Scene, step: str) -> contract.FreezeParams | None:
     """What a step asks for from the artist's camera, read all at once; None if none is chosen."""
     name, folder = own_camera.name_of(scene), chosen.shot_folder(scene)
     if not name or folder is None:
         return None
-    turns = own_camera.sample_path(scene, name, folder, steps.STEPS[step].params(scene).width)
+    turns = own_camera.sample_path(scene, name, folder, _asked(scene, step).width)
     while True:
         try:
             next(turns)
@@ -152,10 +160,10 @@ def read_camera(scene: Any, step: str) -> contract.FreezeParams | None:
             return freeze_from(scene, end.value, step)
 
 
-def read_in_turns(scene: Any, shot: Path, step: str) -> None:
+def read_in_turns(scene: bpy.types.Scene, shot: Path, step: str) -> None:
     """Has the artist's camera read by the timer; then the take is begun, by the step freeze or bake."""
     supervisor.watch_of(shot).notes.clear()
-    turns = own_camera.sample_path(scene, own_camera.name_of(scene), shot, steps.STEPS[step].params(scene).width)
+    turns = own_camera.sample_path(scene, own_camera.name_of(scene), shot, _asked(scene, step).width)
     total = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
     supervisor.work(shot, step, reading(scene.name, shot, step, turns, total))
 

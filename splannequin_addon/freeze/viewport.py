@@ -17,8 +17,10 @@ import gpu
 import numpy as np
 from bpy.app.handlers import persistent
 from gpu_extras.batch import batch_for_shader
+from mathutils import Matrix
 
 from ...torch_backend import contract
+from ..access import scene_in, settings_of
 from ..process import backend
 from ..shot import chosen, made
 from . import live, own_camera
@@ -53,12 +55,12 @@ def failure() -> tuple[str, str] | None:
     return _told
 
 
-def begin(scene: Any) -> None:
+def begin(scene: bpy.types.Scene) -> None:
     """Starts drawing the scene's run. JobError if there is no run, no backend, or no window."""
     global _session, _handler, _told
     if bpy.app.background:
         raise contract.JobError("There is no view to draw in.", "Use Freeze.", contract.ExitCode.USAGE)
-    shot, run = chosen.shot_folder(scene), scene.splannequin.run_name
+    shot, run = chosen.shot_folder(scene), settings_of(scene).run_name
     if shot is None or not contract.RunFolder(contract.ShotFolder(shot).runs / run).checkpoint.is_file():
         raise contract.JobError(f"There is no trained run {run!r}.", "Train first.", contract.ExitCode.USAGE)
     end()
@@ -88,26 +90,26 @@ def end() -> None:
     redraw()
 
 
-def _show_points(scene: Any, shot: Path, shown: bool) -> None:
+def _show_points(scene: bpy.types.Scene, shot: Path, shown: bool) -> None:
     """Opens or closes the eye of our point cloud: its dots would cover the picture."""
     cloud = made.part(scene, shot, "points")
-    for layer in scene.view_layers if cloud is not None else ():
-        if cloud.name in layer.objects:
+    for layer in scene.view_layers:
+        if cloud is not None and cloud.name in layer.objects:
             cloud.hide_set(not shown, view_layer=layer)
 
 
-def instant(scene: Any) -> float | None:
+def instant(scene: bpy.types.Scene) -> float | None:
     """The frame at which time stands still in the view: the artist's t*, else the best suggestion; None before any."""
-    props = scene.splannequin
+    props = settings_of(scene)
     if props.choose_t_star:
         return float(props.t_star)
     suggested = _session.facts.get("suggestions") if _session is not None else None
     return float(suggested[0]["frame"]) if suggested else None
 
 
-def _suggest(scene: Any) -> None:
+def _suggest(scene: bpy.types.Scene) -> None:
     """Has an instant that nobody chose be the one that is drawn: what is shown and what is set agree."""
-    at, props = instant(scene), scene.splannequin
+    at, props = instant(scene), settings_of(scene)
     if at is not None and not props.choose_t_star and props.t_star != round(at):
         props.t_star = round(at)
 
@@ -117,7 +119,7 @@ def suggestions() -> list[dict[str, Any]]:
     return list(_session.facts.get("suggestions", [])) if _session is not None else []
 
 
-def reason(scene: Any) -> str:
+def reason(scene: bpy.types.Scene) -> str:
     """One sentence about the instant in the view: why it is a good one, or where better ones are."""
     if _session is None or not _session.facts:
         return "The backend is loading the run."
@@ -158,7 +160,7 @@ def _tick() -> float | None:
         end()
         return None
     scenes = [s for s in bpy.data.scenes if chosen.shot_folder(s) == _session.shot]
-    if not any(s.splannequin.run_name == _session.run for s in scenes):
+    if not any(settings_of(s).run_name == _session.run for s in scenes):
         end()  # another file, another shot or another run
         return None
     for scene in scenes:
@@ -167,7 +169,11 @@ def _tick() -> float | None:
         _session.drawn,
         (
             bool(_session.facts),
-            *((instant(s), p.live_show, p.detail, p.develop, s.frame_current) for s in scenes for p in [s.splannequin]),
+            *(
+                (instant(s), p.live_show, p.detail, p.develop, s.frame_current)
+                for s in scenes
+                for p in [settings_of(s)]
+            ),
         ),
     )
     now = time.monotonic()
@@ -190,7 +196,12 @@ def _moving(now: float) -> bool:
 
 
 def view_of(
-    scene: Any, shot: Path, size: tuple[int, int], matrices: tuple[Any, Any], t_star: float, pixels: int
+    scene: bpy.types.Scene,
+    shot: Path,
+    size: tuple[int, int],
+    matrices: tuple[Matrix, Matrix],
+    t_star: float,
+    pixels: int,
 ) -> contract.LiveView | None:
     """What a view of the scene shows, as the backend is asked for it; None for an orthographic view.
 
@@ -208,7 +219,7 @@ def view_of(
     shrink = min(1.0, (pixels / max(1, size[0] * size[1])) ** 0.5)
     width, height = max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
     viewmat, K = own_camera.in_solve(scene, shot, matrices[0], matrices[1], width, height)
-    return contract.LiveView(0, 0, viewmat, K, width, height, t_star, show=scene.splannequin.live_show)
+    return contract.LiveView(0, 0, viewmat, K, width, height, t_star, show=settings_of(scene).live_show)
 
 
 def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
@@ -223,7 +234,7 @@ def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
 def _draw() -> None:
     """One region's part: ask for what it shows, draw what has arrived."""
     context = bpy.context
-    scene, region, view = context.scene, context.region, context.region_data
+    scene, region, view = scene_in(context), context.region, context.region_data
     if _session is None or view is None or chosen.shot_folder(scene) != _session.shot:
         return
     t_star = instant(scene)
@@ -238,8 +249,8 @@ def _draw() -> None:
     if view.view_perspective == "CAMERA" and scene.camera == made.part(scene, _session.shot, "camera"):
         quick.exposed_like = sharp.exposed_like = float(scene.frame_current)
     quick.view = sharp.view = key
-    sharp.detail = scene.splannequin.detail and sharp.show == "color"
-    quick.develop = sharp.develop = scene.splannequin.develop
+    sharp.detail = settings_of(scene).detail and sharp.show == "color"
+    quick.develop = sharp.develop = settings_of(scene).develop
     _ask(key, quick, sharp)
     frame = _session.frames.get(key)
     if frame is not None:
@@ -262,14 +273,14 @@ def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:
             _session.ask(sharp)
 
 
-def _paint(key: int, frame: live.Frame, view: Any, scale: float) -> None:
+def _paint(key: int, frame: live.Frame, view: bpy.types.RegionView3D, scale: float) -> None:
     """Draws a frame over the region, each pixel at its own depth."""
     shader = _shader_of()
     seq, colour, depth = _shown.get(key, (-1, None, None))
     if seq != frame.asked.seq:
         h, w = frame.depth.shape
-        colour = gpu.types.GPUTexture((w, h), format="RGBA16F", data=_buffer(frame.rgba))
-        depth = gpu.types.GPUTexture((w, h), format="R32F", data=_buffer(frame.depth * np.float32(scale)))
+        colour = gpu.types.GPUTexture((w, h), format="RGBA16F", data=_buffer(frame.rgba))  # pyright: ignore[reportCallIssue]
+        depth = gpu.types.GPUTexture((w, h), format="R32F", data=_buffer(frame.depth * np.float32(scale)))  # pyright: ignore[reportCallIssue]
         _shown[key] = (frame.asked.seq, colour, depth)
     window = view.window_matrix
     batch = batch_for_shader(shader, "TRI_STRIP", {"pos": ((-1, -1), (1, -1), (-1, 1), (1, 1))})
@@ -290,14 +301,14 @@ def _paint(key: int, frame: live.Frame, view: Any, scale: float) -> None:
 
 def _buffer(values: np.ndarray) -> Any:
     values = np.ascontiguousarray(values, dtype=np.float32)
-    return gpu.types.Buffer("FLOAT", values.size, values.ravel())
+    return gpu.types.Buffer("FLOAT", values.size, values.ravel())  # pyright: ignore[reportCallIssue]
 
 
 def _shader_of() -> Any:
     """The shader, made at the first draw: there is no GPU context before."""
     global _shader
     if _shader is None:
-        between = gpu.types.GPUStageInterfaceInfo("splannequin_frozen")
+        between = gpu.types.GPUStageInterfaceInfo("splannequin_frozen")  # pyright: ignore[reportCallIssue]
         between.smooth("VEC2", "at")
         info = gpu.types.GPUShaderCreateInfo()
         info.vertex_in(0, "VEC2", "pos")
@@ -331,7 +342,7 @@ def _shader_of() -> Any:
 
 
 @persistent
-def _on_load(*_: Any) -> None:
+def _on_load(*_: object) -> None:
     """Another file has other scenes."""
     end()
 

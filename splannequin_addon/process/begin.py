@@ -6,15 +6,18 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...torch_backend import contract
 from ..scene import scene_setup
 from ..shot import chosen, contents, markers
 from . import backend, jobs, steps
 
+if TYPE_CHECKING:
+    import bpy
 
-def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
+
+def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) -> jobs.Job:
     """Starts the job behind a step on the scene's shot, detached.
 
     Raises:
@@ -40,7 +43,7 @@ def begin(scene: Any, step: str, params: Any = None) -> jobs.Job:
     return job
 
 
-def needed(scene: Any, step: str) -> Path:
+def needed(scene: bpy.types.Scene, step: str) -> Path:
     """The scene's shot folder, which a step needs to be there unless it makes it. JobError says what to do."""
     folder = chosen.shot_folder(scene)
     if folder is None:
@@ -53,7 +56,7 @@ def needed(scene: Any, step: str) -> Path:
     return folder
 
 
-def remove_all(scene: Any, shot: Path) -> list[str]:
+def remove_all(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """Takes everything of a shot out of the file; its folder on disk stays. Returns what was done, in words.
 
     What another shot of the scene needs stays: its own things, and the settings of the scene.
@@ -73,7 +76,10 @@ def remove_all(scene: Any, shot: Path) -> list[str]:
 
 
 def run(
-    scene: Any, step: str, params: Any = None, on_event: Callable[[contract.Event], None] | None = None
+    scene: bpy.types.Scene,
+    step: str,
+    params: jobs.Params | None = None,
+    on_event: Callable[[contract.Event], None] | None = None,
 ) -> tuple[Any, list[str]]:
     """A whole step, blocking: for scripts and the command line. Returns the job's result and what changed, in words.
 

@@ -83,7 +83,11 @@ class Job:
         return self.status.state if self.status else "queued"
 
 
-def new_job(shot: Path, kind: str, params: Any) -> Job:
+Params = contract.ImportParams | contract.SolveParams | contract.TrainParams | contract.FreezeParams
+"""What a job may be asked for; `contract.PARAMS` by kind."""
+
+
+def new_job(shot: Path, kind: str, params: Params) -> Job:
     """Makes a job folder in `shot` with its request. `params` is the kind's dataclass of `contract.PARAMS`."""
     return Job(contract.new_job(shot, kind, params), kind, dataclasses.asdict(params))
 

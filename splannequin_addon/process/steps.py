@@ -9,11 +9,14 @@ from __future__ import annotations
 import stat
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 from ...torch_backend import contract
 from ..shot.shot_state import ShotState
 from . import jobs
+
+if TYPE_CHECKING:
+    import bpy
 
 
 @dataclass
@@ -62,19 +65,19 @@ class Step:
     parts: ClassVar[tuple[Part, ...]] = ()
     """Modules of its room with a `register` and an `unregister` of their own."""
 
-    def params(self, scene: Any) -> Any:
+    def params(self, scene: bpy.types.Scene) -> jobs.Params:
         """The backend's parameters, from what the artist set. JobError names what is missing."""
         raise NotImplementedError
 
-    def view(self, scene: Any, state: ShotState | None) -> View:
+    def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """What the panel shows of it, as the shot stands."""
         raise NotImplementedError
 
-    def finish(self, scene: Any, job: jobs.Job) -> list[str]:
+    def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """What a finished job changes in the scene; returns it in words."""
         return []
 
-    def arrive(self, scene: Any, job: jobs.Job) -> bool:
+    def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
         """Has the timer do the work of `finish` in turns, in a window. False if that is not needed."""
         return False
 
@@ -88,7 +91,7 @@ class Step:
     def ended(self, job: jobs.Job) -> None:
         """Its job has ended, well or not."""
 
-    def look(self, window: Any, scene: Any, shot: Path) -> None:
+    def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
         """What a window shows once a finished job has changed its scene."""
 
     def log(self, job: jobs.Job) -> Path | None:
@@ -103,15 +106,15 @@ class Step:
         """Why a run or take of a shot cannot be removed now, in words; empty if it can."""
         return ""
 
-    def stands(self, scene: Any, shot: Path) -> bool:
+    def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
         """True if something of a shot is in the scene."""
         return False
 
-    def remove(self, scene: Any, shot: Path, others: list[Path]) -> list[str]:
+    def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
         """Takes what it made for a shot out of the scene, but what `others`, shots too, need; says what was done."""
         return []
 
-    def scaled(self, scene: Any, shot: Path) -> list[str]:
+    def scaled(self, scene: bpy.types.Scene, shot: Path) -> list[str]:
         """Follows a shot that was scaled in the scene; returns what was changed, in words."""
         return []
 

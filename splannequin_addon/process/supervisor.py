@@ -18,6 +18,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..scene import sequences
 from ..shot import chosen, contents, made, markers
 from ..shot.shot_state import ShotState
@@ -302,12 +303,12 @@ def redraw() -> None:
                     region.tag_redraw()
 
 
-def look_through_camera(window: Any, camera: Any = None) -> None:
+def look_through_camera(window: bpy.types.Window, camera: bpy.types.Object | None = None) -> None:
     """Turns the window's first 3D view to the scene's camera, where the plate is; or to another one, which the view
     alone takes, until it is turned again."""
     for area in window.screen.areas:
         if area.type == "VIEW_3D":
-            space = area.spaces.active
+            space: Any = area.spaces.active
             if camera is not None:
                 space.use_local_camera, space.camera = True, camera
             elif space.use_local_camera and (space.camera is None or made.is_plate(space.camera)):  # or it is gone
@@ -327,12 +328,12 @@ def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
     change(watch, step, lambda scene: steps.STEPS[step].finish(scene, job))
 
 
-def window_of(scene: Any) -> Any | None:
+def window_of(scene: bpy.types.Scene) -> bpy.types.Window | None:
     """The window that shows a scene, if one does."""
     return next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
 
 
-def change(watch: Watch, step: str, how: Callable[[Any], list[str]], only: str = "") -> None:
+def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]], only: str = "") -> None:
     """Changes the scenes that work on a shot, or the one of them that is named `only`: as one undo step each in a
     window. Notes what was changed or why not."""
     for scene in [s for s in chosen.scenes_of(watch.shot) if only in ("", s.name)]:
@@ -342,10 +343,10 @@ def change(watch: Watch, step: str, how: Callable[[Any], list[str]], only: str =
                 watch.notes[step] = how(scene)
                 continue
             with bpy.context.temp_override(window=window, scene=scene):
-                before = scene.splannequin.t_star
+                before = settings_of(scene).t_star
                 watch.notes[step] = how(scene)
                 steps.STEPS[step].look(window, scene, watch.shot)
-                if watch.notes[step] or before != scene.splannequin.t_star:
+                if watch.notes[step] or before != settings_of(scene).t_star:
                     undo_step(step)
         except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
             watch.fail(step, error)
@@ -361,7 +362,7 @@ def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
 
 
 @persistent
-def _on_load(*_: Any) -> None:
+def _on_load(*_: object) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
     markers.forget()
     sequences.forget_ahead()

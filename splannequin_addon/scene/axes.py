@@ -6,11 +6,14 @@ world).
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...torch_backend import contract
+
+if TYPE_CHECKING:
+    from mathutils import Matrix
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenCV camera axes to Blender's, and back."""
@@ -65,7 +68,7 @@ def pixel_aspect(k: tuple[float, float, float, float]) -> tuple[float, float]:
 
 
 def in_solve(
-    view_matrix: Any, window_matrix: Any, placed: np.ndarray, scale: float, size: tuple[int, int]
+    view_matrix: Matrix, window_matrix: Matrix, placed: np.ndarray, scale: float, size: tuple[int, int]
 ) -> tuple[list[float], list[float]]:
     """(viewmat, K) in solve units of what a view shows.
 

@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 
 from .. import compat
+from ..access import settings_of
 
 _KINDS = ("objects", "cameras", "meshes", "collections", "node_groups", "actions", "images", "textures")
 """Kinds of data-blocks that are made here; users before what they use."""
@@ -25,7 +26,7 @@ _SETTINGS = {
 
 
 @contextlib.contextmanager
-def scene_of(scene: Any) -> Iterator[None]:
+def scene_of(scene: bpy.types.Scene) -> Iterator[None]:
     """Within it, a change is whole or nothing: if it raises, what it made is removed and what it set is set back.
 
     What it took away is not brought back: that has to come last, when nothing can fail any more.
@@ -36,7 +37,7 @@ def scene_of(scene: Any) -> Iterator[None]:
     camera = scene.camera.session_uid if scene.camera is not None else None
     switches = compat.compositor_switches(scene)
     own = {key: scene[key] for key in scene.keys() if key.startswith("splannequin_")}  # noqa: SIM118
-    made = len(scene.splannequin.made)
+    made = len(settings_of(scene).made)
     try:
         yield
     except BaseException:
@@ -51,12 +52,12 @@ def scene_of(scene: Any) -> Iterator[None]:
             del scene[key]
         for key, value in own.items():
             scene[key] = value
-        while len(scene.splannequin.made) > made:
-            scene.splannequin.made.remove(made)
+        while len(settings_of(scene).made) > made:
+            settings_of(scene).made.remove(made)
         raise
 
 
-def _owner(scene: Any, name: str) -> Any:
+def _owner(scene: bpy.types.Scene, name: str) -> Any:
     return {
         "scene": scene, "render": scene.render, "view_settings": scene.view_settings, "layer": scene.view_layers[0],
     }[name]  # fmt: skip

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...torch_backend import contract
+from ..access import present
 from . import axes
+
+if TYPE_CHECKING:
+    import bpy
 
 _BEFORE = "splannequin_settings_before"
 _OURS = "splannequin_settings_ours"
@@ -27,21 +31,21 @@ _NEUTRAL = ("Standard", "Un-tone-mapped")
 _VIEW = {"look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False}
 
 
-def untouched(scene: Any) -> bool:
+def untouched(scene: bpy.types.Scene) -> bool:
     """True if size, rate and range of the scene are those of a new file: nothing of the artist's would be lost."""
     render = scene.render
     size = (render.resolution_x, render.resolution_y) == (1920, 1080)
     return size and render.fps == 24 and (scene.frame_start, scene.frame_end) == (1, 250)
 
 
-def fitted(scene: Any) -> bool:
+def fitted(scene: bpy.types.Scene) -> bool:
     """True if `fit_clip` has changed the scene before: it is ours to fit again."""
     before = json.loads(scene.get(_BEFORE, "{}"))
     return "resolution_x" in before.get("render", {}) or "frame_start" in before.get("scene", {})
 
 
 def fit_clip(
-    scene: Any,
+    scene: bpy.types.Scene,
     size: tuple[int, int] | None,
     fps: float,
     frames: tuple[int, int],
@@ -81,7 +85,7 @@ def fit_clip(
     return changes
 
 
-def kept(scene: Any) -> str:
+def kept(scene: bpy.types.Scene) -> str:
     """Size, rate and range as they stand, and what of them was set here, as JSON: for `put_back`."""
     ours = json.loads(scene.get(_OURS, "{}"))
     now = {owner: {name: getattr(_owner(scene, owner), name) for name in names} for owner, names in _SHOTS.items()}
@@ -89,7 +93,7 @@ def kept(scene: Any) -> str:
     return json.dumps({"now": now, "ours": set_here})
 
 
-def put_back(scene: Any, was: str) -> None:
+def put_back(scene: bpy.types.Scene, was: str) -> None:
     """Sets size, rate and range as `kept` told them; nothing in a scene where none of them was ever set here."""
     if not was or not fitted(scene):
         return
@@ -106,7 +110,7 @@ def put_back(scene: Any, was: str) -> None:
         scene.frame_set(scene.frame_start)
 
 
-def keep_plate_colours(scene: Any) -> list[str]:
+def keep_plate_colours(scene: bpy.types.Scene) -> list[str]:
     """Sets the view transform so that pictures leave as they came in; returns what was changed, in words.
 
     Blender's default view (AgX) is made for renders and would change every plate. Dithering is noise on the last bit.
@@ -114,7 +118,8 @@ def keep_plate_colours(scene: Any) -> list[str]:
     """
     changes = []
     if not keeps_plate_colours(scene):
-        was, neutral = scene.view_settings.view_transform, _neutral(scene.view_settings)
+        view = present(scene.view_settings)
+        was, neutral = view.view_transform, _neutral(view)
         _set(scene, "view", {"view_transform": neutral, **_VIEW})
         changes.append(f"View transform set from {was} to {neutral}, so that the plate keeps its colours.")
     if scene.render.dither_intensity:
@@ -141,7 +146,7 @@ def _neutral(view: Any) -> str:
     )
 
 
-def render_cg(scene: Any) -> list[str]:
+def render_cg(scene: bpy.types.Scene) -> list[str]:
     """Has the scene rendered on a transparent film with a depth pass; returns what was changed, in words."""
     changes = []
     if not scene.render.film_transparent:
@@ -153,13 +158,13 @@ def render_cg(scene: Any) -> list[str]:
     return changes
 
 
-def keeps_plate_colours(scene: Any) -> bool:
+def keeps_plate_colours(scene: bpy.types.Scene) -> bool:
     """True if pictures leave the scene with the colours they came in with."""
-    view = scene.view_settings
+    view = present(scene.view_settings)
     return view.view_transform in _NEUTRAL and all(getattr(view, name) == value for name, value in _VIEW.items())
 
 
-def restore(scene: Any) -> bool:
+def restore(scene: bpy.types.Scene) -> bool:
     """Takes back the settings that were changed here, but what the artist has changed since. True if there was one.
 
     Settings that belong together (a size, a rate, a range) are taken back together or not at all.
@@ -179,7 +184,7 @@ def restore(scene: Any) -> bool:
     return True
 
 
-def _touched(scene: Any) -> dict[str, set[str]]:
+def _touched(scene: bpy.types.Scene) -> dict[str, set[str]]:
     """What was set here and is different now, with what belongs together with it, by owner: the artist's."""
     found = {}
     for owner, set_here in json.loads(scene.get(_OURS, "{}")).items():
@@ -194,13 +199,13 @@ def _same(one: Any, other: Any) -> bool:
     return abs(one - other) < 1e-5 if isinstance(other, float) else bool(one == other)
 
 
-def _owner(scene: Any, name: str) -> Any:
+def _owner(scene: bpy.types.Scene, name: str) -> Any:
     return {
         "scene": scene, "render": scene.render, "view": scene.view_settings, "layer": scene.view_layers[0],
     }[name]  # fmt: skip
 
 
-def _set(scene: Any, owner: str, values: dict[str, Any]) -> None:
+def _set(scene: bpy.types.Scene, owner: str, values: dict[str, Any]) -> None:
     """Changes settings; keeps in the scene what they were (unless that is kept already) and what they became."""
     target = _owner(scene, owner)
     before, ours = (json.loads(scene.get(key, "{}")) for key in (_BEFORE, _OURS))
@@ -213,7 +218,7 @@ def _set(scene: Any, owner: str, values: dict[str, Any]) -> None:
     scene[_BEFORE], scene[_OURS] = json.dumps(before), json.dumps(ours)
 
 
-def render_size(scene: Any) -> tuple[int, int]:
+def render_size(scene: bpy.types.Scene) -> tuple[int, int]:
     """Pixels that a render of the scene has."""
     render = scene.render
     share = render.resolution_percentage

@@ -34,7 +34,7 @@ def read(path: Path, name: str, encoding: str, first: int, last: int) -> None:
     _ahead.add(os.path.abspath(path))
 
 
-def load_sequence(path: Path, name: str, encoding: str) -> Any:
+def load_sequence(path: Path, name: str, encoding: str) -> bpy.types.Image:
     """An image sequence as a data-block, reused by path; `encoding` is "linear" or "srgb"."""
     wanted = os.path.abspath(path)
     for image in bpy.data.images:
@@ -60,7 +60,7 @@ def relative_images() -> None:
             image.filepath = paths.blend_path(Path(bpy.path.abspath(image.filepath)))
 
 
-def show_sequence(user: Any, image: Any, first: int, last: int) -> None:
+def show_sequence(user: Any, image: bpy.types.Image, first: int, last: int) -> None:
     """Makes an Image node (or an image user) show file n at scene frame n."""
     if hasattr(user, "image"):
         user.image = image

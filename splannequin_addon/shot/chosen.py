@@ -16,6 +16,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
+from ..access import OneShot, settings_of
 from ..scene import paths, scene_setup
 from . import made
 from .shot_state import ShotState
@@ -28,11 +29,12 @@ _ITEMS_OWN = ("rna_type", "name", "scene_settings")
 
 def names() -> list[str]:
     """Settings that belong to a shot."""
-    rna = bpy.types.Scene.bl_rna.properties["splannequin"].fixed_type.properties["shots"].fixed_type
+    held: Any = bpy.types.Scene.bl_rna.properties["splannequin"]
+    rna = held.fixed_type.properties["shots"].fixed_type
     return [one.identifier for one in rna.properties if one.identifier not in _ITEMS_OWN]
 
 
-def folder_of(one: Any) -> Path | None:
+def folder_of(one: OneShot) -> Path | None:
     """Shot folder that settings name; None while neither it nor a clip is chosen."""
     if one.shot_path:
         return Path(os.path.abspath(bpy.path.abspath(one.shot_path)))
@@ -46,26 +48,26 @@ def beside(clip: Path) -> Path:
     return clip.with_name(clip.stem + contract.SHOT_SUFFIX)
 
 
-def settings(scene: Any) -> list[Any]:
+def settings(scene: bpy.types.Scene) -> list[OneShot]:
     """The settings of every shot of a scene in order, the chosen one's where they are used; one without a list."""
-    held = scene.splannequin
+    held = settings_of(scene)
     return [held if i == held.loaded_shot else item for i, item in enumerate(held.shots)] or [held]
 
 
-def folders(scene: Any) -> list[Path | None]:
+def folders(scene: bpy.types.Scene) -> list[Path | None]:
     """Shot folders in order, None for a shot without a clip."""
     return [folder_of(one) for one in settings(scene)]
 
 
-def label(one: Any) -> str:
+def label(one: OneShot) -> str:
     """What a shot is called: as its folder, which is called as its clip."""
     folder = folder_of(one)
     return made.name_of(folder) if folder is not None else "New shot"
 
 
-def add(scene: Any) -> None:
+def add(scene: bpy.types.Scene) -> None:
     """Appends a shot with settings as at first, and chooses it."""
-    held = scene.splannequin
+    held = settings_of(scene)
     if not len(held.shots):
         _copy(held, held.shots.add())
         held.loaded_shot = 0
@@ -74,9 +76,9 @@ def add(scene: Any) -> None:
     choose(scene, held.active_shot)
 
 
-def choose(scene: Any, index: int) -> None:
+def choose(scene: bpy.types.Scene, index: int) -> None:
     """Puts the settings of a shot in place of the chosen one's, and makes its camera the scene's if it is there."""
-    held = scene.splannequin
+    held = settings_of(scene)
     if not len(held.shots):
         return
     index, before = min(max(index, 0), len(held.shots) - 1), held.loaded_shot
@@ -95,9 +97,9 @@ def choose(scene: Any, index: int) -> None:
         held.active_shot = index
 
 
-def remove(scene: Any, index: int) -> None:
+def remove(scene: bpy.types.Scene, index: int) -> None:
     """Takes a shot off the list, with its keys of t*; a neighbour is chosen in its place. Needs two or more."""
-    held = scene.splannequin
+    held = settings_of(scene)
     if index == held.loaded_shot:
         choose(scene, index + 1 if index + 1 < len(held.shots) else index - 1)
     chosen = held.loaded_shot
@@ -114,12 +116,12 @@ def _path(index: int) -> str:
     return f"splannequin.shots[{index}].t_star"
 
 
-def _copy(one: Any, other: Any) -> None:
+def _copy(one: OneShot, other: OneShot) -> None:
     for name in names():
         setattr(other, name, getattr(one, name))
 
 
-def _rename(scene: Any, paths: Mapping[str, str]) -> None:
+def _rename(scene: bpy.types.Scene, paths: Mapping[str, str]) -> None:
     """Has the scene's F-curves and drivers lead elsewhere, all at once."""
     drivers = scene.animation_data.drivers if scene.animation_data is not None else ()
     for curve in [*compat.fcurves(scene), *drivers]:
@@ -127,32 +129,32 @@ def _rename(scene: Any, paths: Mapping[str, str]) -> None:
             curve.data_path = paths[curve.data_path]
 
 
-def shot_folder(scene: Any) -> Path | None:
+def shot_folder(scene: bpy.types.Scene) -> Path | None:
     """Folder of the scene's shot, of several the chosen one; None while neither it nor a clip is chosen."""
-    return folder_of(scene.splannequin)
+    return folder_of(settings_of(scene))
 
 
-def scenes_of(shot: Path) -> list[Any]:
+def scenes_of(shot: Path) -> list[bpy.types.Scene]:
     """Scenes of the file that work on a shot: of several, it is the chosen one."""
     return [s for s in bpy.data.scenes if shot_folder(s) == shot]
 
 
-def scenes_with(shot: Path) -> list[Any]:
+def scenes_with(shot: Path) -> list[bpy.types.Scene]:
     """Scenes of the file that have a shot, chosen or not."""
     return [s for s in bpy.data.scenes if shot in folders(s)]
 
 
-def missing(scene: Any, state: ShotState | None) -> bool:
+def missing(scene: bpy.types.Scene, state: ShotState | None) -> bool:
     """True if the scene's shot was there before, and its folder is gone now."""
-    folder = folder_of(scene.splannequin)
+    folder = folder_of(settings_of(scene))
     if folder is None or (state is not None and state.info):
         return False
-    return paths.absolute(scene.splannequin.shot_seen) == str(folder) or made.of(scene, folder) is not None
+    return paths.absolute(settings_of(scene).shot_seen) == str(folder) or made.of(scene, folder) is not None
 
 
-def see(scene: Any, state: ShotState | None) -> None:
+def see(scene: bpy.types.Scene, state: ShotState | None) -> None:
     """Remembers that the scene's shot is there, so that it can be missed."""
-    folder, held = folder_of(scene.splannequin), scene.splannequin
+    folder, held = folder_of(settings_of(scene)), settings_of(scene)
     there = folder is not None and state is not None and state.frames and state.folder == folder
     if folder is not None and there and paths.absolute(held.shot_seen) != str(folder):
         held.shot_seen = paths.blend_path(folder)

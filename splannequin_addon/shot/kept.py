@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +15,7 @@ _MOST = 512
 _known: OrderedDict[tuple[Any, ...], tuple[tuple[int, ...], Any]] = OrderedDict()
 
 
-def of(path: Path, read: Callable[..., T], *words: Any) -> T:
+def of(path: Path, read: Callable[..., T], *words: Hashable) -> T:
     """`read(path, *words)`, remembered while file or folder is what it was: same file, same length, same times.
 
     The value is given out again and again: nobody may change it. What `read` raises is not remembered.

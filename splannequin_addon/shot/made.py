@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import bpy
 from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..scene import paths
 from ..scene.mark import TAG
 
@@ -42,9 +42,9 @@ def name_of(shot: Path) -> str:
     return shot.name.removesuffix(contract.SHOT_SUFFIX)
 
 
-def of(scene: Any, shot: Path) -> Any | None:
+def of(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made | None:
     """What was made for a shot, None if nothing was. Never writes: drawing asks."""
-    for entry in scene.splannequin.made:
+    for entry in settings_of(scene).made:
         if entry.name != name_of(shot):
             continue
         folder = os.path.abspath(bpy.path.abspath(entry.folder))
@@ -54,37 +54,37 @@ def of(scene: Any, shot: Path) -> Any | None:
     return None
 
 
-def new(scene: Any, shot: Path) -> Any:
+def new(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made:
     """`of`, made if it is not there."""
-    entry = of(scene, shot) or scene.splannequin.made.add()
+    entry = of(scene, shot) or settings_of(scene).made.add()
     entry.name, entry.folder = name_of(shot), paths.blend_path(shot)
     return entry
 
 
-def drop(scene: Any, shot: Path) -> None:
+def drop(scene: bpy.types.Scene, shot: Path) -> None:
     """Forgets a shot; what it points to stays."""
     entry = of(scene, shot)
     if entry is not None:
-        scene.splannequin.made.remove(list(scene.splannequin.made).index(entry))
+        settings_of(scene).made.remove(list(settings_of(scene).made).index(entry))
 
 
-def part(scene: Any, shot: Path, name: str) -> Any | None:
+def part(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | None:
     """One of `PARTS`, or the plate, if the scene still has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
     return item if item is not None and scene.objects.get(item.name) == item else None
 
 
-def keep_camera(scene: Any) -> None:
+def keep_camera(scene: bpy.types.Scene) -> None:
     """Remembers the scene's camera, before a shot's takes its place."""
     camera = scene.camera
-    if camera is not None and camera not in [entry.camera for entry in scene.splannequin.made]:
-        scene.splannequin.camera_before = camera
+    if camera is not None and camera not in [entry.camera for entry in settings_of(scene).made]:
+        settings_of(scene).camera_before = camera
 
 
-def give_camera_back(scene: Any) -> None:
+def give_camera_back(scene: bpy.types.Scene) -> None:
     """Where the scene's camera went with a shot: another shot's takes its place, or the one before all of them."""
-    held = scene.splannequin
+    held = settings_of(scene)
     if scene.camera is None:
         others = [entry.camera for entry in held.made] + [held.camera_before]
         scene.camera = next((c for c in others if c is not None and scene.objects.get(c.name) == c), None)
@@ -92,12 +92,12 @@ def give_camera_back(scene: Any) -> None:
         held.camera_before = None
 
 
-def tidy(scene: Any) -> None:
+def tidy(scene: bpy.types.Scene) -> None:
     """Lets go of what the artist deleted: the pointer would keep it in the file, out of sight."""
-    before = scene.splannequin.camera_before
+    before = settings_of(scene).camera_before
     if before is not None and not before.users_scene:
-        scene.splannequin.camera_before = None
-    for entry in scene.splannequin.made:
+        settings_of(scene).camera_before = None
+    for entry in settings_of(scene).made:
         for name in (*PARTS, "plate"):
             item = getattr(entry, name)
             if item is not None and not item.users_scene:
@@ -106,10 +106,10 @@ def tidy(scene: Any) -> None:
             entry.collection = None
 
 
-def adopt(scene: Any, shot: Path) -> None:
+def adopt(scene: bpy.types.Scene, shot: Path) -> None:
     """Takes over what 0.2.0 made, which marked objects instead: the one of each kind that kept its name."""
     name = name_of(shot)
-    if scene.splannequin.made or not any(o.get(TAG) == name for o in scene.objects):
+    if settings_of(scene).made or not any(o.get(TAG) == name for o in scene.objects):
         return
     entry = new(scene, shot)
     for item in [o for o in scene.objects if o.get(TAG) == name]:
@@ -122,12 +122,12 @@ def adopt(scene: Any, shot: Path) -> None:
         del collection[TAG]
 
 
-def depth_scale(scene: Any, shot: Path) -> float:
+def depth_scale(scene: bpy.types.Scene, shot: Path) -> float:
     """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
     root = part(scene, shot, "root")
-    return float(sum(root.matrix_world.to_scale()) / 3.0) if root else 1.0
+    return float(sum(root.matrix_world.to_scale()[:]) / 3.0) if root else 1.0
 
 
-def is_plate(camera: Any) -> bool:
+def is_plate(camera: bpy.types.Object) -> bool:
     """True of a camera that shows a clip until it is solved, whichever shot's."""
-    return any(entry.plate == camera for scene in bpy.data.scenes for entry in scene.splannequin.made)
+    return any(entry.plate == camera for scene in bpy.data.scenes for entry in settings_of(scene).made)

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
+
+from ..access import settings_of
+
+if TYPE_CHECKING:
+    import bpy
 
 NAME = "t*"
 _known: dict[str, tuple[int, int]] = {}
 """Scene -> (frame of the marker, t*) when they last agreed."""
 
 
-def toggle(scene: Any) -> bool:
+def toggle(scene: bpy.types.Scene) -> bool:
     """Puts the marker on the timeline, or takes it away. True if it is there now."""
     if remove(scene):
         return False
-    scene.timeline_markers.new(NAME, frame=scene.splannequin.t_star)
-    _known[scene.name] = (scene.splannequin.t_star, scene.splannequin.t_star)
+    scene.timeline_markers.new(NAME, frame=settings_of(scene).t_star)
+    _known[scene.name] = (settings_of(scene).t_star, settings_of(scene).t_star)
     return True
 
 
-def remove(scene: Any) -> bool:
+def remove(scene: bpy.types.Scene) -> bool:
     """Takes the marker away. True if there was one."""
     _known.pop(scene.name, None)
     marker = scene.timeline_markers.get(NAME)
@@ -28,9 +33,9 @@ def remove(scene: Any) -> bool:
     return True
 
 
-def follow(scene: Any) -> bool:
+def follow(scene: bpy.types.Scene) -> bool:
     """Lets whichever of marker and t* changed last lead. True if something was changed."""
-    marker, props = scene.timeline_markers.get(NAME), scene.splannequin
+    marker, props = scene.timeline_markers.get(NAME), settings_of(scene)
     if marker is None or marker.frame == props.t_star:
         if marker is not None:
             _known[scene.name] = (marker.frame, props.t_star)

@@ -17,6 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..scene import paths
 from ..scene.mark import TAG
 from . import chosen, contents, made
@@ -38,7 +39,7 @@ def source_of(state: ShotState) -> str:
     return next((os.path.normpath(p) for p in there if named and _there(p)), "")
 
 
-def locate(scene: Any, folder: Path) -> None:
+def locate(scene: bpy.types.Scene, folder: Path) -> None:
     """Makes `folder` the scene's shot, in place of one that was moved or renamed: what was made from that stays.
 
     Raises:
@@ -51,7 +52,7 @@ def locate(scene: Any, folder: Path) -> None:
     if not state.info:
         hint = "Choose the folder that holds shot.json; its name ends with .splannequin unless it was renamed."
         raise contract.JobError(f"{folder} is no shot folder.", hint, contract.ExitCode.USAGE)
-    held, before = scene.splannequin, chosen.folder_of(scene.splannequin)
+    held, before = settings_of(scene), chosen.folder_of(settings_of(scene))
     entry = made.of(scene, before) if before is not None else None
     if entry is not None and made.of(scene, folder) in (None, entry):
         entry.name, entry.folder = made.name_of(folder), paths.blend_path(folder)
@@ -73,7 +74,7 @@ def _there(path: Path) -> bool:
 def _holders() -> Iterator[tuple[Any, str]]:
     """(owner, property) of every path of ours in the file."""
     for scene in bpy.data.scenes:
-        held = scene.splannequin
+        held = settings_of(scene)
         for one in [held, *held.shots]:
             yield from ((one, name) for name in _SETTINGS)
         yield from ((entry, "folder") for entry in held.made)
@@ -88,7 +89,7 @@ def _relative(path: str, base: str) -> str:
 
 
 @persistent
-def _before_save(file: str = "", *_: Any) -> None:
+def _before_save(file: str = "", *_: object) -> None:
     """Paths become relative to where the file is being saved; with Blender's *Relative Paths* off only those that were
     relative to where it was."""
     _saving.clear()
@@ -103,7 +104,7 @@ def _before_save(file: str = "", *_: Any) -> None:
 
 
 @persistent
-def _after_save(file: str = "", *_: Any) -> None:
+def _after_save(file: str = "", *_: object) -> None:
     """A copy was saved, or nothing was: in the open file the paths stay as they were."""
     if file and _saving and os.path.abspath(file) != bpy.data.filepath:
         for (owner, name), path in zip(_holders(), _saving, strict=True):
@@ -112,7 +113,7 @@ def _after_save(file: str = "", *_: Any) -> None:
 
 
 @persistent
-def _after_load(*_: Any) -> None:
+def _after_load(*_: object) -> None:
     """What an older file names by its whole path, and is not there, is looked for beside the .blend."""
     if not bpy.data.filepath:
         return

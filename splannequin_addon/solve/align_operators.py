@@ -6,9 +6,10 @@ be turned meanwhile. The same operators take the places of selected objects, for
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import blf
 import bpy
@@ -19,6 +20,7 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
 from ...torch_backend import contract
+from ..access import OperatorBase, Outcome, camera_of, mesh_of, present, scene_in
 from ..process import steps, supervisor
 from ..scene import axes
 from ..shot import chosen, made
@@ -55,7 +57,7 @@ def picking() -> Picking | None:
     return _picking
 
 
-def move(scene: Any, shot: Path, change: np.ndarray) -> list[str]:
+def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
     """Moves a shot's root by a change of the world as `alignment` makes them; returns what else was changed, in words.
 
     Args:
@@ -63,91 +65,96 @@ def move(scene: Any, shot: Path, change: np.ndarray) -> list[str]:
         shot: shot folder; its root is there.
         change: [4, 4], multiplied onto the root from the left.
     """
-    root, before = cameras.find(scene, shot, "EMPTY"), made.depth_scale(scene, shot)
-    uniform = max(root.scale) - min(root.scale) <= 1e-5 * max(root.scale)
+    root, before = present(cameras.find(scene, shot, "EMPTY")), made.depth_scale(scene, shot)
+    scale = root.scale[:]
+    uniform = max(scale) - min(scale) <= 1e-5 * max(scale)
     root.matrix_world = Matrix((change @ np.array(root.matrix_world, dtype=np.float64)).tolist())
     if uniform:  # to the last bit, whatever the decomposition left
-        root.scale = [sum(root.scale) / 3.0] * 3
+        root.scale = [sum(root.scale[:]) / 3.0] * 3
     bpy.context.view_layer.update()
     grown = made.depth_scale(scene, shot) / before
     if abs(grown - 1.0) < 1e-6:
         return []
     camera = cameras.find(scene, shot, "CAMERA")
     if camera is not None:
-        camera.data.clip_end *= grown
-        camera.data.clip_start *= grown
+        lens = camera_of(camera)
+        lens.clip_end *= grown
+        lens.clip_start *= grown
     return [note for step in steps.STEPS.values() for note in step.scaled(scene, shot)]
 
 
-def _shot_of(scene: Any) -> Path:
+def _shot_of(scene: bpy.types.Scene) -> Path:
     """The scene's shot; `poll` has seen to it that there is one."""
     shot = chosen.shot_folder(scene)
     assert shot is not None
     return shot
 
 
-def _centres(scene: Any, shot: Path) -> tuple[np.ndarray, np.ndarray]:
+def _centres(scene: bpy.types.Scene, shot: Path) -> tuple[np.ndarray, np.ndarray]:
     """Where the camera was and its upward directions, [F, 3] each, world."""
     poses = axes.poses(contract.CameraPath.load(contract.ShotFolder(shot).cameras))
-    poses = np.array(cameras.find(scene, shot, "EMPTY").matrix_world, dtype=np.float64) @ poses
+    poses = np.array(present(cameras.find(scene, shot, "EMPTY")).matrix_world, dtype=np.float64) @ poses
     return poses[:, :3, 3], poses[:, :3, 1]
 
 
-class _Aligns:
+class _Aligns(OperatorBase):
     """What the three share: clicks or selected objects, then a change of the root."""
 
     count = 0
     asked = ""
+    if TYPE_CHECKING:
+        places: Sequence[float]
+        selected: bool
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Off without the solve in the scene."""
-        shot = chosen.shot_folder(context.scene)
-        if shot is None or cameras.find(context.scene, shot, "EMPTY") is None:
-            cls.poll_message_set(tr("Load the camera of this shot first"))  # type: ignore[attr-defined]
+        shot = chosen.shot_folder(scene_in(context))
+        if shot is None or cameras.find(scene_in(context), shot, "EMPTY") is None:
+            cls.poll_message_set(tr("Load the camera of this shot first"))
             return False
         return True
 
     @classmethod
-    def description(cls, context: Any, properties: Any) -> str:
+    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         """Another tooltip for the button that takes selected objects."""
         return "The same from the places of the selected objects, such as empties" if properties.selected else ""
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Has points clicked, unless they are given or selected objects are to be taken."""
-        if self.selected or self.properties.is_property_set("places"):  # type: ignore[attr-defined]
+        if self.selected or self.properties.is_property_set("places"):
             return self.ready(context)
         return self._begin(context)
 
-    def ready(self, context: Any) -> set[str]:
+    def ready(self, context: bpy.types.Context) -> Outcome:
         """What follows once the points are there."""
         return self.execute(context)
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Moves the root."""
-        scene, shot = context.scene, _shot_of(context.scene)
+        scene, shot = scene_in(context), _shot_of(scene_in(context))
         context.view_layer.update()
         try:
             notes = move(scene, shot, self.change(scene, shot, self._places(context, shot)))
         except (contract.JobError, OSError, ValueError) as error:
             told = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
-            self.report({"ERROR"}, told)  # type: ignore[attr-defined]
+            self.report({"ERROR"}, told)
             return {"CANCELLED"}
         supervisor.watch_of(shot).notes["solve"] = notes
         for note in notes:
-            self.report({"INFO"}, note)  # type: ignore[attr-defined]
+            self.report({"INFO"}, note)
         return {"FINISHED"}
 
-    def change(self, scene: Any, shot: Path, places: np.ndarray) -> np.ndarray:
+    def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
         """The change [4, 4] for the points' places [count, 3], world."""
         raise NotImplementedError
 
-    def _places(self, context: Any, shot: Path) -> np.ndarray:
+    def _places(self, context: bpy.types.Context, shot: Path) -> np.ndarray:
         """The points as they were clicked, else the places of the selected objects, [count, 3], world."""
-        if self.properties.is_property_set("places"):  # type: ignore[attr-defined]
-            return np.array(self.places, dtype=np.float64).reshape(self.count, 3)  # type: ignore[attr-defined]
-        ours = [cameras.find(context.scene, shot, kind) for kind in ("EMPTY", "CAMERA", "MESH")]
-        picked = [o for o in context.selected_objects if o not in ours]
+        if self.properties.is_property_set("places"):
+            return np.array(self.places, dtype=np.float64).reshape(self.count, 3)
+        ours = [cameras.find(scene_in(context), shot, kind) for kind in ("EMPTY", "CAMERA", "MESH")]
+        picked = [o for o in present(context.selected_objects) if o not in ours]
         if len(picked) != self.count:
             raise contract.JobError(
                 f"{len(picked)} objects are selected, {self.count} are needed.",
@@ -156,14 +163,14 @@ class _Aligns:
             )
         return np.array([o.matrix_world.translation for o in picked], dtype=np.float64)
 
-    def _begin(self, context: Any) -> set[str]:
+    def _begin(self, context: bpy.types.Context) -> Outcome:
         global _picking
-        scene, shot = context.scene, _shot_of(context.scene)
+        scene, shot = scene_in(context), _shot_of(scene_in(context))
         cloud = cameras.find(scene, shot, "MESH")
-        xyz = points.coloured(cloud.data)[0] if cloud is not None else np.zeros((0, 3), np.float32)
+        xyz = points.coloured(mesh_of(cloud))[0] if cloud is not None else np.zeros((0, 3), np.float32)
         if bpy.app.background or not len(xyz):
             told = "There are no points to click: select objects that stand where they should be"
-            self.report({"ERROR"}, told)  # type: ignore[attr-defined]
+            self.report({"ERROR"}, told)
             return {"CANCELLED"}
         stop()
         _picking = self._mine = Picking(shot, xyz, self.count)
@@ -172,10 +179,10 @@ class _Aligns:
         self._tell(context)
         return {"RUNNING_MODAL"}
 
-    def modal(self, context: Any, event: Any) -> set[str]:
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """A click takes a point, Backspace gives the last one back, Esc or the right button ends it."""
         picked = _picking
-        root = cameras.find(context.scene, self._mine.shot, "EMPTY")
+        root = cameras.find(scene_in(context), self._mine.shot, "EMPTY")
         if picked is None or picked is not self._mine or root is None:  # another took over, or the shot was removed
             if picked is self._mine:
                 self.cancel(context)
@@ -205,7 +212,7 @@ class _Aligns:
         if event.type == "MOUSEMOVE" or view is None:
             return {"PASS_THROUGH"}
         if under < 0:
-            self.report({"INFO"}, "No point of the solve is there")  # type: ignore[attr-defined]
+            self.report({"INFO"}, "No point of the solve is there")
             return {"RUNNING_MODAL"}
         if under not in picked.picked:
             picked.picked.append(under)
@@ -218,18 +225,18 @@ class _Aligns:
         self.places = places.ravel().tolist()
         return self.picked(context)
 
-    def picked(self, context: Any) -> set[str]:
+    def picked(self, context: bpy.types.Context) -> Outcome:
         """What follows the last click."""
         return self.execute(context)
 
-    def cancel(self, context: Any) -> None:
+    def cancel(self, context: bpy.types.Context) -> None:
         """Ends the clicking; Blender calls it, too, when another file is opened."""
         if _picking is self._mine:
             stop()
         if context.workspace is not None:
             context.workspace.status_text_set(None)
 
-    def _tell(self, context: Any) -> None:
+    def _tell(self, context: bpy.types.Context) -> None:
         """What to do, in the status bar."""
         if _picking is None:
             return
@@ -267,7 +274,7 @@ class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
     places: _places_property(3)
     selected: _SELECTED
 
-    def change(self, scene: Any, shot: Path, places: np.ndarray) -> np.ndarray:
+    def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
         """Lays them into z = 0."""
         return alignment.level(places, *_centres(scene, shot))
 
@@ -284,7 +291,7 @@ class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
     places: _places_property(1)
     selected: _SELECTED
 
-    def change(self, scene: Any, shot: Path, places: np.ndarray) -> np.ndarray:
+    def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
         """Moves it to the origin."""
         return alignment.to_origin(places[0])
 
@@ -311,27 +318,27 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    def change(self, scene: Any, shot: Path, places: np.ndarray) -> np.ndarray:
+    def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
         """One factor for all axes."""
         return alignment.scaled(places, self.distance)
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Moves the root; from now on the scale is known."""
         outcome = super().execute(context)
-        entry = made.of(context.scene, _shot_of(context.scene))
+        entry = made.of(scene_in(context), _shot_of(scene_in(context)))
         if outcome == {"FINISHED"} and entry is not None:
             entry.scaled = True
         return outcome
 
-    def picked(self, context: Any) -> set[str]:
+    def picked(self, context: bpy.types.Context) -> Outcome:
         """Asks for the distance, in a call of its own: this one is still busy with the mouse."""
-        bpy.ops.splannequin.align_scale("INVOKE_DEFAULT", places=list(self.places))
+        bpy.ops.splannequin.align_scale("INVOKE_DEFAULT", places=list(self.places))  # pyright: ignore[reportAttributeAccessIssue]
         return {"CANCELLED"}
 
-    def ready(self, context: Any) -> set[str]:
+    def ready(self, context: bpy.types.Context) -> Outcome:
         """Asks for the distance, with what it is now."""
         try:
-            one, other = self._places(context, _shot_of(context.scene))
+            one, other = self._places(context, _shot_of(scene_in(context)))
         except contract.JobError as error:
             self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
             return {"CANCELLED"}
@@ -340,13 +347,13 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
         return context.window_manager.invoke_props_dialog(self)
 
 
-def scaled(scene: Any, shot: Path) -> bool:
+def scaled(scene: bpy.types.Scene, shot: Path) -> bool:
     """True if somebody gave a shot its scale: by Set Scale, or by hand on its root."""
     entry = made.of(scene, shot)
     return (entry is not None and entry.scaled) or abs(made.depth_scale(scene, shot) - 1.0) > 1e-5
 
 
-def view_under(window: Any, x: int, y: int) -> tuple[Any, Any] | None:
+def view_under(window: bpy.types.Window, x: int, y: int) -> tuple[Any, Any] | None:
     """(region, RegionView3D) of the 3D view under a place of a window in pixels; None beside it or over its sidebar."""
     for area in window.screen.areas:
         if area.type != "VIEW_3D":
@@ -367,7 +374,7 @@ def stop() -> None:
     _picking = None
 
 
-def _redraw(window: Any) -> None:
+def _redraw(window: bpy.types.Window) -> None:
     for area in window.screen.areas:
         if area.type == "VIEW_3D":
             area.tag_redraw()
@@ -376,7 +383,7 @@ def _redraw(window: Any) -> None:
 def _draw() -> None:
     """The points that were clicked, with their numbers, and the one under the mouse; in one region of a 3D view."""
     context = bpy.context
-    root = cameras.find(context.scene, _picking.shot, "EMPTY") if _picking is not None else None
+    root = cameras.find(scene_in(context), _picking.shot, "EMPTY") if _picking is not None else None
     if _picking is None or root is None or context.region_data is None:
         return
     scale = context.preferences.system.ui_scale
@@ -402,12 +409,12 @@ def _dot(at: tuple[float, float], radius: float, colour: tuple[float, float, flo
     rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) * radius + at
     corners = np.concatenate([np.insert(rim[i : i + 2], 0, at, axis=0) for i in range(16)])
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-    batch = batch_for_shader(shader, "TRIS", {"pos": corners.astype(np.float32)})
+    batch = batch_for_shader(shader, "TRIS", {"pos": corners.astype(np.float32)})  # pyright: ignore[reportArgumentType]
     shader.uniform_float("color", colour)
     batch.draw(shader)
 
 
-def draw(layout: Any) -> None:
+def draw(layout: bpy.types.UILayout) -> None:
     """The three buttons; beside each the one that takes selected objects."""
     column = layout.column(align=True)
     for operator in ("align_floor", "align_origin", "align_scale"):

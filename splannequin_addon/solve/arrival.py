@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ..footage import arrival, plate
 from ..scene import intact
 from ..shot import chosen, contents
 from . import cameras
 
+if TYPE_CHECKING:
+    import bpy
 
-def load_camera(scene: Any, shot: Path) -> list[str]:
+
+def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """Brings the solve into the scene. FileNotFoundError if there is none."""
     state = contents.read(shot)
     chosen.see(scene, state)

@@ -17,6 +17,7 @@ from mathutils import Matrix, Quaternion
 
 from ...torch_backend import contract
 from .. import compat
+from ..access import camera_of, present
 from ..scene import axes, intact, sequences
 from ..shot import contents, made
 from . import alignment, guesses
@@ -58,7 +59,7 @@ def scene_from_solve(
     return result
 
 
-def build(scene: Any, shot: Path) -> Any:
+def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     """Brings the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
 
     What an earlier call made for the same shot is replaced; the root's transform, which the artist may have set, stays.
@@ -81,14 +82,22 @@ def build(scene: Any, shot: Path) -> Any:
         # All that can fail comes before what was there is taken away.
         camera, cloud = _new_camera(shot, path), _new_points(shot, xyz, rgb)
         _place(scene, shot, camera, cloud, scene_from_solve(path, xyz, floor), _extent(path))
-        camera.data.clip_start, camera.data.clip_end = (v * made.depth_scale(scene, shot) for v in _clip(path, xyz))
+        lens = camera_of(camera)
+        lens.clip_start, lens.clip_end = (v * made.depth_scale(scene, shot) for v in _clip(path, xyz))
         guesses.mark(scene, shot, unsolved)
         made.keep_camera(scene)
         scene.camera = camera
     return camera
 
 
-def _place(scene: Any, shot: Path, camera: Any, cloud: Any, stands: np.ndarray, size: float) -> None:
+def _place(
+    scene: bpy.types.Scene,
+    shot: Path,
+    camera: bpy.types.Object,
+    cloud: bpy.types.Object,
+    stands: np.ndarray,
+    size: float,
+) -> None:
     """Puts a new camera and new points of a shot into the scene, in place of those that are there.
 
     Args:
@@ -119,13 +128,13 @@ def _place(scene: Any, shot: Path, camera: Any, cloud: Any, stands: np.ndarray, 
         collection.objects.link(item)
         item.parent = root
         item.hide_select = item is cloud
-        for block in (item, item.data):  # now that the names are free
+        for block in (item, present(item.data)):  # now that the names are free
             block.name = f"{name} {kind}"
             if block.animation_data is not None and block.animation_data.action is not None:
                 block.animation_data.action.name = f"{block.name}Action"
 
 
-def _new_camera(shot: Path, path: contract.CameraPath) -> Any:
+def _new_camera(shot: Path, path: contract.CameraPath) -> bpy.types.Object:
     """The solved camera with its keys and the plate behind it, in no scene yet."""
     name = made.name_of(shot)
     data = bpy.data.cameras.new(f"{name} camera")
@@ -136,7 +145,7 @@ def _new_camera(shot: Path, path: contract.CameraPath) -> Any:
     return camera
 
 
-def _new_points(shot: Path, xyz: np.ndarray, rgb: np.ndarray) -> Any:
+def _new_points(shot: Path, xyz: np.ndarray, rgb: np.ndarray) -> bpy.types.Object:
     """The sparse points as an object, in no scene yet."""
     name = f"{made.name_of(shot)} points"
     cloud = bpy.data.objects.new(name, _point_mesh(name, xyz, rgb))
@@ -145,13 +154,13 @@ def _new_points(shot: Path, xyz: np.ndarray, rgb: np.ndarray) -> Any:
     return cloud
 
 
-def find(scene: Any, shot: Path, kind: str) -> Any | None:
+def find(scene: bpy.types.Scene, shot: Path, kind: str) -> bpy.types.Object | None:
     """Our object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points). Never a copy that
     the artist made of it."""
     return made.part(scene, shot, _PARTS[kind])
 
 
-def remove(scene: Any, shot: Path) -> bool:
+def remove(scene: bpy.types.Scene, shot: Path) -> bool:
     """Takes everything that `build` made out of the file. True if there was something.
 
     What the artist hung on the root or put into the collection stays where it is in the scene.
@@ -166,7 +175,7 @@ def remove(scene: Any, shot: Path) -> bool:
     return True
 
 
-def _clear(scene: Any, shot: Path, but: tuple[str, ...] = ()) -> None:
+def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> None:
     """Removes what was built for a shot, except for the named parts and, with them, the collection."""
     entry = made.of(scene, shot)
     if entry is None:
@@ -197,9 +206,9 @@ def _clear(scene: Any, shot: Path, but: tuple[str, ...] = ()) -> None:
     bpy.data.collections.remove(collection)
 
 
-def _animate(camera: Any, path: contract.CameraPath) -> None:
+def _animate(camera: bpy.types.Object, path: contract.CameraPath) -> None:
     """Keys the camera on the clip's own frame numbers, straight between keys."""
-    data = camera.data
+    data = camera_of(camera)
     data.sensor_fit, data.sensor_width = "HORIZONTAL", axes.SENSOR_MM
     data.sensor_height = axes.SENSOR_MM * path.height / path.width
     camera.rotation_mode = "QUATERNION"
@@ -214,8 +223,8 @@ def _animate(camera: Any, path: contract.CameraPath) -> None:
         if before is not None and before.dot(rotation) < 0:  # q and -q turn alike, but keys would go the long way
             rotation.negate()
         before = rotation
-        places.append(tuple(location))
-        turns.append(tuple(rotation))
+        places.append(location[:])
+        turns.append(rotation[:])
     frames = [frame.frame for frame in path.frames]
     camera.location, camera.rotation_quaternion = places[-1], turns[-1]
     data.lens, data.shift_x, data.shift_y = lenses[-1]
@@ -226,7 +235,7 @@ def _animate(camera: Any, path: contract.CameraPath) -> None:
         compat.set_keys(data, frames, {n: columns[i][:, None] for i, n in enumerate(("lens", "shift_x", "shift_y"))})
 
 
-def _show_plate(data: Any, shot: Path, name: str) -> None:
+def _show_plate(data: bpy.types.Camera, shot: Path, name: str) -> None:
     """The undistorted plate behind the camera, fitting the sensor; frame n of the scene shows file n."""
     span = contents.plate_range(shot)
     if span is None:
@@ -236,8 +245,8 @@ def _show_plate(data: Any, shot: Path, name: str) -> None:
     if not path.is_file():
         return
     background = data.background_images.new()
-    background.image = sequences.load_sequence(path, f"Plate {name}", "srgb")
-    sequences.show_sequence(background.image_user, background.image, first, last)
+    background.image = image = sequences.load_sequence(path, f"Plate {name}", "srgb")
+    sequences.show_sequence(background.image_user, image, first, last)
     background.frame_method = "FIT"
     background.display_depth = "BACK"
     background.alpha = 1.0
@@ -259,12 +268,12 @@ def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:
         return stored["xyz"].astype(np.float32), stored["rgb"].astype(np.uint8)
 
 
-def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> Any:
+def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> bpy.types.Mesh:
     """A mesh of loose vertices with their colours in the point attribute "Col"."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(xyz))
     mesh.vertices.foreach_set("co", np.ascontiguousarray(xyz, dtype=np.float32).ravel())
-    colour = mesh.color_attributes.new("Col", "BYTE_COLOR", "POINT")
+    colour: Any = mesh.color_attributes.new("Col", "BYTE_COLOR", "POINT")
     rgba = np.ones((len(rgb), 4), dtype=np.float32)
     rgba[:, :3] = rgb / 255.0
     if len(rgb):

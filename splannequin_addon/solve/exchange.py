@@ -14,18 +14,19 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
+from ..access import present, settings_of, size_of
 from ..process import backend, children
 
 LEAST_TRACKED = 8
 """Frames that a tracked camera has to be solved for."""
 
 
-def params(scene: Any, shot: Path | None) -> contract.SolveParams:
+def params(scene: bpy.types.Scene, shot: Path | None) -> contract.SolveParams:
     """What the solve is asked for, from what the artist set; writes Blender's tracking into the shot if it is chosen.
 
     JobError names what is missing. OSError if the shot cannot be written.
     """
-    props = scene.splannequin
+    props = settings_of(scene)
     asked = contract.SolveParams(camera_model=props.camera_model)
     if props.cameras_from == "FILE":
         if not props.cameras_path:
@@ -46,7 +47,7 @@ def params(scene: Any, shot: Path | None) -> contract.SolveParams:
     return asked
 
 
-def transforms(clip: Any | None) -> dict[str, Any]:
+def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
     """The solved camera of a movie clip as the content of a transforms.json.
 
     Frames are named by the number that Splannequin counts by: the file's own in a sequence, 1 for a video's first.
@@ -58,8 +59,9 @@ def transforms(clip: Any | None) -> dict[str, Any]:
         raise contract.JobError(
             "No tracked clip is chosen.", "Choose the movie clip whose camera is solved.", contract.ExitCode.USAGE
         )
-    tracked = next((o for o in clip.tracking.objects if o.is_camera), None)
-    cameras = list(tracked.reconstruction.cameras) if tracked and tracked.reconstruction.is_valid else []
+    tracked = next((o for o in present(clip.tracking).objects if o.is_camera), None)
+    solved = present(tracked.reconstruction) if tracked else None
+    cameras = list(solved.cameras) if solved and solved.is_valid else []
     if len(cameras) < LEAST_TRACKED:
         raise contract.JobError(
             f"The camera of {clip.name} is solved for {len(cameras)} frames only."
@@ -74,14 +76,14 @@ def transforms(clip: Any | None) -> dict[str, Any]:
         "frames": [
             {
                 "file_path": f"{first + camera.frame - 1}.png",
-                "transform_matrix": [list(row) for row in camera.matrix],
+                "transform_matrix": [list(row[:]) for row in camera.matrix],
             }
             for camera in cameras
         ],
     }
 
 
-def first_number(clip: Any) -> int:
+def first_number(clip: bpy.types.MovieClip) -> int:
     """Our number of what a clip calls its frame 1."""
     number = 1
     if clip.source == "SEQUENCE":
@@ -90,12 +92,12 @@ def first_number(clip: Any) -> int:
     return number + clip.frame_offset
 
 
-def lens(clip: Any) -> dict[str, Any]:
+def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:
     """A clip's lens in nerfstudio's words. JobError for a distortion model that has none there.
 
     Blender's polynomial model is the radial part of OpenCV's; its pixels count from below.
     """
-    camera, (width, height) = clip.tracking.camera, clip.size
+    camera, (width, height) = present(present(clip.tracking).camera), size_of(clip)
     model = camera.distortion_model
     bend = {
         "POLYNOMIAL": ("k1", "k2", "k3"),
@@ -110,7 +112,8 @@ def lens(clip: Any) -> dict[str, Any]:
             "Set it to Polynomial in the Movie Clip editor and solve its camera again.",
             contract.ExitCode.USAGE,
         )
-    focal, (x, y) = float(camera.focal_length_pixels), camera.principal_point_pixels
+    centre: Any = camera.principal_point_pixels
+    focal, (x, y) = float(camera.focal_length_pixels), centre
     told = {"w": int(width), "h": int(height), "fl_x": focal, "fl_y": focal * float(camera.pixel_aspect)}
     told |= {"cx": float(x), "cy": float(height - y), "camera_model": "OPENCV"}
     return {**told, **(values if model == "POLYNOMIAL" else {})}

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...torch_backend import contract
+from ..access import present, settings_of
 from ..shot import made
+
+if TYPE_CHECKING:
+    import bpy
 
 KEY_TYPES = {"localised": "JITTER", "interpolated": "EXTREME"}
 """Source of a camera's frame -> type of its keys, which has a colour in the dope sheet and on the timeline: green for
@@ -43,10 +47,10 @@ def ranges(path: contract.CameraPath, solved: set[int]) -> list[tuple[int, int]]
     return [(numbers[0], numbers[-1]) for numbers in found if solved & set(numbers)]
 
 
-def mark(scene: Any, shot: Path, unsolved: list[tuple[int, int]]) -> None:
+def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) -> None:
     """Puts a marker where each such range begins, which are `ranges`. After `made.new`."""
-    entry = made.of(scene, shot)
-    others = [e for e in scene.splannequin.made if e != entry]
+    entry = present(made.of(scene, shot))
+    others = [e for e in settings_of(scene).made if e != entry]
     put = []
     for first, last in unsolved:
         name = f"no solve {first}-{last}" if last > first else f"no solve {first}"
@@ -55,7 +59,7 @@ def mark(scene: Any, shot: Path, unsolved: list[tuple[int, int]]) -> None:
     entry.marks = json.dumps(put) if put else ""
 
 
-def unmark(scene: Any, shot: Path) -> bool:
+def unmark(scene: bpy.types.Scene, shot: Path) -> bool:
     """Takes those markers away, but what the artist renamed or moved. True if there was one."""
     entry, taken = made.of(scene, shot), False
     for name, frame in json.loads(entry.marks or "[]") if entry is not None else []:

@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
+from ..access import OperatorBase, Outcome, scene_in
 from ..process import supervisor
 from ..scene import sequences
 from ..shot import chosen, contents
@@ -16,7 +17,7 @@ from ..ui import icons
 from . import mattes
 
 
-def _in_editor(context: Any, image: Any, mode: str) -> Any | None:
+def _in_editor(context: bpy.types.Context, image: bpy.types.Image, mode: str) -> Any | None:
     """Shows an image in an Image Editor, the one in this window first, else in a new window; None without windows."""
     if bpy.app.background:
         return None
@@ -32,32 +33,32 @@ def _in_editor(context: Any, image: Any, mode: str) -> Any | None:
     return space
 
 
-class _Matte:
+class _Matte(OperatorBase):
     """What the operators share: off without a solve, the shot of the scene, errors in words."""
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a solve."""
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         state = supervisor.watch_of(folder).state if folder else None
         if state is None or not state.solve:
-            cls.poll_message_set(tr("Solve the camera first"))  # type: ignore[attr-defined]
+            cls.poll_message_set(tr("Solve the camera first"))
             return False
         return True
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Does it; a refusal is reported."""
-        shot = chosen.shot_folder(context.scene)
+        shot = chosen.shot_folder(scene_in(context))
         if shot is None:
             return {"CANCELLED"}
         try:
-            self.report({"INFO"}, tr(self.act(context, shot)))  # type: ignore[attr-defined]
+            self.report({"INFO"}, tr(self.act(context, shot)))
         except contract.JobError as error:
-            self.report({"ERROR"}, f"{tr(error.message)} {tr(error.hint)}".strip())  # type: ignore[attr-defined]
+            self.report({"ERROR"}, f"{tr(error.message)} {tr(error.hint)}".strip())
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def act(self, context: Any, shot: Path) -> str:
+    def act(self, context: bpy.types.Context, shot: Path) -> str:
         """What it does; returns what was done, for people."""
         raise NotImplementedError
 
@@ -70,7 +71,7 @@ class SPLANNEQUIN_OT_show_motion(_Matte, bpy.types.Operator):
     bl_label = "Show Motion"
     bl_options = {"REGISTER", "UNDO"}
 
-    def act(self, context: Any, shot: Path) -> str:
+    def act(self, context: bpy.types.Context, shot: Path) -> str:
         """Loads the mattes as a sequence."""
         image, first, last = mattes.load_sequence(shot)
         space = _in_editor(context, image, "VIEW")
@@ -87,9 +88,9 @@ class SPLANNEQUIN_OT_paint_motion(_Matte, bpy.types.Operator):
     bl_label = "Paint Motion"
     bl_options = {"REGISTER", "UNDO"}
 
-    def act(self, context: Any, shot: Path) -> str:
+    def act(self, context: bpy.types.Context, shot: Path) -> str:
         """Makes the image to paint on."""
-        frame = context.scene.frame_current
+        frame = scene_in(context).frame_current
         _in_editor(context, mattes.paint_image(shot, frame), "PAINT")
         return f"Paint on frame {frame}, then press Save Paint."
 
@@ -101,9 +102,9 @@ class SPLANNEQUIN_OT_save_motion(_Matte, bpy.types.Operator):
     bl_label = "Save Motion Paint"
     bl_options = {"REGISTER", "UNDO"}
 
-    def act(self, context: Any, shot: Path) -> str:
+    def act(self, context: bpy.types.Context, shot: Path) -> str:
         """Writes the current frame's image."""
-        frame = context.scene.frame_current
+        frame = scene_in(context).frame_current
         image = mattes.find_image(shot, frame)
         if image is None:
             message = f"Nothing is painted on frame {frame}."
@@ -120,16 +121,16 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
     bl_label = "Clear Motion Paint"
     bl_options = {"REGISTER"}
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Asks first: what is removed from disk does not come back with undo."""
         return context.window_manager.invoke_confirm(
             self, event, title="Delete the painted matte of this frame from disk?",
             message="What the solve found holds again. This cannot be undone.", confirm_text="Remove", icon="WARNING",
         )  # fmt: skip
 
-    def act(self, context: Any, shot: Path) -> str:
+    def act(self, context: bpy.types.Context, shot: Path) -> str:
         """Removes the current frame's file."""
-        frame = context.scene.frame_current
+        frame = scene_in(context).frame_current
         try:
             gone = mattes.clear_paint(shot, frame)
         except OSError as error:
@@ -141,7 +142,7 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
         return f"Frame {frame} of the motion matte is as the solve found it."
 
 
-def draw(layout: Any) -> None:
+def draw(layout: bpy.types.UILayout) -> None:
     """The buttons."""
     row = layout.row(align=True)
     for name in ("splannequin.show_motion", "splannequin.paint_motion"):

@@ -16,6 +16,7 @@ import bpy
 import numpy as np
 
 from ...torch_backend import contract
+from ..access import pixels_of, size_of
 from ..scene import paths, sequences
 from ..shot import contents, made
 
@@ -48,7 +49,7 @@ def no_matte(shot: Path) -> contract.JobError:
     return contract.JobError(message, "Solve the camera again: its last part finds it.", contract.ExitCode.USAGE)
 
 
-def paint_image(shot: Path, frame: int) -> Any:
+def paint_image(shot: Path, frame: int) -> bpy.types.Image:
     """An image to paint the matte of a frame on: the one there is, else a copy of the painted or the found matte.
 
     JobError if the frame has neither, or a file of it cannot be read.
@@ -71,18 +72,18 @@ def paint_image(shot: Path, frame: int) -> Any:
     pixels[..., 3] = 1.0
     height, width = pixels.shape[:2]
     image = bpy.data.images.new(f"Motion {made.name_of(shot)} {frame}", width, height)
-    image.pixels.foreach_set(pixels.ravel())
+    pixels_of(image).foreach_set(pixels.ravel())
     image.update()
     image[_FRAME], image[_SHOT] = frame, paths.blend_path(shot)
     return image
 
 
-def find_image(shot: Path, frame: int) -> Any | None:
+def find_image(shot: Path, frame: int) -> bpy.types.Image | None:
     """The image that the matte of a frame is painted on, if this file has one."""
     return next((image for image in bpy.data.images if _of(image) == (os.path.abspath(shot), frame)), None)
 
 
-def _of(image: Any) -> tuple[str, int] | None:
+def _of(image: bpy.types.Image) -> tuple[str, int] | None:
     """Shot folder and frame of an image that a matte is painted on."""
     frame, folder = image.get(_FRAME), image.get(_SHOT)
     if not isinstance(frame, int) or not isinstance(folder, str):
@@ -90,7 +91,7 @@ def _of(image: Any) -> tuple[str, int] | None:
     return os.path.abspath(bpy.path.abspath(folder)), frame
 
 
-def save_paint(image: Any) -> Path:
+def save_paint(image: bpy.types.Image) -> Path:
     """Writes an image of `paint_image` into its shot, whole or not at all, and makes it an image of that file.
 
     JobError if it cannot be written.
@@ -100,9 +101,9 @@ def save_paint(image: Any) -> Path:
         message = f"{image.name} is no motion matte."
         raise contract.JobError(message, "Press Paint Motion first.", contract.ExitCode.USAGE)
     path = painted_file(Path(known[0]), known[1])
-    width, height = image.size
+    width, height = size_of(image)
     pixels = np.empty(width * height * image.channels, np.float32)
-    image.pixels.foreach_get(pixels)
+    pixels_of(image).foreach_get(pixels)
     data = packed(pixels.reshape(height, width, image.channels)[::-1])
     try:
         _write(path, data)
@@ -147,11 +148,11 @@ def _pixels(path: Path) -> np.ndarray:
     image = bpy.data.images.load(str(path))
     try:
         image.alpha_mode = "CHANNEL_PACKED"  # nothing is multiplied
-        width, height = image.size
+        width, height = size_of(image)
         if not (width and height):
             raise contract.JobError(f"{path} cannot be read.", "Remove it.", contract.ExitCode.USAGE)
         pixels = np.empty(width * height * 4, np.float32)
-        image.pixels.foreach_get(pixels)
+        pixels_of(image).foreach_get(pixels)
         return pixels.reshape(height, width, 4)
     finally:
         bpy.data.images.remove(image)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ...torch_backend import contract
+from ..access import Outcome, scene_in
 from ..process import children, supervisor
 from ..shot import chosen
 from ..translations import tr
@@ -40,23 +40,23 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
     format: EnumProperty(name="Format", description="What to write", items=FORMATS)
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a solve."""
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         state = supervisor.watch_of(folder).state if folder else None
         if state is None or not state.solve:
             cls.poll_message_set(tr("Solve the camera first"))
             return False
         return True
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Asks for a folder."""
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Has the backend write; in a window the panel tells when it is done."""
-        shot = chosen.shot_folder(context.scene)
+        shot = chosen.shot_folder(scene_in(context))
         if shot is None or not self.directory:
             self.report({"ERROR"}, "No folder was given")
             return {"CANCELLED"}
@@ -91,7 +91,7 @@ class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
     bl_label = "Load Camera"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Builds camera and points."""
         outcome = step_operator.edit(self, context, "solve", arrival.load_camera)
         if outcome == {"FINISHED"} and context.window is not None:
@@ -112,9 +112,9 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a solve, while a step runs, and while the maps are being written."""
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         watch = supervisor.watch_of(folder) if folder else None
         if watch is None or watch.state is None or not watch.state.solve:
             cls.poll_message_set(tr("Solve the camera first"))
@@ -127,9 +127,9 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
             return False
         return True
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Starts the backend; headless, waits for it."""
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         if folder is None:
             return {"CANCELLED"}
         try:

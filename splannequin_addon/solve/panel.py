@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 
+from ..access import layout_of, scene_in, settings_of
 from ..process import steps
 from ..ui import icons, step_panel
 from ..ui.sentences import wrap
@@ -26,26 +25,26 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
     operator = "splannequin.solve_camera"
     folds = "camera"
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """The step's body, and where the solve stands in the scene."""
         super().draw(context)
         watch = self._watch(context)
-        body = step_panel.sub_panel(self.layout, "camera_motion", "Motion Matte")  # type: ignore[attr-defined]
+        body = step_panel.sub_panel(layout_of(self), "camera_motion", "Motion Matte")
         if body is not None:
             matte_operators.draw(body)
-        if watch is None or cameras.find(context.scene, watch.shot, "EMPTY") is None:
+        if watch is None or cameras.find(scene_in(context), watch.shot, "EMPTY") is None:
             return
-        if not align_operators.scaled(context.scene, watch.shot):
-            layout = self.layout  # type: ignore[attr-defined]
+        if not align_operators.scaled(scene_in(context), watch.shot):
+            layout = layout_of(self)
             wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")
             layout.operator("splannequin.align_scale", icon=icons.of("splannequin.align_scale")).selected = False
-        body = step_panel.sub_panel(self.layout, "camera_alignment", "Alignment")  # type: ignore[attr-defined]
+        body = step_panel.sub_panel(layout_of(self), "camera_alignment", "Alignment")
         if body is not None:
             align_operators.draw(body)
 
-    def draw_advanced(self, context: Any, layout: Any) -> None:
+    def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The lens, where cameras come from, and where they go."""
-        props = context.scene.splannequin
+        props = settings_of(scene_in(context))
         layout.prop(props, "camera_model")
         layout.prop(props, "cameras_from")
         if props.cameras_from == "FILE":
@@ -55,9 +54,11 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
         for name in ("splannequin.export_cameras", "splannequin.write_stmaps"):
             layout.operator(name, icon=icons.of(name))
 
-    def _button(self, context: Any, layout: Any, view: steps.View, running: str | None) -> None:
+    def _button(
+        self, context: bpy.types.Context, layout: bpy.types.UILayout, view: steps.View, running: str | None
+    ) -> None:
         watch = self._watch(context)
-        if view.done and watch and cameras.find(context.scene, watch.shot, "CAMERA") is None:
+        if view.done and watch and cameras.find(scene_in(context), watch.shot, "CAMERA") is None:
             row = layout.row()
             row.scale_y = 1.4
             row.enabled = can_load_camera(running)

@@ -12,6 +12,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from .. import compat
+from ..access import mesh_of, scene_in
 from ..process import children
 from ..shot import chosen, made
 
@@ -22,7 +23,7 @@ _kept: tuple[Any, ...] = ()
 """(key of the mesh, shader, batch) of the points drawn last."""
 
 
-def coloured(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+def coloured(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Places [P, 3] and colours [P, 4] sRGB of a cloud's mesh, float32."""
     places = np.empty(3 * len(mesh.vertices), np.float32)
     mesh.vertices.foreach_get("co", places)
@@ -41,18 +42,22 @@ def _draw() -> None:
     context = bpy.context
     if context.space_data is None or not context.space_data.overlay.show_overlays:
         return
-    shot = chosen.shot_folder(context.scene)
-    cloud = made.part(context.scene, shot, "points") if shot is not None else None
-    if cloud is None or cloud.display_type != "BOUNDS" or not cloud.visible_get() or not len(cloud.data.vertices):
+    shot = chosen.shot_folder(scene_in(context))
+    cloud = made.part(scene_in(context), shot, "points") if shot is not None else None
+    if cloud is None or cloud.display_type != "BOUNDS" or not cloud.visible_get():
         return
-    key = (cloud.data.name, len(cloud.data.vertices), tuple(cloud.data.vertices[0].co), str(shot))
+    mesh = mesh_of(cloud)
+    if not len(mesh.vertices):
+        return
+    key = (mesh.name, len(mesh.vertices), mesh.vertices[0].co[:], str(shot))
     if not _kept or _kept[0] != key:
         shader = _first_shader(compat.POINT_SHADERS)
-        places, colours = coloured(cloud.data)
-        _kept = (key, shader, batch_for_shader(shader, "POINTS", {"pos": places, "color": colours}))
+        places, colours = coloured(mesh)
+        batch = batch_for_shader(shader, "POINTS", {"pos": places, "color": colours})  # pyright: ignore[reportArgumentType]
+        _kept = (key, shader, batch)
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.point_size_set(_SIZE * context.preferences.system.ui_scale)
-    with gpu.matrix.push_pop():
+    with gpu.matrix.push_pop():  # pyright: ignore[reportGeneralTypeIssues]
         gpu.matrix.multiply_matrix(cloud.matrix_world)
         _kept[2].draw(_kept[1])
     gpu.state.point_size_set(1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
 from ..footage import plate
@@ -12,6 +12,9 @@ from ..process.steps import Step, View
 from ..shot import chosen, made
 from ..shot.shot_state import ShotState
 from . import align_operators, arrival, cameras, exchange, guesses, matte_operators, operators, panel, points
+
+if TYPE_CHECKING:
+    import bpy
 
 
 class Solve(Step):
@@ -26,11 +29,11 @@ class Solve(Step):
     classes = (*operators.CLASSES, *align_operators.CLASSES, *matte_operators.CLASSES, *panel.CLASSES)
     parts = (points, align_operators, operators)
 
-    def params(self, scene: Any) -> contract.SolveParams:
+    def params(self, scene: bpy.types.Scene) -> contract.SolveParams:
         """The lens, and where cameras come from."""
         return exchange.params(scene, chosen.shot_folder(scene))
 
-    def view(self, scene: Any, state: ShotState | None) -> View:
+    def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Camera: how good the solve is."""
         if state is None or not state.frames:
             return View(False, False, [], self.needs)
@@ -42,11 +45,11 @@ class Solve(Step):
             return View(True, True, lines, "The solve is not in this scene: load it.")
         return View(True, True, lines, "Look through the camera, then train.")
 
-    def finish(self, scene: Any, job: jobs.Job) -> list[str]:
+    def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """Camera, plate and points come into the scene."""
         return arrival.load_camera(scene, job.shot)
 
-    def look(self, window: Any, scene: Any, shot: Path) -> None:
+    def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
         """Through the solved camera."""
         supervisor.look_through_camera(window)
 
@@ -54,11 +57,11 @@ class Solve(Step):
         """The job's own log, and what COLMAP said."""
         return [*super().logs(job), contract.ShotFolder(job.shot).colmap_log]
 
-    def stands(self, scene: Any, shot: Path) -> bool:
+    def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
         """True if camera, points or plate of a shot are in the scene."""
         return made.of(scene, shot) is not None
 
-    def remove(self, scene: Any, shot: Path, others: list[Path]) -> list[str]:
+    def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
         """Takes camera, points and plate out of the file."""
         plate.remove(scene, shot)
         return ["Camera and points were removed."] if cameras.remove(scene, shot) else []

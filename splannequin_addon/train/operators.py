@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 from bpy.props import StringProperty
 
+from ..access import Outcome, scene_in, settings_of
 from ..translations import tr
 from ..ui import pick_operators, step_operator
 from .settings import PRESETS
@@ -30,7 +29,7 @@ class SPLANNEQUIN_OT_pick_run(pick_operators.Pick, bpy.types.Operator):
 
     name: StringProperty(name="Run", description="Name of the run", options={"SKIP_SAVE"})
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Sets the run's name, and the preset that it was trained with."""
         state = pick_operators.known(context)[1]
         run = state.runs.get(self.name) or state.unfinished.get(self.name)
@@ -38,7 +37,7 @@ class SPLANNEQUIN_OT_pick_run(pick_operators.Pick, bpy.types.Operator):
             refusal = state.damaged["run"].get(self.name) or f"This shot has no run {self.name!r}"
             self.report({"ERROR"}, tr(refusal))
             return {"CANCELLED"}
-        settings = context.scene.splannequin
+        settings = settings_of(scene_in(context))
         settings.run_name = self.name
         if run.get("preset") in [preset[0] for preset in PRESETS]:
             settings.preset = run["preset"]

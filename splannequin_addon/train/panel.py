@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import bpy
 
+from ..access import layout_of, scene_in, settings_of
 from ..process import steps
 from ..shot.shot_state import ShotState
 from ..translations import tr
@@ -27,9 +27,9 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
     operator = "splannequin.train"
     folds = "train"
 
-    def draw_settings(self, context: Any, layout: Any) -> None:
+    def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The preset; what the button will do to the run that is there."""
-        props = context.scene.splannequin
+        props = settings_of(scene_in(context))
         watch, plan = self._watch(context), self._plan(context)
         self._presets(context, layout, watch.state if watch is not None else None)
         if watch is None or watch.running() is not None:
@@ -39,9 +39,9 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         if plan.words:
             wrap(layout, context, plan.words, "PAUSE" if self._paused(context) else "INFO")
 
-    def _presets(self, context: Any, layout: Any, state: ShotState | None) -> None:
+    def _presets(self, context: bpy.types.Context, layout: bpy.types.UILayout, state: ShotState | None) -> None:
         """A button for each preset: how large, how many steps, how long on this machine."""
-        props, (rows, told) = context.scene.splannequin, estimates.costs(state)
+        props, (rows, told) = settings_of(scene_in(context)), estimates.costs(state)
         column = layout.column(align=True)
         head = cells(column.row(align=True), _PRESET_WIDTHS)
         for place, text in zip(head, ("Preset", "Pixels", "Steps", "Time"), strict=True):
@@ -61,24 +61,24 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             words = f"By what run {told.get('run', '')} took on the {where}. With a ?: an estimate by pixels and steps."
         wrap(layout, context, words)
 
-    def _plan(self, context: Any) -> training.Plan:
-        props, watch = context.scene.splannequin, self._watch(context)
+    def _plan(self, context: bpy.types.Context) -> training.Plan:
+        props, watch = settings_of(scene_in(context)), self._watch(context)
         return training.plan(watch.state if watch else None, props.run_name, props.preset)
 
-    def _label(self, context: Any, view: steps.View) -> str:
+    def _label(self, context: bpy.types.Context, view: steps.View) -> str:
         return self._plan(context).button
 
-    def _paused(self, context: Any) -> bool:
+    def _paused(self, context: bpy.types.Context) -> bool:
         return self._plan(context).kind in ("resume", "extension")
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """The step's body, and the training in pictures."""
         super().draw(context)
         watch = self._watch(context)
         if watch is None or watch.state is None:
             return
         self._runs(context, watch.state)
-        name, job = context.scene.splannequin.run_name, watch.jobs.get("train")
+        name, job = settings_of(scene_in(context)).run_name, watch.jobs.get("train")
         run = watch.state.runs.get(name) or watch.state.unfinished.get(name) or {}
         going = job is not None and watch.running() == "train"
         if going and job is not None:
@@ -87,7 +87,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             picture, points = run.get("preview"), run.get("history", [])
         else:
             return
-        body = step_panel.sub_panel(self.layout, "train_pictures", "Progress", folded=False)  # type: ignore[attr-defined]
+        body = step_panel.sub_panel(layout_of(self), "train_pictures", "Progress", folded=False)
         if body is None:
             return
         icon = pictures.icon_of(Path(picture)) if picture else 0
@@ -105,19 +105,19 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
                 "NONE",
             )
 
-    def _runs(self, context: Any, state: ShotState) -> None:
+    def _runs(self, context: bpy.types.Context, state: ShotState) -> None:
         """All runs of the shot, to compare and pick."""
         if not state.listed("run"):
             return
-        body = step_panel.sub_panel(self.layout, "runs", "Runs")  # type: ignore[attr-defined]
+        body = step_panel.sub_panel(layout_of(self), "runs", "Runs")
         if body is not None:
-            listing.draw(body, "run", state, context.scene.splannequin.run_name)
+            listing.draw(body, "run", state, settings_of(scene_in(context)).run_name)
             for told in state.damaged["run"].values():
                 wrap(body, context, told, "ERROR")
 
-    def draw_advanced(self, context: Any, layout: Any) -> None:
+    def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The run's name."""
-        layout.prop(context.scene.splannequin, "run_name")
+        layout.prop(settings_of(scene_in(context)), "run_name")
 
 
 CLASSES = (SPLANNEQUIN_PT_train,)

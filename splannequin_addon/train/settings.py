@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from bpy.props import EnumProperty, IntProperty, StringProperty
 
 from ...torch_backend import contract
+from ..access import scene_holding
 from ..process import supervisor
 from ..shot import chosen
 from ..translations import tr
+
+if TYPE_CHECKING:
+    import bpy
 
 PRESETS: list[tuple[str, str, str]] = contract.panel(contract.TrainParams, "preset")["items"]
 """(identifier, name, tooltip) of each."""
 
 
-def runs_of(props: Any) -> list[tuple[str, str]]:
+def runs_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
     """(name, what it is) of the runs of the shot that `props` names, for the field's list."""
-    folder = chosen.shot_folder(props.id_data)
+    folder = chosen.shot_folder(scene_holding(props))
     state = supervisor.watch_of(folder).state if folder else None
     runs = state.runs.items() if state is not None else ()
     return [
@@ -30,7 +34,7 @@ def _third_of(steps: int) -> int:
     return round(steps / 3)
 
 
-def _preset_chosen(props: Any, context: Any) -> None:
+def _preset_chosen(props: TrainSettings, context: bpy.types.Context) -> None:
     """More steps are a third of the preset's unless the artist says otherwise."""
     props.extend_steps = _third_of(contract.PRESET_STEPS[props.preset])
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
+from ..access import settings_of
 from ..process import backend, jobs
 from ..process.steps import Step, View
 from ..shot import chosen, contents
 from ..shot.shot_state import ShotState
 from . import operators, panel, pictures, training
+
+if TYPE_CHECKING:
+    import bpy
 
 
 class Train(Step):
@@ -24,18 +28,18 @@ class Train(Step):
     classes = (*operators.CLASSES, *panel.CLASSES)
     parts = (pictures,)
 
-    def params(self, scene: Any) -> contract.TrainParams:
+    def params(self, scene: bpy.types.Scene) -> contract.TrainParams:
         """The preset, or how a run that is there goes on."""
-        props, folder = scene.splannequin, chosen.shot_folder(scene)
+        props, folder = settings_of(scene), chosen.shot_folder(scene)
         state = contents.read(folder) if folder is not None else None
         return training.params(state, props.run_name, props.preset, props.extend_steps, backend.device())
 
-    def view(self, scene: Any, state: ShotState | None) -> View:
+    def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Train: how good the run is."""
         if state is None or not state.solve:
             return View(False, False, [], self.needs)
-        run = state.runs.get(scene.splannequin.run_name)
-        if run is None and scene.splannequin.run_name in state.unfinished:
+        run = state.runs.get(settings_of(scene).run_name)
+        if run is None and settings_of(scene).run_name in state.unfinished:
             return View(False, True, [], "Resume it, or pick another run.")
         if run is None:
             return View(False, True, [], "Learn the scene and what moves in it.")
@@ -45,7 +49,7 @@ class Train(Step):
         verdict = contract.verdict_lines(run)
         if run.get("quality") == "Poor" and not verdict:  # trained by an older version
             verdict = ["It is poor: take a range in which nobody walks, or solve the camera again."]
-        lines = [f"Run {scene.splannequin.run_name}: {quality}", size, *verdict]
+        lines = [f"Run {settings_of(scene).run_name}: {quality}", size, *verdict]
         return View(True, True, lines, "Next: freeze an instant.")
 
     def began(self, job: jobs.Job) -> None:

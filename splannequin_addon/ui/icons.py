@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-OF = {
+from ..access import Icon
+
+OF: dict[str, Icon] = {
     "splannequin.align_floor": "GRID",
     "splannequin.align_origin": "OBJECT_ORIGIN",
     "splannequin.align_scale": "ARROW_LEFTRIGHT",
@@ -46,6 +48,6 @@ OF = {
 """Operator -> icon."""
 
 
-def of(operator: str) -> str:
+def of(operator: str) -> Icon:
     """Icon of an operator, NONE if it has none."""
     return OF.get(operator, "NONE")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 from bpy.props import StringProperty
 
 from ...torch_backend import contract
+from ..access import Outcome, scene_in
 from ..process import jobs, steps, supervisor
 from ..shot import chosen
 from ..translations import tr
@@ -25,9 +24,9 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         name="Step", description="Name of the step to cancel; empty: the one that runs", options={"SKIP_SAVE"}
     )
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Asks the job to stop."""
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         watch = supervisor.watch_of(folder) if folder else None
         job = watch.jobs.get(steps.current(self.step) or watch.running() or "") if watch else None
         if job is None or job.ended:
@@ -50,9 +49,9 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
 
     step: StringProperty(name="Step", description="Name of the step", options={"SKIP_SAVE"})
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Opens it."""
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         job = supervisor.watch_of(folder).jobs.get(steps.current(self.step)) if folder else None
         log = steps.STEPS[steps.current(self.step)].log(job) if job is not None else None
         if log is None:

@@ -8,11 +8,14 @@ import shutil
 import threading
 import uuid
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
 from ..shot.shot_state import ShotState
 from .sentences import cells as _cells
+
+if TYPE_CHECKING:
+    import bpy
 
 _RUN_HEAD = ("Run", "dB", "Size", "Move", "Time")
 _RUN_WIDTHS = (0.23, 0.19, 0.18, 0.2, 0.2)  # a sidebar of Blender's own width shows all of it
@@ -66,7 +69,7 @@ def duration(seconds: float | None) -> str:
     return f"{seconds / 60:.0f}m" if seconds < 5400 else f"{seconds / 3600:.1f}h"
 
 
-def draw(layout: Any, kind: str, state: ShotState, chosen: str) -> None:
+def draw(layout: bpy.types.UILayout, kind: str, state: ShotState, chosen: str) -> None:
     """Rows of the runs or takes (`kind` "run" or "take"), the `chosen` one marked; a click on a name picks it."""
     rows, head, widths = (
         (run_rows(state), _RUN_HEAD, _RUN_WIDTHS) if kind == "run" else (take_rows(state), _TAKE_HEAD, _TAKE_WIDTHS)

@@ -7,6 +7,7 @@ from typing import Any
 
 import bpy
 
+from ..access import layout_of
 from . import icons
 
 _GROUPS = (
@@ -23,7 +24,7 @@ _ELSEWHERE = {"use_movie_clip"}
 
 def searchable() -> set[str]:
     """Names of the operators that can be called without being told what for: all but the internal ones."""
-    names = dir(bpy.ops.splannequin)
+    names = dir(bpy.ops.splannequin)  # pyright: ignore[reportAttributeAccessIssue]
     return {n for n in names if "INTERNAL" not in getattr(bpy.types, f"SPLANNEQUIN_OT_{n}").bl_options}
 
 
@@ -42,25 +43,25 @@ class SPLANNEQUIN_MT_shot(bpy.types.Menu):
     bl_idname = "SPLANNEQUIN_MT_shot"
     bl_label = "Splannequin"
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """Every operator, in the order of the work."""
         first = True
         for group in entries():
             if group and not first:
-                self.layout.separator()
+                layout_of(self).separator()
             for name in group:
-                self.layout.operator(f"splannequin.{name}", icon=icons.of(f"splannequin.{name}"))
+                layout_of(self).operator(f"splannequin.{name}", icon=icons.of(f"splannequin.{name}"))
                 first = False
 
 
-def _in_render(self: Any, context: Any) -> None:
-    self.layout.separator()
-    self.layout.menu(SPLANNEQUIN_MT_shot.bl_idname, icon="FREEZE")
+def _in_render(self: Any, context: bpy.types.Context) -> None:
+    layout_of(self).separator()
+    layout_of(self).menu(SPLANNEQUIN_MT_shot.bl_idname, icon="FREEZE")
 
 
-def _in_clip(self: Any, context: Any) -> None:
-    self.layout.separator()
-    self.layout.operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
+def _in_clip(self: Any, context: bpy.types.Context) -> None:
+    layout_of(self).separator()
+    layout_of(self).operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
 
 
 def register() -> None:

@@ -8,31 +8,32 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
+from ..access import OperatorBase, Outcome, scene_in
 from ..process import jobs, steps, supervisor
 from ..shot import chosen
 from ..translations import tr
 from . import listing
 
 
-def known(context: Any) -> tuple[supervisor.Watch | None, Any]:
+def known(context: bpy.types.Context) -> tuple[supervisor.Watch | None, Any]:
     """The shot's watch and what its folder holds."""
-    folder = chosen.shot_folder(context.scene)
+    folder = chosen.shot_folder(scene_in(context))
     watch = supervisor.watch_of(folder) if folder else None
     return watch, watch.state if watch else None
 
 
-class Pick:
+class Pick(OperatorBase):
     """What picking a run and picking a take share."""
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Off while a step of this shot runs: what it works on is named by the settings."""
         watch, state = known(context)
         if watch is None or state is None:
-            cls.poll_message_set(tr("No shot is chosen: import a clip first"))  # type: ignore[attr-defined]
+            cls.poll_message_set(tr("No shot is chosen: import a clip first"))
             return False
         if watch.running():
-            cls.poll_message_set(tr("A step of this shot is running"))  # type: ignore[attr-defined]
+            cls.poll_message_set(tr("A step of this shot is running"))
             return False
         return True
 
@@ -44,16 +45,16 @@ class Remove(Pick):
     question = ""
     warning = ""
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Asks first: what is removed from disk does not come back with undo."""
         return context.window_manager.invoke_confirm(
             self, event, title=self.question, message=self.warning, confirm_text="Remove", icon="WARNING"
         )
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Removes the folder."""
         watch, state = known(context)
-        name: str = self.name  # type: ignore[attr-defined]
+        name: str = self.name
         if watch is None or state is None:
             return {"CANCELLED"}
         # Only what is listed, whose names come from the folder itself: any other may lead to somewhere else.
@@ -69,7 +70,7 @@ class Remove(Pick):
             except OSError as error:
                 refusal = f"{folder} cannot be removed: {error.strerror or error}"
         if refusal:
-            self.report({"ERROR"}, refusal)  # type: ignore[attr-defined]
+            self.report({"ERROR"}, refusal)
             return {"CANCELLED"}
         supervisor.refresh(watch)
         supervisor.redraw()

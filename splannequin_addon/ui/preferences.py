@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ...torch_backend import contract
+from ..access import Icon, Outcome, layout_of
 from ..process import backend, children, environment, supervisor
 from ..translations import tr
 from .sentences import wrap
@@ -46,9 +46,9 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         ],
     )
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """What is used, its set-up, the device."""
-        layout = self.layout
+        layout = layout_of(self)
         try:
             there = bool(backend.python())
             if not busy():  # a half-made one is not in use yet
@@ -66,7 +66,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         layout.prop(self, "backend_python")
 
     def _draw_setup(self, there: bool) -> None:
-        box = self.layout.box()
+        box = layout_of(self).box()
         row = box.row()
         row.enabled = not busy()
         row.prop(self, "backend_folder")
@@ -95,7 +95,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         if not bpy.app.online_access:
             self._say(box, "Blender may not go online: allow it in Preferences > System > Network.", "ERROR")
 
-    def _say(self, layout: Any, text: str, icon: str = "NONE") -> None:
+    def _say(self, layout: bpy.types.UILayout, text: str, icon: Icon = "NONE") -> None:
         """A sentence in as many lines as the page is wide for: Blender sets it in by the boxes around it."""
         wrap(layout, bpy.context, text, icon, margin=_INSET)
 
@@ -118,20 +118,20 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Only where Blender may go online, and one at a time."""
         if not bpy.app.online_access:
             cls.poll_message_set(tr("Blender may not go online: allow it in Preferences > System > Network"))
             return False
         return not busy()
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Asks first."""
         return context.window_manager.invoke_props_dialog(self, width=_DIALOG, confirm_text="Download and Install")
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """What is asked."""
-        column = self.layout.column(align=True)
+        column = layout_of(self).column(align=True)
         for text in (
             f"Makes a Python environment in {backend.folder()}",
             f"Needs {environment.SIZE}, downloaded from {environment.sources()}.",
@@ -140,7 +140,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
         ):
             wrap(column, context, text, width=_DIALOG)
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Starts it; headless, waits for its end."""
         global _setup
         try:
@@ -168,7 +168,7 @@ class SPLANNEQUIN_OT_cancel_setup(bpy.types.Operator):
     bl_label = "Cancel"
     bl_options = {"INTERNAL"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Asks it to end."""
         if _setup is not None:
             environment.cancel(_setup)
@@ -182,7 +182,7 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
     bl_label = "Check Backend"
     bl_options = {"REGISTER"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Runs the backend's doctor beside Blender; headless, waits for it."""
         _findings[:] = ["Checking the backend."]
         try:
@@ -209,11 +209,11 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
     bl_label = "Remove Backend"
     bl_options = {"REGISTER"}
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Asks first."""
         return context.window_manager.invoke_confirm(self, event)
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Deletes it."""
         try:
             there = environment.remove(backend.folder())
@@ -247,7 +247,7 @@ def _follow_setup() -> bool:
     if environment.poll(_setup):
         _redraw()
     if not _setup.running and not _setup.failure:
-        bpy.ops.splannequin.check_backend()
+        bpy.ops.splannequin.check_backend()  # pyright: ignore[reportAttributeAccessIssue]
     return _setup.running
 
 

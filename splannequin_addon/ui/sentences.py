@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import re
 import textwrap
-from typing import Any
+from typing import TYPE_CHECKING
 
+from ..access import Icon
 from ..translations import tr
+
+if TYPE_CHECKING:
+    import bpy
 
 _LETTER = 6.2
 """Pixels of a letter on average, at a user interface scale of 1."""
@@ -14,7 +18,14 @@ _UNIT = re.compile(r"(?<=\d) (?=(%|px|dB|fps|s|min|h|[KMG]B)(?!\w))")
 _BOUND = "\N{NO-BREAK SPACE}"
 
 
-def wrap(layout: Any, context: Any, text: str, icon: str = "NONE", margin: int = 50, width: int = 0) -> None:
+def wrap(
+    layout: bpy.types.UILayout,
+    context: bpy.types.Context,
+    text: str,
+    icon: Icon = "NONE",
+    margin: int = 50,
+    width: int = 0,
+) -> None:
     """A sentence, in the interface's language, in as many lines as it asks for.
 
     Args:
@@ -39,7 +50,7 @@ def lines(text: str, letters: int) -> list[str]:
     return [line.replace(_BOUND, " ") for line in found]
 
 
-def cells(line: Any, widths: tuple[float, ...]) -> list[Any]:
+def cells(line: bpy.types.UILayout, widths: tuple[float, ...]) -> list[bpy.types.UILayout]:
     """Parts of a row, as wide as `widths` say, which sum to 1."""
     parts, left = [], 1.0
     for width in widths[:-1]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ...torch_backend import contract
+from ..access import Outcome, layout_of, scene_in, settings_of
 from ..process import begin, supervisor
 from ..scene import paths
 from ..shot import chosen, places
@@ -20,11 +20,19 @@ class SPLANNEQUIN_UL_shots(bpy.types.UIList):
 
     bl_idname = "SPLANNEQUIN_UL_shots"
 
-    def draw_item(
-        self, context: Any, layout: Any, data: Any, item: Any, icon: Any, active_data: Any, active: str, index: int
+    def draw_item(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: bpy.types.AnyType,
+        item: bpy.types.AnyType,
+        icon: int,
+        active_data: bpy.types.AnyType,
+        active: str,
+        index: int,
     ) -> None:
         """Name, and whether a step of it runs."""
-        one = chosen.settings(context.scene)[index]
+        one = chosen.settings(scene_in(context))[index]
         folder = chosen.folder_of(one)
         running = supervisor.watch_of(folder).running() if folder is not None else None
         layout.label(text=chosen.label(one), icon="SORTTIME" if running else "FILE_MOVIE", translate=False)
@@ -38,16 +46,16 @@ class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Off while the chosen shot has no clip: it is a new one."""
-        if chosen.shot_folder(context.scene) is None:
+        if chosen.shot_folder(scene_in(context)) is None:
             cls.poll_message_set(tr("Choose a clip for this shot first"))
             return False
         return True
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Adds and chooses it."""
-        chosen.add(context.scene)
+        chosen.add(scene_in(context))
         return {"FINISHED"}
 
 
@@ -66,25 +74,25 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
     )
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """On for one of several."""
-        if len(context.scene.splannequin.shots) < 2:
+        if len(settings_of(scene_in(context)).shots) < 2:
             cls.poll_message_set(tr("This is the only shot of the scene"))
             return False
         return True
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Asks what is to be done with its things."""
         return context.window_manager.invoke_props_dialog(self)
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Removes it."""
-        scene = context.scene
+        scene = scene_in(context)
         folder = chosen.shot_folder(scene)
         if self.things and folder is not None:
             for note in begin.remove_all(scene, folder):
                 self.report({"INFO"}, note)
-        chosen.remove(scene, scene.splannequin.loaded_shot)
+        chosen.remove(scene, settings_of(scene).loaded_shot)
         return {"FINISHED"}
 
 
@@ -100,19 +108,19 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
     )
     filter_folder: BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Has the folder chosen, beginning where it was."""
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         if folder is not None:
             there = next((p for p in folder.parents if p.is_dir()), None)
             self.directory = f"{there}/" if there is not None else ""
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Takes it, if there is a shot in it."""
         try:
-            places.locate(context.scene, Path(paths.absolute(self.directory)))
+            places.locate(scene_in(context), Path(paths.absolute(self.directory)))
         except contract.JobError as error:
             self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}
@@ -129,10 +137,10 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
     bl_category = "Splannequin"
     bl_options = {"HIDE_HEADER"}
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """A list once there are several; before, a button."""
-        props = context.scene.splannequin
-        row = self.layout.row()
+        props = settings_of(scene_in(context))
+        row = layout_of(self).row()
         if len(props.shots) < 2:
             row.label(text=chosen.label(props), icon="FILE_MOVIE", translate=False)
             row.operator("splannequin.shot_add", icon="ADD")
@@ -157,11 +165,11 @@ class SPLANNEQUIN_PT_layout(bpy.types.Panel):
     bl_order = 99
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Now and then."""
         return supervisor.lay_out()
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """Nothing."""
 
 

@@ -5,33 +5,35 @@ Headless, a button's `execute` blocks until the work is done; in a window the ti
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from pathlib import Path
 
 import bpy
 
 from ...torch_backend import contract
-from ..process import begin, steps, supervisor
+from ..access import OperatorBase, Outcome, scene_in
+from ..process import begin, jobs, steps, supervisor
 from ..shot import chosen
 from ..translations import tr
 
 
-class StepOperator:
+class StepOperator(OperatorBase):
     """What the five share: begin the job, then wait for it or have it followed."""
 
     step = ""
 
     @classmethod
-    def poll(cls, context: Any) -> bool:
+    def poll(cls, context: bpy.types.Context) -> bool:
         """Off while a step of this shot runs."""
-        folder = chosen.shot_folder(context.scene)
+        folder = chosen.shot_folder(scene_in(context))
         if folder is not None and supervisor.watch_of(folder).running():
-            cls.poll_message_set(tr("A step of this shot is running"))  # type: ignore[attr-defined]
+            cls.poll_message_set(tr("A step of this shot is running"))
             return False
         return True
 
-    def execute(self, context: Any) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> Outcome:
         """Runs the step."""
-        scene = context.scene
+        scene = scene_in(context)
         try:
             job = begin.begin(scene, self.step, self.params(scene))
             supervisor.follow(self.step, job)
@@ -40,36 +42,41 @@ class StepOperator:
             begin.wait(job)
             notes = self.after(scene, job)
         except contract.Cancelled:
-            self.report({"WARNING"}, "Cancelled: finished work is kept")  # type: ignore[attr-defined]
+            self.report({"WARNING"}, "Cancelled: finished work is kept")
             return {"CANCELLED"}
         except (contract.JobError, ValueError, OSError, RuntimeError) as error:
             folder = chosen.shot_folder(scene)
             sentence = getattr(error, "message", str(error))
             if folder is not None:
                 supervisor.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
-            self.report({"ERROR"}, tr(f"{sentence} {getattr(error, 'hint', '')}".strip()))  # type: ignore[attr-defined]
+            self.report({"ERROR"}, tr(f"{sentence} {getattr(error, 'hint', '')}".strip()))
             return {"CANCELLED"}
         for note in notes:
-            self.report({"INFO"}, tr(note))  # type: ignore[attr-defined]
+            self.report({"INFO"}, tr(note))
         return {"FINISHED"}
 
-    def params(self, scene: Any) -> Any:
+    def params(self, scene: bpy.types.Scene) -> jobs.Params | None:
         """What the job is asked for; None: what the scene's settings say."""
         return None
 
-    def after(self, scene: Any, job: Any) -> list[str]:
+    def after(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """What follows the job when blocking; returns what changed, in words."""
         return steps.STEPS[self.step].finish(scene, job)
 
 
-def edit(operator: Any, context: Any, step: str, change: Any) -> set[str]:
+def edit(
+    operator: bpy.types.Operator,
+    context: bpy.types.Context,
+    step: str,
+    change: Callable[[bpy.types.Scene, Path], list[str]],
+) -> Outcome:
     """Runs a change of the scene; says what was done or why not."""
-    folder = chosen.shot_folder(context.scene)
+    folder = chosen.shot_folder(scene_in(context))
     if folder is None:
         operator.report({"ERROR"}, "No shot is chosen: import a clip first")
         return {"CANCELLED"}
     try:
-        notes = change(context.scene, folder)
+        notes = change(scene_in(context), folder)
     except (contract.JobError, OSError, ValueError) as error:
         operator.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
         return {"CANCELLED"}

@@ -5,18 +5,22 @@ Drawing only reads what the supervisor keeps; it touches the disk when a shot is
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ..access import PanelBase, layout_of, scene_in
 from ..process import steps, supervisor
 from ..shot import chosen
 from ..translations import tr
 from . import icons
 from .sentences import wrap
 
+if TYPE_CHECKING:
+    import bpy
+
 CATEGORY = "Splannequin"
 
 
-class StepPanel:
+class StepPanel(PanelBase):
     """What the five panels share. State, settings, one button, progress with Cancel, what comes next."""
 
     bl_space_type = "VIEW_3D"
@@ -27,29 +31,29 @@ class StepPanel:
     folds = ""
     """What its parts that can be folded are called in the files that keep how they stand."""
 
-    def _watch(self, context: Any) -> supervisor.Watch | None:
-        folder = chosen.shot_folder(context.scene)
+    def _watch(self, context: bpy.types.Context) -> supervisor.Watch | None:
+        folder = chosen.shot_folder(scene_in(context))
         return supervisor.watch_of(folder) if folder else None
 
-    def _view(self, context: Any) -> steps.View:
+    def _view(self, context: bpy.types.Context) -> steps.View:
         watch = self._watch(context)
-        if watch is not None and chosen.missing(context.scene, watch.state):
+        if watch is not None and chosen.missing(scene_in(context), watch.state):
             return steps.View(
                 False,
                 steps.STEPS[self.step].makes_shot,
                 [],
                 "" if steps.STEPS[self.step].makes_shot else "Locate the shot first.",
             )
-        return steps.STEPS[self.step].view(context.scene, watch.state if watch else None)
+        return steps.STEPS[self.step].view(scene_in(context), watch.state if watch else None)
 
-    def _next_done(self, context: Any) -> bool:
+    def _next_done(self, context: bpy.types.Context) -> bool:
         """True if the step after this one is done: what comes next need not be said any more."""
         names = list(steps.STEPS)
         after = names[names.index(self.step) + 1 :]
         watch = self._watch(context)
-        return bool(after) and steps.STEPS[after[0]].view(context.scene, watch.state if watch else None).done
+        return bool(after) and steps.STEPS[after[0]].view(scene_in(context), watch.state if watch else None).done
 
-    def draw_header(self, context: Any) -> None:
+    def draw_header(self, context: bpy.types.Context) -> None:
         """An icon for the state: a tick, at work, failed, next, or not yet."""
         watch = self._watch(context)
         view = self._view(context)
@@ -62,11 +66,11 @@ class StepPanel:
             icon = "CHECKMARK"
         else:
             icon = "RADIOBUT_ON" if view.ready else "RADIOBUT_OFF"
-        self.layout.label(text="", icon=icon)  # type: ignore[attr-defined]
+        layout_of(self).label(text="", icon=icon)
 
-    def draw(self, context: Any) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         """The step's body."""
-        layout = self.layout  # type: ignore[attr-defined]
+        layout = layout_of(self)
         watch, view = self._watch(context), self._view(context)
         self.draw_trouble(context, layout)
         for line in view.state:
@@ -88,31 +92,33 @@ class StepPanel:
             body.enabled = running is None
             self.draw_advanced(context, body)
 
-    def draw_trouble(self, context: Any, layout: Any) -> None:
+    def draw_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """What keeps the step from being done at all, with the button that helps."""
 
-    def draw_always(self, context: Any, layout: Any) -> None:
+    def draw_always(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """What stays in reach while a step runs."""
 
-    def draw_settings(self, context: Any, layout: Any) -> None:
+    def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The settings that an artist needs."""
 
-    def draw_advanced(self, context: Any, layout: Any) -> None:
+    def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The settings that need no touching."""
 
-    def _button(self, context: Any, layout: Any, view: steps.View, running: str | None) -> None:
+    def _button(
+        self, context: bpy.types.Context, layout: bpy.types.UILayout, view: steps.View, running: str | None
+    ) -> None:
         row = layout.row()
         row.scale_y = 1.0 if view.done else 1.4
         row.enabled = view.ready and running is None
         row.operator(self.operator, text=self._label(context, view), icon=icons.of(self.operator))
 
-    def _label(self, context: Any, view: steps.View) -> str:
+    def _label(self, context: bpy.types.Context, view: steps.View) -> str:
         """What the button says."""
         step = steps.STEPS[self.step]
         return step.again if view.done else step.button
 
-    def _progress(self, context: Any, watch: supervisor.Watch) -> None:
-        layout = self.layout  # type: ignore[attr-defined]
+    def _progress(self, context: bpy.types.Context, watch: supervisor.Watch) -> None:
+        layout = layout_of(self)
         work = watch.work
         if work is not None:
             self._own_progress(layout, context, work.progress)
@@ -129,7 +135,9 @@ class StepPanel:
             detail.append(f"about {minutes(status.eta_seconds)} left")
         wrap(layout, context, ", ".join(tr(part) for part in detail) if detail else "The backend is starting.", "INFO")
 
-    def _own_progress(self, layout: Any, context: Any, now: supervisor.Progress | None) -> None:
+    def _own_progress(
+        self, layout: bpy.types.UILayout, context: bpy.types.Context, now: supervisor.Progress | None
+    ) -> None:
         """How far work is that Blender does itself."""
         if now is None:
             layout.progress(factor=0.0, type="BAR", text=tr("Starting"))
@@ -138,7 +146,9 @@ class StepPanel:
         if now.hint:
             wrap(layout, context, now.hint, "INFO")
 
-    def _outcome(self, context: Any, layout: Any, watch: supervisor.Watch | None, said: list[str]) -> None:
+    def _outcome(
+        self, context: bpy.types.Context, layout: bpy.types.UILayout, watch: supervisor.Watch | None, said: list[str]
+    ) -> None:
         """What went wrong, or what was changed, unless it was `said` above."""
         if watch is None:
             return
@@ -162,7 +172,7 @@ class StepPanel:
         for note in watch.notes.get(self.step, []):
             wrap(layout, context, note, "DOT")
 
-    def _paused(self, context: Any) -> bool:
+    def _paused(self, context: bpy.types.Context) -> bool:
         """True if the panel says already that what was stopped can go on."""
         return False
 
@@ -179,7 +189,7 @@ def minutes(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def sub_panel(layout: Any, name: str, label: str, folded: bool = True) -> Any | None:
+def sub_panel(layout: bpy.types.UILayout, name: str, label: str, folded: bool = True) -> Any | None:
     """A part of a panel that can be folded away, `folded` at first; None while it is."""
     header, body = layout.panel(f"splannequin_{name}", default_closed=folded)
     header.label(text=label)

@@ -1,0 +1,86 @@
+"""What the add-on's functions are told, as types; and that Blender's types are for the checker alone."""
+
+import ast
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+MOST = 0.05
+"""Share of the add-on's parameters whose type may be open."""
+RECORDS = ("dict[str, Any]", "Mapping[str, Any]")
+"""What was read from JSON: whoever takes a value out of it looks at what it is."""
+OPEN = {
+    "bake/freeze_group.py: _factor(socket)": "Blender's types know the plain subtype of a socket alone",
+    "compat.py: _own_tree(scene)": "a Blender older than its types",
+    "process/children.py: start(streams)": "what Popen takes, by name",
+    "scene/scene_setup.py: _neutral(view)": "Blender's types know the views of one colour configuration",
+    "scene/scene_setup.py: _same(one)": "the value of any setting",
+    "scene/scene_setup.py: _same(other)": "the value of any setting",
+    "scene/sequences.py: show_sequence(user)": "an image user, or a node that has the same in itself",
+}
+"""Parameters that are `Any` -> why."""
+
+
+def parameters(tree: ast.AST) -> Iterator[tuple[str, str, str]]:
+    """(function, parameter, type) of every function of a file but `self` and `cls`; the type is empty without one."""
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            told = node.args
+            stars = [one for one in (told.vararg, told.kwarg) if one is not None]
+            for one in [*told.posonlyargs, *told.args, *told.kwonlyargs, *stars]:
+                if one.arg not in ("self", "cls"):
+                    yield node.name, one.arg, ast.unparse(one.annotation) if one.annotation is not None else ""
+
+
+def is_open(kind: str) -> bool:
+    """True of a type that says nothing, in whole or in part."""
+    return not kind or any(isinstance(n, ast.Name) and n.id == "Any" for n in ast.walk(ast.parse(kind)))
+
+
+def addon_parameters() -> list[tuple[str, str]]:
+    """(parameter, type) of all of the add-on's."""
+    folder = ROOT / "splannequin_addon"
+    return [
+        (f"{path.relative_to(folder).as_posix()}: {function}({name})", kind)
+        for path in sorted(folder.rglob("*.py"))
+        for function, name, kind in parameters(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+
+
+def test_hardly_a_parameter_of_the_addon_has_an_open_type():
+    told = addon_parameters()
+    assert len(told) > 900
+    assert sum(is_open(kind) for _, kind in told) < MOST * len(told)
+
+
+def test_every_open_parameter_of_the_addon_has_a_reason():
+    told = addon_parameters()
+    assert {name for name, kind in told if is_open(kind) and kind not in RECORDS} == set(OPEN)
+
+
+@pytest.mark.parametrize(
+    ("kind", "nothing"),
+    [("", True), ("Any", True), ("list[Any] | None", True), ("bpy.types.AnyType", False), ("dict[str, int]", False)],
+)
+def test_the_count_knows_an_open_type(kind: str, nothing: bool):
+    assert is_open(kind) == nothing
+
+
+def test_the_count_sees_every_kind_of_parameter():
+    source = "class A:\n    def f(self, a, /, b: Any, *c: int, d: str = '', **e): ..."
+    assert list(parameters(ast.parse(source))) == [
+        ("f", "a", ""),
+        ("f", "b", "Any"),
+        ("f", "d", "str"),
+        ("f", "c", "int"),
+        ("f", "e", ""),
+    ]
+
+
+def test_blenders_types_are_nothing_that_this_python_can_import():
+    """A package of types in folders of bpy's own names would pass for Blender where there is none."""
+    if importlib.util.find_spec("_bpy") is None:
+        assert importlib.util.find_spec("bpy") is None
