@@ -50,8 +50,8 @@ class DetailConfig:
     """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
     sees flickers from pixel to pixel."""
     rough: int = 1
-    """Pixels of decisions around a place that a plate has to show, too, to fill it: along edges, where depth is rough,
-    what it is seen to show changes from pixel to pixel, and single ones would stand out."""
+    """Pixels of decisions around a place that a plate has to show, too, to fill it where something moves: depth is
+    rough there, what it is seen to show changes from pixel to pixel along edges, and single ones would stand out."""
     sway: float = 3.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.15

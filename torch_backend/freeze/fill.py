@@ -110,6 +110,7 @@ def fill(
         [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
     )
     doubt = look_up(posed.doubt, small)
+    uneasy = torch.maximum(motion, doubt).clamp(0.0, 1.0)
     weights, places = list[Tensor](), list[Tensor]()
     untold = 1.0 - unknown
     truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
@@ -121,7 +122,8 @@ def fill(
         else:
             sighting = sightings.seen(frame, points + look_up(fillers.moved[n], small))
         sighting = _doubted(sighting, doubt)
-        sighting.visible = torch.minimum(sighting.visible, look_up(fillers.shown[n], small))
+        around = torch.minimum(sighting.visible, look_up(fillers.shown[n], small))
+        sighting.visible = torch.lerp(sighting.visible, around, uneasy)
         sway = _sway(sightings, config, frame, points, sighting) * untold * look_up(fillers.agreed[n], small)
         weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway))
         places.append(sighting.pixels * larger)
