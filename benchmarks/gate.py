@@ -18,7 +18,7 @@ import torch
 from benchmarks.sources import load_source
 from benchmarks.training_step import _Silent
 from torch_backend.contract import TrainParams
-from torch_backend.freeze.query import freeze_at, render_frozen
+from torch_backend.freeze.frozen import freeze_at, render_frozen
 from torch_backend.raster.cpu import warm_up
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot

@@ -48,7 +48,7 @@ class JobReporter:
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
         now = time.time()
-        pid, host = os.getpid(), contract.host_name()
+        pid, host = os.getpid(), contract.computer_name()
         self.status = Status(kind, "running", pid, now, contract.process_start(pid), now, host=host)
         self._events = open(folder / contract.EVENTS_FILE, "a", encoding="utf-8")  # noqa: SIM115 - lives as long as the job
         self._stop = threading.Event()

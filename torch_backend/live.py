@@ -31,8 +31,8 @@ from torch import Tensor
 from .contract import NO_DEPTH, JobError, LiveView, from_dict, read_message, write_message
 from .footage.plates import Plates
 from .freeze.detail import DetailConfig, DetailedFrame, Detailer
-from .freeze.developed import developed_path, load_developed
-from .freeze.query import (
+from .freeze.developed_instants import developed_path, load_developed
+from .freeze.frozen import (
     FrozenGaussians,
     FrozenImage,
     OutputFrame,

@@ -31,7 +31,7 @@ _BARE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os
 def only_writer(root: Path, kind: str, job: str) -> Generator[Writer]:
     """Holds the shot in `root` for a job. JobError if another one does, or if the shot cannot be written."""
     pid = os.getpid()
-    mine = Writer(contract.host_name(), pid, contract.process_start(pid), kind, job, time.time())
+    mine = Writer(contract.computer_name(), pid, contract.process_start(pid), kind, job, time.time())
     try:
         _take(root, mine)
     except OSError as error:

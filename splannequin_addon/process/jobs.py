@@ -156,7 +156,7 @@ def is_alive(job: Job, status: contract.Status | None) -> bool:
         return job.process.poll() is None
     if status is None or not status.pid:
         return time.time() - _made(job.folder) < _START_SECONDS
-    if status.host and status.host != contract.host_name():
+    if status.host and status.host != contract.computer_name():
         return _holds(job) or not _silent(job, status)
     if status.host or (status.process_started and sys.platform == "linux"):
         return contract.runs_still(status.pid, status.process_started)
@@ -172,7 +172,7 @@ def refuse_second_writer(shot: Path) -> None:
     if writer is not None and writer.works() and not contract.gives_back(shot, writer):
         raise contract.busy(shot, writer)
     for job in latest(shot).values():
-        here = job.status is None or job.status.host in ("", contract.host_name())  # others have the lock
+        here = job.status is None or job.status.host in ("", contract.computer_name())  # others have the lock
         if here and not job.ended and is_alive(job, job.status):
             raise contract.JobError(
                 f"A step of {shot.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
@@ -419,7 +419,7 @@ def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
 
 def _keep(job: Job, status: contract.Status) -> contract.Status:
     """Writes the status of a job that can no longer do so; what another computer writes is not ours to correct."""
-    if status.host in ("", contract.host_name()):
+    if status.host in ("", contract.computer_name()):
         write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
     return status
 
@@ -437,7 +437,7 @@ def _kill(job: Job) -> None:
         pid = job.process.pid  # ours until it is waited for: the system gives its number to no other
     else:
         status = job.status
-        if status is None or status.host not in ("", contract.host_name()):
+        if status is None or status.host not in ("", contract.computer_name()):
             where = status.host.partition(" (")[0] if status else "another computer"
             raise _not_ours(f"This step runs on {where}: only there it can be ended.")
         pid = status.pid

@@ -238,7 +238,7 @@ def believed_running(jobs, contract, shot, pid: int, started: float, host: str):
 )
 def test_cancel_ends_no_process_on_a_files_word(addon, contract, empty_shot, sleeper, words):
     jobs, innocent = addon("process.jobs"), sleeper(*words)
-    for host in ("", contract.host_name()):
+    for host in ("", contract.computer_name()):
         job = believed_running(jobs, contract, empty_shot, innocent.pid, contract.process_start(innocent.pid), host)
         with pytest.raises(contract.JobError, match="cannot be told from others"):
             jobs.cancel(job)
@@ -283,13 +283,15 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     jobs, worker = addon("process.jobs"), sleeper()
     scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(empty_shot)
     started = contract.process_start(worker.pid)
-    writer = contract.Writer(contract.host_name(), worker.pid, started, "train", "from a terminal", time.time() - 90000)
+    writer = contract.Writer(
+        contract.computer_name(), worker.pid, started, "train", "from a terminal", time.time() - 90000
+    )
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
     with pytest.raises(contract.JobError) as told:
         addon("process.begin").begin(scene, "import")
     assert told.value.exit_code == contract.ExitCode.USAGE and told.value.hint == "Wait for it or cancel it."
     since = time.strftime("%Y-%m-%d %H:%M", time.localtime(writer.since))
-    where = contract.host_name().partition(" (")[0]
+    where = contract.computer_name().partition(" (")[0]
     assert told.value.message == f"The training of {empty_shot.name} has been running on {where} since {since}."
     german = addon("translations").translate(told.value.message, "de_DE")
     assert german == f"Das Training von {empty_shot.name} läuft seit {since} auf {where}."
@@ -300,7 +302,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     assert str(empty_shot / "lock.json") in told.value.hint
     ending = jobs.new_job(empty_shot, "train", contract.TrainParams())
     jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name)))
-    told = contract.Status("train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.host_name())
+    told = contract.Status("train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.computer_name())
     jobs.write_json(ending.folder / "status.json", dataclasses.asdict(told))
     jobs.refuse_second_writer(empty_shot)  # its process has told its end, and lets go in a moment
     worker.kill()

@@ -57,7 +57,7 @@ def wait_for_lock(shot, child) -> Writer:
 def dead_writer() -> Writer:
     ended = subprocess.Popen([sys.executable, "-c", "pass"])
     ended.wait()
-    return Writer(contract.host_name(), ended.pid, 12345.0, "train", "a job", time.time())
+    return Writer(contract.computer_name(), ended.pid, 12345.0, "train", "a job", time.time())
 
 
 def put_lock(shot, writer: Writer) -> None:
@@ -68,8 +68,8 @@ def test_a_job_begun_as_soon_as_the_one_before_told_its_end_waits_for_its_lock(s
     """A status is written before the lock is given back: whoever reads it may begin the next step in between."""
     folder = job.new_job(shot, "import", contract.ImportParams())
     now, pid = time.time(), os.getpid()
-    status = contract.Status("import", "running", pid, now, 0.0, now, host=contract.host_name())
-    put_lock(shot, Writer(contract.host_name(), pid, contract.process_start(pid), "import", folder.name, now))
+    status = contract.Status("import", "running", pid, now, 0.0, now, host=contract.computer_name())
+    put_lock(shot, Writer(contract.computer_name(), pid, contract.process_start(pid), "import", folder.name, now))
     write_json(folder / contract.STATUS_FILE, dataclasses.asdict(status))
     with pytest.raises(JobError, match="has been running"), only_writer(shot.root, "solve", "next"):
         pass
@@ -89,8 +89,8 @@ def test_the_second_job_is_refused_in_words_and_the_first_goes_on(shot):
         second, other = begin_import(shot)
         assert second.wait() == ExitCode.USAGE and second.communicate()
         told = status_of(other)
-        assert told.state == "failed" and told.host == contract.host_name()
-        where, since = contract.host_name().partition(" (")[0], time.strftime("%H:", time.localtime(writer.since))
+        assert told.state == "failed" and told.host == contract.computer_name()
+        where, since = contract.computer_name().partition(" (")[0], time.strftime("%H:", time.localtime(writer.since))
         assert told.message.startswith(f"The import of a.splannequin has been running on {where} since {since}")
         assert told.hint == "Wait for it or cancel it."
         assert contract.read_writer(shot.root) == writer

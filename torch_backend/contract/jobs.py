@@ -125,7 +125,7 @@ class Status:
     exit_code: int | None = None
     """Exit code once it has ended."""
     host: str = ""
-    """Computer that the job runs on, as `host_name` says; empty in files from before version 2."""
+    """Computer that the job runs on, as `computer_name` says; empty in files from before version 2."""
     version: int = STATUS_VERSION
     """Version of this file."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from .errors import ExitCode, JobError
 from .files import SHORT_JSON, checked_name, printable, read_json
 from .jobs import STATUS_FILE, WORK
-from .processes import host_name, runs_still
+from .processes import computer_name, runs_still
 from .shot_folder import ShotFolder
 from .typed import CONTRACT_VERSION, check_version, from_dict
 
@@ -19,7 +19,7 @@ class Writer:
     """lock.json of a shot: who writes into it. There is none while nobody does."""
 
     host: str
-    """Computer that it runs on, as `host_name` says."""
+    """Computer that it runs on, as `computer_name` says."""
     pid: int
     """Its process."""
     process_started: float
@@ -35,7 +35,7 @@ class Writer:
 
     def works(self) -> bool:
         """True if its process lives, stopped or not. That of another computer is never said not to."""
-        return self.host != host_name() or runs_still(self.pid, self.process_started)
+        return self.host != computer_name() or runs_still(self.pid, self.process_started)
 
 
 def read_writer(shot: Path) -> Writer | None:
@@ -67,6 +67,6 @@ def busy(shot: Path, writer: Writer) -> JobError:
         since = "an unknown time"
     what, where = WORK.get(writer.kind, "A step"), printable(writer.host.partition(" (")[0], 80)
     hint, lock = "Wait for it or cancel it.", ShotFolder(shot).lock
-    if writer.host != host_name():
+    if writer.host != computer_name():
         hint = f"Wait for it or cancel it there. If {where} surely works on it no longer, delete {lock}."
     return JobError(f"{what} of {shot.name} has been running on {where} since {since}.", hint, ExitCode.USAGE)

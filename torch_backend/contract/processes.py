@@ -75,7 +75,7 @@ def program(name: str) -> str | None:
 
 
 @functools.cache
-def host_name() -> str:
+def computer_name() -> str:
     """This computer as files name it: its name, and in brackets what tells it from another one of the same name.
 
     On Linux that is a hash of the machine's id and, in a container, of its process ids' namespace; on Windows of the

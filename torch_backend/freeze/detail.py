@@ -33,10 +33,10 @@ from ..train import LoadedRun
 from .bands import bands, hand_back
 from .detail_config import DetailConfig
 from .fill import Fillers, Filling, fill, fillers_of
-from .instant import InstantLayer, instant_layer, join
-from .lead import leading_matte, leading_plate
+from .frozen import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
+from .leading_plate import leading_matte, leading_plate
+from .missing_layer import InstantLayer, instant_layer, join
 from .posed import PosedFrame, posed_frame, with_overscan
-from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
 from .reproject import resized
 from .sightings import MovingOf, PlateReader, Sightings
 from .transfer import to_display, to_linear
@@ -133,7 +133,7 @@ class Detailer:
         leading = leading_plate(self.seen, output, posed, usable)
         matte, st, own = leading_matte(self.seen, self.config, output, posed, leading, usable, (width, height))
         fillers = fillers_of(self.seen, self.config, posed, matte, leading, usable)
-        return self._mixed(posed, splat, leading, matte, st, own, fillers)
+        return self._mix_frame(posed, splat, leading, matte, st, own, fillers)
 
     # ------------------------------------------------------------------------------------------------- the frame
 
@@ -171,7 +171,7 @@ class Detailer:
 
     # ------------------------------------------------------------------------------------------------- the mix
 
-    def _mixed(
+    def _mix_frame(
         self,
         posed: PosedFrame,
         splat: FrozenImage,
@@ -203,7 +203,7 @@ class Detailer:
             lead = sample(plate, st[band]) if plate is not None else None
             if gives and own:
                 lead = self._placed(leading, rows, columns, band)
-            self._mix(made, filling, lead, band)
+            self._mix_rows(made, filling, lead, band)
         return made
 
     def _placed(self, frame: int, rows: int, columns: int, band: slice) -> Tensor:
@@ -219,7 +219,7 @@ class Detailer:
             out[first - band.start : last - band.start, left : left + width] = part
         return out
 
-    def _mix(self, made: DetailedFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
+    def _mix_rows(self, made: DetailedFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
         """Fills some rows of a frame whose `matte` is settled and whose `alpha` is the splats'.
 
         `lead` [h, W, 3] are the leading plate's pixels there, scene-linear; None where it gives nothing.

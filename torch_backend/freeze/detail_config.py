@@ -62,6 +62,6 @@ class DetailConfig:
     """Low-passed difference, display-referred, between a plate of another time and plate t* at which the first is
     believed 1/e in what moves: it may show another state."""
     instant: bool = True
-    """Give what plate t* shows and the model lacks a surface of its own (`instant.py`)."""
+    """Give what plate t* shows and the model lacks a surface of its own (`missing_layer.py`)."""
     sightings: SightingConfig = field(default_factory=SightingConfig)
     """How plates are compared with the model."""

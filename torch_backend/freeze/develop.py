@@ -1,7 +1,7 @@
 """Develop: a frozen instant is trained on as the static scene that it is, until it shows what plate t* shows.
 
 The field has to explain a whole clip; a freeze needs one instant of it. So the frozen Gaussians, with what plate t*
-shows and the field lost (`instant.py`), become parameters of their own. Still pixels are learnt from all trained
+shows and the field lost (`missing_layer.py`), become parameters of their own. Still pixels are learnt from all trained
 frames, in each of which what moves stands where the field has it; what moves at t* is learnt from plate t* alone. The
 pictures are larger than those of a preview run, so the frozen scene becomes sharper than the run.
 
@@ -22,10 +22,10 @@ from ..train import LoadedRun
 from ..train.adam import FusedAdam
 from ..train.losses import photometric
 from ..train.model import render
-from .query import FrozenGaussians
+from .frozen import FrozenGaussians
 from .sightings import MovingOf
 from .travel import Travel
-from .working import WorkingPlates, showing, spread
+from .working_plates import WorkingPlates, showing, spread
 
 Check = Callable[[int, int], None]
 """Called with (steps done, steps in all); raises to cancel."""

@@ -11,7 +11,7 @@ from ..scene import resize_intrinsics
 from ..torch_types import norm_of_all
 from ..train.model import render
 from .detail_config import DetailConfig
-from .query import FrozenGaussians, FrozenImage, OutputFrame
+from .frozen import FrozenGaussians, FrozenImage, OutputFrame
 from .reproject import look_up, pixel_centres, resized, unproject
 from .sightings import Sightings
 

@@ -18,7 +18,7 @@ from ..shot import Shot
 from ..solve.motion import MOVING, UNKNOWN, load_motion
 from ..torch_types import from_numpy
 from ..train import LoadedRun
-from .query import FrozenGaussians, FrozenImage, render_frozen
+from .frozen import FrozenGaussians, FrozenImage, render_frozen
 from .regions import grown
 from .reproject import blurred, inside, look_up, pixel_centres, project, resized, same_surface, widened
 from .travel import Stage

@@ -46,10 +46,10 @@ from ..train.anew import SUMMARY_FILE
 from .bands import bands
 from .contact_sheet import write_contact_sheet
 from .detail import DetailedFrame, Detailer
-from .developed import Instants
+from .developed_instants import Instants
 from .exr import DetailLayers, FrameMetadata, Made, read_frozen_exr, read_key, write_frozen_exr
+from .frozen import FrozenGaussians, FrozenImage, OutputFrame, render_frozen, suggest_t_star
 from .grain import Brush, Grain, measure_plate
-from .query import FrozenGaussians, FrozenImage, OutputFrame, render_frozen, suggest_t_star
 from .reproject import resized
 from .transfer import to_display
 from .verdict import judge_take, unsure

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..gaussians.model import PARAM_NAMES
 from ..scene import Scene
 from ..train import LoadedRun
-from .query import FrozenGaussians, freeze_at
+from .frozen import FrozenGaussians, freeze_at
 
 _KEPT = 64
 """Frames whose changes are kept: of 25,000 open Gaussians about 3 MB each."""
@@ -20,7 +20,7 @@ class Travel:
     """From a scene frozen at t* to the clip's frames.
 
     The run's own Gaussians come first in the scene; what stands behind them (an instant's layer) is not moved, nor is
-    what was closed at t* (`twin.py`).
+    what was closed at t* (`static_twin.py`).
     """
 
     def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians) -> None:

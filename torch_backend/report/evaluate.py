@@ -17,8 +17,8 @@ from ..contract import CHECKPOINT_FILE, METRICS_FILE, SUMMARY_FILE, JobError, Re
 from ..footage.images import write_png
 from ..footage.plates import Plates
 from ..freeze.detail import Detailer
-from ..freeze.developed import Instants
-from ..freeze.query import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
+from ..freeze.developed_instants import Instants
+from ..freeze.frozen import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
 from ..scene import Scene, evenly_spaced, load_scene, read_image, split_frames
 from ..shot import Shot
 from ..solve.motion import find_motion

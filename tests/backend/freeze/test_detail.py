@@ -18,7 +18,7 @@ from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze import bands
 from torch_backend.freeze.detail import DetailConfig, Detailer
-from torch_backend.freeze.query import OutputFrame, freeze_at, render_frozen
+from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen
 from torch_backend.freeze.warp import sample, snap
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0

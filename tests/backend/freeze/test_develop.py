@@ -11,7 +11,7 @@ from torch_backend.contract import Cancelled, FreezeParams, LiveView, TrainParam
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.develop import DevelopConfig, develop
-from torch_backend.freeze.developed import (
+from torch_backend.freeze.developed_instants import (
     MOST,
     Instants,
     config_for,
@@ -21,11 +21,11 @@ from torch_backend.freeze.developed import (
     load_developed,
 )
 from torch_backend.freeze.exr import read_key
-from torch_backend.freeze.instant import instant_layer, join
-from torch_backend.freeze.query import render_frozen, span_of
+from torch_backend.freeze.frozen import render_frozen, span_of
+from torch_backend.freeze.missing_layer import instant_layer, join
 from torch_backend.freeze.sightings import motion_mattes
+from torch_backend.freeze.static_twin import held_still, settled
 from torch_backend.freeze.travel import Stage, Travel
-from torch_backend.freeze.twin import closed, settled
 from torch_backend.live import LiveSession
 from torch_backend.scene import load_scene
 from torch_backend.solve.motion import load_motion
@@ -127,7 +127,7 @@ def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(tra
     shut = (torn.motion > 0.5) & (mended.motion < 0.5)
     assert float(shut[wall].float().mean()) > 0.8, "what is seen of it"
     stays = mended.motion[patch] > 0.5
-    ours, twins = (scores(world, run, scene, f) for f in (mended, closed(run, torn, run.model.open_rows())))
+    ours, twins = (scores(world, run, scene, f) for f in (mended, held_still(run, torn, run.model.open_rows())))
     was_moving, was_still = scores(world, run, scene, torn)
     assert ours[1] > was_still + 2.0 and ours[1] > twins[1] - 0.05, "no worse than static where nothing moves"
     assert ours[0] > was_moving - 0.1 and ours[0] > twins[0] + 1.0 and bool(stays.any())

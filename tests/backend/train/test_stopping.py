@@ -12,7 +12,7 @@ import torch
 
 from torch_backend.cli import Console
 from torch_backend.contract import Event, TrainParams
-from torch_backend.freeze.query import freeze_at, render_frozen
+from torch_backend.freeze.frozen import freeze_at, render_frozen
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
 from torch_backend.train.checkpoint import load_checkpoint

@@ -23,9 +23,9 @@ from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.model import gathered, render
 from ..train.movers import mean_of
-from .query import FrozenGaussians
+from .frozen import FrozenGaussians
 from .sightings import MovingOf
-from .working import WorkingPlates, showing, spread
+from .working_plates import WorkingPlates, showing, spread
 
 _SEEN = 0.05
 """Pixels that a plate has to see of a Gaussian before it counts."""
@@ -70,18 +70,18 @@ def settled(
         left = rows[frozen.motion[rows] > 0.5]
         if not len(left):
             break
-        pair = _Pair(run, plates, frozen, closed(run, frozen, left), left, movers)
+        pair = _Pair(run, plates, frozen, held_still(run, frozen, left), left, movers)
         near = _nearest(frozen.state["means"][left], config.neighbours)
         gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
         stays = (harm <= 0.0) | (gain > harm)
         if bool(stays.all()):
             break
-        frozen = closed(run, frozen, left[~stays])
+        frozen = held_still(run, frozen, left[~stays])
     return frozen
 
 
 @torch.no_grad()
-def closed(run: LoadedRun, frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
+def held_still(run: LoadedRun, frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
     """A frozen scene in which `rows` [M] int64 of the run's Gaussians are what they are on average, and do not move."""
     mean, state = mean_of(run.model, rows), dict(frozen.state)
     for name, value in state.items():

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from torch_backend.footage.images import write_png
-from torch_backend.freeze.instant import InstantConfig, instant_layer, join, low_difference
-from torch_backend.freeze.query import FrozenGaussians, freeze_at, render_frozen
+from torch_backend.freeze.frozen import FrozenGaussians, freeze_at, render_frozen
+from torch_backend.freeze.missing_layer import InstantConfig, instant_layer, join, low_difference
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
 from torch_backend.scene import Scene

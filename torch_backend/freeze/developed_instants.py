@@ -20,10 +20,10 @@ from ..solve.motion import load_motion, motion_key
 from ..train import LoadedRun
 from ..train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from .develop import DevelopConfig, develop
-from .instant import instant_layer, join
-from .query import FrozenGaussians, freeze_at, span_of
+from .frozen import FrozenGaussians, freeze_at, span_of
+from .missing_layer import instant_layer, join
 from .sightings import motion_mattes
-from .twin import settled
+from .static_twin import settled
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..scene import Scene, read_image
 from ..train.model import gathered
-from .query import FrozenGaussians
+from .frozen import FrozenGaussians
 from .reproject import resized, widened
 from .sightings import MovingOf
 

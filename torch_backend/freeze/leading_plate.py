@@ -8,8 +8,8 @@ from torch import Tensor
 from ..torch_types import norm
 from .bands import bands
 from .detail_config import DetailConfig
+from .frozen import OutputFrame
 from .posed import PosedFrame, displacements, parallax
-from .query import OutputFrame
 from .regions import closed, grown, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import Sighting, Sightings

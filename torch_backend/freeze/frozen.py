@@ -170,7 +170,7 @@ def _shown(
 
 
 @dataclass
-class Instant:
+class CandidateInstant:
     """A trained frame as a place for time to stand still."""
 
     index: int
@@ -188,9 +188,9 @@ def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray
     return max(rank_instants(model, times, sharpness), key=lambda instant: instant.score).index
 
 
-def best_instants(instants: list[Instant], count: int = 5, apart: float = 0.08) -> list[Instant]:
+def best_instants(instants: list[CandidateInstant], count: int = 5, apart: float = 0.08) -> list[CandidateInstant]:
     """Up to `count` of a ranking, best first, at least `apart` of the trained frames from each other."""
-    chosen: list[Instant] = []
+    chosen: list[CandidateInstant] = []
     for instant in sorted(instants, key=lambda i: -i.score):
         if all(abs(instant.index - other.index) >= apart * len(instants) for other in chosen):
             chosen.append(instant)
@@ -198,7 +198,7 @@ def best_instants(instants: list[Instant], count: int = 5, apart: float = 0.08) 
 
 
 @torch.no_grad()
-def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> list[Instant]:
+def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> list[CandidateInstant]:
     """Every trained frame as an instant to freeze: one that saw most of what moves and whose plate is sharp is good.
 
     Gaussians count by how far they travel, so that people weigh more than a flickering lamp. Between two that are as
@@ -211,7 +211,7 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     rows = model.open_rows()
     rank = np.argsort(np.argsort(sharpness)) / max(1, len(sharpness) - 1)
     if not len(rows) or model.field is None:
-        return [Instant(n, float(r), 1.0, float(r)) for n, r in enumerate(rank)]
+        return [CandidateInstant(n, float(r), 1.0, float(r)) for n, r in enumerate(rank)]
     instants = torch.linspace(0, 1, 12, device=model.device)
     moves = [model.deltas(rows, instants[n : n + 1]) for n in range(len(instants))]
     places = torch.stack([move.means for move in moves if move is not None])
@@ -224,4 +224,4 @@ def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray)
     inner = np.minimum(end / max(1.0, _ENDS * len(times)), 1.0)
     scores = share / max(float(share.max()), 1e-6) + 0.5 * rank + 0.1 * inner
     figures = zip(scores.tolist(), share.tolist(), rank.tolist(), strict=True)
-    return [Instant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(figures)]
+    return [CandidateInstant(n, score, saw, sharp) for n, (score, saw, sharp) in enumerate(figures)]

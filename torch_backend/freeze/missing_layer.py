@@ -23,9 +23,9 @@ from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.exposure import Exposure
 from ..train.model import gathered
+from .frozen import FrozenGaussians, FrozenImage, render_frozen
 from .instant_depth import DepthConfig, Region, View, inverse_depth, own_motion
 from .instant_track import Track, TrackConfig, swing, tracks
-from .query import FrozenGaussians, FrozenImage, render_frozen
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a motion matte (`solve/motion.py`)."""

@@ -1,0 +1,21 @@
+"""A paused run is asked for again with everything that it was begun with."""
+
+import dataclasses
+
+ASKED_ELSEWHERE = {
+    "run": "the folder's name",
+    "device": "Preferences, or wherever it goes on",
+    "resume": "asked for by going on",
+    "extend": "of finished runs",
+}
+"""Fields that no stored configuration holds -> where they come from."""
+
+
+def test_every_number_of_a_training_is_asked_for_again(addon, contract):
+    config = {
+        "preset": "preview", "method": "auto", "iterations": 1, "width": 2, "holdout": 3, "seed": 4,
+        "densify": {"budget": 5}, "supervision": {"preset": "support"},
+    }  # fmt: skip
+    again = set(addon("shot.checkpoints").params_of(config))
+    assert again | set(ASKED_ELSEWHERE) == {field.name for field in dataclasses.fields(contract.TrainParams)}
+    assert not again & set(ASKED_ELSEWHERE)
