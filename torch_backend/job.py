@@ -192,7 +192,7 @@ def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack 
             held.enter_context(only_writer(shot.root, request.kind, reporter.folder.name))
         reporter.check_cancelled()
         with _kept_in_place(shot, request.kind):
-            result = STATIONS[request.kind](shot, params, reporter)
+            result = RUNNERS[request.kind](shot, params, reporter)
     except Cancelled:
         state, code = "cancelled", int(ExitCode.CANCELLED)
         message, hint = "Cancelled.", "Start it again to go on: finished work is kept."
@@ -317,7 +317,7 @@ def _freeze(shot: Shot, params: contract.FreezeParams, report: Reporter) -> Any:
     return freeze_shot(shot, params, report)
 
 
-STATIONS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
+RUNNERS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "import": _import,
     "solve": _solve,
     "train": _train,

@@ -29,7 +29,7 @@ def status_of(folder):
 
 def run_with(shot, monkeypatch, station):
     """Runs an import job whose station is `station`: the job machinery is what is under test."""
-    monkeypatch.setitem(job.STATIONS, "import", station)
+    monkeypatch.setitem(job.RUNNERS, "import", station)
     folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
     return folder, job.run_job(folder)
 

@@ -124,7 +124,7 @@ def test_the_shot_is_free_again_however_a_job_ends(shot, monkeypatch, ends):
         if ends == "cancelled":
             raise contract.Cancelled
 
-    monkeypatch.setitem(job.STATIONS, "import", station)
+    monkeypatch.setitem(job.RUNNERS, "import", station)
     folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
     job.run_job(folder)
     assert seen[0].pid == os.getpid() and seen[0].job == folder.name and seen[0].works()
@@ -132,7 +132,7 @@ def test_the_shot_is_free_again_however_a_job_ends(shot, monkeypatch, ends):
 
 
 def test_runs_of_one_benchmark_may_be_trained_at_once(shot, monkeypatch):
-    monkeypatch.setitem(job.STATIONS, "train", lambda *_: "trained")
+    monkeypatch.setitem(job.RUNNERS, "train", lambda *_: "trained")
     with only_writer(shot.root, "train", "another"):
         folder = job.new_job(shot, "train", contract.TrainParams(run="mine"))
         assert job.run_job(folder)[0] == ExitCode.USAGE
