@@ -77,6 +77,6 @@ def annotate(cls: type) -> None:
     """Makes annotations of the properties that a class and what it is made of assign. Again does nothing."""
     for one in cls.__mro__:
         for name, value in list(vars(one).items()):
-            if isinstance(value, props._PropertyDeferred):
+            if isinstance(value, props._PropertyDeferred):  # pyright: ignore[reportPrivateUsage]
                 one.__annotations__[name] = value
                 delattr(one, name)

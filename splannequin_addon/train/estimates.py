@@ -31,7 +31,7 @@ def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
     # Where nothing may move a step is several times as fast.
     timed = [run for run in timed if run.get("method") != "static"] or timed
     across = state.size[0] if state is not None else 0
-    rows = []
+    rows: list[Cost] = []
     for preset, steps in contract.PRESET_STEPS.items():
         width = min(contract.PRESET_WIDTHS[preset], across or contract.PRESET_WIDTHS[preset])
         own = [run for run in timed if run.get("preset") == preset and run.get("width_px") == width]
