@@ -116,11 +116,14 @@ class DetailClip:
 
     def view(self, frame: int, t_star: int, withheld: Collection[int] = (), image: FrozenImage | None = None) -> View:
         """The frozen frame with plate detail; `image` is that of `splats`, if it is at hand."""
-        viewmat, K = self.camera(frame)
         image = image or self.splats(frame, t_star)
-        output = OutputFrame(frame, viewmat, K, float(t_star), float(frame))
-        detailed = self.detailer.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
+        detailed = self.detailed(frame, t_star, image, withheld)
         return View(image, detailed, over(image.color, image.alpha), over(detailed.color, detailed.alpha))
+
+    def detailed(self, frame: int, t_star: int, image: FrozenImage, withheld: Collection[int] = ()) -> DetailedFrame:
+        """The frozen frame of plates as a take makes it, from its render by `splats`."""
+        output = OutputFrame(frame, *self.camera(frame), float(t_star), float(frame))
+        return self.detailer.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
 
     def plate(self, frame: int) -> Tensor:
         """The plate of a frame, [H, W, 3] in [0, 1]."""

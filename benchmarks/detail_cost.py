@@ -115,10 +115,10 @@ def measure(shot: Path, run: str, width: int, poses: Sequence[int], develop: boo
         since = time.perf_counter()
         image = clip.splats(pose, t_star)
         splats = time.perf_counter() - since
-        view = clip.view(pose, t_star, image=image)
+        made = clip.detailed(pose, t_star, image)
         rows.append({"frame": pose, "splats": splats, "whole": time.perf_counter() - since})
-        sources |= {int(frame) for frame in view.detailed.source.unique().tolist()} - {0}
-        del image, view  # as a take does: a frame is written and let go before the next is made
+        sources |= {int(frame) for frame in made.source.unique().tolist()} - {0}
+        del image, made  # as a take does: a frame is written and let go before the next is made
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "width": clip.width,

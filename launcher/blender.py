@@ -62,7 +62,7 @@ def choose_wheels() -> list[tuple[str, str]]:
     at_hand = [(s, sys.executable) for s in DEMO_WHEELS if BPY_WHEELS[s] == sys.version_info[:2]]
     if at_hand:
         return sorted(at_hand, key=lambda wheel: not bpy_environment(wheel[0]).ready())
-    other = []
+    other: list[tuple[str, str]] = []
     for series in DEMO_WHEELS:
         if bpy_environment(series).ready():
             return [(series, "")]

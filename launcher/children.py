@@ -37,14 +37,15 @@ def start_child(command: Sequence[str], environ: dict[str, str], **streams: Any)
 
     It stands beside its program, as in `contract.python_child`, unless `cwd` says where.
     """
+    streams.setdefault("stdin", subprocess.DEVNULL)
     streams.setdefault("cwd", os.path.dirname(os.path.abspath(command[0])))
     try:
         if WINDOWS:
             group = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-            apart: dict[str, Any] = {"creationflags": group}
+            streams["creationflags"] = group
         else:
-            apart = {"start_new_session": True}
-        return subprocess.Popen(command, env=environ, **{"stdin": subprocess.DEVNULL, **apart, **streams})
+            streams["start_new_session"] = True
+        return subprocess.Popen(command, env=environ, **streams)
     except OSError as error:
         raise LauncherError(f"Cannot start {command[0]} ({error}): run `setup` again, or see `doctor`.") from error
 

@@ -187,7 +187,8 @@ def _has_pip(environment: Environment) -> bool:
     if version is None or version < NEEDED_PYTHON:
         return False
     command = python_child(environment.python, "pip", "--version")
-    return subprocess.run(**command, env=child_environ(), capture_output=True).returncode == 0
+    done = subprocess.run(command["args"], cwd=command["cwd"], env=child_environ(), capture_output=True)
+    return done.returncode == 0
 
 
 def _make_room(environment: Environment) -> None:

@@ -39,7 +39,7 @@ def find_python(accept: Callable[[tuple[int, int]], bool], names: Sequence[str])
     """The first Python of the machine whose version is accepted: this one, then `names` on the PATH, then pyenv's."""
     if accept(sys.version_info[:2]):
         return sys.executable
-    candidates = []
+    candidates: list[str] = []
     for name in names:
         for folder in os.get_exec_path():
             found = shutil.which(name, path=folder)

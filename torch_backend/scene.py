@@ -7,6 +7,9 @@ percentile of the distance from it) is 1, so learning rates, near planes and thr
 
 from __future__ import annotations
 
+import math
+import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,7 @@ from torch import Tensor
 from .contract import ExitCode, JobError, Reporter, frame_file
 from .footage.images import read_frame
 from .footage.importing import load_frames
-from .shot import Shot
+from .shot import Shot, make_folder, need_disk
 from .solve.stored import damaged, load_cameras, load_points
 from .torch_types import from_numpy
 
@@ -155,18 +158,46 @@ def split_frames(solved: list[int], holdout: int, phase: int = 0) -> tuple[list[
     return [i for i in solved if i not in held], test
 
 
-def load_images(scene: Scene, indices: list[int], width: int, height: int, report: Reporter | None = None) -> Tensor:
+HELD_BYTES = 1 << 30
+"""Bytes of training images that are held in memory; more lie in a file, of which the system holds what is in use."""
+
+
+def load_images(
+    scene: Scene,
+    indices: list[int],
+    width: int,
+    height: int,
+    report: Reporter | None = None,
+    beside: Path | None = None,
+) -> Tensor:
     """Working frames `indices` at a training size, [I, height, width, 3] float16 display-referred in [0, 1].
 
-    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip.
+    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `HELD_BYTES` of them are
+    mapped from a nameless file in the folder `beside`, if there is one: however the process ends, nothing stays.
+    JobError if the disk has no room for that.
     """
-    images = torch.empty(len(indices), height, width, 3, dtype=torch.float16)
+    shape = len(indices), height, width, 3
+    if beside is None or 2 * math.prod(shape) <= HELD_BYTES:
+        images = torch.empty(*shape, dtype=torch.float16)
+    else:
+        images = _mapped(beside, shape)
     for n, index in enumerate(indices):
         images[n] = read_image(scene.image_path(index), width, height)
         if report:
             report.check_cancelled()
             report.progress("loading frames", n + 1, len(indices), f"frame {scene.frames[index]}")
     return images
+
+
+def _mapped(folder: Path, shape: tuple[int, ...]) -> Tensor:
+    """A tensor of float16 in a file that has no name, or loses it with the process where a file must have one."""
+    size = 2 * math.prod(shape)
+    make_folder(folder)
+    need_disk(folder, size, "Frames for the training, which are too many for the memory,")
+    with tempfile.TemporaryFile(dir=folder, prefix="frames-") as file:
+        if hasattr(os, "posix_fallocate"):  # a disk that fills up later would kill the process, without a word
+            os.posix_fallocate(file.fileno(), 0, size)
+        return from_numpy(np.memmap(file, dtype=np.float16, mode="r+", shape=shape))
 
 
 def read_image(path: Path, width: int, height: int) -> Tensor:

@@ -16,7 +16,7 @@ class Cost:
     preset: str
     """preview, standard or final."""
     width: int
-    """Width in pixels of the training images."""
+    """Width in pixels of the training images; 0: the working frames', of which nothing is known yet."""
     steps: int
     """Training steps."""
     seconds: float | None
@@ -33,7 +33,8 @@ def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
     across = state.size[0] if state is not None else 0
     rows: list[Cost] = []
     for preset, steps in contract.PRESET_STEPS.items():
-        width = min(contract.PRESET_WIDTHS[preset], across or contract.PRESET_WIDTHS[preset])
+        width = contract.PRESET_WIDTHS[preset] or across
+        width = min(width, across) if across else width
         own = [run for run in timed if run.get("preset") == preset and run.get("width_px") == width]
         nearest = own[-1:] or timed[-1:]
         seconds = None

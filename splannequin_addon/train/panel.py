@@ -52,7 +52,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             label = tr(names[row.preset])  # ours: Blender's own word for Final is too long for the column in German
             columns[0].prop_enum(props, "preset", row.preset, text=label, translate=False)
             spent = "-" if row.seconds is None else step_panel.minutes(row.seconds) + ("" if row.measured else " ?")
-            for place, text in zip(columns[1:], (str(row.width), f"{row.steps / 1000:g}k", spent), strict=True):
+            for place, text in zip(columns[1:], (str(row.width or "-"), f"{row.steps / 1000:g}k", spent), strict=True):
                 place.label(text=text, translate=False)
         if told is None:
             words = "Preview took 150 s on two cores without a graphics card. Times here come with the first run."

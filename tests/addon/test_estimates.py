@@ -7,7 +7,9 @@ import pytest
 
 def test_a_tooltip_tells_what_the_preset_is(addon, contract):
     for name, _, words in addon("train.settings").PRESETS:
-        assert words.startswith(f"{contract.PRESET_WIDTHS[name]} pixels wide, {contract.PRESET_STEPS[name]} steps")
+        width = contract.PRESET_WIDTHS[name]
+        wide = f"{width} pixels wide" if width else "As wide as the working frames"
+        assert words.startswith(f"{wide}, {contract.PRESET_STEPS[name]} steps")
 
 
 @pytest.mark.parametrize("by_hand", [False, True])

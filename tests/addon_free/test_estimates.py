@@ -24,16 +24,17 @@ def test_without_a_timed_run_nothing_is_promised(costs, addon, contract):
         rows, told = costs(runs)
         assert told is None and all(row.seconds is None and not row.measured for row in rows.values())
     assert {n: (r.steps, r.width) for n, r in rows.items()} == {
-        n: (contract.PRESET_STEPS[n], contract.PRESET_WIDTHS[n]) for n in ("preview", "standard", "final")
+        n: (contract.PRESET_STEPS[n], contract.PRESET_WIDTHS[n] or 1280) for n in ("preview", "standard", "final")
     }
-    assert addon("train.estimates").costs(None)[1] is None
+    rows, told = addon("train.estimates").costs(None)
+    assert told is None and rows[-1].width == 0, "nothing is known of the clip"
 
 
 def test_a_preset_that_was_run_takes_as_long_again_and_others_by_pixels_and_steps(costs):
     rows, told = costs({"main": run(iterations=1000, train_seconds=100.0)})
     assert told["run"] == "main"
     assert (rows["preview"].seconds, rows["preview"].measured) == (200.0, True)
-    assert (rows["standard"].seconds, rows["standard"].measured) == (pytest.approx(200.0 * 4.5 * 4), False)
+    assert (rows["standard"].seconds, rows["standard"].measured) == (pytest.approx(200.0 * 4.5 * 9), False)
     assert rows["final"].seconds == 200.0 * 15 * 16
 
 

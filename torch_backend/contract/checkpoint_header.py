@@ -7,7 +7,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from .files import open_regular
+from .files import is_json_object, open_regular
 
 _LONGEST = 1 << 22
 """Bytes of a header that are read."""
@@ -21,8 +21,8 @@ def checkpoint_facts(path: Path) -> dict[str, Any]:
     with open_regular(path) as source:
         try:
             (length,) = struct.unpack("<Q", source.read(8))
-            header = json.loads(source.read(length)) if length < _LONGEST else {}
-            told = json.loads(header["__metadata__"]["splannequin"])
+            header: dict[str, Any] = json.loads(source.read(length)) if length < _LONGEST else {}
+            facts = json.loads(header["__metadata__"]["splannequin"])
         except (ValueError, KeyError, TypeError, RecursionError, struct.error):
             return {}
-    return told if isinstance(told, dict) else {}
+    return facts if is_json_object(facts) else {}

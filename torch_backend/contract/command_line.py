@@ -33,7 +33,7 @@ def command_line(
     )
     top.add_argument("--json", action="store_true", dest="json_before", help=_JSON)
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    parsers = {}
+    parsers: dict[str, argparse.ArgumentParser] = {}
     for name, verb in VERBS.items():
         if side not in verb.sides:
             continue
@@ -152,7 +152,7 @@ def _refuse_what_a_clip_wants(args: argparse.Namespace) -> None:
 def notes(args: argparse.Namespace) -> list[str]:
     """Sentences on what a command line says in vain, or in an old word."""
     verb, said = VERBS[args.command], getattr(args, "said", {})
-    found = []
+    found: list[str] = []
     if verb.now:
         found.append(f"`{args.command} SHOT` is called `{verb.now} SHOT` now: the old word goes with the next version.")
     for cls in (verb.words, *verb.jobs.values()):

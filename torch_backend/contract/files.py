@@ -9,7 +9,7 @@ import stat
 import sys
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeGuard
 
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
@@ -54,9 +54,14 @@ def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
         data = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:  # ValueError: no JSON, no UTF-8, or a number of too many digits
         raise ValueError(f"{path} is not valid JSON: {error}") from error
-    if not isinstance(data, dict):
+    if not is_json_object(data):
         raise ValueError(f"{path} should hold a JSON object, found {type(data).__name__}")
     return data
+
+
+def is_json_object(value: object) -> TypeGuard[dict[str, Any]]:
+    """True if what was read from JSON is an object: a dictionary, whose keys are text then."""
+    return isinstance(value, dict)
 
 
 def _no_number(name: str) -> float:

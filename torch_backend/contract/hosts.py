@@ -12,7 +12,7 @@ _FOLDER = Path(__file__).resolve().parents[1] / "deformation"
 @functools.cache
 def host_names(folder: Path = _FOLDER) -> tuple[str, ...]:
     """Names of the hosts in a folder: what each module's `HOST = HostSpec(...)` calls itself, first or as `name=`."""
-    found = set()
+    found: set[str] = set()
     for file in folder.glob("*.py"):
         source = file.read_text(encoding="utf-8")
         if "\nHOST" in source:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from .errors import ExitCode, JobError
+from .files import is_json_object
 from .options import PARAMS, check_params
 from .processes import process
 from .shot_folder import ShotFolder
@@ -64,7 +65,7 @@ class JobRequest:
     """import, solve, train or freeze."""
     shot: str
     """Absolute path of the shot folder."""
-    params: dict[str, Any] = field(default_factory=dict)
+    params: dict[str, Any] = field(default_factory=dict[str, Any])
     """Fields of the kind's dataclass in `PARAMS`."""
     version: int = CONTRACT_VERSION
     """Version of this contract."""
@@ -176,7 +177,7 @@ def new_job(shot: ShotFolder | Path, kind: str, params: Any) -> Path:
     folder = shot_folder.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
     shot_folder.jobs.mkdir(exist_ok=True)
     folder.mkdir()
-    values: dict[str, Any] = params if isinstance(params, dict) else dataclasses.asdict(params)
+    values = params if is_json_object(params) else dataclasses.asdict(params)
     request = JobRequest(kind=kind, shot=str(shot_folder.root), params=values)
     write_json(folder / REQUEST_FILE, dataclasses.asdict(request), parents=False)
     return folder

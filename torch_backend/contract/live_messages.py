@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
+from .files import is_json_object
+
 
 @dataclass
 class LiveView:
@@ -86,13 +88,14 @@ def read_message(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
     if text is None or body is None:
         return None
     header = json.loads(text)
-    if not isinstance(header, dict):
+    if not is_json_object(header):
         raise ValueError("a live message's header should be a JSON object")
     return header, body
 
 
 def _read_exactly(stream: BinaryIO, count: int) -> bytes | None:
-    parts, missing = [], count
+    parts: list[bytes] = []
+    missing = count
     while missing:
         part = stream.read(missing)
         if not part:

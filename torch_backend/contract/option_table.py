@@ -23,7 +23,7 @@ class Limit:
     """Least."""
     high: float
     """Most."""
-    also: Mapping[int, str] = field(default_factory=dict)
+    also: Mapping[int, str] = field(default_factory=dict[int, str])
     """Values outside of that which have a meaning -> what they are for."""
 
 
@@ -63,7 +63,7 @@ class Option:
     """Name on the panel; empty: the panel has it not, or in another form."""
     tip: str = ""
     """Tooltip on the panel."""
-    items: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    items: Mapping[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
     """On the panel, of choices: value -> (name, tooltip), in the order that .blend files keep: new ones go last."""
 
     @property

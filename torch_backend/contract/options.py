@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from .files import is_json_object
 from .hosts import host_names
 from .option_table import SWITCH, Limit, Option, limits_of, option, overscan
 
@@ -12,8 +14,8 @@ LAST_FRAME = 1_048_574
 """Blender's last frame number: no scene reaches further."""
 PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
-PRESET_WIDTHS = {"preview": 320, "standard": 640, "final": 1280}
-"""Width in pixels of each preset's training images, never above the working frames'."""
+PRESET_WIDTHS = {"preview": 320, "standard": 960, "final": 0}
+"""Width in pixels of each preset's training images, never above the working frames'; 0: theirs."""
 CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV")
 """What `SolveParams.camera_model` may be."""
 HOSTS = host_names()
@@ -173,8 +175,8 @@ class TrainParams:
         tip="How much to spend on training",
         items={
             "preview": ("Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
-            "standard": ("Standard", "640 pixels wide, 9000 steps: for most shots"),
-            "final": ("Final", "1280 pixels wide, 30000 steps, most Gaussians: takes longest"),
+            "standard": ("Standard", "960 pixels wide, 9000 steps: for most shots"),
+            "final": ("Final", "As wide as the working frames, 30000 steps, most Gaussians: takes longest"),
         },
     )
     """preview, standard or final."""
@@ -301,7 +303,7 @@ class FreezeParams:
     )
     """Frame number of the clip at which time stands still; None: suggested from support and sharpness."""
     t_star_per_frame: dict[str, float] = field(
-        default_factory=dict, metadata={"option": Option(limit=Limit("t* of a frame", -_FRAMES, _FRAMES))}
+        default_factory=dict[str, float], metadata={"option": Option(limit=Limit("t* of a frame", -_FRAMES, _FRAMES))}
     )
     """Clip frame number -> t* as a frame number, one per output frame: freeze ramps. Overrides `t_star`."""
     first: int | None = option(None, limit=Limit("first frame", -_FRAMES, _FRAMES))
@@ -392,11 +394,11 @@ LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.va
 """The numbers of each kind of parameters, by field."""
 
 
-def check_params(params: Any) -> None:
+def check_params(params: object) -> None:
     """ValueError, in a sentence, names the first number of a job's parameters that is out of its `LIMITS`."""
     for name, limit in LIMITS.get(type(params), {}).items():
         given = getattr(params, name)
-        values = given.values() if isinstance(given, dict) else (given,)
+        values: Iterable[Any] = given.values() if is_json_object(given) else (given,)
         for value in values:
             if value is None or value in limit.also or limit.low <= value <= limit.high:  # NaN is none of them
                 continue

@@ -81,7 +81,7 @@ def host_name() -> str:
     On Linux that is a hash of the machine's id and, in a container, of its process ids' namespace; on Windows of the
     machine's GUID; elsewhere there is none.
     """
-    marks = []
+    marks: list[str] = []
     if sys.platform == "win32":
         import winreg
 
@@ -107,8 +107,11 @@ class Process:
     """Its command line, arguments separated by spaces; empty if the system does not tell."""
 
 
-def process(pid: int) -> Process | None:
-    """A living process of this computer; None if there is none of that id. Standard library, on all three systems."""
+def process(pid: object) -> Process | None:
+    """A living process of this computer; None if there is none of that id, which may be anything that a file says.
+
+    Standard library, on all three systems.
+    """
     if not (isinstance(pid, int) and 0 < pid < 1 << 31):
         return None
     if sys.platform == "win32":

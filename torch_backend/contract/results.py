@@ -6,16 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from .files import printable
+from .files import is_json_object, printable
 from .typed import CONTRACT_VERSION, from_dict
 
 
 def measured(row: Mapping[str, Any]) -> tuple[float, float] | None:
     """(seconds of training, dB on frames kept out) of a measurement; None if it is none, or holds no plain numbers."""
-    seconds, quality = row.get("seconds"), row.get("heldout_psnr_db")
-    if any(isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e9 for v in (seconds, quality)):
+    seconds, quality = _plain_number(row.get("seconds")), _plain_number(row.get("heldout_psnr_db"))
+    return (seconds, quality) if seconds is not None and quality is not None else None
+
+
+def _plain_number(value: object) -> float | None:
+    """A number that a measurement may hold; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
         return None
-    return float(seconds), float(quality)  # pyright: ignore[reportArgumentType]
+    return float(value)
 
 
 VERDICT_WORDS = {"good": "Good.", "fair": "Fair.", "poor": "Poor."}
@@ -31,9 +36,9 @@ class Verdict:
     """One of `VERDICT_WORDS`."""
     sentences: list[str]
     """What is so."""
-    where: list[dict[str, Any]] = field(default_factory=list)
+    where: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     """Where it will not hold, worst first: `first` and `last` frame number, and `region` of the picture in words."""
-    advice: list[str] = field(default_factory=list)
+    advice: list[str] = field(default_factory=list[str])
     """What to do about it."""
 
     def lines(self) -> list[str]:
@@ -44,13 +49,13 @@ class Verdict:
 def verdict_of(facts: Mapping[str, Any]) -> Verdict | None:
     """The verdict in a summary.json or take.json, which may come from anywhere; None if there is none to be shown."""
     data = facts.get("verdict")
-    if not isinstance(data, dict):
+    if not is_json_object(data):
         return None
     try:
         found: Verdict = from_dict(Verdict, data)
     except ValueError:
         return None
-    texts = [*found.sentences, *found.advice]
+    texts: list[object] = [*found.sentences, *found.advice]
     if found.word not in VERDICT_WORDS or not found.sentences or not all(isinstance(text, str) for text in texts):
         return None
     shown, advice = ([printable(text, 300) for text in part[:_MOST_LINES]] for part in (found.sentences, found.advice))
@@ -77,6 +82,7 @@ def summarise(
         wall_seconds: seconds in all.
     """
     train, freeze, solve = results["train"], results["freeze"], results["solve"]
+    detail: Mapping[str, Any] = freeze.get("detail") or {}
     return {
         "version": CONTRACT_VERSION,
         "shot": shot,
@@ -87,7 +93,7 @@ def summarise(
         "modelled": train.get("modelled", []),
         "quality": train.get("quality", ""),
         "verdict": verdict_lines(train, freeze),
-        **{k: (freeze.get("detail") or {}).get(k) for k in ("plate_share", "invented_share")},
+        **{k: detail.get(k) for k in ("plate_share", "invented_share")},
         **{k: freeze[k] for k in ("t_star_frame", "exr_dir", "contact_sheet", "video", "ply", "take")},
         "run": train["run"],
         "wall_seconds_by_stage": dict(stages),

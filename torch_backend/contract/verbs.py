@@ -145,13 +145,13 @@ class Verb:
     """What it does."""
     words: type = NoWords
     """Dataclass of what it asks for besides the parameters of jobs."""
-    jobs: Mapping[str, type] = field(default_factory=dict)
+    jobs: Mapping[str, type] = field(default_factory=dict[str, type])
     """Kind of job that it starts -> dataclass of its parameters, in their order."""
     sides: tuple[str, ...] = (BACKEND, BLENDER)
     """Which command lines have it."""
     json: bool = True
     """--json changes what it prints."""
-    shown: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    shown: Mapping[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
     """Field -> (what --help calls it, what it says of it), where this verb means more by it than others."""
     now: str = ""
     """What it is called now: the word itself goes with the next version."""

@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ _worked_on: list[Path] = []
 
 
 @contextlib.contextmanager
-def working_on(*roots: Path) -> Iterator[None]:
+def working_on(*roots: Path) -> Generator[None]:
     """While it lasts, `make_folder` makes nothing of a shot whose own folder was moved or deleted."""
     _worked_on.extend(roots)
     try:
@@ -49,7 +49,7 @@ def make_folder(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | Path, parents: bool = True) -> Iterator[Path]:
+def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
     """A path beside `path`, with the same suffix, to write to; fsynced and renamed over `path` if all went well.
 
     Its folder is made, and with `parents` what that is in; FileNotFoundError without, in a shot that was moved.
@@ -72,7 +72,7 @@ def atomic_path(path: str | Path, parents: bool = True) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def replacing_folder(path: str | Path) -> Iterator[Path]:
+def replacing_folder(path: str | Path) -> Generator[Path]:
     """Yields an empty folder beside `path`, which takes its place if the block ends well, whole or not at all.
 
     Until then, and if the block fails, `path` stays as it was. What a killed process left is swept by the next one:
@@ -125,7 +125,7 @@ def replace_file(source: Path, target: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
+def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Generator[None]:
     """Holds a lock file, after waiting for whoever has it; `waiting` is called once if it has to.
 
     The system frees it when this process ends, however that comes about.

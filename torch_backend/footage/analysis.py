@@ -38,7 +38,7 @@ class FrameMeasures:
     """Variance of the Laplacian of luma, in squared 8-bit steps."""
     exposure: float
     """Mean luminance in stops above 18 % grey."""
-    flags: list[str] = field(default_factory=list)
+    flags: list[str] = field(default_factory=list[str])
     """blank, duplicate, corrupt."""
     thumb: NDArray[np.float32] = field(repr=False, default_factory=lambda: np.zeros((0, 0, 3), np.float32))
     """[36, 64, 3] encoded colour in [0, 1]."""
@@ -67,12 +67,16 @@ def measure(frame: int, pixels: NDArray[Any]) -> FrameMeasures:
 
 def thumbnail(pixels: NDArray[Any]) -> NDArray[np.float32]:
     """[H, W, 3] to [36, 64, 3] block means in the units of the pixels; a smaller picture gives a smaller one."""
-    sums = pixels.astype(np.float32)
-    for axis, size in ((0, THUMB_HEIGHT), (1, THUMB_WIDTH)):
-        edges = np.linspace(0, sums.shape[axis], min(size, sums.shape[axis]) + 1).astype(int)
-        shape = [-1 if i == axis else 1 for i in range(3)]
-        sums = np.add.reduceat(sums, edges[:-1], axis=axis) / np.diff(edges).reshape(shape)
-    return sums.astype(np.float32)
+    rows = _block_means(pixels.astype(np.float32), 0, THUMB_HEIGHT)
+    return _block_means(rows, 1, THUMB_WIDTH).astype(np.float32)
+
+
+def _block_means(values: NDArray[Any], axis: int, size: int) -> NDArray[Any]:
+    """[H, W, 3] with at most `size` blocks along an axis, each the mean of what lies in it."""
+    length = int(values.shape[axis])
+    edges = np.linspace(0, length, min(size, length) + 1).astype(int)
+    shape = [-1 if i == axis else 1 for i in range(3)]
+    return np.add.reduceat(values, edges[:-1], axis=axis) / np.diff(edges).reshape(shape)
 
 
 def flag_duplicate(current: FrameMeasures, last_distinct: FrameMeasures | None) -> bool:
@@ -127,7 +131,7 @@ def find_cuts(measures: Sequence[FrameMeasures]) -> list[tuple[int, int]]:
     """Hard cuts as (last frame before, first frame after). Blank frames are stepped over; a flash is not a cut."""
     seen = [m for m in measures if not {"blank", "corrupt"} & set(m.flags)]
     scores = np.array([cut_score(a.thumb, b.thumb) for a, b in itertools.pairwise(seen)])
-    cuts = []
+    cuts: list[tuple[int, int]] = []
     for i in np.flatnonzero(scores > CUT_SCORE):
         near = np.concatenate([scores[max(0, i - 8) : i], scores[i + 1 : i + 9]])
         if near.size and scores[i] < CUT_OUTLIER * float(np.median(near)):

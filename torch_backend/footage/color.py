@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import linear_solution
+
 SRGB_KNEE = np.float32(0.04045)
 """Encoded value where the linear segment ends."""
 LINEAR_KNEE = np.float32(0.04045 / 12.92)
@@ -68,7 +70,7 @@ def linear_to_srgb8(x: ArrayLike) -> NDArray[np.uint8]:
     return (np.clip(encoded, 0.0, 1.0) * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
 
 
-def _on_straight_colour(rgba: ArrayLike, curve) -> NDArray[np.float32]:
+def _on_straight_colour(rgba: ArrayLike, curve: Callable[[ArrayLike], NDArray[np.float32]]) -> NDArray[np.float32]:
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.ndim < 1 or rgba.shape[-1] != 4:
         raise ValueError(f"rgba should be [..., 4], got shape {list(rgba.shape)}")
@@ -104,6 +106,10 @@ _HALF_MAX = 65504.0
 _REC2020_LUMA = np.array([0.2627, 0.6780, 0.0593], np.float32)
 
 
+Curve = Callable[[ArrayLike], NDArray[np.float32]]
+"""Numbers of any shape into others, one by one."""
+
+
 def rgb_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
     """[3, 3] from linear RGB of these primaries to CIE XYZ, white at Y = 1. ValueError if they span no gamut."""
     x, y = np.array(chromaticities, np.float64).reshape(4, 2).T
@@ -121,8 +127,8 @@ def to_rec709(chromaticities: Chromaticities) -> NDArray[np.float64]:
     bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
     ours, theirs = rgb_to_xyz(REC709), rgb_to_xyz(chromaticities)
     cones = (bradford @ ours.sum(axis=1)) / (bradford @ theirs.sum(axis=1))
-    adapted = np.linalg.solve(bradford, cones[:, None] * (bradford @ theirs))
-    return np.linalg.solve(ours, adapted)
+    adapted = linear_solution(bradford, cones[:, None] * (bradford @ theirs))
+    return linear_solution(ours, adapted)
 
 
 def cineon_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -244,7 +250,7 @@ class InputSpace:
             light = light if self.is_light else srgb_to_linear(encode(light))
         return np.clip(np.nan_to_num(light, nan=0.0), -_HALF_MAX, _HALF_MAX)
 
-    def _light(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], Callable]:
+    def _light(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], Curve]:
         """Light of these numbers, with Rec.709's primaries, and the curve by which it leaves."""
         decode, encode = _DISPLAY.get(self.transfer) or (_SCENE[self.transfer], linear_to_srgb)
         light = decode(pixels)

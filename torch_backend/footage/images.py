@@ -17,10 +17,10 @@ from typing import Any
 import av
 import numpy as np
 import OpenImageIO as oiio
-import scipy.sparse as sparse
 from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
+from ..array_types import SparseMatrix, sparse_entries
 from ..contract import FRAMES_FOLDER, RAW_FOLDER, ExitCode, JobError, open_regular
 from ..shot import atomic_path
 
@@ -45,7 +45,7 @@ def error_of(source: Any = oiio) -> str:
 
 def write_png(path: str | Path, pixels: NDArray[Any]) -> None:
     """Writes [H, W, 3] uint8 or uint16 as PNG of the same depth, whole or not at all. OSError if it cannot."""
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype not in (np.uint8, np.uint16):
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype.type not in (np.uint8, np.uint16):
         raise ValueError(f"pixels should be [H, W, 3] uint8 or uint16, got {pixels.shape} {pixels.dtype}")
     buffer = oiio.ImageBuf(np.ascontiguousarray(pixels))
     buffer.specmod().attribute("png:compressionLevel", PNG_COMPRESSION)
@@ -140,7 +140,7 @@ def _weigh(pixels: NDArray[np.float32], width: int, height: int, lobes: int) -> 
     return wide
 
 
-def _weights(size: int, new_size: int, lobes: int) -> sparse.csr_array:
+def _weights(size: int, new_size: int, lobes: int) -> SparseMatrix:
     """[wanted, size] float32 weights along one side, of a tent (1 lobe) or Lanczos's kernel; the border is repeated.
 
     Shrinking, the kernel is as much wider as pixels become fewer.
@@ -154,8 +154,8 @@ def _weights(size: int, new_size: int, lobes: int) -> sparse.csr_array:
     weights = np.where(np.abs(at) < lobes, kernel, 0.0)
     weights /= weights.sum(axis=1, keepdims=True)
     rows = np.broadcast_to(np.arange(new_size)[:, None], index.shape).ravel()
-    entries = weights.astype(np.float32).ravel(), (rows, index.clip(0, size - 1).ravel())
-    return sparse.csr_array(sparse.coo_array(entries, shape=(new_size, size)))
+    columns = index.clip(0, size - 1).ravel()
+    return sparse_entries(weights.astype(np.float32).ravel(), rows, columns, (new_size, size))
 
 
 def working_size(width: int, height: int, requested_height: int, limit: int = 720) -> tuple[int, int]:

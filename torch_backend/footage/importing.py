@@ -122,7 +122,7 @@ def load_frames(shot: Shot) -> dict[str, Any]:
         numbers = [number for number, *_ in rows]
         whole = bool(rows) and numbers == sorted(set(numbers)) and int(record["width"]) * int(record["height"]) > 0
     except (ValueError, TypeError, KeyError, OverflowError):
-        whole = False
+        record, whole = {}, False
     if not whole:
         raise footage_error(f"{path} is damaged.", "Import the clip again.")
     return record
@@ -260,7 +260,7 @@ def _cut_error(measures: list[FrameMeasures], cuts: list[tuple[int, int]]) -> Ex
 
 def _remarks(extracted: _Extracted) -> list[tuple[str, str]]:
     """Warnings (message, hint) about a clip that is usable."""
-    remarks = []
+    remarks: list[tuple[str, str]] = []
     measures = extracted.measures
     stops = [m.exposure for m in measures if not m.flags]
     drift = max(stops) - min(stops)

@@ -8,6 +8,7 @@ from pathlib import Path
 import OpenImageIO as oiio
 
 from .images import error_of
+from .oiio_types import channel_names
 from .sources import footage_error
 
 BEAUTY = ("", "rgba", "rgb", "beauty", "combined", "c", "composite", "color", "colour", "final", "main", "master")
@@ -92,9 +93,9 @@ def _layers(file: Path) -> tuple[list[Layer], list[str]]:
                 raise footage_error(f"{file.name} holds deep data.", "Flatten it before import.")
             several = spec.get_int_attribute("oiio:subimages") > 1
             title = str(spec.getattribute("oiio:subimagename") or "") if several else ""
-            for prefix in dict.fromkeys(name.rpartition(".")[0] for name in spec.channelnames):
+            for prefix in dict.fromkeys(name.rpartition(".")[0] for name in channel_names(spec)):
                 layer = _colour(spec, part, prefix, title, image.format_name() == "openexr")
-                names.append(prefix or title or ("" if layer else "/".join(spec.channelnames)))
+                names.append(prefix or title or ("" if layer else "/".join(channel_names(spec))))
                 found += [layer] if layer else []
             part += 1
     except UnicodeDecodeError as error:
@@ -105,7 +106,7 @@ def _layers(file: Path) -> tuple[list[Layer], list[str]]:
 
 
 def _colour(spec: oiio.ImageSpec, part: int, prefix: str, title: str, is_exr: bool) -> Layer | None:
-    names = list(spec.channelnames)
+    names = list(channel_names(spec))
     dot = prefix + "." if prefix else ""
     for colours in _COLOURS:
         red, green, blue, alpha = (names.index(dot + c) if dot + c in names else None for c in colours)

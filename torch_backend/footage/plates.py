@@ -11,7 +11,6 @@ from collections import OrderedDict
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,7 +19,8 @@ from ..shot import Shot, content_key
 from ..solve.plate_lens import PlateLens, load_plate_lenses
 from ..solve.stored import load_cameras, load_record
 from ..solve.undistort import BandUndistorter
-from . import codes
+from ..torch_types import from_numpy
+from . import plate_encoding
 from .images import read_frame, read_png, resize_float, working_size
 from .importing import FootageConfig, import_key, load_frames
 from .opening import open_source
@@ -36,7 +36,7 @@ _DISAGREE_SHARE = 1e-3
 
 
 class Plates:
-    """Undistorted source frames, read as they are asked for; the last few are kept, as codes (see `codes`).
+    """Undistorted source frames, read as they are asked for; the last few are kept, as codes (see `plate_encoding`).
 
     A kept plate takes 3 to 6 bytes a pixel, 50 MB at 3840 x 2160. Not safe to use from several threads.
     """
@@ -88,11 +88,11 @@ class Plates:
 
         ValueError if the shot has no such frame; JobError (FOOTAGE, SOLVE) if its picture cannot be read any more.
         """
-        return torch.from_numpy(codes.display(self._codes(frame)))
+        return from_numpy(plate_encoding.display(self._codes(frame)))
 
     def linear(self, frame: int, rows: slice = slice(None)) -> Tensor:
         """The same in scene-linear Rec.709: all of it, or some rows, which at 4K spares 100 MB."""
-        return torch.from_numpy(codes.linear(self._codes(frame)[rows]))
+        return from_numpy(plate_encoding.linear(self._codes(frame)[rows]))
 
     @property
     def kept(self) -> int:
@@ -119,7 +119,7 @@ class Plates:
     def _read(self, frame: int) -> NDArray[Any]:
         if self._reader is None:
             picture = read_frame(self._shot.plate(frame))
-            return codes.resize_plate(picture, self.width, self.height)
+            return plate_encoding.resize_plate(picture, self.width, self.height)
         try:
             picture = self._reader.plate(frame)
         except OSError as error:
@@ -128,7 +128,7 @@ class Plates:
                 "Check that the disk it lies on is there, and that the file is whole.",
                 ExitCode.FOOTAGE,
             ) from error
-        return self._undistorted(codes.resize_plate(picture, self.width, self.height), frame)
+        return self._undistorted(plate_encoding.resize_plate(picture, self.width, self.height), frame)
 
     def _undistorted(self, picture: NDArray[Any], frame: int) -> NDArray[Any]:
         """Codes without the lens; those of 8 bits become 16, which lie between them."""
@@ -140,7 +140,7 @@ class Plates:
             self._warp = lens, BandUndistorter(lens.where(self.width, self.height))
         kind = np.dtype(np.float16 if picture.dtype == np.float16 else np.uint16)
         into = np.empty(picture.shape, kind)
-        return self._warp[1](picture, codes.display, lambda x: codes.from_display(x, kind), into)
+        return self._warp[1](picture, plate_encoding.display, lambda x: plate_encoding.from_display(x, kind), into)
 
     # ------------------------------------------------------------------------------------------------- the source
 
@@ -193,10 +193,10 @@ class Plates:
             return True  # nothing to hold it against
         width, height = self._working
         if picture.dtype == np.float16:
-            small = resize_float(np.clip(codes.display(picture), 0.0, 1.0), width, height)
+            small = resize_float(np.clip(plate_encoding.display(picture), 0.0, 1.0), width, height)
         else:
-            small = codes.display(codes.resize_plate(picture, width, height))
-        off = np.abs(np.clip(small, 0.0, 1.0) - codes.display(raw))
+            small = plate_encoding.display(plate_encoding.resize_plate(picture, width, height))
+        off = np.abs(np.clip(small, 0.0, 1.0) - plate_encoding.display(raw))
         return bool((off > _AGREE).mean() < _DISAGREE_SHARE)
 
 
@@ -212,13 +212,14 @@ def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
 
 
 def _config(record: dict[str, Any]) -> FootageConfig:
-    recorded = record.get("config") or {}
+    recorded: dict[str, Any] = record.get("config") or {}
     return FootageConfig(**{name: recorded[name] for name in FootageConfig.__dataclass_fields__ if name in recorded})
 
 
 def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
     """True if the footage is known to have the working frames' size and no values that they lack."""
-    size, recorded = record.get("source_size"), record.get("config") or {}
+    size = record.get("source_size")
+    recorded: dict[str, Any] = record.get("config") or {}
     if size is None:  # imported by an earlier version
         same = not recorded.get("working_height") and working[1] < _NO_LARGER
         return same and record.get("bits") == 8

@@ -18,6 +18,7 @@ import av
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from .av_types import seconds_of
 from .sources import Known, footage_error
 
 _THREADS = 2
@@ -151,8 +152,8 @@ class VideoReader:
             if isinstance(frame, FFmpegError):
                 continue
             if found == self._listed[0] and self._start is None:
-                self._start = frame.time
-                self._can_seek &= frame.time is not None
+                self._start = seconds_of(frame)
+                self._can_seek &= self._start is not None
             self._kept.append((found, frame))
             if found >= number:
                 return frame if found == number else None
@@ -164,13 +165,15 @@ class VideoReader:
 
     def _number_at(self, frame: av.VideoFrame) -> int | None:
         """Number of a frame by its time; None if import listed none there."""
-        if frame.time is None or self._start is None:
+        seconds = seconds_of(frame)
+        if seconds is None or self._start is None:
             return None
-        since = frame.time - self._start
+        since = seconds - self._start
         at = bisect_left(self._seconds, since - self._slack)
         near = at < len(self._seconds) and abs(self._seconds[at] - since) <= self._slack
         return self._listed[at] if near else None
 
     def _is_past(self, frame: av.VideoFrame, number: int) -> bool:
         """True if a frame without a number comes after `number`, or cannot be placed at all."""
-        return frame.time is None or frame.time > self._time_of(number) + self._slack
+        seconds = seconds_of(frame)
+        return seconds is None or seconds > self._time_of(number) + self._slack

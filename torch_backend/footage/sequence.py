@@ -17,10 +17,11 @@ from fileseq.exceptions import FileSeqException
 from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
-from . import codes
+from . import plate_encoding
 from .color import InputSpace, named_space, space_of_chromaticities
 from .images import error_of, resize
 from .layers import Layer, find_layer, shown
+from .oiio_types import attribute, channel_names
 from .sources import (
     FASTEST_FPS,
     SLOWEST_FPS,
@@ -97,13 +98,13 @@ class SequenceSource:
         if len(self._files) < FEW:
             raise footage_error(f"{sequence} holds fewer than {FEW} pictures.", "Choose a longer sequence.")
         first, spec, self._layer, names = self._first_readable(layer)
-        self._channels = spec.channelnames
+        self._channels = channel_names(spec)
         self._space = _input_space(first, spec, self.warnings)
         self._aspect = believable_aspect(_pixel_aspect(spec), self.warnings)
         self._stored = spec.full_width, spec.full_height
         width, height = square_size(*self._stored, self._aspect)
         self._describe(names, layer, (width, height))
-        rate = spec.getattribute("framesPerSecond") or spec.getattribute("FramesPerSecond")
+        rate = attribute(spec, "framesPerSecond") or attribute(spec, "FramesPerSecond")
         if isinstance(rate, tuple):  # a rational, as OpenEXR stores it
             rate = rate[0] / rate[1] if rate[1] else 0.0
         rate = rate if isinstance(rate, (int, float)) and SLOWEST_FPS <= rate <= FASTEST_FPS else 0.0
@@ -147,7 +148,8 @@ class SequenceSource:
             self.warnings.append(
                 (f"The sequence lacks {frame_words(missing)}.", "Those frames are left out of the shot.")
             )
-        unreadable, findings = [], _Findings()
+        unreadable: list[int] = []
+        findings = _Findings()
         for number in sorted(n for n in self._files if first <= n <= last):
             try:
                 pixels, clipped = self._read(self._files[number], findings)
@@ -192,7 +194,7 @@ class SequenceSource:
             if not failed:
                 return file, spec, layer, names
         raise footage_error(
-            f"No picture of the sequence in {file.parent} can be read.",
+            f"No picture of the sequence in {next(iter(self._files.values())).parent} can be read.",
             "Open one in Blender to see whether it is whole.",
         )
 
@@ -206,10 +208,10 @@ class SequenceSource:
             raise footage_error(f"Frame {number} of the sequence is not there any more.", "Put it back.")
         rgb = self._stored_pixels(self._files[number], _Findings())
         if self.info.extended:
-            rgb = codes.half_of(rgb, self._space)
+            rgb = plate_encoding.half_of(rgb, self._space)
         elif self.info.deep:
             rgb = np.rint(np.clip(rgb, 0.0, 1.0) * np.float32(65535.0)).astype(np.uint16)
-        return codes.resize_plate(np.ascontiguousarray(rgb), self.info.width, self.info.height)
+        return plate_encoding.resize_plate(np.ascontiguousarray(rgb), self.info.width, self.info.height)
 
     def close(self) -> None:
         """See `PlateReader.close`: files are not kept open."""
@@ -225,7 +227,7 @@ class SequenceSource:
     def _stored_pixels(self, file: Path, findings: _Findings) -> NDArray[Any]:
         """[h, w, 3] of the layer, straight, in the file's space and pixels: uint8, or float32 if the source is deep."""
         (spec, buffer, failed), layer = _open(file, self._layer.part), self._layer
-        if spec.channelnames != self._channels:
+        if channel_names(spec) != self._channels:
             layer = self._same_layer(file)
             spec, buffer, failed = _open(file, layer.part)
         if failed:
@@ -318,7 +320,7 @@ def _input_space(file: Path, spec: oiio.ImageSpec, warnings: list[tuple[str, str
     if suffix in (".dpx", ".cin"):
         return _film_space(suffix, str(spec.getattribute("dpx:Transfer") or ""), warnings)
     named = named_space(name)
-    primaries = spec.getattribute("chromaticities")
+    primaries = attribute(spec, "chromaticities")
     if isinstance(primaries, tuple) and len(primaries) == 8 and (named is None or named.transfer == "lin"):
         try:
             return space_of_chromaticities(primaries)

@@ -57,7 +57,7 @@ class SourceInfo:
     """srgb, or linear for pictures that hold light: scene-linear, log, HDR."""
     key: list[Any]
     """What tells this footage from another: names, sizes, modification times."""
-    reading: dict[str, Any] = field(default_factory=dict)
+    reading: dict[str, Any] = field(default_factory=dict[str, Any])
     """How it is read, and what of that was assumed: the record in frames.json says so."""
 
 
@@ -92,7 +92,7 @@ class PlateReader(Protocol):
     """Single frames of a source, in any order; ascending ones, and their near neighbours, are quick."""
 
     def plate(self, number: int) -> NDArray[Any]:
-        """Frame `number`, upright, with square pixels, uncut, as `codes` has it.
+        """Frame `number`, upright, with square pixels, uncut, as `plate_encoding` has it.
 
         OSError or JobError (FOOTAGE) if it cannot be read.
         """

@@ -14,7 +14,8 @@ from av.error import FFmpegError
 from av.video.reformatter import Colorspace, Interpolation
 from numpy.typing import NDArray
 
-from . import codes
+from . import plate_encoding
+from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
 from .images import resize
@@ -105,7 +106,8 @@ class VideoSource:
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
         """See `Source.frames`."""
         begin = 1 if first is None else first
-        number, got, lost, seen = 0, 0, [], _Seen()
+        number, got, seen = 0, 0, _Seen()
+        lost: list[int] = []
         with self._open() as container:
             stream = _best_stream(container, self.path)
             stream.thread_type = "AUTO"
@@ -119,7 +121,8 @@ class VideoSource:
                 if (frame.width, frame.height) != self._size:
                     self._stop_at_change(number, got, frame)
                     break
-                seconds = float(frame.time) if frame.time is not None else (number - 1) / self.info.fps
+                at = seconds_of(frame)
+                seconds = float(at) if at is not None else (number - 1) / self.info.fps
                 seen.add(number, seconds)
                 if number >= begin:
                     got += 1
@@ -143,14 +146,14 @@ class VideoSource:
         return VideoReader(self, known)
 
     def plate_of(self, frame: av.VideoFrame) -> NDArray[Any]:
-        """A decoded frame as a plate, see `codes`. JobError if its size is not the clip's."""
+        """A decoded frame as a plate, see `plate_encoding`. JobError if its size is not the clip's."""
         if (frame.width, frame.height) != self._size:
             raise footage_error(f"{self.path.name} is not the clip that was imported: its size changes.")
         if self._space.as_it_stands:
             pixels = _rgb(frame, "rgb48le" if self._deep else "rgb24")
         else:
-            pixels = codes.half_of(_exact_rgb(frame), self._space)
-        pixels = codes.resize_plate(pixels, *square_size(frame.width, frame.height, self._aspect))
+            pixels = plate_encoding.half_of(_exact_rgb(frame), self._space)
+        pixels = plate_encoding.resize_plate(pixels, *square_size(frame.width, frame.height, self._aspect))
         return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
 
     def decode(self, container: Any, stream: Any) -> Iterator[Any]:
@@ -241,7 +244,7 @@ class _Seen:
     """Its time."""
     gap: float = 0.0
     """Longest time between two frames, beyond the second: rates may vary."""
-    damaged: set[int | None] = field(default_factory=set)
+    damaged: set[int | None] = field(default_factory=set[int | None])
     """Time stamps of packets that the container knows to be incomplete."""
 
     def add(self, number: int, seconds: float) -> None:
@@ -301,23 +304,23 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
     The packet in the middle of which a file ends is left out: it would be half a picture, and its error would cost
     those that the decoder has not given out yet.
     """
-    packets = container.demux(stream)
-    packet: Any
+    packets: Iterator[Any] = container.demux(stream)
     held: Any = None
     while True:
+        error = None
         try:
             packet = next(packets, None)
-        except FFmpegError as error:
-            packet = error
-        empty = isinstance(packet, av.Packet) and not packet.size
-        if empty and packet.dts is not None:  # a repeat of the frame before, in an AVI: to a decoder it means the end
-            continue
-        at_end = packet is None or empty or isinstance(packet, FFmpegError)
+        except FFmpegError as failure:
+            packet, error = None, failure
+        if packet is not None and not packet.size and packet.dts is not None:
+            continue  # a repeat of the frame before, in an AVI: to a decoder it means the end
+        at_end = packet is None or not packet.size
         if held is not None and not (at_end and held.is_corrupt):
             yield held
-        held = None
         if at_end:
-            if packet is not None:
+            if error is not None:
+                yield error
+            elif packet is not None:
                 yield packet
             return
         held = packet

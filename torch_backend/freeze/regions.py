@@ -13,7 +13,7 @@ from .reproject import narrowed, resized, widened
 
 def opened(mask: Tensor, by: int) -> Tensor:
     """The mask without what is narrower than 2 `by` + 1 pixels: outlines, which errors of depth explain."""
-    return widened(narrowed(mask.float(), by), by) > 0.5 if bool(mask.any()) else mask
+    return widened(narrowed(mask, by), by) if bool(mask.any()) else mask
 
 
 def closed(mask: Tensor, by: int) -> Tensor:
@@ -21,9 +21,9 @@ def closed(mask: Tensor, by: int) -> Tensor:
     if by <= 0:
         return mask
     h, w = mask.shape
-    half = (resized(mask.float(), (w + 1) // 2, (h + 1) // 2) > 0.4).float()  # a quarter of the work
+    half = resized(mask.float(), (w + 1) // 2, (h + 1) // 2) > 0.4  # a quarter of the work
     filled = narrowed(widened(half, (by + 1) // 2), (by + 1) // 2)
-    return mask | (resized(filled, w, h) > 0.5)
+    return mask | (resized(filled.float(), w, h) > 0.5)
 
 
 def grown(seeds: Tensor, where: Tensor, reach: int, thin: int = 0) -> Tensor:
@@ -36,10 +36,9 @@ def grown(seeds: Tensor, where: Tensor, reach: int, thin: int = 0) -> Tensor:
     h, w = seeds.shape
     size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work; regions are larger than its pixels
     found, inside = (resized(mask.float(), *size) > 0.4 for mask in (seeds, where))
-    inside = (opened(inside, (thin + 1) // 2) | found).float()
-    found = found.float()
+    inside = opened(inside, (thin + 1) // 2) | found
     for _ in range((reach + 1) // 2):
-        before, found = found, torch.minimum(widened(found, 1), inside)
+        before, found = found, widened(found, 1) & inside
         if torch.equal(before, found):  # nothing is left to reach
             break
-    return seeds | (where & (resized(found, w, h) > 0.25))
+    return seeds | (where & (resized(found.float(), w, h) > 0.25))

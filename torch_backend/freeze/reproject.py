@@ -90,13 +90,29 @@ def blurred(picture: Tensor, sigma: float) -> Tensor:
 
 
 def widened(matte: Tensor, by: int) -> Tensor:
-    """[H, W] float, every value spread `by` pixels to all sides: the greatest one around."""
-    if by <= 0:
-        return matte
-    side = 2 * by + 1
-    return F.max_pool2d(F.max_pool2d(matte[None, None], (side, 1), 1, (by, 0)), (1, side), 1, (0, by))[0, 0]
+    """[H, W] float or bool, every value spread `by` pixels to all sides: the greatest one around."""
+    return _greatest(_greatest(matte, by, 0), by, 1) if by > 0 else matte
+
+
+def _greatest(matte: Tensor, by: int, along: int) -> Tensor:
+    """[H, W] the greatest of the 2 `by` + 1 values around each in one direction; beyond the border nothing counts.
+
+    Windows twice as wide are made of two: a fifth of the time of `max_pool2d`, which has one channel to share out.
+    """
+    size, side = matte.shape[along], 2 * by + 1
+    shape = list(matte.shape)
+    shape[along] = size + 2 * by
+    least = False if matte.dtype == torch.bool else -torch.inf
+    out = torch.full(shape, least, dtype=matte.dtype, device=matte.device)
+    out.narrow(along, by, size).copy_(matte)
+    wide = 1
+    while 2 * wide <= side:
+        count = out.shape[along] - wide
+        out = torch.maximum(out.narrow(along, 0, count), out.narrow(along, wide, count))
+        wide *= 2
+    return torch.maximum(out.narrow(along, 0, size), out.narrow(along, side - wide, size))
 
 
 def narrowed(matte: Tensor, by: int) -> Tensor:
-    """[H, W] float, the least value within `by` pixels; beyond the border nothing counts."""
-    return -widened(-matte, by)
+    """[H, W] float or bool, the least value within `by` pixels; beyond the border nothing counts."""
+    return ~widened(~matte, by) if matte.dtype == torch.bool else -widened(-matte, by)

@@ -28,7 +28,7 @@ MovingOf = Callable[[int], "Tensor | None"]
 DOUBT = 0.4
 """How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
 _LENGTHS_OF = 640.0
-_VIEWS, _VIEWS_BYTES = 72, 400e6
+_VIEWS, _VIEWS_BYTES = 66, 400e6
 _RESIDUALS_BYTES = 250e6
 _FINEST = 1280
 """Width at which the model's own render of a plate is made at most: splats show no more, and 4K costs memory."""
@@ -65,12 +65,9 @@ class PlateView:
     """[4, 4] world-to-camera, scene units."""
     K: Tensor
     """[3, 3] pixels of the size of decisions."""
-    depth: Tensor
-    """[h, w] median depth."""
-    moving: Tensor
-    """[h, w] in 0..1: something that moves in the clip is seen there."""
-    explained: Tensor
-    """[h, w] float16 in 0..1: the model shows there what the plate shows, but for detail."""
+    surface: Tensor
+    """[h, w, 3], looked up together: median depth; in 0..1, something that moves in the clip is seen there; in 0..1,
+    the model shows there what the plate shows, but for detail."""
     picture: Tensor
     """[h, w, 3] float16, the plate, display-referred."""
     missed: Tensor
@@ -172,8 +169,9 @@ class Sightings:
         if frame not in self._views:
             self._views[frame] = self._make_view(frame)
             width, height = self.size
-            each = 18.0 * width * height + 12.0 * len(self.rows)
-            while len(self._views) > max(12, min(_VIEWS, _VIEWS_BYTES / each)):
+            each = 20.0 * width * height + 12.0 * len(self.rows)
+            room = _VIEWS_BYTES - 24.0 * self.plates.width * self.plates.height  # frames of 4K need it more
+            while len(self._views) > max(12, min(_VIEWS, room / each)):
                 self._views.popitem(last=False)
         self._views.move_to_end(frame)
         return self._views[frame]
@@ -202,9 +200,9 @@ class Sightings:
         view = self.view(frame)
         pixels, depth = project(points, view.viewmat, view.K)
         within = inside(pixels, *self.size)
-        visible = same_surface(depth, look_up(view.depth, pixels), self.config.depth_tolerance) * within
-        looks = look_up(torch.stack([view.moving, view.explained], dim=-1), pixels)
-        return Sighting(pixels, depth, visible, within, looks[..., 0], looks[..., 1])
+        shown, moving, explained = look_up(view.surface, pixels).unbind(-1)
+        visible = same_surface(depth, shown, self.config.depth_tolerance) * within
+        return Sighting(pixels, depth, visible, within, moving, explained)
 
     def whole(self, moving: Tensor, off: Tensor, least: float = 0.0) -> Tensor:
         """[h, w] bool: `moving`, bool, and the regions that touch it in which plate and model differ, by `off` [h, w].
@@ -253,11 +251,10 @@ class Sightings:
         off = self.difference(plate, image.color, 1.0)
         region = round(self.config.region * self.unit)
         off = blurred(widened(off, region), 0.5 * region)
+        explained = torch.exp(-(off / self.config.unexplained).square()).half().float()
         return PlateView(
             *self.camera(frame, width, height),
-            image.depth,
-            widened(moving, round(self.config.margin * self.unit)),
-            torch.exp(-(off / self.config.unexplained).square()).half(),
+            torch.stack([image.depth, widened(moving, round(self.config.margin * self.unit)), explained], dim=-1),
             plate.half(),
             missed.half(),
             frozen.state["means"].cpu()[self.rows],

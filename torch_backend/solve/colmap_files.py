@@ -12,6 +12,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,7 +167,7 @@ class _Bytes:
         self.data = path.read_bytes()
         self.at = 0
 
-    def take(self, layout: str) -> tuple:
+    def take(self, layout: str) -> tuple[Any, ...]:
         values = struct.unpack_from("<" + layout, self.data, self.at)
         self.at += struct.calcsize("<" + layout)
         return values
@@ -222,7 +223,8 @@ def _points_bin(path: Path) -> ColmapPoints:
     count = file.take("Q")[0]
     if count > _MOST_POINTS:
         raise ValueError(f"it tells of {count} points")
-    rows, tracks = [], []
+    rows: list[list[float]] = []
+    tracks: list[NDArray[np.int64]] = []
     for _ in range(count):
         *row, length = file.take("Q3d3BdQ")
         start = file.at
@@ -265,7 +267,8 @@ def _images_txt(path: Path) -> Iterator[ColmapImage]:
 
 
 def _points_txt(path: Path) -> ColmapPoints:
-    rows, tracks = [], []
+    rows: list[list[float]] = []
+    tracks: list[NDArray[np.int64]] = []
     for line in _lines(path):
         words = line.split()
         if not words:
@@ -306,7 +309,7 @@ def _points_as_bytes(model: ColmapModel) -> bytes:
     return b"".join(parts)
 
 
-def _numbers(values: NDArray | tuple[float, ...]) -> str:
+def _numbers(values: NDArray[Any] | tuple[float, ...]) -> str:
     """As many digits as bring the same numbers back."""
     return " ".join(repr(float(v)) for v in values)
 
@@ -317,7 +320,7 @@ def _cameras_as_text(model: ColmapModel) -> bytes:
 
 
 def _images_as_text(model: ColmapModel) -> bytes:
-    rows = []
+    rows: list[str] = []
     for i in model.images:
         pose = np.concatenate([rotation_to_quat(i.pose[:, :3]), i.pose[:, 3]])
         rows += [f"{i.number} {_numbers(pose)} {i.camera} {i.name}", ""]

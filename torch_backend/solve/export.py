@@ -52,9 +52,9 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False) -> l
     return write_model(folder, _model(path, points), text)
 
 
-def _model(path: CameraPath, points: dict[str, NDArray]) -> ColmapModel:
+def _model(path: CameraPath, points: dict[str, NDArray[Any]]) -> ColmapModel:
     lenses: dict[tuple[float, ...], int] = {}
-    images = []
+    images: list[ColmapImage] = []
     for number, frame in enumerate(path.frames, start=1):
         lens = lenses.setdefault(tuple(frame.K), len(lenses) + 1)
         pose = np.reshape(np.array(frame.viewmat, np.float64), (4, 4))[:3]
@@ -64,9 +64,9 @@ def _model(path: CameraPath, points: dict[str, NDArray]) -> ColmapModel:
     return ColmapModel(cameras, images, ColmapPoints(xyz, points["rgb"], error, [np.zeros(0, np.int64)] * len(xyz)))
 
 
-def _write_transforms(shot: Shot, path: CameraPath, points: dict[str, NDArray], folder: Path) -> list[Path]:
+def _write_transforms(shot: Shot, path: CameraPath, points: dict[str, NDArray[Any]], folder: Path) -> list[Path]:
     shared = path.frames[0].K
-    frames = []
+    frames: list[dict[str, Any]] = []
     for frame in path.frames:
         to_world = np.linalg.inv(np.reshape(np.array(frame.viewmat, np.float64), (4, 4))) @ _TO_OPENGL
         row: dict[str, Any] = {"file_path": _seen_from(folder, shot.plate(frame.frame))}
@@ -74,7 +74,7 @@ def _write_transforms(shot: Shot, path: CameraPath, points: dict[str, NDArray], 
         if shared != frame.K:
             row |= _intrinsics(frame.K)
         frames.append(row)
-    data = {
+    data: dict[str, Any] = {
         "camera_model": "PINHOLE",
         "w": path.width,
         "h": path.height,
@@ -100,7 +100,7 @@ def _seen_from(folder: Path, file: Path) -> str:
         return file.as_posix()
 
 
-def _ply(xyz: NDArray, rgb: NDArray) -> bytes:
+def _ply(xyz: NDArray[Any], rgb: NDArray[Any]) -> bytes:
     """Points with colours as binary PLY."""
     rows = np.empty(len(xyz), np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
     rows["xyz"], rows["rgb"] = xyz, rgb

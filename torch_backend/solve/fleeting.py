@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -60,7 +61,7 @@ class Shades:
         return np.maximum(np.maximum(red, green), blue)
 
 
-def _sampled(picture: NDArray, x: Map, y: Map) -> NDArray:
+def _sampled(picture: NDArray[Any], x: Map, y: Map) -> NDArray[Any]:
     """[..., 3] colours of a picture at positions [a, b], bilinear, in rows that are short enough for OpenCV."""
     count = -(-x.size // _ROW)
     x_rows, y_rows = (np.resize(p, (count, _ROW)) for p in (x, y))  # the last row is filled up with whatever
@@ -73,9 +74,9 @@ class Sight:
     """A frame and its camera."""
 
     shades: Shades
-    viewmat: NDArray
+    viewmat: NDArray[np.float64]
     """[4, 4] world-to-camera, solve units."""
-    K: NDArray
+    K: NDArray[np.float64]
     """[3, 3] in flow pixels."""
 
 
@@ -132,7 +133,9 @@ class Fleeting:
         weak &= ~self._explained(frame, others, weak, depth)
         return seeded(weak, weak & strong, self._least)
 
-    def _share(self, frame: Sight, others: Sequence[Other], rows: NDArray, columns: NDArray, inverse: Map) -> NDArray:
+    def _share(
+        self, frame: Sight, others: Sequence[Other], rows: NDArray[Any], columns: NDArray[Any], inverse: Map
+    ) -> NDArray[Any]:
         """[N] share of the others that show the still points at rows and columns, and show something else there.
 
         They have to agree with each other, else it is they that are changing, as behind a head that passes. 0 if a
@@ -167,7 +170,7 @@ class Fleeting:
         far = [o for o in others if o.step == 4] or [o for o in others if o.step == 2]
         return far[:2]
 
-    def _points(self, rows: NDArray, columns: NDArray) -> tuple[Map, Map]:
+    def _points(self, rows: NDArray[Any], columns: NDArray[Any]) -> tuple[Map, Map]:
         """Positions [1, N] of points of the grid."""
         return self._grid[0][rows, columns][None], self._grid[1][rows, columns][None]
 

@@ -24,14 +24,16 @@ _TRIES, _LOOKED_AT, _FINAL, _ALL = 5000, 400, 12, 3000
 """Triples drawn; points that each is judged by at first; those judged by all points; most points used."""
 
 
-def floor_of(path: CameraPath, points: NDArray) -> dict[str, Any] | None:
+def floor_of(path: CameraPath, points: NDArray[Any]) -> dict[str, Any] | None:
     """`find_floor` of solved cameras and points [P, 3] as solve.json has it: normal, height; None if there is none."""
     viewmats = np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4)
     found = find_floor(points, np.stack([camera_centre(v) for v in viewmats]), -viewmats[:, 1, :3])
     return None if found is None else {"normal": found[0].tolist(), "height": found[1]}
 
 
-def find_floor(points: NDArray, centres: NDArray, ups: NDArray) -> tuple[NDArray[np.float64], float] | None:
+def find_floor(
+    points: NDArray[Any], centres: NDArray[Any], ups: NDArray[Any]
+) -> tuple[NDArray[np.float64], float] | None:
     """The floor under a solve: the plane with most points among those that have next to nothing under them.
 
     The same points give the same floor, always.
@@ -76,7 +78,9 @@ def find_floor(points: NDArray, centres: NDArray, ups: NDArray) -> tuple[NDArray
     return None if best is None else best[1:]
 
 
-def _judged(points: NDArray, normals: NDArray, heights: NDArray, near: float, big: float, below: float) -> NDArray:
+def _judged(
+    points: NDArray[Any], normals: NDArray[Any], heights: NDArray[Any], near: float, big: float, below: float
+) -> NDArray[Any]:
     """Share of the points on each of K planes, [K]; 0 for a plane that is too small or has too much under it."""
     above = points @ normals.T - heights
     on = (np.abs(above) < near).mean(axis=0)
@@ -84,7 +88,9 @@ def _judged(points: NDArray, normals: NDArray, heights: NDArray, near: float, bi
     return np.where((on >= big) & (under <= below), on, 0.0)
 
 
-def _refined(points: NDArray, normal: NDArray, height: float, near: float) -> tuple[NDArray[np.float64], float]:
+def _refined(
+    points: NDArray[Any], normal: NDArray[Any], height: float, near: float
+) -> tuple[NDArray[np.float64], float]:
     """A plane fitted to the points that are near it, three times over: the direction in which they spread least."""
     for _ in range(3):
         on = points[np.abs(points @ normal - height) < near]
@@ -97,7 +103,7 @@ def _refined(points: NDArray, normal: NDArray, height: float, near: float) -> tu
     return normal, height
 
 
-def _unit(vectors: NDArray) -> NDArray[np.float64]:
+def _unit(vectors: NDArray[Any]) -> NDArray[np.float64]:
     """Vectors [..., 3] at length 1; those of length 0 stay 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)

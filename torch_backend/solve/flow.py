@@ -13,11 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from ..array_types import meshgrid
 
 _OUTSIDE = 16.0
 """Flow leads at most so many flow pixels out of the picture."""
@@ -120,9 +122,9 @@ class Matches:
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._flows: dict[tuple[int, int], NDArray[np.float16]] = {}
         self._found: dict[tuple[int, int], Mask] = {}
-        height, width = picture(0).shape
+        height, width = (int(side) for side in picture(0).shape)
         self.size = width // 2, height // 2
-        x, y = np.meshgrid(np.arange(1, width, 2), np.arange(1, height, 2))
+        x, y = meshgrid(np.arange(1, width, 2), np.arange(1, height, 2))
         self.grid: tuple[Map, Map] = x.astype(np.float32), y.astype(np.float32)
         """Positions of the grid's points."""
 
@@ -147,8 +149,8 @@ class Matches:
             # Past the border DIS runs off to any number, and a start that is one reads what is not the picture's.
             start = np.stack([np.clip(start[i], -self.grid[i], 2 * self.size[i] - self.grid[i]) for i in (0, 1)], -1)
             whole = cv2.resize(start, one.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        found = self._dis.calc(one, two, whole)  # type: ignore[call-overload]
-        small = np.nan_to_num(cv2.resize(found, self.size, interpolation=cv2.INTER_AREA))
+        found = dense_flow(self._dis, one, two, whole)
+        small = np.nan_to_num(np.asarray(cv2.resize(found, self.size, interpolation=cv2.INTER_AREA), np.float32))
         ranges = [(-_OUTSIDE - self.grid[i], 2 * self.size[i] + _OUTSIDE - self.grid[i]) for i in (0, 1)]
         return np.stack([np.clip(small[..., i], *ranges[i]) for i in (0, 1)])
 
@@ -183,7 +185,17 @@ class Matches:
                     del store[a, b]
 
 
-def sample(values: NDArray, at: tuple[Map, Map]) -> Map:
+def dense_flow(
+    dis: cv2.DISOpticalFlow, one: NDArray[np.uint8], two: NDArray[Any], start: NDArray[Any] | None = None
+) -> Map:
+    """[H, W, 2] from each pixel of one picture to its place in another, looked for around `start` if there is one.
+
+    OpenCV's types know nothing of a flow without a start.
+    """
+    return cast(Any, dis).calc(one, two, start)
+
+
+def sample(values: NDArray[Any], at: tuple[Map, Map]) -> Map:
     """Values of the grid [h, w] at positions, bilinear; outside the border's."""
     half = np.float32(0.5)
     values = values.astype(np.float32, copy=False)

@@ -200,7 +200,7 @@ def _lens(model: str, width: int, height: int, params: tuple[float, ...]) -> Len
 def _from_path(file: Path, data: dict[str, Any]) -> ForeignSolve:
     path = CameraPath.from_json(data)
     lenses: dict[Lens, int] = {}
-    cameras = []
+    cameras: list[ForeignCamera] = []
     for frame in path.frames:
         lens = lenses.setdefault(_lens("PINHOLE", path.width, path.height, tuple(frame.K)), len(lenses))
         pose = _rigid(np.reshape(frame.viewmat, (4, 4)), f"frame {frame.frame}")
@@ -211,7 +211,7 @@ def _from_path(file: Path, data: dict[str, Any]) -> ForeignSolve:
 def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
     """nerfstudio's format: camera-to-world, OpenGL axes; what a frame does not say of its lens stands at the top."""
     lenses: dict[Lens, int] = {}
-    cameras = []
+    cameras: list[ForeignCamera] = []
     for n, frame in enumerate(data["frames"]):
         name = frame.get("file_path")
         matrix = np.array(frame.get("transform_matrix", []), np.float64)
@@ -251,7 +251,7 @@ def _transforms_lens(file: Path, told: dict[str, Any]) -> Lens:
     return _lens("OPENCV", width, height, (*pinhole, k1, k2, p1, p2))
 
 
-def _rigid(matrix: NDArray, name: str) -> NDArray[np.float64]:
+def _rigid(matrix: NDArray[Any], name: str) -> NDArray[np.float64]:
     """[3, 4] of a rigid [4, 4]: the rotation nearest to its own, which a file may have rounded."""
     if not np.isfinite(matrix).all():
         raise ValueError(f"the camera of {name} is not finite")
@@ -347,10 +347,10 @@ def match(
 
 def remarks(solve: ForeignSolve, matched: Matched) -> list[tuple[str, str]]:
     """(sentence, hint) of what the artist should know about the matching."""
-    told = []
+    remarks: list[tuple[str, str]] = []
     if matched.shift:
         first = min(matched.cameras)
-        told.append(
+        remarks.append(
             (
                 f"The cameras' pictures are numbered from {first - matched.shift}, the clip's frames from {first}: "
                 "they were taken in order.",
@@ -358,16 +358,16 @@ def remarks(solve: ForeignSolve, matched: Matched) -> list[tuple[str, str]]:
             )
         )
     if matched.missing:
-        told.append(
+        remarks.append(
             (
                 f"{len(matched.missing)} frames have no camera in {solve.path.name}: {frame_words(matched.missing)}.",
                 "Their cameras are placed between their neighbours'.",
             )
         )
-    return told
+    return remarks
 
 
-def own_points(solve: ForeignSolve, matched: Matched, size: tuple[int, int]) -> dict[str, NDArray] | None:
+def own_points(solve: ForeignSolve, matched: Matched, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
     """The solve's own points as points.npz has them before filtering, and the angle under which they are seen.
 
     Returns xyz float32 [P, 3], rgb uint8 [P, 3], error float32 [P] px of the working frames (0 where unknown), track
@@ -383,11 +383,12 @@ def own_points(solve: ForeignSolve, matched: Matched, size: tuple[int, int]) -> 
     poses = np.array([camera.pose for camera in chosen])
     lenses = [solve.lenses[c.lens] for c in chosen]
     pictures = np.array([[*lens.params[:4], lens.width, lens.height] for lens in lenses])
-    told = any(len(seen) for seen in solve.points["seen"])
-    track, depth, sight = np.zeros(len(xyz)), np.full(len(xyz), -np.inf), []
+    has_tracks = any(len(seen) for seen in solve.points["seen"])
+    track, depth = np.zeros(len(xyz)), np.full(len(xyz), -np.inf)
+    sight: list[NDArray[np.int64]] = []
     for n, seen in enumerate(solve.points["seen"]):
         at = poses[:, :, :3] @ xyz[n] + poses[:, :, 3]
-        if told:
+        if has_tracks:
             rows = np.array([row_of[i] for i in seen.tolist() if i in row_of], np.int64)
         else:
             rows = _in_picture(at, pictures)
@@ -405,7 +406,7 @@ def own_points(solve: ForeignSolve, matched: Matched, size: tuple[int, int]) -> 
     }
 
 
-def _in_picture(at: NDArray, pictures: NDArray) -> NDArray[np.int64]:
+def _in_picture(at: NDArray[Any], pictures: NDArray[Any]) -> NDArray[np.int64]:
     """Rows of the cameras whose picture, straightened, a point lies in: the point in camera axes [C, 3]; `pictures`
     [C, 6] fx, fy, cx, cy, width, height."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -413,9 +414,9 @@ def _in_picture(at: NDArray, pictures: NDArray) -> NDArray[np.int64]:
     return np.flatnonzero((at[:, 2] > 0) & ((pixels >= 0) & (pixels < pictures[:, 4:])).all(axis=1))
 
 
-def _angle(xyz: NDArray, poses: NDArray, sight: list[NDArray[np.int64]]) -> float:
+def _angle(xyz: NDArray[Any], poses: NDArray[Any], sight: list[NDArray[np.int64]]) -> float:
     centres = np.array([camera_centre(pose) for pose in poses])
-    angles = []
+    angles: list[float] = []
     for n in range(0, len(xyz), max(1, len(xyz) // _ANGLE_POINTS)):
         rays = centres[sight[n]] - xyz[n]
         lengths = np.linalg.norm(rays, axis=1, keepdims=True)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import save_arrays
 from ..contract import POINTS_FILE, REQUEST_FILE, ExitCode, JobError, Reporter
 from ..shot import Shot, write_json
 from . import foreign
@@ -110,7 +111,7 @@ def take_over(
     (scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
     if own and points is not None:
         angle = float(points.pop("angle"))
-        np.savez(scratch / POINTS_FILE, **points)  # pyright: ignore[reportArgumentType]
+        save_arrays(scratch / POINTS_FILE, points)
         _write_model(scratch / "model", lenses, poses, points)
         known = points["error"][points["error"] > 0]
         answer = {
@@ -157,14 +158,14 @@ def doubts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _enough(points: dict[str, NDArray], centres: NDArray) -> bool:
+def _enough(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> bool:
     """True if points of a file, with errors that were measured, are enough to train from."""
     table = {name: points[name] for name in ("xyz", "rgb", "error", "track", "depth")}
     return bool((points["error"] > 0).any()) and len(filter_points(table, centres)["xyz"]) >= LEAST_POINTS
 
 
 def _write_model(
-    folder: Path, lenses: list[foreign.Lens], poses: dict[str, dict[str, Any]], points: dict[str, NDArray]
+    folder: Path, lenses: list[foreign.Lens], poses: dict[str, dict[str, Any]], points: dict[str, NDArray[Any]]
 ) -> None:
     """The given model, of the working frames, as a solve would leave its own."""
     cameras = {n: ColmapCamera(n, x.model, x.width, x.height, x.params) for n, x in enumerate(lenses, start=1)}

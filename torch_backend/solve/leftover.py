@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .flow import FlowConfig, Map, Mask, Seen, sample
+from ..array_types import linear_solution
+from .flow import FlowConfig, Map, Mask, Seen, dense_flow, sample
 from .still import FEW, Look, Pair, StillTest, Texture, brightness, inside, outlines, still_points
 
 _FINEST, _STRIDE, _DESCENTS, _REFINEMENTS = 1, 4, 16, 2
@@ -66,14 +67,15 @@ class Leftover:
             return np.zeros_like(inverse), np.zeros_like(inverse)
         pairs = [each.pair for each in laid]
         inverse = still_points(pairs, inverse, depth, self._test.unit, turns=3)
-        told, known = [], np.zeros_like(inverse)
+        evidence: list[Map] = []
+        known = np.zeros_like(inverse)
         for each in laid:
             _, x, y, length = each.pair.miss(inverse)
             limit = self._limit(length, (each.pair.weight > 0.5) & texture.telling)
             seen = np.minimum(texture.change(x, y, length) / each.visible, 1.0)
-            told.append(np.minimum(length / limit, config.most) * seen * each.gained * each.pair.weight)
+            evidence.append(np.minimum(length / limit, config.most) * seen * each.gained * each.pair.weight)
             known += each.pair.weight
-        second = np.partition(np.stack(told), -2, axis=0)[-2]  # one alone is what is hidden there
+        second = np.partition(np.stack(evidence), -2, axis=0)[-2]  # one alone is what is hidden there
         faint = config.faint
         score = (second / (1.0 + config.rim * outlines(inverse)) - faint) / (config.clear - faint)
         return np.clip(score, 0.0, 1.0), np.minimum(known, 1.0)
@@ -95,8 +97,8 @@ class Leftover:
         # Past the border there is nothing: the picture itself, that flow stays at rest there.
         outside = cv2.resize((~within).astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST)
         cv2.copyTo(one, outside, brought)
-        flow = np.nan_to_num(self._dis.calc(one, brought, None))  # type: ignore[call-overload]
-        return cv2.resize(flow, within.shape[::-1], interpolation=cv2.INTER_AREA)
+        flow = np.nan_to_num(dense_flow(self._dis, one, brought))
+        return np.asarray(cv2.resize(flow, within.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
     def _laid(self, key: int, other: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
         """The other key frame, laid over a key frame by inverse depths."""
@@ -145,5 +147,5 @@ def _drift(left: list[Map], told: Mask, inverse: Map, unit: float) -> list[Map]:
         gap = np.sum((wanted - design @ found) ** 2, axis=1)
         weight = 1.0 / np.square(1.0 + gap / max(unit**2, float(np.median(gap))))
         normal = design.T @ (design * weight[:, None]) + 1e-3 * len(design) * np.eye(count)
-        found = np.linalg.solve(normal, design.T @ (wanted * weight[:, None]))
+        found = linear_solution(normal, design.T @ (wanted * weight[:, None]))
     return [(terms @ found[:, i].astype(np.float32)) for i in (0, 1)]

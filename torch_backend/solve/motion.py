@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypedDict, cast
 
 import cv2
 import numpy as np
@@ -96,12 +96,13 @@ def _begin(folder: Path, key: str) -> None:
 
 def _shares(labels: NDArray[np.uint8]) -> tuple[float, float, float]:
     """How much of a matte is still, unknown and moving."""
-    return tuple(float((labels == value).mean()) for value in (STILL, UNKNOWN, MOVING))  # type: ignore[return-value]
+    still, unknown, moving = (float((labels == value).mean()) for value in (STILL, UNKNOWN, MOVING))
+    return still, unknown, moving
 
 
 def _solve_key(shot: Shot, config: FlowConfig) -> str:
     """Identifies the cameras and frames that a matte is made from; of a shot without them, what it has."""
-    digests = []
+    digests: list[str] = []
     for file in (shot.cameras, shot.listing):
         with contextlib.suppress(OSError, ValueError), open_regular(file) as handle:
             digests.append(hashlib.sha256(handle.read()).hexdigest())
@@ -115,10 +116,10 @@ def _record(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     whole = found.get("version") == MOTION_VERSION and isinstance(found.get("key"), str)
-    result = found.get("result", {})
+    result: Any = found.get("result", {})
     if not whole or not isinstance(result, dict):
         return {}
-    named = path.name != _RECORD or set(result) == set(MotionResult.__annotations__)
+    named = path.name != _RECORD or set(cast(dict[str, Any], result)) == set(MotionResult.__annotations__)
     return found if named else {}
 
 
@@ -170,7 +171,7 @@ def _read_found(path: Path) -> NDArray[np.uint8]:
 def _painted(path: Path, found: NDArray[np.uint8] | None, size: tuple[int, int]) -> NDArray[np.uint8]:
     """`found` with what was painted over it: grey below 85 of 255 is still, above 170 moving, alpha to 0.5 nothing."""
     pixels = _decoded(path, cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+    if pixels is None or pixels.dtype.type not in (np.uint8, np.uint16):
         raise JobError(
             f"The painted motion matte {path} is damaged or no PNG.", "Paint it again, or remove it.", ExitCode.FOOTAGE
         )
@@ -185,7 +186,7 @@ def _painted(path: Path, found: NDArray[np.uint8] | None, size: tuple[int, int])
     return np.where(alpha > 127.5, labels, below)
 
 
-def _decoded(path: Path, how: int) -> NDArray | None:
+def _decoded(path: Path, how: int) -> NDArray[Any] | None:
     """Pixels of a file; None if it holds no picture that can be read whole."""
     with open_regular(path) as handle:
         data = np.frombuffer(handle.read(), np.uint8)

@@ -7,6 +7,7 @@ through a window of a few seconds, so a clip of any length takes the same memory
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -121,7 +122,7 @@ def _keys(seconds: list[float]) -> list[int]:
     return sorted({*range(0, len(seconds), stride), len(seconds) - 1})
 
 
-def _typical_depth(points: NDArray, viewmat: NDArray) -> float:
+def _typical_depth(points: NDArray[Any], viewmat: NDArray[Any]) -> float:
     """Median depth of points [P, 3] before a camera [4, 4]; 1 if there are none."""
     z = points @ viewmat[2, :3] + viewmat[2, 3]
     z = z[z > 0]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import meshgrid
 from ..shot import Shot
 from . import foreign
 from .lens import load_lens
@@ -47,7 +48,7 @@ class PlateLens:
         x = ((np.arange(width) + 0.5) / ratio[0] - cx) / fx
         for top in range(0, height, _ROWS):
             y = ((np.arange(top, min(top + _ROWS, height)) + 0.5) / ratio[1] - cy) / fy
-            out[top : top + _ROWS] = self._original(*np.meshgrid(x, y)) * ratio
+            out[top : top + _ROWS] = self._original(*meshgrid(x, y)) * ratio
         return out
 
     def _original(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -78,19 +79,19 @@ def load_plate_lenses(shot: Shot) -> dict[int, PlateLens]:
     keep the lenses of a zoom or a fisheye.
     """
     record, path = load_record(shot), load_cameras(shot)
-    told = record.get("lenses")
-    if told is None:
+    recorded = record.get("lenses")
+    if recorded is None:
         one = load_lens(shot)
         lens = foreign.Lens("OPENCV", one.width, one.height, (*one.focal, *one.centre, one.k1, one.k2, one.p1, one.p2))
         return dict.fromkeys((frame.frame for frame in path.frames), PlateLens(lens, one.intrinsics))
     try:
         known = [
             foreign.lens_from_colmap(str(x["model"]), path.width, path.height, [float(p) for p in x["params"]])
-            for x in told
+            for x in recorded
         ]
         index = [int(n) for n in record["lens_of_frame"]]
         shared: dict[tuple[int, tuple[float, ...]], PlateLens] = {}
-        lenses = {}
+        lenses: dict[int, PlateLens] = {}
         for frame, n in zip(path.frames, index, strict=True):
             fx, fy, cx, cy = frame.K
             lenses[frame.frame] = shared.setdefault((n, tuple(frame.K)), PlateLens(known[n], (fx, fy, cx, cy)))

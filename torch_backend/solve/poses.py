@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 
-def rotation_to_quat(rotation: NDArray) -> NDArray[np.float64]:
+def rotation_to_quat(rotation: NDArray[Any]) -> NDArray[np.float64]:
     """[3, 3] rotation to a unit quaternion wxyz with w >= 0, by the largest of the four ways (Shepperd 1978)."""
     r = np.asarray(rotation, np.float64)
     trace = r.trace()
@@ -26,7 +28,7 @@ def rotation_to_quat(rotation: NDArray) -> NDArray[np.float64]:
     return -quat if quat[0] < 0 else quat
 
 
-def quat_to_rotation(quat: NDArray) -> NDArray[np.float64]:
+def quat_to_rotation(quat: NDArray[Any]) -> NDArray[np.float64]:
     """Quaternion wxyz (any length but zero) to [3, 3]."""
     w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)
     return np.array(
@@ -38,12 +40,12 @@ def quat_to_rotation(quat: NDArray) -> NDArray[np.float64]:
     )
 
 
-def _multiply(a: NDArray, b: NDArray) -> NDArray[np.float64]:
+def _multiply(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
     w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
     return np.concatenate([[w], v])
 
 
-def slerp(a: NDArray, b: NDArray, share: float) -> NDArray[np.float64]:
+def slerp(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[np.float64]:
     """From unit quaternion `a` the `share` of the shorter way to `b`: a exp(share log(a^-1 b))."""
     relative = _multiply(a * [1.0, -1.0, -1.0, -1.0], b)
     if relative[0] < 0:
@@ -56,12 +58,12 @@ def slerp(a: NDArray, b: NDArray, share: float) -> NDArray[np.float64]:
     return moved / np.linalg.norm(moved)
 
 
-def camera_centre(pose: NDArray) -> NDArray[np.float64]:
+def camera_centre(pose: NDArray[Any]) -> NDArray[np.float64]:
     """Centre in the world, solve units, of a [3, 4] or [4, 4] world-to-camera pose."""
     return -pose[:3, :3].T @ pose[:3, 3]
 
 
-def interpolate_pose(a: NDArray, b: NDArray, share: float) -> NDArray[np.float64]:
+def interpolate_pose(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[np.float64]:
     """[3, 4] world-to-camera pose at `share` in [0, 1] between `a` and `b`: slerp of the rotation, line of centres."""
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     rotation = quat_to_rotation(slerp(rotation_to_quat(a[:3, :3]), rotation_to_quat(b[:3, :3]), share))
@@ -69,7 +71,7 @@ def interpolate_pose(a: NDArray, b: NDArray, share: float) -> NDArray[np.float64
     return np.concatenate([rotation, (-rotation @ centre)[:, None]], axis=1)
 
 
-def fill_poses(seconds: NDArray, known: dict[int, NDArray]) -> list[NDArray[np.float64]]:
+def fill_poses(seconds: NDArray[Any], known: dict[int, NDArray[Any]]) -> list[NDArray[np.float64]]:
     """A [3, 4] pose for each of the N times, given poses at some indices: between neighbours by time, else clamped.
 
     `seconds` is [N], ascending. ValueError if nothing is known.
@@ -77,7 +79,7 @@ def fill_poses(seconds: NDArray, known: dict[int, NDArray]) -> list[NDArray[np.f
     if not known:
         raise ValueError("no pose is known: there is nothing to interpolate")
     indices = np.array(sorted(known))
-    poses = []
+    poses: list[NDArray[np.float64]] = []
     for i, time in enumerate(seconds):
         at = int(np.searchsorted(indices, i))
         if at < len(indices) and indices[at] == i:

@@ -13,6 +13,7 @@ from typing import Any, NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import save_arrays
 from ..contract import (
     CAMERAS_FILE,
     COLMAP_FOLDER,
@@ -153,7 +154,8 @@ def _with_motion(shot: Shot, result: SolveResult, report: Reporter) -> SolveResu
     try:
         from .motion import find_motion
 
-        return SolveResult(**{**result, **find_motion(shot, report)})
+        found = find_motion(shot, report)
+        return {**result, **found}
     except Cancelled:
         raise
     except Exception as error:  # OpenCV raises its own kinds, and is missing where set-up was not run again
@@ -213,7 +215,7 @@ def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
 def _ask_worker(
     shot: Shot, frames: dict[str, Any], config: SolveConfig, scratch: Path, report: Reporter
 ) -> dict[str, Any]:
-    names = {True: [], False: []}
+    names: dict[bool, list[str]] = {True: [], False: []}
     for frame in frames["frames"]:
         names[bool(frame["solve"])].append(Path(frame["file"]).name)
     request = {
@@ -366,7 +368,7 @@ def _finish(
         refuse_misfit(answer, len(points["xyz"]))
     _undistort_all(shot, frames, lenses, maps, staged.frames, report)
     with atomic_path(staged.solve / POINTS_FILE) as beside:
-        np.savez(beside, **points)  # pyright: ignore[reportArgumentType]
+        save_arrays(beside, points)
     (scratch / "model").rename(staged.solve / COLMAP_FOLDER)
     write_json(staged.solve / CAMERAS_FILE, path.to_json())
     result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
@@ -423,7 +425,7 @@ def _camera_path(
     filled = fill_poses(np.array([f["seconds"] for f in listed]), known)
     nearest = _nearest(sorted(known), len(names))
     lenses = [int(poses[names[k]].get("lens", 0)) for k in nearest]
-    cameras = []
+    cameras: list[CameraFrame] = []
     for frame, name, pose, lens in zip(listed, names, filled, lenses, strict=True):
         viewmat = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]]).ravel().tolist()
         source = poses[name]["source"] if name in poses else "interpolated"
@@ -512,7 +514,7 @@ def quality_words(registered: int, solved: int, error_px: float, given: bool = F
 def _warnings(
     frames: dict[str, Any], path: CameraPath, result: SolveResult, given: bool = False
 ) -> list[tuple[str, str]]:
-    warnings = []
+    warnings: list[tuple[str, str]] = []
     lost = [
         camera.frame
         for camera, frame in zip(path.frames, frames["frames"], strict=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +29,9 @@ _MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
 class Ray:
     """Where points on a key frame's rays are seen in another one, by their inverse depth."""
 
-    def __init__(self, grid: tuple[Map, Map], views: tuple[NDArray, NDArray], Ks: tuple[NDArray, NDArray]) -> None:
+    def __init__(
+        self, grid: tuple[Map, Map], views: tuple[NDArray[Any], NDArray[Any]], Ks: tuple[NDArray[Any], NDArray[Any]]
+    ) -> None:
         """`views` [4, 4] and `Ks` [3, 3] of the key frame and of the other one."""
         motion = views[1].astype(np.float64) @ np.linalg.inv(views[0].astype(np.float64))
         turn = (Ks[1] @ motion[:3, :3] @ np.linalg.inv(Ks[0])).astype(np.float32)
@@ -72,9 +75,9 @@ class StillTest:
 
     look: Callable[[int], Look]
     """Of any key."""
-    viewmats: NDArray
+    viewmats: NDArray[Any]
     """[K, 4, 4] world-to-camera of the keys, solve units."""
-    Ks: NDArray
+    Ks: NDArray[Any]
     """[K, 3, 3] in flow pixels."""
     guessed: list[bool]
     """Keys whose pose was not solved."""

@@ -17,6 +17,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ..contract import STMAP_FILES, TAKE_REDISTORT, ExitCode, FreezeParams, JobError
+from ..footage.oiio_types import open_output
 from ..shot import Shot, atomic_path, disk_error, is_disk_full, need_disk
 from .lens import Lens, load_lens
 
@@ -172,7 +173,7 @@ def write_map(path: Path, pixels: NDArray[np.float32]) -> Path:
             output = oiio.ImageOutput.create(str(beside))
             if output is None:
                 raise OSError(errno.EIO, f"OpenImageIO cannot write EXR: {oiio.geterror()}", str(path))
-            if not (output.open(str(beside), spec) and output.write_image(pixels) and output.close()):
+            if not (open_output(output, beside, spec) and output.write_image(pixels) and output.close()):
                 need_disk(path.parent, pixels.nbytes, "the map")
                 raise OSError(errno.EIO, f"map not written: {output.geterror()}", str(path))
     except OSError as error:

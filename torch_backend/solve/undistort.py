@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
+
+from ..array_types import sparse_rows
 
 _TAPS = 4
 _BAND = 64
@@ -34,9 +36,9 @@ class Undistorter:
         starts = np.arange(count + 1, dtype=np.int64) * _TAPS**2
         if starts[-1] < np.iinfo(np.int32).max:
             starts = starts.astype(np.int32)
-        self._matrix = sparse.csr_array((weights, index, starts), shape=(count, count))
+        self._matrix = sparse_rows(weights, index, starts, count)
 
-    def __call__(self, pixels: NDArray) -> NDArray:
+    def __call__(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """[H, W, 3] uint8 or uint16 to the same. ValueError if the size is not the map's."""
         if pixels.shape != (self.height, self.width, 3):
             raise ValueError(f"the picture is {pixels.shape}, the map {self.height}x{self.width}: their sizes differ")
@@ -61,11 +63,11 @@ class BandUndistorter:
 
     def __call__(
         self,
-        picture: NDArray,
-        read: Callable[[NDArray], NDArray[np.float32]],
-        write: Callable[[NDArray[np.float32]], NDArray],
-        out: NDArray,
-    ) -> NDArray:
+        picture: NDArray[Any],
+        read: Callable[[NDArray[Any]], NDArray[np.float32]],
+        write: Callable[[NDArray[np.float32]], NDArray[Any]],
+        out: NDArray[Any],
+    ) -> NDArray[Any]:
         """Fills `out` [H, W, 3] from `picture` [h, w, 3], and returns it.
 
         `read` turns rows of the picture to float32, black 0 and white 1; `write` such rows to what `out` holds.
@@ -77,7 +79,7 @@ class BandUndistorter:
 
 
 def _band(
-    picture: NDArray, read: Callable[[NDArray], NDArray[np.float32]], where: NDArray[np.float32]
+    picture: NDArray[Any], read: Callable[[NDArray[Any]], NDArray[np.float32]], where: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Some rows of the output, [h, W, 3] float32."""
     height, width = picture.shape[:2]

@@ -1,8 +1,8 @@
 """The child process in which COLMAP runs: `python -m torch_backend.solve.worker REQUEST.json`.
 
 A process of its own because pycolmap and OpenImageIO cannot share one (see footage/images.py), because COLMAP ends its
-process on a failed check, and because a process can be stopped at any moment. It is the only module that imports
-pycolmap.
+process on a failed check, and because a process can be stopped at any moment. No other module imports pycolmap, but for
+`colmap_types.py`, which says what types it has.
 
 Standard input is held open by the parent: when it closes, the parent is gone and so is the worker. Standard output
 carries JSON lines: {"stage"} when one begins, with {"done", "total"} where COLMAP calls back; {"result": {...}} or
@@ -21,6 +21,7 @@ import json
 import os
 import sys
 import threading
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ..contract import POINTS_FILE
+from . import colmap_types as colmap
 from .lens import doubtful
 
 SEED = 0
@@ -103,7 +105,7 @@ def main(path: str) -> int:
     say(
         result={
             "registered": model.num_reg_images(),
-            "parts": [sorted(image.name for image in m.images.values() if image.has_pose) for m in models],
+            "parts": [sorted(image.name for image in posed(m)) for m in models],
             "reprojection_error_px": model.compute_mean_reprojection_error(),
             "points": model.num_points3D(),
             "triangulation_angle_deg": triangulation_angle(model),
@@ -142,7 +144,7 @@ def take_over(request: Request, known: dict[str, Any]) -> int:
     write_points(request, model)
     folder = request.scratch / "model"
     folder.mkdir()
-    model.write_binary(folder)
+    colmap.write_binary(model, folder)
     say(
         result={
             "points": model.num_points3D(),
@@ -165,7 +167,7 @@ def agreement(request: Request, model: pycolmap.Reconstruction) -> float:
             for image, side in zip(pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches.T, strict=True):
                 matched.setdefault(image, []).append(side)
     total = sum(len(np.unique(np.concatenate(sides))) for sides in matched.values())
-    return sum(image.num_points3D for image in model.images.values()) / max(total, 1)
+    return sum(image.num_points3D for image in colmap.images(model).values()) / max(total, 1)
 
 
 def triangulate(
@@ -202,7 +204,7 @@ def triangulate(
     folder = request.scratch / "triangulated"
     folder.mkdir()
     say(stage="points")
-    return pycolmap.triangulate_points(known, request.database, request.images, folder, True, options)
+    return colmap.triangulate_points(known, request.database, request.images, folder, options)
 
 
 # --------------------------------------------------------------------------------------------------- COLMAP's stages
@@ -226,17 +228,9 @@ def extract(
     # Numbers given beforehand, in the clip's order: else the first thread to finish would choose them.
     with closing_database(request):
         pass  # makes the file
-    pycolmap.import_images(request.database, request.images, mode, names, reader)
+    colmap.import_images(request.database, request.images, mode, names, reader)
     say(stage="features" if camera_id is None else "other features")
-    pycolmap.extract_features(
-        request.database,
-        request.images,
-        image_names=names,
-        camera_mode=mode,
-        reader_options=reader,
-        extraction_options=options,
-        device=pycolmap.Device.cpu,
-    )
+    colmap.extract_features(request.database, request.images, mode, names, reader, options)
 
 
 def _matching() -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
@@ -258,7 +252,7 @@ def match(request: Request) -> None:
     pairing.quadratic_overlap = True
     pairing.num_threads = request.threads
     say(stage="matches")
-    pycolmap.match_sequential(request.database, options, pairing, geometry, device=pycolmap.Device.cpu)
+    colmap.match_sequential(request.database, options, pairing, geometry)
 
 
 def median_flow(request: Request) -> tuple[float, int]:
@@ -290,7 +284,12 @@ def turning_share(request: Request) -> float:
 
 def first_camera(model: pycolmap.Reconstruction) -> pycolmap.Camera:
     """The lens of a solve of our own: all its images share one."""
-    return next(iter(model.cameras.values()))
+    return next(iter(colmap.cameras(model).values()))
+
+
+def posed(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """The images that have a place in the model."""
+    return [image for image in colmap.images(model).values() if image.has_pose]
 
 
 def lens_doubt(model: pycolmap.Reconstruction) -> str:
@@ -338,9 +337,7 @@ def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruc
         done += 1
         say(stage="cameras", done=min(done, total), total=total)
 
-    found = pycolmap.incremental_mapping(
-        request.database, request.images, folder, options, next_image_callback=next_image
-    )
+    found = colmap.incremental_mapping(request.database, request.images, folder, options, next_image)
     say(stage="cameras", done=total, total=total)
     # The first model that the mapper writes is often a fragment: the largest is meant.
     models = [m for m in found.values() if m.num_reg_images() >= 2]
@@ -358,20 +355,18 @@ def localise(request: Request, model: pycolmap.Reconstruction) -> dict[str, dict
     """
     poses: dict[str, dict[str, Any]] = {}
     ids: dict[str, int] = {}
-    for image in model.images.values():
-        if image.has_pose:
-            ids[image.name] = image.image_id
-            poses[image.name] = {"pose": image.cam_from_world().matrix().tolist(), "source": "registered"}
+    for image in posed(model):
+        ids[image.name] = image.image_id
+        poses[image.name] = {"pose": colmap.pose(image).tolist(), "source": "registered"}
     missing = [name for name in request.order if name not in ids]
     if not missing or request.neighbours < 1:
         return poses
     pairs = {name: _nearest_registered(request, name, ids) for name in missing}
     new = [name for name in request.others if name in pairs]
     if new:
-        camera_id = next(iter(model.cameras))
-        extract(request, new, camera_id)
+        extract(request, new, next(iter(colmap.cameras(model))))
     _match_pairs(request, pairs)
-    camera = next(iter(model.cameras.values()))
+    camera = first_camera(model)
     with closing_database(request) as database:
         for name in missing:
             found = _place(database, model, camera, name, [ids[other] for other in pairs[name]])
@@ -396,7 +391,7 @@ def _match_pairs(request: Request, pairs: dict[str, list[str]]) -> None:
     pairing.match_list_path = listing
     pairing.block_size = 4 * request.neighbours  # COLMAP counts its progress in blocks
     say(stage="other matches")
-    pycolmap.match_image_pairs(request.database, options, pairing, geometry, device=pycolmap.Device.cpu)
+    colmap.match_image_pairs(request.database, options, pairing, geometry)
 
 
 def _place(
@@ -412,7 +407,7 @@ def _place(
         if not database.exists_matches(image.image_id, other):
             continue
         matches = database.read_two_view_geometry(image.image_id, other).inlier_matches
-        points = model.images[other].points2D
+        points = colmap.images(model)[other].points2D
         for own, theirs in matches:
             point = points[int(theirs)]
             if point.has_point3D():
@@ -420,17 +415,17 @@ def _place(
     if len(links) < LOCALISE_LEAST_INLIERS:
         return None
     xy = np.array([keypoints[own] for own, _ in links], np.float64)
-    xyz = np.array([model.points3D[point].xyz for _, point in links], np.float64)
+    xyz = np.array([colmap.points(model)[point].xyz for _, point in links], np.float64)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = LOCALISE_MAX_ERROR_PX
     options.ransac.random_seed = SEED
-    found = pycolmap.estimate_and_refine_absolute_pose(xy, xyz, camera, options)
+    found = colmap.absolute_pose(xy, xyz, camera, options)
     if found is None:
         return None
-    inliers = int(found["num_inliers"])
+    pose, inliers = found
     if inliers < LOCALISE_LEAST_INLIERS or inliers < LOCALISE_LEAST_RATIO * len(links):
         return None
-    return {"pose": found["cam_from_world"].matrix().tolist(), "source": "localised", "inliers": inliers}
+    return {"pose": pose.tolist(), "source": "localised", "inliers": inliers}
 
 
 # --------------------------------------------------------------------------------------------------- answers
@@ -438,14 +433,14 @@ def _place(
 
 def triangulation_angle(model: pycolmap.Reconstruction) -> float:
     """Median over points (at most 2000) of the widest angle in degrees under which a point is seen."""
-    centres = {i.image_id: i.projection_center() for i in model.images.values() if i.has_pose}
-    points = sorted(model.points3D.items())
-    angles = []
+    centres = {image.image_id: image.projection_center() for image in posed(model)}
+    points = sorted(colmap.points(model).items())
+    angles: list[float] = []
     for _, point in points[:: max(1, len(points) // 2000)]:
         seen = np.array([centres[e.image_id] for e in point.track.elements])
         rays = seen - point.xyz
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+        angles.append(float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))))
     return float(np.median(angles)) if angles else 0.0
 
 
@@ -453,15 +448,15 @@ def write_answers(request: Request, model: pycolmap.Reconstruction, poses: dict[
     """Everything the parent needs, in formats that need no pycolmap."""
     folder = request.scratch / "model"
     folder.mkdir()
-    model.write_binary(folder)
+    colmap.write_binary(model, folder)
     write_points(request, model)
     (request.scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
-    write_undistortion(request, next(iter(model.cameras.values())), 0)
+    write_undistortion(request, first_camera(model), 0)
 
 
 def write_points(request: Request, model: pycolmap.Reconstruction) -> None:
     """points.npz of a model: what the parent filters."""
-    points = [model.points3D[i] for i in sorted(model.points3D)]
+    points = [point for _, point in sorted(colmap.points(model).items())]
     np.savez(
         request.scratch / POINTS_FILE,
         xyz=np.array([p.xyz for p in points], np.float32).reshape(-1, 3),
@@ -475,13 +470,13 @@ def write_points(request: Request, model: pycolmap.Reconstruction) -> None:
 def write_undistortion(request: Request, camera: pycolmap.Camera, number: int) -> None:
     """`undistortion` of a lens, as the parent reads it."""
     pinhole, where = undistortion(camera)
-    lens = {"model": camera.model_name, "params": camera.params}
-    np.savez(request.scratch / f"undistort_{number}.npz", pinhole=pinhole, where=where, **lens)
+    file = request.scratch / f"undistort_{number}.npz"
+    np.savez(file, pinhole=pinhole, where=where, model=camera.model_name, params=camera.params)
 
 
 def smallest_depths(model: pycolmap.Reconstruction, points: list[pycolmap.Point3D]) -> NDArray[np.float32]:
     """[P]: the least depth of each point over the images that see it, in solve units."""
-    rows = {i.image_id: i.cam_from_world().matrix()[2] for i in model.images.values() if i.has_pose}
+    rows = {image.image_id: colmap.pose(image)[2] for image in posed(model)}
     return np.array(
         [min(float(rows[e.image_id] @ np.append(p.xyz, 1.0)) for e in p.track.elements) for p in points], np.float32
     )
@@ -506,7 +501,7 @@ def undistortion(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], NDArray[
         ]
     )
 
-    def distorted(pixels: NDArray, zoom: float) -> NDArray:
+    def distorted(pixels: NDArray[Any], zoom: float) -> NDArray[Any]:
         rays = np.ones((len(pixels), 3))
         rays[:, :2] = (pixels - [cx, cy]) / (focal * zoom)
         return np.asarray(camera.img_from_cam(rays))
@@ -541,9 +536,9 @@ def _die_with_parent() -> None:
 
 
 @contextmanager
-def closing_database(request: Request) -> Any:
+def closing_database(request: Request) -> Generator[pycolmap.Database]:
     """COLMAP's database, closed afterwards."""
-    database = pycolmap.Database.open(request.database)
+    database = colmap.open_database(request.database)
     try:
         yield database
     finally:

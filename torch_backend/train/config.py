@@ -30,7 +30,7 @@ class TrainConfig:
     iterations: int = 2000
     """Training steps of one image each."""
     width: int = 320
-    """Width in pixels of the training images (never above the working frames')."""
+    """Width in pixels of the training images, never above the working frames'; 0: theirs."""
     holdout: int = 8
     """Every how many solved frames one is held out, never the first or last; 0: none."""
     holdout_phase: int = 0
@@ -105,11 +105,11 @@ def _standard() -> TrainConfig:
     return TrainConfig(
         preset="standard",
         iterations=9000,
-        width=640,
+        width=960,
         holdout=0,
         sh_degree=3,
         init=InitConfig(seeds=15_000, frames=24, sh_degree=3),
-        densify=DensifyConfig(budget=80_000),
+        densify=DensifyConfig(budget=160_000),
     )
 
 
@@ -117,11 +117,11 @@ def _final() -> TrainConfig:
     return TrainConfig(
         preset="final",
         iterations=30_000,
-        width=1280,
+        width=0,
         holdout=0,
         sh_degree=3,
         init=InitConfig(seeds=30_000, frames=32, sh_degree=3),
-        densify=DensifyConfig(budget=250_000),
+        densify=DensifyConfig(budget=400_000),
     )
 
 

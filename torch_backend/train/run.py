@@ -18,7 +18,7 @@ from ..footage.images import write_png
 from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
-from ..scene import Scene, load_images, load_scene, split_frames
+from ..scene import HELD_BYTES, Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
 from ..solve.motion import load_motion, motion_key
 from . import adam
@@ -100,7 +100,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
             "The run's settings, cameras or motion mattes changed: it is trained anew.",
             "The run that is there stays until the new one is done.",
         )
-    images = place_images(load_images(scene, train + test, width, height, report), device)
+    images = place_images(load_images(scene, train + test, width, height, report, folder), device)
     identity = {"key": key, "solve": solve_key(shot), "motion": motion}
     movers = load_movers(functools.partial(load_motion, shot), scene, train, width, height) if motion else None
     trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers)
@@ -155,7 +155,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     device = _prepared_device(config, params, report)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     size = training_size(scene, config.width)
-    images = place_images(load_images(scene, train + test, *size, report), device)
+    images = place_images(load_images(scene, train + test, *size, report, folder), device)
     held_out = images[len(train) :]
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     identity = {"key": facts["key"], "solve": facts["solve"], "motion": motion}
@@ -200,16 +200,19 @@ def _prepared_device(config: TrainConfig, params: TrainParams, report: Reporter)
 
 
 def place_images(images: Tensor, device: torch.device) -> Tensor:
-    """Images [I, H, W, 3] on the device, or in pinned host memory if they would fill half of what is free there."""
+    """Images [I, H, W, 3] on the device, or if they would fill half of what is free there in pinned host memory, or
+    if they are too many for that, too, where they are."""
     if device.type == "cpu":
         return images
     free, _ = torch.cuda.mem_get_info(device)
-    return images.to(device) if images.nbytes <= free // 2 else images.pin_memory()
+    if images.nbytes <= free // 2:
+        return images.to(device)
+    return images.pin_memory() if images.nbytes <= HELD_BYTES else images
 
 
 def training_size(scene: Scene, requested_width: int) -> tuple[int, int]:
-    """(width, height) of the training images: the working frames' shape, never larger than they are."""
-    width = min(requested_width, scene.width)
+    """(width, height) of the training images: the working frames' shape, never larger; as large if 0 is asked for."""
+    width = min(requested_width or scene.width, scene.width)
     return width, max(16, round(scene.height * width / scene.width))
 
 

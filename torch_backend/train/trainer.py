@@ -485,7 +485,7 @@ class Trainer:
         )  # fmt: skip
         return model.exposure.apply(out.colors[0], time) if exposure else out.colors[0]
 
-    def frame_psnrs(self, indices: list[int], images: Tensor, **options: Any) -> list[float]:
+    def frame_psnrs(self, indices: list[int], images: Tensor | list[Tensor], **options: Any) -> list[float]:
         """PSNR in dB of each frame `indices` of the scene at its own time against images [I, H, W, 3].
 
         `options` go to `render_frame`.
@@ -508,7 +508,7 @@ class Trainer:
         if not (exposure or self.config.exposure.on) or not (field or self.model.field is not None) or not frames:
             return None
         indices, options = [self.train_ids[n] for n in frames], {**options, "exposure": exposure, "field": field}
-        values = self.frame_psnrs(indices, self.images[frames], **options)
+        values = self.frame_psnrs(indices, [self.images[n] for n in frames], **options)
         value = sum(values) / len(values)
         return value if math.isfinite(value) else None
 

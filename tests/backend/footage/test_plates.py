@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from torch_backend.contract import CameraFrame, CameraPath, JobError, frame_file
-from torch_backend.footage import FootageConfig, codes, import_footage, load_frames
+from torch_backend.footage import FootageConfig, import_footage, load_frames, plate_encoding
 from torch_backend.footage.images import read_png, resize_float, write_png
 from torch_backend.footage.opening import open_source
 from torch_backend.footage.plates import Plates
@@ -63,7 +63,7 @@ def write_sequence(folder, pictures, suffix="png"):
 
 
 def working_of(shot, frame, folder=""):
-    return codes.display(read_png(shot.frames / folder / frame_file(frame, ".png")))
+    return plate_encoding.display(read_png(shot.frames / folder / frame_file(frame, ".png")))
 
 
 def test_a_clip_of_the_working_size_is_the_undistorted_frames(tmp_path, shot_of, pan, write_video):
@@ -153,7 +153,7 @@ def test_the_lens_is_taken_out_at_the_sources_size_as_at_the_working_size(tmp_pa
     # Not softer than the solve's own way at that size.
     where = load_plate_lenses(shot)[1002].where(256, 192)
     whole = Undistorter(where)(pictures[1])
-    assert np.abs(plates.display(1002).numpy() - codes.display(whole)).max() < 1e-4
+    assert np.abs(plates.display(1002).numpy() - plate_encoding.display(whole)).max() < 1e-4
 
 
 def test_a_lamp_wears_no_black_ring(tmp_path, shot_of):

@@ -19,7 +19,7 @@ from torch_backend.solve.child import run_worker
 from torch_backend.solve.floor import floor_of
 from torch_backend.solve.motion import load_motion
 from torch_backend.solve.poses import camera_centre
-from torch_backend.solve.solving import filter_points, lens_remarks, quality_words, refuse_poor
+from torch_backend.solve.solving import lens_remarks, quality_words, refuse_poor
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -377,18 +377,6 @@ def test_solving_before_importing_says_so(tmp_path, tools):
 def test_settings_that_make_no_sense_name_their_values(tmp_path, tools, config):
     with pytest.raises(ValueError, match=r"FISHEYE|got 0"):
         solve_shot(Shot.create(tmp_path / "a.splannequin"), config, tools.recorder())
-
-
-def test_points_are_filtered():
-    points = {
-        "xyz": np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, 4], [0, 0, 5], [0, 0, 200]], np.float32),
-        "rgb": np.zeros((6, 3), np.uint8),
-        "error": np.array([0.5, 2.5, 0.5, 0.5, 0.5, 0.5], np.float32),
-        "track": np.array([3, 9, 2, 9, 9, 9], np.uint16),
-        "depth": np.array([1, 1, 1, -1, 1, 1], np.float32),
-    }
-    kept = filter_points(points, np.zeros((4, 3)))
-    assert kept["xyz"][:, 2].tolist() == [1, 5]
 
 
 @pytest.mark.parametrize(

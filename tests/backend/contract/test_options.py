@@ -10,7 +10,7 @@ import pytest
 from torch_backend import cli, contract
 from torch_backend.contract import option_table
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 NEEDED = {"import": ("s.splannequin", "a.mp4"), "freeze": ("a.mp4",)}
 """What a command cannot do without."""
 

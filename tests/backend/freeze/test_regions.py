@@ -1,0 +1,48 @@
+"""Masks that grow, shrink and close, against definitions that take each pixel by itself."""
+
+import numpy as np
+import pytest
+import torch
+
+from torch_backend.freeze.regions import grown, opened
+from torch_backend.freeze.reproject import narrowed, widened
+
+
+def around(matte: np.ndarray, by: int, pick) -> np.ndarray:
+    h, w = matte.shape
+    out = np.empty_like(matte)
+    for y in range(h):
+        for x in range(w):
+            out[y, x] = pick(matte[max(0, y - by) : y + by + 1, max(0, x - by) : x + by + 1])
+    return out
+
+
+@pytest.mark.parametrize("by", [0, 1, 2, 3, 5, 20])
+@pytest.mark.parametrize("kind", [np.float32, bool])
+def test_each_pixel_is_the_greatest_or_least_of_its_square(by, kind):
+    rng = np.random.default_rng(by)
+    matte = rng.normal(size=(9, 14)).astype(np.float32)
+    matte = matte if kind is np.float32 else matte > 1.0
+    assert np.array_equal(widened(torch.from_numpy(matte), by).numpy(), around(matte, by, np.max))
+    assert np.array_equal(narrowed(torch.from_numpy(matte), by).numpy(), around(matte, by, np.min))
+
+
+def test_what_is_thin_leads_nowhere():
+    where = torch.zeros(40, 80, dtype=torch.bool)
+    where[10:30, 4:30] = where[10:30, 50:76] = True
+    where[19:22, 30:50] = True  # a string from one square to the other
+    seeds = torch.zeros_like(where)
+    seeds[18:22, 6:10] = True
+    assert opened(where, 2).sum() == 2 * 20 * 26
+    reached = grown(seeds, where, 200, thin=2)
+    assert reached[10:30, 4:30].all() and not reached[10:30, 50:76].any()
+    assert grown(seeds, where, 200)[10:30, 50:76].any(), "else the string leads nowhere anyhow"
+
+
+def test_growing_ends_at_its_reach():
+    where = torch.zeros(20, 100, dtype=torch.bool)
+    where[6:14] = True
+    seeds = where.clone()
+    seeds[:, 10:] = False
+    columns = grown(seeds, where, 16).any(dim=0).nonzero()
+    assert abs(int(columns.max()) - (9 + 16)) <= 2

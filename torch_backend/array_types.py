@@ -1,0 +1,51 @@
+# pyright: reportMissingTypeStubs=false
+"""Types for what NumPy and SciPy leave without any: each function is that call and a cast, as in `torch_types`."""
+
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+
+class SparseMatrix(Protocol):
+    """A matrix [R, C] of float32 of which most entries are zero."""
+
+    def __matmul__(self, dense: NDArray[np.float32], /) -> NDArray[np.float32]:
+        """The product with [C, N], dense: [R, N]."""
+        ...
+
+
+def sparse_rows(
+    weights: NDArray[np.float32], columns: NDArray[np.integer[Any]], starts: NDArray[np.integer[Any]], width: int
+) -> SparseMatrix:
+    """A matrix by its rows: row r has `weights` [starts[r]:starts[r + 1]] at those `columns`, and is `width` wide."""
+    return cast(Any, sparse).csr_array((weights, columns, starts), shape=(len(starts) - 1, width))
+
+
+def sparse_entries(
+    weights: NDArray[np.float32],
+    rows: NDArray[np.integer[Any]],
+    columns: NDArray[np.integer[Any]],
+    shape: tuple[int, int],
+) -> SparseMatrix:
+    """A matrix by its entries, in any order; those at one place add up."""
+    library = cast(Any, sparse)
+    return library.csr_array(library.coo_array((weights, (rows, columns)), shape=shape))
+
+
+def meshgrid(x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """`np.meshgrid` of two axes [W] and [H]: x and y at each place, [H, W] each."""
+    return cast(tuple[NDArray[Any], NDArray[Any]], np.meshgrid(x, y))
+
+
+def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """`np.savez` of a dictionary: a type checker takes its keys for any of that function's own parameters."""
+    entries: Any = arrays
+    np.savez(path, **entries)
+
+
+def linear_solution(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`np.linalg.solve`: x of matrix [K, K] @ x = right [K, M]. LinAlgError if there is no single one."""
+    return np.asarray(cast(Any, np.linalg).solve(matrix, right))

@@ -1,0 +1,124 @@
+"""Types for what pycolmap leaves without any: each function is that call and a cast. For `worker.py` alone.
+
+Its stubs name bare `os.PathLike`, `dict` and containers that say nothing of what is in them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+_colmap = cast(Any, pycolmap)
+
+
+def cameras(model: pycolmap.Reconstruction) -> Mapping[int, pycolmap.Camera]:
+    """Cameras by their ids."""
+    return cast(Any, model).cameras
+
+
+def images(model: pycolmap.Reconstruction) -> Mapping[int, pycolmap.Image]:
+    """Images by their ids, also those without a pose."""
+    return cast(Any, model).images
+
+
+def points(model: pycolmap.Reconstruction) -> Mapping[int, pycolmap.Point3D]:
+    """Points by their ids."""
+    return cast(Any, model).points3D
+
+
+def pose(image: pycolmap.Image) -> NDArray[np.float64]:
+    """[3, 4] world-to-camera of an image that has one."""
+    return cast(Any, image).cam_from_world().matrix()
+
+
+def write_binary(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """cameras.bin, images.bin, points3D.bin and what else COLMAP writes, into a folder that exists."""
+    cast(Any, model).write_binary(folder)
+
+
+def open_database(file: Path) -> pycolmap.Database:
+    """A database, made if it is not there; to be closed."""
+    return _colmap.Database.open(file)
+
+
+def import_images(
+    database: Path, folder: Path, mode: pycolmap.CameraMode, names: Sequence[str], reader: pycolmap.ImageReaderOptions
+) -> None:
+    """Numbers images in the order of their names."""
+    _colmap.import_images(database, folder, mode, names, reader)
+
+
+def extract_features(
+    database: Path,
+    folder: Path,
+    mode: pycolmap.CameraMode,
+    names: Sequence[str],
+    reader: pycolmap.ImageReaderOptions,
+    options: pycolmap.FeatureExtractionOptions,
+) -> None:
+    """Features of images into the database, on the CPU."""
+    _colmap.extract_features(
+        database,
+        folder,
+        image_names=names,
+        camera_mode=mode,
+        reader_options=reader,
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def match_sequential(
+    database: Path,
+    options: pycolmap.FeatureMatchingOptions,
+    pairing: pycolmap.SequentialPairingOptions,
+    geometry: pycolmap.TwoViewGeometryOptions,
+) -> None:
+    """Matches of images with the next ones, on the CPU."""
+    _colmap.match_sequential(database, options, pairing, geometry, device=pycolmap.Device.cpu)
+
+
+def match_image_pairs(
+    database: Path,
+    options: pycolmap.FeatureMatchingOptions,
+    pairing: pycolmap.ImportedPairingOptions,
+    geometry: pycolmap.TwoViewGeometryOptions,
+) -> None:
+    """Matches of the pairs in a file, on the CPU."""
+    _colmap.match_image_pairs(database, options, pairing, geometry, device=pycolmap.Device.cpu)
+
+
+def incremental_mapping(
+    database: Path,
+    folder: Path,
+    into: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    next_image: Callable[[], None],
+) -> dict[int, pycolmap.Reconstruction]:
+    """Models by number; `next_image` is called whenever one has found its place."""
+    return _colmap.incremental_mapping(database, folder, into, options, next_image_callback=next_image)
+
+
+def triangulate_points(
+    known: pycolmap.Reconstruction,
+    database: Path,
+    folder: Path,
+    into: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> pycolmap.Reconstruction:
+    """Points of a model whose cameras are held; those that it had are cleared."""
+    return _colmap.triangulate_points(known, database, folder, into, True, options)
+
+
+def absolute_pose(
+    xy: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    camera: pycolmap.Camera,
+    options: pycolmap.AbsolutePoseEstimationOptions,
+) -> tuple[NDArray[np.float64], int] | None:
+    """World-to-camera pose [3, 4] from pixels [N, 2] and points [N, 3], and how many agree; None without any."""
+    found = _colmap.estimate_and_refine_absolute_pose(xy, xyz, camera, options)
+    return (found["cam_from_world"].matrix(), int(found["num_inliers"])) if found is not None else None
