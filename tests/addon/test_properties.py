@@ -1,5 +1,7 @@
 """Properties that classes assign are Blender's once they are registered."""
 
+import inspect
+
 import bpy
 
 
@@ -31,7 +33,7 @@ def test_every_property_that_a_class_assigns_is_blenders(package):
     for cls in classes:
         for one in cls.__mro__:
             assert not [n for n, v in vars(one).items() if isinstance(v, bpy.props._PropertyDeferred)], cls
-            own = vars(one).get("__annotations__", {})
+            own = inspect.get_annotations(one)
             properties = [n for n, v in own.items() if isinstance(v, bpy.props._PropertyDeferred)]
             known = cls.bl_rna.properties
             if issubclass(cls, bpy.types.Operator):
