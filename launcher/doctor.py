@@ -121,8 +121,8 @@ def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
     yield from map(gpu_finding, cards)
     if any(card.fits for card in cards) and facts.get("trains_on") == "cpu":
         unseen = None if facts.get("torch_device") == "cuda" else why_unused(facts.get("torch_cuda"))
-        told = " ".join(unseen) if unseen else facts.get("cuda_refusal") or "CUDA_VISIBLE_DEVICES hides the card"
-        yield Finding("torch on gpu", "note", told)
+        reason = " ".join(unseen) if unseen else facts.get("cuda_refusal") or "CUDA_VISIBLE_DEVICES hides the card"
+        yield Finding("torch on gpu", "note", reason)
 
 
 def gpu_finding(card: Card) -> Finding:

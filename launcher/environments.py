@@ -286,7 +286,7 @@ def _step(
     finally:
         close_input(child)
     if code:
-        told = "\n".join([*said[:5], *said[-40:]])  # pip names its indexes first
-        refuse(environment.name, environment.log, step, told)
+        printed = "\n".join([*said[:5], *said[-40:]])  # pip names its indexes first
+        refuse(environment.name, environment.log, step, printed)
     if condense is None:
         say(f"  {time.monotonic() - started:5.0f} s  {step}: done")

@@ -56,11 +56,11 @@ def refuse(name: str, log: Path, step: str, output: str) -> None:
 
 def _unreachable(output: str) -> tuple[str, str]:
     """What pip could not reach, and what to do about it, from what it printed."""
-    told = re.search(r"host='([^']+)'", output)
+    named = re.search(r"host='([^']+)'", output)
     listed = re.search(r"Looking in indexes: (.*)", output)
     urls = [url.strip() for url in listed.group(1).split(",")] if listed else ["https://pypi.org/simple"]
     hosts = [part.hostname for part in map(urllib.parse.urlsplit, urls) if part.scheme != "file" and part.hostname]
-    what = told.group(1) if told else " or ".join(dict.fromkeys(hosts)) or "the package index"
+    what = named.group(1) if named else " or ".join(dict.fromkeys(hosts)) or "the package index"
     again = "then start the same command again: it goes on where it stopped"
     if re.search(r"ProxyError|Cannot connect to proxy", output):
         return f"the proxy on the way to {what} cannot be used", f"check HTTPS_PROXY and pip.conf, {again}"

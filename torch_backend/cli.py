@@ -99,7 +99,7 @@ def _begun(folder: str) -> Shot:
 
 def one_step(args: argparse.Namespace, console: Console) -> int:
     """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`."""
-    ((kind, params),) = asked(args).items()
+    ((kind, params),) = contract.requested_params(args).items()
     folder = args.clip if args.command == "freeze" else args.shot
     shot = _begun(folder) if kind == "import" else Shot.open(folder)
     result = run_station(shot, kind, params, console)
@@ -132,14 +132,9 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
-def asked(args: argparse.Namespace) -> dict[str, Any]:
-    """Kind of job -> parameters that a parsed command line asks for; none of a command that starts no job."""
-    return contract.asked(args)
-
-
 def _requests(args: argparse.Namespace) -> dict[str, Any]:
     """Kind of job -> parameters of `freeze CLIP`. ValueError or JobError on what cannot be, before any work is done."""
-    requests = asked(args)
+    requests = contract.requested_params(args)
     for params in requests.values():
         contract.check_params(params)
     for name, what in ((args.run, "run"), (args.take, "take"), (args.shot_name, "shot")):
@@ -168,10 +163,10 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
     )
 
 
-def print_verdict(told: dict[str, Any], console: Console) -> None:
+def print_verdict(facts: dict[str, Any], console: Console) -> None:
     """What an artist should know of a run or a take, line by line."""
     if not console.as_json:
-        for line in contract.verdict_lines(told):
+        for line in contract.verdict_lines(facts):
             print(line, file=console.stream, flush=True)
 
 
@@ -234,15 +229,15 @@ def status(args: argparse.Namespace, console: Console) -> int:
     for path in sorted(shot.jobs.glob(f"*/{contract.STATUS_FILE}")):
         try:
             job: contract.Status = contract.from_dict(contract.Status, contract.read_json(path, contract.SHORT_JSON))
-            told = f"{job.state:<9} {job.stage} {100 * job.fraction:.0f}%  {job.message}"
+            line = f"{job.state:<9} {job.stage} {100 * job.fraction:.0f}%  {job.message}"
             facts = dataclasses.asdict(job)
         except (OSError, ValueError) as error:
-            told = f"damaged   {error}"
+            line = f"damaged   {error}"
             facts = {"state": "damaged", "message": str(error)}
         if console.as_json:
             print(json.dumps({"job": path.parent.name, **facts}), file=console.stream)
         else:
-            print(contract.printable(f"{path.parent.name}  {told}").rstrip(), file=console.stream)
+            print(contract.printable(f"{path.parent.name}  {line}").rstrip(), file=console.stream)
     return ExitCode.OK
 
 
@@ -276,11 +271,11 @@ def stmaps(args: argparse.Namespace, console: Console) -> int:
 
 def _give_up(error: OSError, where: Path, hint: str = "Choose another --output folder.") -> NoReturn:
     """Ends the command on a folder that cannot be written, in one sentence."""
-    told = path_error(error) or contract.JobError(
+    refusal = path_error(error) or contract.JobError(
         f"Cannot write to {where}: {error.strerror or error}.", hint, ExitCode.USAGE
     )
-    print(f"Error: {told.message} {told.hint}", file=sys.stderr)
-    raise SystemExit(told.exit_code)
+    print(f"Error: {refusal.message} {refusal.hint}", file=sys.stderr)
+    raise SystemExit(refusal.exit_code)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -309,10 +304,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
         return error.exit_code
     except OSError as error:
-        told = path_error(error)
-        text = f"{told.message} {told.hint}" if told else str(error)
+        refusal = path_error(error)
+        text = f"{refusal.message} {refusal.hint}" if refusal else str(error)
         print(f"Error: {text}", file=sys.stderr)
-        return told.exit_code if told else ExitCode.USAGE
+        return refusal.exit_code if refusal else ExitCode.USAGE
     except ValueError as error:
         print(f"Error: {error}", file=sys.stderr)
         return ExitCode.USAGE

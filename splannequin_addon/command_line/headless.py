@@ -343,7 +343,7 @@ def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
     """Kind of job -> parameters that a parsed command line asks for; none of a command that starts no job."""
-    return contract.asked(args, {"device": backend.device()})
+    return contract.requested_params(args, {"device": backend.device()})
 
 
 def _device(args: argparse.Namespace) -> str:

@@ -73,7 +73,7 @@ def test_an_old_run_is_frozen_by_the_new_word_and_by_the_old_one(shot: Shot, cap
 @pytest.mark.parametrize("line", LINES, ids=lambda line: " ".join(line["argv"]))
 def test_an_old_command_line_asks_for_the_same(line):
     args = cli.parser().parse_args(line["argv"])
-    found = cli.asked(args)
+    found = contract.requested_params(args)
     assert found.keys() == line["asks"].keys()
     for kind, params in found.items():
         told = dataclasses.asdict(params)

@@ -32,12 +32,12 @@ from .checkpoint_header import (
 )
 from .command_line import (
     as_json,
-    asked,
     command_line,
     freezes_a_shot,
     is_shot,
     notes,
     options_for,
+    requested_params,
 )
 from .errors import (
     Cancelled,
@@ -333,7 +333,6 @@ __all__ = [
     "Verdict",
     "Writer",
     "as_json",
-    "asked",
     "atomic_path",
     "busy",
     "channels_of",
@@ -386,6 +385,7 @@ __all__ = [
     "remove_link",
     "replace_file",
     "replacing_folder",
+    "requested_params",
     "restore_folder",
     "runs_job",
     "runs_still",

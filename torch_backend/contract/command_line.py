@@ -63,38 +63,38 @@ class _Noted(argparse.Action):
 def options_for(name: str, cls: type, side: str = "") -> list[tuple[Any, Option]]:
     """(field, option) of a dataclass that a verb has on a side's command line; `side` empty: on either."""
     return [
-        (one, told)
-        for one, told in options_of(cls)
-        if told.flag and (not told.commands or name in told.commands) and (not side or told.side in ("", side))
+        (one, spec)
+        for one, spec in options_of(cls)
+        if spec.flag and (not spec.commands or name in spec.commands) and (not side or spec.side in ("", side))
     ]
 
 
 def _add_options(parser: argparse.ArgumentParser, name: str, verb: Verb, side: str, unset: Mapping[str, str]) -> None:
     """Gives a verb its options; one that several of its dataclasses have, once."""
-    there: set[str] = set()
+    added: set[str] = set()
     for cls in (verb.words, *verb.jobs.values()):
         hints = typing.get_type_hints(cls)
-        for one, told in options_for(name, cls, side):
-            if told.flag in there:
+        for one, spec in options_for(name, cls, side):
+            if spec.flag in added:
                 continue
-            there.add(told.flag)
-            words: dict[str, Any] = {"action": _Noted, "help": told.help}
-            if told.switch:
-                parser.add_argument(told.flag, nargs=0, default=False, required=False, **words)
+            added.add(spec.flag)
+            words: dict[str, Any] = {"action": _Noted, "help": spec.help}
+            if spec.switch:
+                parser.add_argument(spec.flag, nargs=0, default=False, required=False, **words)
                 continue
-            words.update(metavar=told.metavar, choices=told.choices or None)
+            words.update(metavar=spec.metavar, choices=spec.choices or None)
             if one.name in verb.shown:
                 words["metavar"], words["help"] = verb.shown[one.name]
-            if told.flag.startswith("--"):
+            if spec.flag.startswith("--"):
                 own = unset.get(one.name)
-                words["required"] = told.required
-                words["default"] = (None if told.required else one.default) if own is None else ""
-                default = own or default_of(one, told)
+                words["required"] = spec.required
+                words["default"] = (None if spec.required else one.default) if own is None else ""
+                default = own or default_of(one, spec)
                 words["help"] += f" (default: {default})" if default else ""
-            parser.add_argument(told.flag, type=_parser_of(told, hints[one.name]), **words)
+            parser.add_argument(spec.flag, type=_parser_of(spec, hints[one.name]), **words)
 
 
-def asked(args: argparse.Namespace, unset: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def requested_params(args: argparse.Namespace, unset: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Kind of job -> its parameters, as parsed arguments ask for them; none of a verb that starts no job.
 
     Args:
@@ -114,12 +114,12 @@ def asked(args: argparse.Namespace, unset: Mapping[str, Any] | None = None) -> d
 
 def _values(args: argparse.Namespace, name: str, cls: type, unset: Mapping[str, Any]) -> dict[str, Any]:
     """Field -> value of a dataclass, from parsed arguments."""
-    values = {one.name: told.always for one, told in options_of(cls) if told.always is not None}
-    for one, told in options_for(name, cls):
-        value = getattr(args, told.dest)
-        if told.switch:
+    values = {one.name: spec.always for one, spec in options_of(cls) if spec.always is not None}
+    for one, spec in options_for(name, cls):
+        value = getattr(args, spec.dest)
+        if spec.switch:
             value = one.default != value
-        elif told.is_path and value and "://" not in value:
+        elif spec.is_path and value and "://" not in value:
             value = str(Path(value).absolute())
         values[one.name] = unset.get(one.name, value) if value == "" else value
     return values
@@ -138,7 +138,7 @@ def freezes_a_shot(args: argparse.Namespace) -> bool:
 
 def _refuse_what_a_clip_wants(args: argparse.Namespace) -> None:
     """JobError if `freeze SHOT` was told what only the steps before it can heed."""
-    known = {told.dest for _, told in options_for("freeze", FreezeParams)}
+    known = {spec.dest for _, spec in options_for("freeze", FreezeParams)}
     lost = [flag for dest, flag in getattr(args, "said", {}).items() if dest not in known]
     if lost:
         verb = "is" if len(lost) == 1 else "are"
@@ -156,14 +156,14 @@ def notes(args: argparse.Namespace) -> list[str]:
     if verb.now:
         found.append(f"`{args.command} SHOT` is called `{verb.now} SHOT` now: the old word goes with the next version.")
     for cls in (verb.words, *verb.jobs.values()):
-        dests = {one.name: told.dest for one, told in options_for(args.command, cls)}
-        for one, told in options_for(args.command, cls):
-            if told.heeded_with is None or dests[one.name] not in said:
+        dests = {one.name: spec.dest for one, spec in options_for(args.command, cls)}
+        for one, spec in options_for(args.command, cls):
+            if spec.heeded_with is None or dests[one.name] not in said:
                 continue
-            field, values = told.heeded_with
+            field, values = spec.heeded_with
             if getattr(args, dests[field]) not in values:
                 other = _listed([f"--{field.replace('_', '-')} {value}" for value in values])
-                found.append(f"{told.flag} is passed over: it is heeded only with {other}.")
+                found.append(f"{spec.flag} is passed over: it is heeded only with {other}.")
     if "extend" in said:
         lost = [flag for dest, flag in said.items() if dest not in ("extend", "run", "device")]
         if lost:
@@ -176,10 +176,10 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
-def _parser_of(told: Option, hint: Any) -> Callable[[str], Any]:
+def _parser_of(spec: Option, hint: Any) -> Callable[[str], Any]:
     """What makes a value of the text on a command line."""
-    if told.parse is not None:
-        return _in_words(told.parse)
+    if spec.parse is not None:
+        return _in_words(spec.parse)
     return next(kind for kind in (int, float, str) if kind is hint or kind in typing.get_args(hint))
 
 

@@ -72,9 +72,9 @@ class Option:
         return self.flag.lstrip("-").replace("-", "_")
 
 
-def option(default: Any, *, words: str = "", **told: Any) -> Any:
-    """A dataclass field with an `Option` of the words in `told`; `words` is its default in words."""
-    return field(default=default, metadata={"option": Option(default=words, **told)})
+def option(default: Any, *, words: str = "", **entries: Any) -> Any:
+    """A dataclass field with an `Option` of the words in `entries`; `words` is its default in words."""
+    return field(default=default, metadata={"option": Option(default=words, **entries)})
 
 
 def options_of(cls: type) -> Iterator[tuple[dataclasses.Field[Any], Option]]:
@@ -84,16 +84,16 @@ def options_of(cls: type) -> Iterator[tuple[dataclasses.Field[Any], Option]]:
             yield one, one.metadata["option"]
 
 
-def default_of(one: dataclasses.Field[Any], told: Option) -> str:
+def default_of(one: dataclasses.Field[Any], spec: Option) -> str:
     """The default of a field in words; empty if it says nothing."""
-    if told.default or one.default in (None, "") or told.switch:
-        return told.default
+    if spec.default or one.default in (None, "") or spec.switch:
+        return spec.default
     return f"{one.default:g}" if isinstance(one.default, float) else str(one.default)
 
 
 def limits_of(cls: type) -> dict[str, Limit]:
     """Field -> what the number in it may be."""
-    return {one.name: told.limit for one, told in options_of(cls) if told.limit is not None}
+    return {one.name: spec.limit for one, spec in options_of(cls) if spec.limit is not None}
 
 
 def panel(cls: type, name: str, default: Any = None) -> dict[str, Any]:
@@ -104,12 +104,12 @@ def panel(cls: type, name: str, default: Any = None) -> dict[str, Any]:
         name: the field, which has a `label`.
         default: what the panel shows until it is set; None: the field's own default.
     """
-    one, told = next((one, told) for one, told in options_of(cls) if one.name == name)
-    words: dict[str, Any] = {"name": told.label, "description": told.tip}
+    one, spec = next((one, spec) for one, spec in options_of(cls) if one.name == name)
+    words: dict[str, Any] = {"name": spec.label, "description": spec.tip}
     words["default"] = one.default if default is None else default
-    if told.items:
-        words["items"] = [(value, *shown) for value, shown in told.items.items()]
-    elif told.choices == SWITCH:
+    if spec.items:
+        words["items"] = [(value, *shown) for value, shown in spec.items.items()]
+    elif spec.choices == SWITCH:
         words["default"] = one.default == SWITCH[0]
     return words
 

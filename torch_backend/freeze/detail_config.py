@@ -25,10 +25,10 @@ class DetailConfig:
     doubt: float = 0.05
     """Sum of weights at which a pixel is half plate, half splats: what plates say is believed in part, as it is wrong
     in part. On truth the best share of a single plate's residual in what moves is 0.4 to 0.65."""
-    travel: float = 1.0
+    travel: float = 0.5
     """Pixels that the model moves a point by, from t* to the frame's own plate, from which on that plate is not
     believed there if it bears the motion out: sways too small for the flow."""
-    borne_out: float = 0.03
+    borne_out: float = 0.02
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
     carried: float = 2.0
     """Travel in pixels from which on what the model moves belongs to what moves beside it: of a body that has turned,
@@ -49,6 +49,9 @@ class DetailConfig:
     gap: int = 4
     """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
     sees flickers from pixel to pixel."""
+    rough: int = 1
+    """Pixels of decisions around a place that a plate has to show, too, to fill it where something moves: depth is
+    rough there, what it is seen to show changes from pixel to pixel along edges, and single ones would stand out."""
     sway: float = 3.0
     """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.15

@@ -11,7 +11,7 @@ from ..torch_types import norm
 from .bands import look_up_near
 from .detail_config import DetailConfig
 from .posed import PosedFrame, displacements, parallax
-from .reproject import look_up, project, resized, unproject
+from .reproject import blurred, look_up, narrowed, project, resized, unproject
 from .sightings import Sighting, Sightings
 
 WHOLE = 0.999
@@ -28,6 +28,8 @@ class Fillers:
     """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
     unknown: Tensor
     """[h, w] in 0..1: share of it whose way nobody knows."""
+    shown: list[Tensor]
+    """[h, w] in 0..1 each: that plate shows it, and what is around it."""
     agreed: list[Tensor]
     """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
     residuals: list[Tensor]
@@ -58,28 +60,33 @@ def fillers_of(
         return None
     chosen = _chosen(sightings, config, posed, matte, leading, usable)
     moved, unknown = displacements(sightings, posed, chosen)
-    agreed = _agreed(sightings, config, posed, chosen, moved)
-    return Fillers(chosen, moved, unknown, agreed, [sightings.residual(frame) for frame in chosen])
+    seen = [
+        sightings.seen(frame, posed.points if frame == posed.t else posed.points + way)
+        for frame, way in zip(chosen, moved, strict=True)
+    ]
+    shown = [blurred(narrowed(sighting.visible, config.rough), float(config.rough)) for sighting in seen]
+    agreed = _agreed(sightings, config, posed, chosen, seen)
+    return Fillers(chosen, moved, unknown, shown, agreed, [sightings.residual(frame) for frame in chosen])
 
 
 def _agreed(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], moved: list[Tensor]
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], seen: list[Sighting]
 ) -> list[Tensor]:
     """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
     h, w = posed.depth.shape
     if posed.t not in chosen:
         return [torch.ones_like(posed.depth) for _ in chosen]
-    points = posed.points[::2, ::2]  # a quarter of the work: it is low-passed
-    truth = sightings.seen(posed.t, points)
-    shown_at_t = look_up(sightings.view(posed.t).picture.float(), truth.pixels)
+    pixels = [sighting.pixels[::2, ::2] for sighting in seen]  # a quarter of the work: it is low-passed
+    visible = [sighting.visible[::2, ::2] for sighting in seen]
+    of_truth = chosen.index(posed.t)
+    shown_at_t = look_up(sightings.view(posed.t).picture.float(), pixels[of_truth])
     out: list[Tensor] = []
-    for frame, way in zip(chosen, moved, strict=True):
+    for n, frame in enumerate(chosen):
         if frame == posed.t:
             out.append(torch.ones_like(posed.depth))
             continue
-        sighting = sightings.seen(frame, points + way[::2, ::2])
-        says = look_up(sightings.view(frame).picture.float(), sighting.pixels)
-        both = (truth.visible * sighting.visible)[..., None]
+        says = look_up(sightings.view(frame).picture.float(), pixels[n])
+        both = (visible[of_truth] * visible[n])[..., None]
         off = sightings.difference(says * both, shown_at_t * both, 0.5)
         out.append(resized(torch.exp(-(off / config.agreement).square()), w, h))
     return out
@@ -103,6 +110,7 @@ def fill(
         [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
     )
     doubt = look_up(posed.doubt, small)
+    uneasy = torch.maximum(motion, doubt).clamp(0.0, 1.0)
     weights, places = list[Tensor](), list[Tensor]()
     untold = 1.0 - unknown
     truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
@@ -114,6 +122,8 @@ def fill(
         else:
             sighting = sightings.seen(frame, points + look_up(fillers.moved[n], small))
         sighting = _doubted(sighting, doubt)
+        around = torch.minimum(sighting.visible, look_up(fillers.shown[n], small))
+        sighting.visible = torch.lerp(sighting.visible, around, uneasy)
         sway = _sway(sightings, config, frame, points, sighting) * untold * look_up(fillers.agreed[n], small)
         weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway))
         places.append(sighting.pixels * larger)

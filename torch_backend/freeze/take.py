@@ -59,7 +59,7 @@ from .warp import WarpMetadata, write_warp
 
 TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
-DETAIL_VERSION = 3
+DETAIL_VERSION = 4
 """The same, of frames made of plates."""
 _FRAME = re.compile(r"-?\d+")
 

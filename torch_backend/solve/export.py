@@ -44,10 +44,10 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False) -> l
     if kind == "nerfstudio":
         return _write_transforms(shot, path, points, folder)
     other = [folder / (part + (".bin" if text else ".txt")) for part in PARTS]
-    there = next((file for file in other if file.is_file()), None)
-    if there is not None:
+    existing = next((file for file in other if file.is_file()), None)
+    if existing is not None:
         raise JobError(
-            f"{folder} holds another COLMAP model already ({there.name}).", "Choose another folder.", ExitCode.USAGE
+            f"{folder} holds another COLMAP model already ({existing.name}).", "Choose another folder.", ExitCode.USAGE
         )
     return write_model(folder, _model(path, points), text)
 

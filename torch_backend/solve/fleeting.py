@@ -209,9 +209,9 @@ class Fleeting:
         _, areas = cv2.connectedComponents(mask.astype(np.uint8))
         number = (areas[rows, columns].astype(np.int64) << 32) + (rows // _BLOCK << 16) + columns // _BLOCK
         names, block, sizes = np.unique(number, return_inverse=True, return_counts=True)
-        told = ((rows + columns) % 2 == 0) | (sizes[block] <= _BLOCK)  # of many, half say it as well
+        chosen = ((rows + columns) % 2 == 0) | (sizes[block] <= _BLOCK)  # of many, half say it as well
         every, whole = (rows, columns), block
-        rows, columns, block = rows[told], columns[told], block[told]
+        rows, columns, block = rows[chosen], columns[chosen], block[chosen]
         sizes = np.bincount(block, minlength=len(names))
         tried = np.linspace(0.0, _NEAREST / depth, c.depths).astype(np.float32)
         points, values = self._points(rows, columns), frame.shades.colors[rows, columns][None]

@@ -156,11 +156,11 @@ class Matches:
 
     def match(self, a: int, b: int) -> tuple[Map, Map, Mask]:
         """Positions x, y in b of a's points, and which are found: inside, and back again."""
-        there = self.flow(a, b).astype(np.float32)
-        at = self.grid[0] + there[0], self.grid[1] + there[1]
+        forth = self.flow(a, b).astype(np.float32)
+        at = self.grid[0] + forth[0], self.grid[1] + forth[1]
         if (a, b) not in self._found:
             back = self.flow(b, a)
-            gap = (there[0] + sample(back[0], at)) ** 2 + (there[1] + sample(back[1], at)) ** 2
+            gap = (forth[0] + sample(back[0], at)) ** 2 + (forth[1] + sample(back[1], at)) ** 2
             self._found[a, b] = self.inside(at) & (gap <= (self._config.round_trip * self._unit) ** 2)
         return *at, self._found[a, b]
 

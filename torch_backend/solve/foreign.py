@@ -226,20 +226,20 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
     return ForeignSolve(file, "transforms.json", list(lenses), cameras)
 
 
-def _transforms_lens(file: Path, told: dict[str, Any]) -> Lens:
+def _transforms_lens(file: Path, values: dict[str, Any]) -> Lens:
     def number(name: str, otherwise: float | None = None) -> float:
-        value = told.get(name, otherwise)
+        value = values.get(name, otherwise)
         if value is None or isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"{file} has no {name}, the lens cannot be told")
         return float(value)
 
     width, height = int(number("w")), int(number("h"))
-    if "fl_x" not in told and "camera_angle_x" in told:  # as instant-ngp writes it, radians
-        told = {**told, "fl_x": 0.5 * width / math.tan(0.5 * number("camera_angle_x"))}
+    if "fl_x" not in values and "camera_angle_x" in values:  # as instant-ngp writes it, radians
+        values = {**values, "fl_x": 0.5 * width / math.tan(0.5 * number("camera_angle_x"))}
     fx = number("fl_x")
     pinhole = (fx, number("fl_y", fx), number("cx", 0.5 * width), number("cy", 0.5 * height))
     k1, k2, k3, k4, p1, p2 = (number(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = str(told.get("camera_model", "OPENCV"))
+    model = str(values.get("camera_model", "OPENCV"))
     if model == "OPENCV_FISHEYE":
         return _lens(model, width, height, (*pinhole, k1, k2, k3, k4))
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"):
@@ -280,14 +280,14 @@ def frame_numbers(names: Sequence[str]) -> list[int | None]:
     first: list[int | None] | None = None
     for place in range(1, max(map(len, runs), default=0) + 1):
         numbers = [int(run[-place]) if len(run) >= place else None for run in runs]
-        told = [n for n in numbers if n is not None]
-        if told and len(set(told)) == len(told):
+        numbered = [n for n in numbers if n is not None]
+        if numbered and len(set(numbered)) == len(numbered):
             return numbers
         first = first or numbers
     if first is None:
         return [None] * len(names)
-    told = [n for n in first if n is not None]
-    twice = next(n for n in told if told.count(n) > 1)
+    numbered = [n for n in first if n is not None]
+    twice = next(n for n in numbered if numbered.count(n) > 1)
     both = [name for name, n in zip(names, first, strict=True) if n == twice]
     raise ValueError(f"{both[0]} and {both[1]} have the same frame number {twice}")
 

@@ -170,8 +170,8 @@ def _write_model(
     """The given model, of the working frames, as a solve would leave its own."""
     cameras = {n: ColmapCamera(n, x.model, x.width, x.height, x.params) for n, x in enumerate(lenses, start=1)}
     images = [
-        ColmapImage(n, name, told["lens"] + 1, np.array(told["pose"]))
-        for n, (name, told) in enumerate(sorted(poses.items()), start=1)
+        ColmapImage(n, name, camera["lens"] + 1, np.array(camera["pose"]))
+        for n, (name, camera) in enumerate(sorted(poses.items()), start=1)
     ]
     count = len(points["xyz"])
     xyz, error = points["xyz"].astype(np.float64), points["error"].astype(np.float64)

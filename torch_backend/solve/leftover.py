@@ -83,10 +83,10 @@ class Leftover:
     def _guessed(self, key: int, other: int) -> bool:
         return self._test.guessed[key] or self._test.guessed[other]
 
-    def _limit(self, length: Map, told: Mask) -> float:
+    def _limit(self, length: Map, telling: Mask) -> float:
         """The distance that may tell of motion, from how far matches are off as a rule."""
         least = self._config.least * self._test.unit
-        noise = float(np.median(length[told])) if np.count_nonzero(told) >= FEW else 0.0
+        noise = float(np.median(length[telling])) if np.count_nonzero(telling) >= FEW else 0.0
         return float(np.clip(self._config.unusual * noise, least, self._config.most_left * least))
 
     def _left(self, key: int, other: int, at: tuple[Map, Map], within: Mask) -> Map:
@@ -111,8 +111,8 @@ class Leftover:
         match = sample(at[0], moved), sample(at[1], moved)
         off = [match[i] - at[i] for i in (0, 1)]
         drift = _drift(off, within & texture.telling, inverse, self._config.least * test.unit)
-        pair.gain = brightness(look.grid, sample(pair.there.grid, match), within)
-        still, found = (pair.there.unlike(look.grid, place, pair.gain) for place in (at, match))
+        pair.gain = brightness(look.grid, sample(pair.other.grid, match), within)
+        still, found = (pair.other.unlike(look.grid, place, pair.gain) for place in (at, match))
         sharp = within & texture.telling
         usual = float(np.median(found[sharp])) if np.count_nonzero(sharp) >= FEW else 0.0
         likeness = within / (1.0 + found / (4.0 * usual + 8.0 * _FLOOR))
@@ -124,19 +124,19 @@ class Leftover:
         return _Laid(pair, np.clip(gained, 0.0, 1.0), min(max(noise, least**2), most**2))
 
 
-def _drift(left: list[Map], told: Mask, inverse: Map, unit: float) -> list[Map]:
+def _drift(left: list[Map], telling: Mask, inverse: Map, unit: float) -> list[Map]:
     """By how much x and y of the whole picture are off, [h, w] each: a poor pose, a rolling shutter, a lens.
 
     A second-order polynomial, and what is nearer more so, as a camera that stands elsewhere sees it, through what is
-    `told` of what is `left`, those far from it hardly counting. What moves by itself does so here and there and not
+    `telling` of what is `left`, those far from it hardly counting. What moves by itself does so here and there and not
     evenly over the picture.
     """
-    height, width = told.shape
+    height, width = telling.shape
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j].astype(np.float32)
-    few = told[::_SPARSE, ::_SPARSE]
+    few = telling[::_SPARSE, ::_SPARSE]
     if np.count_nonzero(few) < FEW:
         return [np.zeros_like(part) for part in left]
-    near = np.minimum(inverse / max(float(np.median(inverse[told])), 1e-9), _NEAREST).astype(np.float32)
+    near = np.minimum(inverse / max(float(np.median(inverse[telling])), 1e-9), _NEAREST).astype(np.float32)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, near], axis=-1)
     design = terms[::_SPARSE, ::_SPARSE][few].astype(np.float64)
     wanted = np.stack([part[::_SPARSE, ::_SPARSE][few] for part in left], axis=-1).astype(np.float64)

@@ -178,8 +178,8 @@ class Lens:
 
 def load_lens(shot: Shot) -> Lens:
     """The lens of a solved shot, from solve.json and cameras.json. JobError (SOLVE) if they do not tell it."""
-    told, path = load_record(shot), load_cameras(shot)
-    model, extra, focal = told.get("camera_model"), told.get("distortion"), told.get("focal_px")
+    record, path = load_record(shot), load_cameras(shot)
+    model, extra, focal = record.get("camera_model"), record.get("distortion"), record.get("focal_px")
     if model is None or extra is None or not focal:
         raise JobError(
             f"The solve of {shot.root.name} does not tell its lens.", "Solve the camera again.", ExitCode.SOLVE

@@ -64,8 +64,8 @@ class Look:
     def unlike(self, values: Map, at: tuple[Map, Map], gain: tuple[float, float]) -> Map:
         """Mean square difference around each point between `values` and this picture, times and plus `gain`, there."""
         half = np.float32(0.5)
-        there = cv2.remap(self._smooth, at[0] - half, at[1] - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        beyond = values - np.float32(gain[1]) - there * np.float32(gain[0])
+        shown = cv2.remap(self._smooth, at[0] - half, at[1] - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        beyond = values - np.float32(gain[1]) - shown * np.float32(gain[0])
         return cv2.blur(beyond * beyond, (3, 3))
 
 
@@ -114,7 +114,7 @@ class Pair:
     ray: Ray
     limit: float
     """Matches farther than this from where the still point is seen may tell of motion; flow pixels."""
-    there: Look
+    other: Look
     """The other's picture, and how its brightness becomes this one's."""
     gain: tuple[float, float] = (1.0, 0.0)
     matched: Map = field(init=False)
@@ -154,11 +154,11 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
     agree = np.zeros_like(inverse)
     for pair in pairs:
         *_, length = pair.miss(inverse)
-        told = pair.seen.found & texture.telling
-        if np.count_nonzero(told) >= FEW:
+        telling = pair.seen.found & texture.telling
+        if np.count_nonzero(telling) >= FEW:
             guessed = test.guessed[key] or test.guessed[pair.seen.key]
             most = np.inf if guessed else config.most_noise * pair.limit
-            pair.limit = max(pair.limit, min(config.noise * float(np.median(length[told])), most))
+            pair.limit = max(pair.limit, min(config.noise * float(np.median(length[telling])), most))
         agree += pair.seen.found & (length <= pair.limit)
     depths = _surroundings(inverse, agree >= 3)
     inverse = _best_depth(look, pairs, depths)
@@ -177,8 +177,8 @@ def outlines(inverse: Map) -> Map:
 def _pair(test: StillTest, key: int, seen: Seen, texture: Texture, config: FlowConfig) -> Pair:
     """A key frame and one in which it is seen again."""
     look, pair = test.look(key), Pair.between(test, key, seen, config)
-    pair.gain = brightness(look.grid, sample(pair.there.grid, seen.at), seen.found)
-    pair.matched = pair.there.unlike(look.grid, seen.at, pair.gain)
+    pair.gain = brightness(look.grid, sample(pair.other.grid, seen.at), seen.found)
+    pair.matched = pair.other.unlike(look.grid, seen.at, pair.gain)
     pair.right = pair.matched - texture.nearly < _like(pair.matched, seen.found & texture.telling, config)
     return pair
 
@@ -214,7 +214,7 @@ def _counted(
     for pair in pairs:
         found, after = pair.seen.found, pair.seen.key - key
         at, x, y, length = pair.miss(inverse)
-        unlike = pair.there.unlike(look.grid, at, pair.gain)
+        unlike = pair.other.unlike(look.grid, at, pair.gain)
         away = found & (length > pair.limit)
         alike = unlike - texture.nearly < _like(unlike, found & ~away & texture.telling, config)
         within = inside(at, look.grid.shape)
@@ -225,7 +225,7 @@ def _counted(
         smeared = found & ~away & ~alike & ~pair.right
         on += weight * ((found & ~away & ~smeared) + 0.5 * ((away & ~better) | (within & alike & ~found)))
         # A picture lost in blur looks like nothing far from it, wherever it moves.
-        if abs(after) <= _NEAR or look.sharpness >= config.blurred * pair.there.sharpness:
+        if abs(after) <= _NEAR or look.sharpness >= config.blurred * pair.other.sharpness:
             gone[after] = within & ~alike & (~found | smeared)
     for step in config.baselines[:3]:
         if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
@@ -254,7 +254,7 @@ def _best_depth(look: Look, pairs: list[Pair], depths: list[Map]) -> Map:
             if pair.seen.links == 1:
                 at, _ = pair.ray.project(inverse)
                 within = inside(at, inverse.shape)
-                cost += within * np.minimum(pair.there.unlike(look.grid, at, pair.gain), _MOST_UNLIKE)
+                cost += within * np.minimum(pair.other.unlike(look.grid, at, pair.gain), _MOST_UNLIKE)
                 count += within
         cost = cost / count + (_OTHER_DEPTH if number else 0.0)
         better = cost < least if number else np.ones(cost.shape, bool)

@@ -82,10 +82,10 @@ def margin(shot: Shot, params: FreezeParams, width: int, height: int, Ks: NDArra
     `Ks` [F, 4] are fx, fy, cx, cy of its frames at that size: what the lens needs is known for the clip's own alone.
     JobError (USAGE or SOLVE) if it cannot be had.
     """
-    asked = params.overscan
-    if asked == 0.0:
+    overscan = params.overscan
+    if overscan == 0.0:
         return 0, 0
-    if asked < 0.0:
+    if overscan < 0.0:
         lens = load_lens(shot)
         if not same_camera(lens, width, height, Ks):
             raise JobError(
@@ -104,13 +104,13 @@ def margin(shot: Shot, params: FreezeParams, width: int, height: int, Ks: NDArra
                 ExitCode.SOLVE,
             )
         return found
-    if not asked <= _MOST_PERCENT:
+    if not overscan <= _MOST_PERCENT:
         raise JobError(
-            f"Overscan is {asked:g} percent: it should be 0 to {_MOST_PERCENT:g}, or what the lens needs.",
+            f"Overscan is {overscan:g} percent: it should be 0 to {_MOST_PERCENT:g}, or what the lens needs.",
             "Choose a smaller one.",
             ExitCode.USAGE,
         )
-    return math.ceil(asked / 100.0 * width), math.ceil(asked / 100.0 * height)
+    return math.ceil(overscan / 100.0 * width), math.ceil(overscan / 100.0 * height)
 
 
 def same_camera(lens: Lens, width: int, height: int, Ks: NDArray[np.float64]) -> bool:

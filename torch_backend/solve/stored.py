@@ -67,8 +67,8 @@ def load_points(shot: Shot) -> dict[str, NDArray[Any]]:
 
 def damaged(path: Path, why: Exception | str) -> JobError:
     """The sentence for a file of the solve that is not as it was written."""
-    told = " ".join(str(why).split()) or type(why).__name__
-    return JobError(f"{path} is damaged ({told[:200]}).", "Solve the camera again.", ExitCode.SOLVE)
+    reason = " ".join(str(why).split()) or type(why).__name__
+    return JobError(f"{path} is damaged ({reason[:200]}).", "Solve the camera again.", ExitCode.SOLVE)
 
 
 def _there(shot: Shot, name: str) -> Path:

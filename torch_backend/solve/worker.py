@@ -136,7 +136,7 @@ def take_over(request: Request, known: dict[str, Any]) -> int:
     if not known["triangulate"]:
         say(result={})
         return 0
-    poses = {name: (told["lens"], np.array(told["pose"], np.float64)) for name, told in known["images"].items()}
+    poses = {name: (image["lens"], np.array(image["pose"], np.float64)) for name, image in known["images"].items()}
     model = triangulate(request, lenses, poses)
     if not model.num_points3D():
         say(result={"points": 0})

@@ -37,7 +37,7 @@ def words_for(one, told) -> tuple[str, ...]:
 
 
 def fields_of(args: argparse.Namespace) -> dict[str, object]:
-    asked = cli.asked(args).items()
+    asked = contract.requested_params(args).items()
     return {f"{kind}.{name}": value for kind, params in asked for name, value in dataclasses.asdict(params).items()}
 
 
@@ -47,14 +47,14 @@ def test_every_option_changes_what_it_is_for_and_nothing_else(command, words, fi
     before = fields_of(cli.parser().parse_args(bare))
     after = fields_of(cli.parser().parse_args([*bare, *words]))
     assert {name for name in before if before[name] != after[name]} == set(fields)
-    for kind, params in cli.asked(cli.parser().parse_args([*bare, *words])).items():
+    for kind, params in contract.requested_params(cli.parser().parse_args([*bare, *words])).items():
         assert isinstance(params, contract.PARAMS[kind])
 
 
 def test_what_is_asked_for_without_an_option_is_each_fields_default_but_for_finished_frames():
     for command in contract.COMMANDS:
         args = cli.parser().parse_args([command, *NEEDED.get(command, ("s.splannequin",))])
-        for params in cli.asked(args).values():
+        for params in contract.requested_params(args).values():
             plain = dataclasses.asdict(type(params)())
             other = {name for name, value in plain.items() if value != getattr(params, name)} - {"source"}
             assert other == ({"only_missing"} if isinstance(params, contract.FreezeParams) else set())
@@ -114,7 +114,7 @@ def test_the_scan_sees_what_is_read(tmp_path):
 
 
 def ask(*words):
-    return cli.asked(cli.parser().parse_args([str(w) for w in words]))
+    return contract.requested_params(cli.parser().parse_args([str(w) for w in words]))
 
 
 def test_freeze_of_a_shot_asks_for_the_freeze_alone_and_of_a_clip_for_everything(tmp_path):
