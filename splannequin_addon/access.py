@@ -60,17 +60,26 @@ def layout_of(drawn: _Drawn) -> bpy.types.UILayout:
 
 def settings_of(scene: bpy.types.Scene) -> SPLANNEQUIN_PG_scene:
     """What the artist set in a scene."""
-    return scene.splannequin  # pyright: ignore[reportAttributeAccessIssue]
+    held: Any = scene
+    return held.splannequin
+
+
+def named(things: bpy.types.bpy_prop_collection[T], name: str) -> T | None:
+    """What is called so in a collection, None if nothing is. Its own `get`, say its types, finds nothing ever."""
+    found: Any = things.get(name)
+    return found
 
 
 def value_of(socket: bpy.types.NodeSocket) -> Any:
     """The value that a socket has where nothing is led into it. Not every kind of sockets has one."""
-    return socket.default_value  # pyright: ignore[reportAttributeAccessIssue]
+    kind: Any = socket
+    return kind.default_value
 
 
 def set_value(socket: bpy.types.NodeSocket, value: float | tuple[float, ...]) -> None:
     """Sets it."""
-    socket.default_value = value  # pyright: ignore[reportAttributeAccessIssue]
+    kind: Any = socket
+    kind.default_value = value
 
 
 def pixels_of(image: bpy.types.Image) -> Any:
@@ -80,8 +89,8 @@ def pixels_of(image: bpy.types.Image) -> Any:
 
 def size_of(footage: bpy.types.Image | bpy.types.MovieClip) -> tuple[int, int]:
     """Width and height in pixels. An array without items, says its type."""
-    width, height = footage.size  # pyright: ignore[reportGeneralTypeIssues]
-    return int(width), int(height)
+    size: Any = footage.size
+    return int(size[0]), int(size[1])
 
 
 def camera_of(thing: bpy.types.Object) -> bpy.types.Camera:

@@ -113,7 +113,7 @@ def new_output_node(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket | None:
     """Adds the missing output node to a tree; returns the socket through which the picture leaves."""
     if not HAS_COMPOSITING_GROUP:
         return tree.nodes.new("CompositorNodeComposite").inputs["Image"]
-    if not any(i.in_out == "OUTPUT" and i.socket_type == "NodeSocketColor" for i in sockets_of(tree)):
+    if not any(i.in_out == "OUTPUT" and str(i.socket_type) == "NodeSocketColor" for i in sockets_of(tree)):
         new_socket(tree, "Image", "OUTPUT", "NodeSocketColor")
     tree.nodes.new("NodeGroupOutput")
     return output_socket(tree)

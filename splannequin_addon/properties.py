@@ -39,9 +39,25 @@ class Items(Protocol[Item]):
         ...
 
 
+class _Declared:
+    """A property of a class that Blender does not know yet."""
+
+    def __init__(self, declare: Callable[..., object], options: dict[str, object]) -> None:
+        self.declare = declare
+        self.options = options
+
+
+_declared: dict[type, dict[str, _Declared]] = {}
+"""What each class assigned, which `annotate` took out of it."""
+
+
 def _of(declare: Callable[P, object], kind: type[T]) -> Callable[P, T]:
     """A function of bpy.props, with the type of what its property holds."""
-    return declare  # pyright: ignore[reportReturnType]
+
+    def assigned(*_: P.args, **options: P.kwargs) -> T:
+        return _Declared(declare, options)  # pyright: ignore[reportReturnType]
+
+    return assigned
 
 
 BoolProperty = _of(props.BoolProperty, bool)
@@ -70,13 +86,23 @@ if TYPE_CHECKING:
         """A list of property groups."""
         raise NotImplementedError
 else:
-    PointerProperty, CollectionProperty = props.PointerProperty, props.CollectionProperty
+    PointerProperty, CollectionProperty = _of(props.PointerProperty, object), _of(props.CollectionProperty, object)
 
 
 def annotate(cls: type) -> None:
-    """Makes annotations of the properties that a class and what it is made of assign. Again does nothing."""
+    """Makes annotations of the properties that a class and what it is made of assign, for Blender to read."""
     for one in cls.__mro__:
         for name, value in list(vars(one).items()):
-            if isinstance(value, props._PropertyDeferred):
-                one.__annotations__[name] = value
+            if isinstance(value, _Declared):
+                _declared.setdefault(one, {})[name] = value
                 delattr(one, name)
+        for name, value in _declared.get(one, {}).items():
+            one.__annotations__[name] = value.declare(**value.options)
+
+
+def release(cls: type) -> None:
+    """Leaves names in the annotations once Blender has read them: over what else stood there, bpy 4.2 as a module
+    crashes when Python ends."""
+    for one in cls.__mro__:
+        for name, value in _declared.get(one, {}).items():
+            one.__annotations__[name] = value.declare.__name__

@@ -51,15 +51,21 @@ def register() -> None:
     if registered():
         return
     _take_tooltips_from_docstrings()
-    _take_properties_from_values()
     for step in _STEPS:
         steps.add(step)
-    for part in _PARTS:
-        part.register()
-    for cls in _CLASSES:
-        bpy.utils.register_class(cls)
-    for part in _PARTS_AFTER:
-        part.register()
+    holders = _holders_of_properties()
+    for cls in holders:
+        properties.annotate(cls)
+    try:
+        for part in _PARTS:
+            part.register()
+        for cls in _CLASSES:
+            bpy.utils.register_class(cls)
+        for part in _PARTS_AFTER:
+            part.register()
+    finally:
+        for cls in holders:
+            properties.release(cls)
 
 
 def unregister() -> None:
@@ -83,9 +89,7 @@ def _take_tooltips_from_docstrings() -> None:
                 cls.bl_description = " ".join(cls.__doc__.split())
 
 
-def _take_properties_from_values() -> None:
-    """Puts the properties of each of our classes where Blender looks for them."""
-    for kind in (bpy.types.Operator, bpy.types.PropertyGroup, bpy.types.AddonPreferences):
-        for cls in kind.__subclasses__():
-            if cls.__module__.startswith(f"{__package__}."):
-                properties.annotate(cls)
+def _holders_of_properties() -> list[type]:
+    """Those of our classes that may have properties."""
+    kinds = (bpy.types.Operator, bpy.types.PropertyGroup, bpy.types.AddonPreferences)
+    return [c for kind in kinds for c in kind.__subclasses__() if c.__module__.startswith(f"{__package__}.")]

@@ -22,7 +22,7 @@ PACKAGE = "bl_ext.user_default.splannequin"
 def load_package() -> types.ModuleType:
     """The extension package under its Blender name; loaded once, not registered."""
     with contextlib.suppress(ImportError):  # in a Python without Blender, for modules that need none
-        import bpy  # noqa: F401  -- makes `bl_ext` where Blender has it
+        import bpy  # noqa: F401  # pyright: ignore[reportUnusedImport]  -- makes `bl_ext` where Blender has it
 
     if PACKAGE in sys.modules:
         return sys.modules[PACKAGE]

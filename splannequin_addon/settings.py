@@ -71,7 +71,7 @@ def register() -> None:
     bpy.utils.register_class(made.SPLANNEQUIN_PG_made)
     bpy.utils.register_class(SPLANNEQUIN_PG_shot)
     bpy.utils.register_class(SPLANNEQUIN_PG_scene)
-    bpy.types.Scene.splannequin = PointerProperty(type=SPLANNEQUIN_PG_scene)  # pyright: ignore[reportAttributeAccessIssue]
+    bpy.types.Scene.splannequin = bpy.props.PointerProperty(type=SPLANNEQUIN_PG_scene)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def unregister() -> None:

@@ -11,7 +11,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import present, set_value, value_of
+from ..access import named, present, set_value, value_of
 from ..scene.mark import TAG
 from .node_names import AS_WARP, DEPTH, FROZEN, GRAIN, GROUP_NAME, INVENTED
 
@@ -45,7 +45,7 @@ def wants_warp(scene: bpy.types.Scene) -> bool:
 
 def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
     """What our node is asked for that the take does not have, in words."""
-    inside, asked = present(node.node_tree).nodes, []
+    inside, asked = present(node.node_tree).nodes, list[str]()
     if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
         asked.append("The take has no grain to add: freeze it again.")
     frozen = inside[FROZEN].outputs
@@ -76,7 +76,7 @@ def shown(scene: bpy.types.Scene) -> tuple[Path, float] | None:
     if node is None:
         return None
     inside = present(node.node_tree).nodes
-    frozen, depth = inside.get(FROZEN), inside.get(DEPTH)
+    frozen, depth = named(inside, FROZEN), named(inside, DEPTH)
     if not isinstance(frozen, bpy.types.CompositorNodeImage) or frozen.image is None or depth is None:
         return None
     file = Path(os.path.abspath(bpy.path.abspath(frozen.image.filepath)))

@@ -6,7 +6,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import present
+from ..access import named, present
 from ..scene import sequences
 from . import fitting, warp_nodes
 from .node_names import AS_WARP, DEPTH, FROZEN, GAP, GRAIN, INVENTED
@@ -67,7 +67,7 @@ def fill(
         if layer.output and layer.name in fitted and layer.name not in ("Combined", "Depth"):
             group.links.new(fitted[layer.name], leave.inputs[layer.output])
     for name in old - shown:
-        stale = bpy.data.images.get(name)
+        stale = named(bpy.data.images, name)
         if stale is not None and stale.users == 0:
             bpy.data.images.remove(stale)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import bpy
 
 from ...torch_backend import contract
-from ..access import settings_of
+from ..access import named, settings_of
 from ..process import supervisor
 from ..scene import intact, scene_setup
 from ..shot import contents, made
@@ -170,8 +171,9 @@ def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
     if not seen:
         return
     yield None
-    scene = bpy.data.scenes.get(seen)
+    scene = named(bpy.data.scenes, seen)
     window = supervisor.window_of(scene) if scene is not None else None
     if window is not None:
-        with bpy.context.temp_override(window=window, scene=window.scene):
-            bpy.ops.splannequin.render("INVOKE_DEFAULT")  # pyright: ignore[reportAttributeAccessIssue]
+        with bpy.context.temp_override(window=window, scene=window.scene):  # pyright: ignore[reportUnknownMemberType]
+            ops: Any = bpy.ops  # ours are not in its types
+            ops.splannequin.render("INVOKE_DEFAULT")

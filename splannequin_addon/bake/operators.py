@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -43,7 +44,8 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
         )
         if outcome == {"FINISHED"}:
             try:
-                bpy.ops.splannequin.render("EXEC_DEFAULT")  # pyright: ignore[reportAttributeAccessIssue]
+                ops: Any = bpy.ops  # ours are not in its types
+                ops.splannequin.render("EXEC_DEFAULT")
             except RuntimeError as error:
                 self.report({"ERROR"}, str(error).strip())
                 return {"CANCELLED"}

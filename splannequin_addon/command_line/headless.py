@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import bpy
 
@@ -88,7 +88,7 @@ def _stop_if_interrupted() -> None:
 
 def main(argv: Sequence[str]) -> int:
     """Runs one command; returns an exit code. Ctrl-C and SIGTERM cancel the job at work with a checkpoint."""
-    before = {}
+    before: dict[int, Any] = {}
     _interrupts.clear()
     for name in ("SIGINT", "SIGTERM", "SIGBREAK"):
         if hasattr(signal, name):
@@ -211,7 +211,7 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
         arrival.load_camera(scene, shot)
     baked = _bake(scene, fresh, shot, args.take, output, console, span, args.as_warp or None)
     path = output / contract.SUMMARY_FILE
-    summary = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
+    summary: dict[str, Any] = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
     jobs.write_json(path, {**summary, **baked})
     console.say(f"Composited frames: {baked['composited_dir']}")
@@ -265,7 +265,7 @@ def _one_step(args: argparse.Namespace, console: Console, step: str, shot: str) 
     if console.as_json:
         print(json.dumps({"result": result}))
     elif isinstance(result, dict):
-        for line in contract.verdict_lines(result):
+        for line in contract.verdict_lines(cast("dict[str, Any]", result)):
             console.say(line)
     return ExitCode.OK
 

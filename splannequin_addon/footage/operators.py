@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 
 from ..access import Outcome, layout_of, scene_in, settings_of
@@ -65,7 +67,8 @@ class SPLANNEQUIN_OT_use_movie_clip(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Hands its file on."""
-        return bpy.ops.splannequin.use_clip(filepath=bpy.path.abspath(context.space_data.clip.filepath))  # pyright: ignore[reportAttributeAccessIssue]
+        ops: Any = bpy.ops  # ours are not in its types
+        return ops.splannequin.use_clip(filepath=bpy.path.abspath(context.space_data.clip.filepath))
 
 
 class SPLANNEQUIN_PT_movie_clip(bpy.types.Panel):

@@ -48,18 +48,18 @@ class Session:
     """Shot folder."""
     run: str
     """Name of the run."""
-    facts: dict[str, Any] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict[str, Any])
     """Its `ready` message (torch_backend/live.py); empty while it loads."""
-    frames: dict[int, Frame] = field(default_factory=dict)
+    frames: dict[int, Frame] = field(default_factory=dict[int, Frame])
     """Newest frame of each view."""
     failure: tuple[str, str] | None = None
     """(sentence, hint) of what ended it."""
     drawn: int = 0
     """Frames that have arrived."""
     _process: subprocess.Popen[bytes] | None = None
-    _asked: dict[int, contract.LiveView] = field(default_factory=dict)
-    _to_send: dict[int, contract.LiveView] = field(default_factory=dict)
-    _sent: dict[int, contract.LiveView] = field(default_factory=dict)
+    _asked: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
+    _to_send: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
+    _sent: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
     _change: threading.Condition = field(default_factory=threading.Condition)
     _closed: bool = False
     _seq: int = 0
@@ -68,6 +68,12 @@ class Session:
     def open(self) -> bool:
         """True while it draws, or is about to."""
         return not self._closed and self.failure is None
+
+    def begin(self, process: subprocess.Popen[bytes], log: Path) -> None:
+        """Talks to its child from now on, beside Blender; what that says of its end is in the file `log`."""
+        self._process = process
+        threading.Thread(target=self._send, name="splannequin live out", daemon=True).start()
+        threading.Thread(target=self._read, args=(log,), name="splannequin live in", daemon=True).start()
 
     def ask(self, view: contract.LiveView) -> None:
         """Asks for a view, without waiting; `seq` is set here. A newer one for the same view replaces an older one."""
@@ -174,16 +180,15 @@ def open_session(shot: Path, run: str, python: str, package_root: Path) -> Sessi
         log.parent.mkdir(parents=True, exist_ok=True)
         with open(log, "wb") as errors:
             placed = contract.python_child(python, "torch_backend", "live", str(shot.absolute()), "--run", run)
-            piped = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors}
-            session._process = children.start(placed, package_root, outlives=False, **piped)
+            piped: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors}
+            child = children.start(placed, package_root, outlives=False, **piped)
     except OSError as error:
         raise contract.JobError(
             f"The live session could not be started: {error.strerror or error}.",
             "Check the backend's Python in the add-on's preferences.",
             contract.ExitCode.ENVIRONMENT,
         ) from error
-    threading.Thread(target=session._send, name="splannequin live out", daemon=True).start()
-    threading.Thread(target=session._read, args=(log,), name="splannequin live in", daemon=True).start()
+    session.begin(child, log)
     return session
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..access import settings_of
+from ..access import camera_of, named, settings_of
 from ..scene import axes, scene_setup
 from ..shot import chosen, contents, made
 
@@ -72,8 +72,8 @@ def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Ge
 def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[int, int]) -> contract.CameraFrame:
     """A camera at one frame, as `sample_path` reads it."""
     scene = bpy.data.scenes[scene_name]
-    camera = scene.objects.get(name)
-    if camera is None or camera.type != "CAMERA" or camera.data.type != "PERSP":
+    camera = named(scene.objects, name)
+    if camera is None or camera.type != "CAMERA" or camera_of(camera).type != "PERSP":
         raise contract.JobError(
             f"{name} is not a perspective camera of this scene.",
             "Choose another camera to freeze from.",

@@ -16,7 +16,7 @@ import bpy
 import gpu
 import numpy as np
 from bpy.app.handlers import persistent
-from gpu_extras.batch import batch_for_shader
+from gpu_extras.batch import batch_for_shader  # pyright: ignore[reportUnknownVariableType]
 from mathutils import Matrix
 
 from ...torch_backend import contract

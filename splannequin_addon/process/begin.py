@@ -63,7 +63,7 @@ def remove_all(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """
     others = [f for f in chosen.folders(scene) if f is not None and f != shot]
     others = [f for f in others if any(step.stands(scene, f) for step in steps.STEPS.values())]
-    done = []
+    done: list[str] = []
     for step in reversed(steps.STEPS.values()):
         done += step.remove(scene, shot, others)
     if others:

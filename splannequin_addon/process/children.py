@@ -99,7 +99,7 @@ class Question:
 
 def ask(python: str, package_root: Path, *words: str) -> Question:
     """Asks the backend something, without waiting: `torch_backend WORDS`. JobError if it cannot be started."""
-    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "encoding": "utf-8"}
+    piped: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "encoding": "utf-8"}
     try:
         child = start(contract.python_child(python, "torch_backend", *words), package_root, **piped)
     except OSError as error:

@@ -60,7 +60,7 @@ class SetUp:
     folder: Path
     """Folder that holds the environment."""
     process: subprocess.Popen[bytes] | None = None
-    said: list[str] = field(default_factory=list)
+    said: list[str] = field(default_factory=list[str])
     """Last lines of what it said."""
     failure: str = ""
     """Why it ended, if not well."""

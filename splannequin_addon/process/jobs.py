@@ -44,7 +44,7 @@ class Job:
     """Job folder, shot/jobs/<id>."""
     kind: str
     """import, solve, train or freeze."""
-    params: dict[str, Any] = field(default_factory=dict)
+    params: dict[str, Any] = field(default_factory=dict[str, Any])
     """Parameters of the request."""
     process: subprocess.Popen[bytes] | None = None
     """The child, if this Blender started it."""
@@ -52,13 +52,13 @@ class Job:
     """Last status read."""
     read_to: int = 0
     """Bytes of events.jsonl read so far."""
-    warnings: list[tuple[str, str]] = field(default_factory=list)
+    warnings: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
     """(sentence, hint) the job wants the artist to know."""
-    metrics: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict[str, Any])
     """Latest figures of the job, by name."""
-    history: list[tuple[float, float]] = field(default_factory=list)
+    history: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])
     """(seconds of training, dB on frames kept out) as they came."""
-    images: dict[str, str] = field(default_factory=dict)
+    images: dict[str, str] = field(default_factory=dict[str, str])
     """Latest picture by label: path."""
     result: Any = None
     """What the job answered in its `done` event."""

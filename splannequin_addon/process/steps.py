@@ -27,7 +27,7 @@ class View:
     """It has been done."""
     ready: bool
     """What it needs is there."""
-    state: list[str] = field(default_factory=list)
+    state: list[str] = field(default_factory=list[str])
     """What there is, a few short lines."""
     advice: str = ""
     """One sentence: what comes next."""

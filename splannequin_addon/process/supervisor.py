@@ -64,7 +64,7 @@ class Watch:
 
     shot: Path
     """Shot folder."""
-    jobs: dict[str, jobs.Job] = field(default_factory=dict)
+    jobs: dict[str, jobs.Job] = field(default_factory=dict[str, jobs.Job])
     """Newest job of each step, by the step's name."""
     state: ShotState | None = None
     """What the folder holds."""
@@ -72,13 +72,13 @@ class Watch:
     """Of the folder when `state` was read."""
     looked: float = 0.0
     """When the folder was last looked at, monotonic seconds."""
-    notes: dict[str, list[str]] = field(default_factory=dict)
+    notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     """What a finished step changed in the scene, or why it could not, by the step's name."""
-    failures: dict[str, tuple[str, str]] = field(default_factory=dict)
+    failures: dict[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
     """(sentence, hint) of what failed on Blender's side, by the step's name."""
     work: Work | None = None
     """What Blender itself is doing for it."""
-    pending: dict[str, jobs.Job] = field(default_factory=dict)
+    pending: dict[str, jobs.Job] = field(default_factory=dict[str, Any])  # `jobs` is a field here
     """Jobs that ended well while another shot of the scene was chosen, by the step's name: they wait for this one."""
     redraw: bool = False
     """Something changed outside the timer: draw at its next turn."""
@@ -342,7 +342,7 @@ def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]],
             if window is None:
                 watch.notes[step] = how(scene)
                 continue
-            with bpy.context.temp_override(window=window, scene=scene):
+            with bpy.context.temp_override(window=window, scene=scene):  # pyright: ignore[reportUnknownMemberType]
                 before = settings_of(scene).t_star
                 watch.notes[step] = how(scene)
                 steps.STEPS[step].look(window, scene, watch.shot)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Any
 
 import bpy
@@ -26,7 +26,7 @@ _SETTINGS = {
 
 
 @contextlib.contextmanager
-def scene_of(scene: bpy.types.Scene) -> Iterator[None]:
+def scene_of(scene: bpy.types.Scene) -> Generator[None, None, None]:
     """Within it, a change is whole or nothing: if it raises, what it made is removed and what it set is set back.
 
     What it took away is not brought back: that has to come last, when nothing can fail any more.

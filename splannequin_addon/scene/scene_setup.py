@@ -63,8 +63,8 @@ def fit_clip(
         over: also what the artist has changed since it was set here.
     """
     render = scene.render
-    changes = []
-    spared = set() if over else {name for names in _touched(scene).values() for name in names}
+    changes: list[str] = []
+    spared = set[str]() if over else {name for names in _touched(scene).values() for name in names}
     aspect = axes.pixel_aspect(k) if k else (render.pixel_aspect_x, render.pixel_aspect_y)
     now = (render.resolution_x, render.resolution_y, render.resolution_percentage)
     if size is not None and now != (*size, 100) and "resolution_x" not in spared:
@@ -116,7 +116,7 @@ def keep_plate_colours(scene: bpy.types.Scene) -> list[str]:
     Blender's default view (AgX) is made for renders and would change every plate. Dithering is noise on the last bit.
     JobError if the colour configuration has no such view.
     """
-    changes = []
+    changes: list[str] = []
     if not keeps_plate_colours(scene):
         view = present(scene.view_settings)
         was, neutral = view.view_transform, _neutral(view)
@@ -148,7 +148,7 @@ def _neutral(view: Any) -> str:
 
 def render_cg(scene: bpy.types.Scene) -> list[str]:
     """Has the scene rendered on a transparent film with a depth pass; returns what was changed, in words."""
-    changes = []
+    changes: list[str] = []
     if not scene.render.film_transparent:
         _set(scene, "render", {"film_transparent": True})
         changes.append("Film set to transparent.")
@@ -160,7 +160,7 @@ def render_cg(scene: bpy.types.Scene) -> list[str]:
 
 def keeps_plate_colours(scene: bpy.types.Scene) -> bool:
     """True if pictures leave the scene with the colours they came in with."""
-    view = present(scene.view_settings)
+    view: Any = present(scene.view_settings)
     return view.view_transform in _NEUTRAL and all(getattr(view, name) == value for name, value in _VIEW.items())
 
 
@@ -186,7 +186,7 @@ def restore(scene: bpy.types.Scene) -> bool:
 
 def _touched(scene: bpy.types.Scene) -> dict[str, set[str]]:
     """What was set here and is different now, with what belongs together with it, by owner: the artist's."""
-    found = {}
+    found: dict[str, set[str]] = {}
     for owner, set_here in json.loads(scene.get(_OURS, "{}")).items():
         touched = {n for n, v in set_here.items() if not _same(getattr(_owner(scene, owner), n), v)}
         for group in _TOGETHER:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ...torch_backend import contract
 from ...torch_backend.contract import ShotFolder
@@ -100,7 +100,7 @@ def _frame_count(take: Path) -> int:
 
 def _history(path: Path) -> list[tuple[float, float]]:
     """(seconds, dB on frames kept out) of a run's metrics.jsonl; what cannot be read is passed over."""
-    points = []
+    points: list[tuple[float, float]] = []
     try:
         with contextlib.closing(contract.read_lines(path)) as lines:
             for line, end in lines:
@@ -119,7 +119,7 @@ def _measured(line: bytes) -> tuple[float, float] | None:
         told = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return contract.measured(told) if isinstance(told, dict) else None
+    return contract.measured(cast("dict[str, Any]", told)) if isinstance(told, dict) else None
 
 
 @dataclass
@@ -178,7 +178,7 @@ class _Take:
     height: int
     first: int
     last: int
-    t_star_per_frame: dict[str, Any] = field(default_factory=dict)
+    t_star_per_frame: dict[str, Any] = field(default_factory=dict[str, Any])
     margin: list[Any] = field(default_factory=lambda: [0, 0])
     camera_path: str = ""
     overscan: float = 0.0
@@ -208,7 +208,8 @@ def _read_typed(path: Path, kind: type, longest: int = contract.SHORT_JSON) -> d
 
 def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
     names = [one.name for one in dataclasses.fields(kind) if one.name in data]
-    values = vars(contract.from_dict(kind, {name: data[name] for name in names}))
+    made: object = contract.from_dict(kind, {name: data[name] for name in names})
+    values = vars(made)
     for name, value in values.items():
         if isinstance(value, (int, float)) and not abs(value) < _LARGEST:
             raise ValueError(f"{kind.__name__}.{name} cannot be that large")
@@ -229,7 +230,7 @@ _LONGEST_HISTORY = 1 << 24
 
 def _named(kind: type, folder: Path, file: str, damaged: dict[str, str]) -> dict[str, dict[str, Any]]:
     """Name -> file of every folder that has it; of those that cannot be believed, in `damaged` why not."""
-    found = {}
+    found: dict[str, dict[str, Any]] = {}
     for name in _names(folder, file):
         try:
             found[name] = _typed(kind, folder / name / file)

@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 
 from ...torch_backend import contract
-from ..access import settings_of
+from ..access import named, settings_of
 from ..properties import BoolProperty, PointerProperty, StringProperty
 from ..scene import paths
 from ..scene.mark import TAG
@@ -72,7 +72,7 @@ def part(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | No
     """One of `PARTS`, or the plate, if the scene still has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
-    return item if item is not None and scene.objects.get(item.name) == item else None
+    return item if item is not None and named(scene.objects, item.name) == item else None
 
 
 def keep_camera(scene: bpy.types.Scene) -> None:
@@ -87,7 +87,7 @@ def give_camera_back(scene: bpy.types.Scene) -> None:
     held = settings_of(scene)
     if scene.camera is None:
         others = [entry.camera for entry in held.made] + [held.camera_before]
-        scene.camera = next((c for c in others if c is not None and scene.objects.get(c.name) == c), None)
+        scene.camera = next((c for c in others if c is not None and named(scene.objects, c.name) == c), None)
     if not len(held.made):
         held.camera_before = None
 

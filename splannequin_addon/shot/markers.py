@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..access import settings_of
+from ..access import named, settings_of
 
 if TYPE_CHECKING:
     import bpy
@@ -26,7 +26,7 @@ def toggle(scene: bpy.types.Scene) -> bool:
 def remove(scene: bpy.types.Scene) -> bool:
     """Takes the marker away. True if there was one."""
     _known.pop(scene.name, None)
-    marker = scene.timeline_markers.get(NAME)
+    marker = named(scene.timeline_markers, NAME)
     if marker is None:
         return False
     scene.timeline_markers.remove(marker)
@@ -35,7 +35,7 @@ def remove(scene: bpy.types.Scene) -> bool:
 
 def follow(scene: bpy.types.Scene) -> bool:
     """Lets whichever of marker and t* changed last lead. True if something was changed."""
-    marker, props = scene.timeline_markers.get(NAME), settings_of(scene)
+    marker, props = named(scene.timeline_markers, NAME), settings_of(scene)
     if marker is None or marker.frame == props.t_star:
         if marker is not None:
             _known[scene.name] = (marker.frame, props.t_star)

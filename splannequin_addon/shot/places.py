@@ -89,7 +89,7 @@ def _relative(path: str, base: str) -> str:
 
 
 @persistent
-def _before_save(file: str = "", *_: object) -> None:
+def _before_save(file: object = "", *_: object) -> None:
     """Paths become relative to where the file is being saved; with Blender's *Relative Paths* off only those that were
     relative to where it was."""
     _saving.clear()

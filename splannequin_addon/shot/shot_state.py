@@ -13,21 +13,21 @@ class ShotState:
 
     folder: Path
     """Shot folder."""
-    info: dict[str, Any] = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict[str, Any])
     """shot.json; empty if there is no shot."""
     frames: int = 0
     """Imported frames, 0 before the import."""
     beside: str = ""
     """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
-    solve: dict[str, Any] = field(default_factory=dict)
+    solve: dict[str, Any] = field(default_factory=dict[str, Any])
     """solve.json; empty before the solve."""
-    runs: dict[str, dict[str, Any]] = field(default_factory=dict)
+    runs: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     """Trained runs: name -> summary.json, with `history`, `preview`, `extension`, `anew` (see `checkpoints`) and
     `other_cameras` added."""
-    unfinished: dict[str, dict[str, Any]] = field(default_factory=dict)
+    unfinished: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells, with
     `history`, `preview`, `anew` and `other_cameras` added."""
-    takes: dict[str, dict[str, Any]] = field(default_factory=dict)
+    takes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     """Frozen takes: name -> take.json, with `frame_count` added."""
     damaged: dict[str, dict[str, str]] = field(default_factory=lambda: {"run": {}, "take": {}})
     """Runs and takes whose files are not what we write: kind -> name -> what is wrong, in a sentence."""

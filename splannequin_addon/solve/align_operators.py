@@ -14,7 +14,7 @@ import blf
 import bpy
 import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
+from gpu_extras.batch import batch_for_shader  # pyright: ignore[reportUnknownVariableType]
 from mathutils import Matrix
 
 from ...torch_backend import contract
@@ -40,7 +40,7 @@ class Picking:
     """All its points, [P, 3] float32, solve units."""
     wanted: int
     """How many are asked for."""
-    picked: list[int] = field(default_factory=list)
+    picked: list[int] = field(default_factory=list[int])
     """Those that were clicked, indices into `xyz`."""
     under: int = -1
     """The one under the mouse, -1 if none."""
@@ -331,7 +331,8 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
 
     def picked(self, context: bpy.types.Context) -> Outcome:
         """Asks for the distance, in a call of its own: this one is still busy with the mouse."""
-        bpy.ops.splannequin.align_scale("INVOKE_DEFAULT", places=list(self.places))  # pyright: ignore[reportAttributeAccessIssue]
+        ops: Any = bpy.ops  # ours are not in its types
+        ops.splannequin.align_scale("INVOKE_DEFAULT", places=list(self.places))
         return {"CANCELLED"}
 
     def ready(self, context: bpy.types.Context) -> Outcome:

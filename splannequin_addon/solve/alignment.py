@@ -11,36 +11,39 @@ from numpy.typing import NDArray
 
 from ...torch_backend.contract import ExitCode, JobError
 
+Floats = NDArray[np.float32] | NDArray[np.float64]
 FLATTEST = 0.02
 """Sine of the angle between two sides under which three points count as one line."""
 
 
-def unit(vectors: NDArray) -> NDArray[np.float64]:
+def unit(vectors: Floats) -> NDArray[np.float64]:
     """Vectors [..., 3] at length 1; those of length 0 stay 0."""
     vectors = np.asarray(vectors, dtype=np.float64)
     length = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
     return vectors / np.where(length > 0, length, 1.0)
 
 
-def middle(values: NDArray) -> NDArray[np.float64]:
+def middle(values: Floats) -> NDArray[np.float64]:
     """The median along the first axis. numpy's own takes 20 ms the first time, for its masked arrays."""
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=0)
     return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
 
 
-def turn(one: NDArray, other: NDArray) -> NDArray[np.float64]:
+def turn(one: Floats, other: Floats) -> NDArray[np.float64]:
     """The shortest rotation [3, 3] that brings the direction of `one` to that of `other`, both [3]."""
     one, other = unit(one), unit(other)
-    axis, cosine = np.cross(one, other), float((one * other).sum())
+    axis = np.asarray(np.cross(one, other), dtype=np.float64)
+    cosine = float((one * other).sum())
     if cosine < -1.0 + 1e-12:  # half a turn, about whatever is square to it
-        about = unit(np.cross(one, np.eye(3)[np.argmin(np.abs(one))]))
+        square = np.asarray(np.cross(one, np.eye(3)[np.argmin(np.abs(one))]), dtype=np.float64)
+        about = unit(square)
         return 2.0 * np.outer(about, about) - np.eye(3)
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
 
 
-def level(places: NDArray, centres: NDArray, ups: NDArray) -> NDArray[np.float64]:
+def level(places: Floats, centres: Floats, ups: Floats) -> NDArray[np.float64]:
     """The change that lays three points into z = 0 with the cameras above; their middle keeps its x and y.
 
     Args:
@@ -69,14 +72,14 @@ def level(places: NDArray, centres: NDArray, ups: NDArray) -> NDArray[np.float64
     return change
 
 
-def to_origin(place: NDArray) -> NDArray[np.float64]:
+def to_origin(place: Floats) -> NDArray[np.float64]:
     """The change that moves a point [3] of the world to the world's origin."""
     change = np.eye(4)
     change[:3, 3] = -np.asarray(place, dtype=np.float64)
     return change
 
 
-def scaled(places: NDArray, distance: float) -> NDArray[np.float64]:
+def scaled(places: Floats, distance: float) -> NDArray[np.float64]:
     """The change that brings two points [2, 3] to a distance; the world's origin, and so the floor, stays.
 
     Raises:
@@ -91,7 +94,7 @@ def scaled(places: NDArray, distance: float) -> NDArray[np.float64]:
     return np.diag([distance / now] * 3 + [1.0])
 
 
-def nearest(pixel: tuple[float, float], places: NDArray, matrix: NDArray, size: tuple[int, int], reach: float) -> int:
+def nearest(pixel: tuple[float, float], places: Floats, matrix: Floats, size: tuple[int, int], reach: float) -> int:
     """Which of some places is seen nearest to a pixel, -1 if none is within reach.
 
     Args:
@@ -108,7 +111,7 @@ def nearest(pixel: tuple[float, float], places: NDArray, matrix: NDArray, size: 
     return int(distance.argmin())
 
 
-def seen(places: NDArray, matrix: NDArray, size: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def seen(places: Floats, matrix: Floats, size: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Pixels [P, 2] of places [P, 3] in a region, and which of them lie before the view; as `nearest` takes them."""
     matrix = np.asarray(matrix, dtype=np.float64)
     clip = np.asarray(places, dtype=np.float64).reshape(-1, 3) @ matrix[:, :3].T + matrix[:, 3]
@@ -117,5 +120,5 @@ def seen(places: NDArray, matrix: NDArray, size: tuple[int, int]) -> tuple[NDArr
     return (ratio + 1.0) * 0.5 * np.array(size, dtype=np.float64), before
 
 
-def _length(vector: NDArray) -> float:
+def _length(vector: Floats) -> float:
     return float(np.sqrt((vector * vector).sum()))

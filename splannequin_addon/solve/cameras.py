@@ -217,7 +217,8 @@ def _animate(camera: bpy.types.Object, path: contract.CameraPath) -> None:
         max(column) - min(column) > 1e-6 * max(abs(max(column)), 1.0) for column in zip(*lenses)
     )
     before: Quaternion | None = None
-    places, turns = [], []
+    places: list[tuple[float, ...]] = []
+    turns: list[tuple[float, ...]] = []
     for matrix in axes.poses(path).tolist():
         location, rotation, _ = Matrix(matrix).decompose()
         if before is not None and before.dot(rotation) < 0:  # q and -q turn alike, but keys would go the long way
@@ -272,7 +273,8 @@ def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> bpy.types.Mesh:
     """A mesh of loose vertices with their colours in the point attribute "Col"."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(xyz))
-    mesh.vertices.foreach_set("co", np.ascontiguousarray(xyz, dtype=np.float32).ravel())
+    vertices: Any = mesh.vertices
+    vertices.foreach_set("co", np.ascontiguousarray(xyz, dtype=np.float32).ravel())
     colour: Any = mesh.color_attributes.new("Col", "BYTE_COLOR", "POINT")
     rgba = np.ones((len(rgb), 4), dtype=np.float32)
     rgba[:, :3] = rgb / 255.0

@@ -51,7 +51,7 @@ def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) ->
     """Puts a marker where each such range begins, which are `ranges`. After `made.new`."""
     entry = present(made.of(scene, shot))
     others = [e for e in settings_of(scene).made if e != entry]
-    put = []
+    put: list[list[str | int]] = []
     for first, last in unsolved:
         name = f"no solve {first}-{last}" if last > first else f"no solve {first}"
         name += f" ({entry.name})" if others else ""
@@ -62,7 +62,8 @@ def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) ->
 def unmark(scene: bpy.types.Scene, shot: Path) -> bool:
     """Takes those markers away, but what the artist renamed or moved. True if there was one."""
     entry, taken = made.of(scene, shot), False
-    for name, frame in json.loads(entry.marks or "[]") if entry is not None else []:
+    marks: list[tuple[str, int]] = json.loads(entry.marks or "[]") if entry is not None else []
+    for name, frame in marks:
         marker = next((m for m in scene.timeline_markers if m.name == name and m.frame == frame), None)
         if marker is not None:
             scene.timeline_markers.remove(marker)

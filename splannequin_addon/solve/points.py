@@ -9,10 +9,10 @@ from typing import Any
 import bpy
 import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
+from gpu_extras.batch import batch_for_shader  # pyright: ignore[reportUnknownVariableType]
 
 from .. import compat
-from ..access import mesh_of, scene_in
+from ..access import mesh_of, named, scene_in
 from ..process import children
 from ..shot import chosen, made
 
@@ -26,9 +26,10 @@ _kept: tuple[Any, ...] = ()
 def coloured(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Places [P, 3] and colours [P, 4] sRGB of a cloud's mesh, float32."""
     places = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", places)
+    vertices: Any = mesh.vertices
+    vertices.foreach_get("co", places)
     colours = np.full((len(mesh.vertices), 4), 0.9, np.float32)
-    layer = mesh.color_attributes.get("Col")
+    layer: Any = named(mesh.color_attributes, "Col")
     if layer is not None and len(layer.data) == len(colours):
         flat = np.empty(colours.size, np.float32)
         layer.data.foreach_get("color_srgb", flat)

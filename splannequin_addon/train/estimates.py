@@ -31,7 +31,7 @@ def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
     # Where nothing may move a step is several times as fast.
     timed = [run for run in timed if run.get("method") != "static"] or timed
     across = state.size[0] if state is not None else 0
-    rows = []
+    rows: list[Cost] = []
     for preset, steps in contract.PRESET_STEPS.items():
         width = contract.PRESET_WIDTHS[preset] or across
         width = min(width, across) if across else width

@@ -47,10 +47,11 @@ def curve(points: Sequence[tuple[float, float]], size: tuple[int, int]) -> np.nd
     width, height = size
     picture = np.zeros((height, width, 4), np.float32)
     picture[...] = (0.11, 0.11, 0.11, 1.0)
-    x, y = np.array(points, dtype=np.float64).T
+    places = np.array(points, dtype=np.float64)
+    x, y = places[:, 0], places[:, 1]
     spread = [max(float(np.ptp(v)), 1e-6) for v in (x, y)]
     at = np.linspace(0, width - 1, 4 * width)
-    level = np.interp(at / (width - 1) * spread[0] + x.min(), x, y)
+    level = np.asarray(np.interp(at / (width - 1) * spread[0] + x.min(), x, y), dtype=np.float64)
     rows = 4 + (height - 9) * (level - y.min()) / spread[1]
     for share in (0.25, 0.5, 0.75):
         picture[int(share * height), :, :3] = 0.2

@@ -684,4 +684,4 @@ BACKEND: dict[str, str] = {
 }
 """The commonest of what the backend says; the rest of its sentences stay English."""
 
-MESSAGES |= BACKEND
+MESSAGES.update(BACKEND)

@@ -28,7 +28,7 @@ def run_rows(state: ShotState) -> list[tuple[str, ...]]:
 
     Of one that is not finished (name, how far it came), of one that cannot be read (name, that it is damaged).
     """
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name in state.listed("run"):
         run = state.runs.get(name)
         if name in state.damaged["run"]:
@@ -49,7 +49,7 @@ def run_rows(state: ShotState) -> list[tuple[str, ...]]:
 
 def take_rows(state: ShotState) -> list[tuple[str, ...]]:
     """(name, t*, frames on disk, run) of every take, as shown; of one that cannot be read (name, "damaged")."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name in state.listed("take"):
         take = state.takes.get(name)
         if take is None:

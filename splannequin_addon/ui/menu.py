@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import bpy
@@ -24,7 +24,8 @@ _ELSEWHERE = {"use_movie_clip"}
 
 def searchable() -> set[str]:
     """Names of the operators that can be called without being told what for: all but the internal ones."""
-    names = dir(bpy.ops.splannequin)  # pyright: ignore[reportAttributeAccessIssue]
+    ops: Any = bpy.ops  # ours are not in its types
+    names = dir(ops.splannequin)
     return {n for n in names if "INTERNAL" not in getattr(bpy.types, f"SPLANNEQUIN_OT_{n}").bl_options}
 
 
@@ -54,25 +55,30 @@ class SPLANNEQUIN_MT_shot(bpy.types.Menu):
                 first = False
 
 
-def _in_render(self: Any, context: bpy.types.Context) -> None:
+def _in_render(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     layout_of(self).separator()
     layout_of(self).menu(SPLANNEQUIN_MT_shot.bl_idname, icon="FREEZE")
 
 
-def _in_clip(self: Any, context: bpy.types.Context) -> None:
+def _in_clip(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     layout_of(self).separator()
     layout_of(self).operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
+
+
+def _hung() -> list[tuple[Any, Callable[[bpy.types.Menu, bpy.types.Context], None]]]:
+    """Menus of Blender's, and what draws our entries in them."""
+    return [(bpy.types.TOPBAR_MT_render, _in_render), (bpy.types.CLIP_MT_clip, _in_clip)]
 
 
 def register() -> None:
     """Registers the menu and hangs it into Blender's."""
     bpy.utils.register_class(SPLANNEQUIN_MT_shot)
-    bpy.types.TOPBAR_MT_render.append(_in_render)
-    bpy.types.CLIP_MT_clip.append(_in_clip)
+    for menu, draw in _hung():
+        menu.append(draw)
 
 
 def unregister() -> None:
     """Undoes `register`."""
-    bpy.types.CLIP_MT_clip.remove(_in_clip)
-    bpy.types.TOPBAR_MT_render.remove(_in_render)
+    for menu, draw in _hung():
+        menu.remove(draw)
     bpy.utils.unregister_class(SPLANNEQUIN_MT_shot)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import bpy
 
@@ -247,7 +248,8 @@ def _follow_setup() -> bool:
     if environment.poll(_setup):
         _redraw()
     if not _setup.running and not _setup.failure:
-        bpy.ops.splannequin.check_backend()  # pyright: ignore[reportAttributeAccessIssue]
+        ops: Any = bpy.ops  # ours are not in its types
+        ops.splannequin.check_backend()
     return _setup.running
 
 

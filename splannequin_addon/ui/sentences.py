@@ -52,7 +52,8 @@ def lines(text: str, letters: int) -> list[str]:
 
 def cells(line: bpy.types.UILayout, widths: tuple[float, ...]) -> list[bpy.types.UILayout]:
     """Parts of a row, as wide as `widths` say, which sum to 1."""
-    parts, left = [], 1.0
+    parts: list[bpy.types.UILayout] = []
+    left = 1.0
     for width in widths[:-1]:
         line = line.split(factor=width / left, align=True)
         parts.append(line.row(align=True))

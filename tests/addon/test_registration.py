@@ -44,21 +44,3 @@ def test_the_panels_stand_in_order_in_one_tab(addon):
 def test_handlers_and_timer_survive_another_file(addon):
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     assert handlers() == 9
-
-
-def test_every_property_that_a_class_assigns_is_blenders(package):
-    """Left in the class it would be an object that says nothing, and no setting."""
-    kinds = (bpy.types.Operator, bpy.types.PropertyGroup, bpy.types.AddonPreferences)
-    classes = [c for kind in kinds for c in kind.__subclasses__() if _ours(c)]
-    seen = 0
-    for cls in classes:
-        for one in cls.__mro__:
-            assert not [n for n, v in vars(one).items() if isinstance(v, bpy.props._PropertyDeferred)], cls
-            own = vars(one).get("__annotations__", {})
-            properties = [n for n, v in own.items() if isinstance(v, bpy.props._PropertyDeferred)]
-            known = cls.bl_rna.properties
-            if issubclass(cls, bpy.types.Operator):
-                known = getattr(bpy.ops.splannequin, cls.bl_idname.partition(".")[2]).get_rna_type().properties
-            assert all(n in known for n in properties), cls
-            seen += len(properties)
-    assert seen > 60
