@@ -60,7 +60,7 @@ def main() -> int:
     args = parser.parse_args()
     sys.path.insert(0, str(ROOT / "splannequin_addon"))
     package = importlib.import_module("run_in_bpy").load_package()
-    shots = importlib.import_module(f"{package.__name__}.splannequin_addon.shot.contents")
+    shots = importlib.import_module(f"{package.__name__}.splannequin_addon.shot.inventory")
     with tempfile.TemporaryDirectory(prefix="splannequin-reading-") as name:
         folder = Path(name) / "long.splannequin"
         take = build(folder, args.frames, args.runs)

@@ -71,7 +71,7 @@ def make(shot: Path, take: str, output: Path) -> None:
     def ours(name: str):
         return importlib.import_module(f"{_package().__name__}.splannequin_addon.{name}")
 
-    bake, shots = ours("bake.insertion"), ours("shot.contents")
+    bake, shots = ours("bake.insertion"), ours("shot.inventory")
     shot, output = shot.absolute(), output.absolute()
     state = shots.read(shot)
     if not state.solve or take not in state.takes:

@@ -13,7 +13,7 @@ from .bake.step import STEP as BAKE
 from .command_line import command
 from .footage.step import STEP as IMPORT
 from .freeze.step import STEP as FREEZE
-from .process import steps, supervisor
+from .process import job_timer, steps
 from .shot import places
 from .solve.step import STEP as SOLVE
 from .train.step import STEP as TRAIN
@@ -36,7 +36,7 @@ _PARTS_AFTER: tuple[steps.Part, ...] = (
     menu,
     places,
     *(part for step in _STEPS for part in step.parts),
-    supervisor,
+    job_timer,
     command,
 )
 

@@ -9,14 +9,14 @@ from .bake.settings import BakeSettings
 from .footage.settings import ImportSettings
 from .freeze.settings import FreezeSettings
 from .properties import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
-from .shot import chosen, made
+from .shot import scene_objects, selection
 from .solve.settings import SolveSettings
 from .train.settings import TrainSettings
 
 
 def _chosen(props: SPLANNEQUIN_PG_scene, context: bpy.types.Context) -> None:
     """Another shot of the list was clicked."""
-    chosen.choose(scene_holding(props), props.active_shot)
+    selection.choose(scene_holding(props), props.active_shot)
 
 
 class ShotSettings(ImportSettings, SolveSettings, TrainSettings, FreezeSettings):
@@ -62,13 +62,16 @@ class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, bpy.types.PropertyGroup):
         options={"HIDDEN"},
     )
     made = CollectionProperty(
-        name="Made", description="What was put into this scene, by shot", type=made.SPLANNEQUIN_PG_made, options=set()
+        name="Made",
+        description="What was put into this scene, by shot",
+        type=scene_objects.SPLANNEQUIN_PG_made,
+        options=set(),
     )
 
 
 def register() -> None:
     """Registers the property groups and hangs them on the scene."""
-    bpy.utils.register_class(made.SPLANNEQUIN_PG_made)
+    bpy.utils.register_class(scene_objects.SPLANNEQUIN_PG_made)
     bpy.utils.register_class(SPLANNEQUIN_PG_shot)
     bpy.utils.register_class(SPLANNEQUIN_PG_scene)
     bpy.types.Scene.splannequin = bpy.props.PointerProperty(type=SPLANNEQUIN_PG_scene)  # pyright: ignore[reportAttributeAccessIssue]
@@ -79,4 +82,4 @@ def unregister() -> None:
     del bpy.types.Scene.splannequin  # pyright: ignore[reportAttributeAccessIssue]
     bpy.utils.unregister_class(SPLANNEQUIN_PG_scene)
     bpy.utils.unregister_class(SPLANNEQUIN_PG_shot)
-    bpy.utils.unregister_class(made.SPLANNEQUIN_PG_made)
+    bpy.utils.unregister_class(scene_objects.SPLANNEQUIN_PG_made)

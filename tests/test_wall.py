@@ -438,7 +438,7 @@ def test_every_room_of_the_addon_has_its_place_in_the_order():
         ({"freeze.takes": {"bake.insertion"}, "bake.insertion": set()}, 1),
         (
             {
-                "process.supervisor": {"train.pictures", "solve.cameras"},
+                "process.job_timer": {"train.pictures", "solve.cameras"},
                 "train.pictures": set(),
                 "solve.cameras": set(),
             },

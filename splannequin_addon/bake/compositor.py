@@ -20,7 +20,7 @@ from ...torch_backend import contract
 from .. import compat
 from ..access import present, size_of
 from ..scene import numbered, sequences
-from ..scene.mark import TAG
+from ..scene.ownership import TAG
 from . import fitting, freeze_group, group_inside, placing, warp_nodes
 from .node_names import GAP, GROUP_NAME
 from .take_files import WARP_FOLDER, Take

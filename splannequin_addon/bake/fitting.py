@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import compat
 from ..access import pixels_of, set_value
-from ..scene.mark import TAG
+from ..scene.ownership import TAG
 from .node_names import GAP, GRAIN
 
 

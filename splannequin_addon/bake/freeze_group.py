@@ -12,7 +12,7 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..access import named, present, set_value, value_of
-from ..scene.mark import TAG
+from ..scene.ownership import TAG
 from .node_names import AS_WARP, DEPTH, FROZEN, GRAIN, GROUP_NAME, INVENTED
 
 BEFORE = "splannequin_before"

@@ -11,9 +11,9 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import named, settings_of
-from ..process import supervisor
-from ..scene import intact, scene_setup
-from ..shot import contents, made
+from ..process import job_timer
+from ..scene import rollback, scene_setup
+from ..shot import inventory, scene_objects
 from ..shot.shot_state import ShotState
 from . import compositor, freeze_group, rendering, take_files
 from .take_files import Take
@@ -36,7 +36,7 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
         _need_warp(shot, frozen)
     footage = _footage(scene, shot, plate)
     changes = compositor.insert(scene, frozen, plate, footage, settings_of(scene).insert_at, warp)
-    lacking = contents.missing_frames(shot, take, rendering.frames_of(scene))
+    lacking = inventory.missing_frames(shot, take, rendering.frames_of(scene))
     if lacking:
         changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
     return changes
@@ -58,7 +58,7 @@ def _need_warp(shot: Path, take: Take) -> None:
             "Freeze it again with detail.",
             contract.ExitCode.BAKE,
         )
-    if contents.read(shot).takes.get(name, {}).get("camera_path"):
+    if inventory.read(shot).takes.get(name, {}).get("camera_path"):
         raise contract.JobError(
             f"The take {name!r} is seen from a camera of your own: its warp looks into other frames of the plate.",
             "Use its frozen frames, or freeze a take on the clip's own camera.",
@@ -69,7 +69,7 @@ def _need_warp(shot: Path, take: Take) -> None:
 def _sources(scene: bpy.types.Scene, shot: Path, take: str) -> tuple[Take, Path | None]:
     """A take, and the first picture of its plate if there is one. JobError if the take has no frames."""
     try:
-        frozen = take_files.take_of(contract.ShotFolder(shot).takes / take, made.depth_scale(scene, shot))
+        frozen = take_files.take_of(contract.ShotFolder(shot).takes / take, scene_objects.depth_scale(scene, shot))
     except FileNotFoundError as error:
         raise contract.JobError(
             f"The take {take!r} of {shot.name} holds no frozen frames.", "Freeze first.", contract.ExitCode.BAKE
@@ -80,7 +80,7 @@ def _sources(scene: bpy.types.Scene, shot: Path, take: str) -> tuple[Take, Path 
 
 def _footage(scene: bpy.types.Scene, shot: Path, plate: Path | None) -> list[Path]:
     """Files by which a node that shows the plate is known: the undistorted plate, the clip."""
-    told = str(contents.read(shot).info.get("source", ""))
+    told = str(inventory.read(shot).info.get("source", ""))
     chosen = settings_of(scene).clip
     files = [plate, Path(told) if told else None, Path(bpy.path.abspath(chosen)) if chosen else None]
     return [file for file in files if file is not None]
@@ -102,7 +102,7 @@ def fit_take(scene: bpy.types.Scene, shot: Path, take: str, new: bool = False) -
     """
     frozen, state, render = (
         take_files.take_of(contract.ShotFolder(shot).takes / take),
-        contents.read(shot),
+        inventory.read(shot),
         scene.render,
     )
     width, height = size = _plate_size(state) if new else (render.resolution_x, render.resolution_y)
@@ -126,7 +126,7 @@ def _plate_size(state: ShotState) -> tuple[int, int]:
 
 def insert_freeze(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = None) -> list[str]:
     """Puts a take into the scene's compositor, or its warp, and keeps the plate's colours if the artist consents."""
-    with intact.scene_of(scene):
+    with rollback.scene_of(scene):
         changes = scene_setup.keep_plate_colours(scene) if settings_of(scene).keep_colours else []
         return insert(scene, shot, take, warp) + changes
 
@@ -134,7 +134,7 @@ def insert_freeze(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | No
 def combine_cg(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """Has the scene's own objects stand among the frozen. JobError if the freeze is not in the compositor."""
     compositor.may_combine_cg(scene)
-    with intact.scene_of(scene):
+    with rollback.scene_of(scene):
         changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
         return compositor.combine_cg(scene) + changes
 
@@ -148,7 +148,7 @@ def bring_in(scene: bpy.types.Scene, shot: Path, take: str, alone: bool = True) 
         take: name of a take.
         alone: see `scene`.
     """
-    supervisor.work(shot, "bake", _turns(scene.name, shot, take, scene.name if alone else ""))
+    job_timer.work(shot, "bake", _turns(scene.name, shot, take, scene.name if alone else ""))
 
 
 def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
@@ -162,17 +162,17 @@ def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
     def put_in(scene: bpy.types.Scene) -> list[str]:
         nonlocal seen
         changes = insert_freeze(scene, shot, take)
-        if supervisor.window_of(scene) is not None:
+        if job_timer.window_of(scene) is not None:
             changes += rendering.choose_output(scene, shot, take)  # here, for it belongs to the same undo step
             seen = scene.name
         return changes
 
-    supervisor.change(supervisor.watch_of(shot), "bake", put_in, only)
+    job_timer.change(job_timer.watch_of(shot), "bake", put_in, only)
     if not seen:
         return
     yield None
     scene = named(bpy.data.scenes, seen)
-    window = supervisor.window_of(scene) if scene is not None else None
+    window = job_timer.window_of(scene) if scene is not None else None
     if window is not None:
         with bpy.context.temp_override(window=window, scene=window.scene):  # pyright: ignore[reportUnknownMemberType]
             ops: Any = bpy.ops  # ours are not in its types

@@ -10,8 +10,8 @@ import bpy
 from ...torch_backend import contract
 from ..access import Outcome, scene_in, settings_of
 from ..freeze import own_camera, takes
-from ..process import backend, begin, jobs, supervisor
-from ..shot import chosen
+from ..process import backend, begin, job_timer, jobs
+from ..shot import selection
 from ..translations import tr
 from ..ui import step_operator
 from . import freeze_group, insertion, progress, rendering
@@ -29,7 +29,7 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Bakes; a complete take needs no backend."""
         scene = scene_in(context)
-        folder = chosen.shot_folder(scene)
+        folder = selection.shot_folder(scene)
         take = settings_of(scene).take_name
         if folder is None or backend.available() or not takes.complete(folder, take, rendering.frames_of(scene)):
             if folder is not None and not bpy.app.background and own_camera.follows_camera(scene):
@@ -80,13 +80,13 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
 
     def _render(self, context: bpy.types.Context, how: str) -> Outcome:
         scene = scene_in(context)
-        folder = chosen.shot_folder(scene)
+        folder = selection.shot_folder(scene)
         if folder is None:
             self.report({"ERROR"}, "No shot is chosen: import a clip first")
             return {"CANCELLED"}
         notes = rendering.choose_output(scene, folder, settings_of(scene).take_name)
         if notes:
-            supervisor.undo_step("bake")
+            job_timer.undo_step("bake")
         progress.began(folder, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
         try:
             refused = "CANCELLED" in bpy.ops.render.render(how, animation=True, scene=scene.name) and "it was cancelled"
@@ -156,7 +156,7 @@ class SPLANNEQUIN_OT_remove_shot(bpy.types.Operator):
 
         def remove(scene: bpy.types.Scene, shot: Path) -> list[str]:
             notes = begin.remove_all(scene, shot)
-            supervisor.watch_of(shot).notes.clear()  # they tell of what is no longer there
+            job_timer.watch_of(shot).notes.clear()  # they tell of what is no longer there
             return notes
 
         return step_operator.edit(self, context, "bake", remove)

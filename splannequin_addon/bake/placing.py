@@ -16,7 +16,7 @@ from ...torch_backend import contract
 from .. import compat
 from ..access import present, size_of
 from ..scene import scene_setup
-from ..scene.mark import TAG
+from ..scene.ownership import TAG
 
 _STANDS_IN = "splannequin_stands_in"
 _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")

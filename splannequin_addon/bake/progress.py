@@ -7,18 +7,18 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
-from ..process import supervisor
-from ..process.supervisor import Progress, Watch, Work
+from ..process import job_timer
+from ..process.job_timer import Progress, Watch, Work
 
 
 def began(shot: Path, frames: int) -> None:
     """A render of a baked shot begins."""
-    supervisor.watch_of(shot).work = Work("bake", None, _progress(0, frames))
+    job_timer.watch_of(shot).work = Work("bake", None, _progress(0, frames))
 
 
 def refused(shot: Path) -> None:
     """It did not begin: nothing else would tell the panel."""
-    supervisor.watch_of(shot).work = None
+    job_timer.watch_of(shot).work = None
 
 
 def _progress(done: int, total: int) -> Progress:
@@ -27,7 +27,7 @@ def _progress(done: int, total: int) -> Progress:
 
 def _renders() -> list[tuple[Watch, Progress]]:
     """Shots that are being rendered, and how far they are."""
-    works = [(watch, watch.work) for watch in supervisor.watches()]
+    works = [(watch, watch.work) for watch in job_timer.watches()]
     return [(w, k.progress) for w, k in works if k is not None and k.turns is None and k.progress is not None]
 
 

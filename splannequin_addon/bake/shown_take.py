@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
-from ..shot import made
+from ..shot import scene_objects
 from . import freeze_group
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def stale_scale(scene: bpy.types.Scene, shot: Path) -> bool:
     there = freeze_group.shown(scene)
     if there is None or not shown(scene, shot):
         return False
-    scale = made.depth_scale(scene, shot)
+    scale = scene_objects.depth_scale(scene, shot)
     return abs(there[1] - scale) > 1e-4 * scale
 
 
@@ -32,5 +32,5 @@ def follow_scale(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """Brings the depth of a take in the compositor to the shot's scale; returns what was changed, in words."""
     if not stale_scale(scene, shot):
         return []
-    freeze_group.set_depth_scale(scene, made.depth_scale(scene, shot))
+    freeze_group.set_depth_scale(scene, scene_objects.depth_scale(scene, shot))
     return ["Depth in the compositor follows the new scale."]

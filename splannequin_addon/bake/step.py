@@ -15,7 +15,7 @@ from ..freeze import takes
 from ..process import backend, jobs
 from ..process.steps import Step, View
 from ..scene import scene_setup
-from ..shot import chosen, made
+from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
 from . import freeze_group, insertion, operators, panel, progress, shown_take
 
@@ -34,7 +34,7 @@ class Bake(Step):
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:
         """What the take was asked for with, for the frames of the scene's range."""
-        props, folder = settings_of(scene), chosen.shot_folder(scene)
+        props, folder = settings_of(scene), selection.shot_folder(scene)
         params = takes.params_of(scene)
         if folder is None:
             return params
@@ -55,7 +55,7 @@ class Bake(Step):
             return View(False, True, [], "Put the freeze before your compositor's output and render.")
         there, take = freeze_group.shown(scene), shown_take.shown(scene, state.folder)
         if there is not None and take != settings_of(scene).take_name:
-            shown = f"take {take}" if take else f"another shot, {made.name_of(there[0].parent.parent)}"
+            shown = f"take {take}" if take else f"another shot, {scene_objects.name_of(there[0].parent.parent)}"
             lines = [f"Your compositor shows {shown}: the one that was baked last."]
             return View(False, True, lines, "Baking puts this take in its place.")
         lines = ["The freeze is in your compositor.", *unsure(state.takes[settings_of(scene).take_name])]

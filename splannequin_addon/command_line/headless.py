@@ -29,7 +29,7 @@ from ..bake import insertion, rendering
 from ..freeze import takes
 from ..process import backend, begin, jobs, steps
 from ..scene import paths, scene_setup, sequences
-from ..shot import contents
+from ..shot import inventory
 from ..solve import arrival, cameras, exchange, stmaps
 
 
@@ -174,7 +174,7 @@ def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
     since = time.perf_counter()
     baked = _bake(scene, fresh, shot, args.take, output, console)
     stages["bake"] = round(time.perf_counter() - since, 2)
-    source = str(contents.read(shot).info.get("source", args.clip))
+    source = str(inventory.read(shot).info.get("source", args.clip))
     summary = contract.summarise(str(shot), source, results, stages, time.perf_counter() - began)
     jobs.write_json(output / contract.SUMMARY_FILE, {**summary, **baked})
     for line in summary["verdict"]:
@@ -285,7 +285,7 @@ def _scene(blend: str) -> tuple[Any, bool]:
 
 def _fit_range(scene: bpy.types.Scene, shot: Path, take: str) -> None:
     """A new scene's range: the take's, or the clip's before there is a take."""
-    state = contents.read(shot)
+    state = inventory.read(shot)
     facts = state.takes.get(take)
     scene.frame_start, scene.frame_end = (facts["first"], facts["last"]) if facts else state.frame_range
 
@@ -354,7 +354,7 @@ def _device(args: argparse.Namespace) -> str:
 def _shot(args: argparse.Namespace) -> Path:
     """The shot folder that a command is about. JobError if there is none."""
     shot = Path(args.shot).absolute()
-    if not contents.read(shot).info:
+    if not inventory.read(shot).info:
         raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
     return shot
 
@@ -365,7 +365,7 @@ def _output(args: argparse.Namespace) -> Path:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise contents.unwritable(output, error, "Choose another --output folder.") from error
+        raise inventory.unwritable(output, error, "Choose another --output folder.") from error
     return output
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ...torch_backend import contract
 from ..access import settings_of
 from ..scene import scene_setup
-from ..shot import chosen, contents
+from ..shot import inventory, selection
 from ..shot.shot_state import ShotState
 from . import plate
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 def imported(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """After the import: the scene takes the clip's size, rate and range if it is new or the artist consents."""
-    state = contents.read(shot)
+    state = inventory.read(shot)
     props = settings_of(scene)
-    chosen.see(scene, state)
+    selection.see(scene, state)
     first, last = state.frame_range
     if not first <= props.t_star <= last:
         props.t_star = (first + last) // 2

@@ -7,9 +7,9 @@ from typing import Any
 import bpy
 
 from ..access import Outcome, layout_of, scene_in, settings_of
-from ..process import supervisor
+from ..process import job_timer
 from ..properties import BoolProperty, StringProperty
-from ..shot import chosen
+from ..shot import selection
 from ..ui import icons, step_operator
 
 VIDEO = ".mp4;.mov;.m4v;.mkv;.avi;.mxf;.mts;.webm;.mpg;.mpeg"
@@ -40,14 +40,14 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
         if not self.filepath:
             self.report({"ERROR"}, "No file was given")
             return {"CANCELLED"}
-        known = [i for i, one in enumerate(chosen.settings(scene_in(context))) if one.clip == self.filepath]
+        known = [i for i, one in enumerate(selection.settings(scene_in(context))) if one.clip == self.filepath]
         if known and len(props.shots):
-            chosen.choose(scene_in(context), known[0])
+            selection.choose(scene_in(context), known[0])
         elif props.clip != self.filepath:
-            folder = chosen.shot_folder(scene_in(context))
-            state = supervisor.watch_of(folder).state if folder is not None else None
+            folder = selection.shot_folder(scene_in(context))
+            state = job_timer.watch_of(folder).state if folder is not None else None
             if state is not None and state.frames:
-                chosen.add(scene_in(context))
+                selection.add(scene_in(context))
             props.clip, props.shot_path = self.filepath, ""
         self.report({"INFO"}, "Clip chosen: press Import Clip in the Splannequin tab")
         return {"FINISHED"}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import bpy
 
 from ..access import scene_in, settings_of
-from ..process import backend, steps, supervisor
-from ..shot import chosen
+from ..process import backend, job_timer, steps
+from ..shot import selection
 from ..ui import icons, preferences, step_panel
 from ..ui.sentences import wrap
 
@@ -35,7 +35,7 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
         """No backend, no shot folder: what to do about it."""
         self._backend_trouble(context, layout)
         watch = self._watch(context)
-        if watch is not None and chosen.missing(scene_in(context), watch.state):
+        if watch is not None and selection.missing(scene_in(context), watch.state):
             box = layout.box()
             column = box.column(align=True)
             column.alert = True
@@ -45,7 +45,7 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
 
     def _backend_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """No backend, or one that is being set up."""
-        trouble, setup = supervisor.backend_trouble(), preferences.running_setup()
+        trouble, setup = job_timer.backend_trouble(), preferences.running_setup()
         if setup is not None:
             wrap(layout, context, "The backend is being set up.", "IMPORT")
             for line in setup.said[-1:]:
@@ -65,7 +65,7 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
 
     def _label(self, context: bpy.types.Context, view: steps.View) -> str:
         watch = self._watch(context)
-        gone = watch is not None and chosen.missing(scene_in(context), watch.state)
+        gone = watch is not None and selection.missing(scene_in(context), watch.state)
         return "Import Anew" if gone else super()._label(context, view)
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:

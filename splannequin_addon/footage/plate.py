@@ -10,7 +10,7 @@ import bpy
 from ...torch_backend import contract
 from ..access import camera_of
 from ..scene import sequences
-from ..shot import made
+from ..shot import scene_objects
 
 _REACH = 1e-2
 """How far the camera sees, in scene units: the plate alone, nothing of the scene stands before it."""
@@ -28,22 +28,22 @@ def show(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object | None:
     if span is None:
         return None
     first, last, path = span
-    name = f"{made.name_of(shot)} plate"
+    name = f"{scene_objects.name_of(shot)} plate"
     data = bpy.data.cameras.new(name)
     data.clip_start, data.clip_end = 0.1 * _REACH, _REACH
     background = data.background_images.new()
-    background.image = image = sequences.load_sequence(path, f"Clip {made.name_of(shot)}", "srgb")
+    background.image = image = sequences.load_sequence(path, f"Clip {scene_objects.name_of(shot)}", "srgb")
     sequences.show_sequence(background.image_user, image, first, last)
     background.frame_method, background.display_depth, background.alpha = "FIT", "BACK", 1.0
     data.show_background_images = True
-    camera = made.new(scene, shot).plate = bpy.data.objects.new(name, data)
+    camera = scene_objects.new(scene, shot).plate = bpy.data.objects.new(name, data)
     scene.collection.objects.link(camera)
     return camera
 
 
 def find(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object | None:
     """The camera, if the scene still has it."""
-    return made.part(scene, shot, "plate")
+    return scene_objects.part(scene, shot, "plate")
 
 
 def remove(scene: bpy.types.Scene, shot: Path) -> bool:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
 from ..access import settings_of
-from ..process import jobs, supervisor
+from ..process import job_timer, jobs
 from ..process.steps import Step, View
 from ..scene import paths
 from ..shot.shot_state import ShotState
@@ -58,7 +58,7 @@ class Import(Step):
         """Through the camera that shows the clip."""
         camera = plate.find(scene, shot)
         if camera is not None:
-            supervisor.look_through_camera(window, camera)
+            job_timer.look_through_camera(window, camera)
 
 
 STEP = Import()

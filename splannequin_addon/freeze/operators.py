@@ -6,9 +6,9 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in, settings_of
-from ..process import supervisor
+from ..process import job_timer
 from ..properties import IntProperty, StringProperty
-from ..shot import chosen, markers
+from ..shot import markers, selection
 from ..translations import tr
 from ..ui import pick_operators, step_operator
 from . import own_camera, takes, viewport
@@ -25,7 +25,7 @@ class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Runs the step. In a window a camera of the artist's is read a few frames per turn of the timer."""
         scene = scene_in(context)
-        folder = chosen.shot_folder(scene)
+        folder = selection.shot_folder(scene)
         if not own_camera.name_of(scene) or folder is None or bpy.app.background:
             return super().execute(context)
         takes.read_in_turns(scene, folder, self.step)
@@ -46,9 +46,9 @@ class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Takes the current frame, held within the clip's range."""
         scene = scene_in(context)
-        folder = chosen.shot_folder(scene)
+        folder = selection.shot_folder(scene)
         frame = scene.frame_current
-        state = supervisor.watch_of(folder).state if folder else None
+        state = job_timer.watch_of(folder).state if folder else None
         if state is not None and state.frames:
             first, last = state.frame_range
             frame = min(max(frame, first), last)
@@ -85,8 +85,8 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
         if bpy.app.background:
             cls.poll_message_set(tr("There is no 3D view"))
             return False
-        folder = chosen.shot_folder(scene_in(context))
-        state = supervisor.watch_of(folder).state if folder else None
+        folder = selection.shot_folder(scene_in(context))
+        state = job_timer.watch_of(folder).state if folder else None
         if state is None or settings_of(scene_in(context)).run_name not in state.runs:
             cls.poll_message_set(tr("Train first"))
             return False

@@ -12,7 +12,7 @@ from mathutils import Matrix
 from ...torch_backend import contract
 from ..access import camera_of, named, settings_of
 from ..scene import axes, scene_setup
-from ..shot import chosen, contents, made
+from ..shot import inventory, scene_objects, selection
 
 
 def in_solve(
@@ -32,9 +32,9 @@ def in_solve(
         viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
         K: fx, fy, cx, cy in pixels.
     """
-    root = made.part(scene, shot, "root")
+    root = scene_objects.part(scene, shot, "root")
     placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
-    return axes.in_solve(view_matrix, window_matrix, placed, made.depth_scale(scene, shot), (width, height))
+    return axes.in_solve(view_matrix, window_matrix, placed, scene_objects.depth_scale(scene, shot), (width, height))
 
 
 def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:
@@ -90,15 +90,15 @@ def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[in
 
 def name_of(scene: bpy.types.Scene) -> str:
     """Name of the artist's camera to freeze from; empty for the clip's own move."""
-    camera, folder = settings_of(scene).path_camera, chosen.shot_folder(scene)
-    if camera is None or folder is None or camera == made.part(scene, folder, "camera"):
+    camera, folder = settings_of(scene).path_camera, selection.shot_folder(scene)
+    if camera is None or folder is None or camera == scene_objects.part(scene, folder, "camera"):
         return ""
     return str(camera.name)
 
 
 def follows_camera(scene: bpy.types.Scene) -> bool:
     """True if a bake has to look at the artist's camera again: the take was seen from one, and one is chosen."""
-    folder = chosen.shot_folder(scene)
+    folder = selection.shot_folder(scene)
     if folder is None or not name_of(scene):
         return False
-    return bool(contents.read(folder).takes.get(settings_of(scene).take_name, {}).get("camera_path"))
+    return bool(inventory.read(folder).takes.get(settings_of(scene).take_name, {}).get("camera_path"))

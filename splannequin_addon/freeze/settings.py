@@ -6,16 +6,16 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import scene_holding
-from ..process import supervisor
+from ..process import job_timer
 from ..properties import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
-from ..shot import chosen
+from ..shot import selection
 from ..translations import tr
 
 
 def takes_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
     """(name, what it is) of the takes of the shot that `props` names, for the field's list."""
-    folder = chosen.shot_folder(scene_holding(props))
-    state = supervisor.watch_of(folder).state if folder else None
+    folder = selection.shot_folder(scene_holding(props))
+    state = job_timer.watch_of(folder).state if folder else None
     takes = state.takes.items() if state is not None else ()
     return [(name, tr(f"t* {take['t_star_frame']}, run {take['run']}")) for name, take in takes]
 

@@ -13,8 +13,8 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..access import settings_of
-from ..process import backend, begin, steps, supervisor
-from ..shot import chosen, contents
+from ..process import backend, begin, job_timer, steps
+from ..shot import inventory, selection
 from . import own_camera
 
 READING_SECONDS = 0.02
@@ -43,8 +43,8 @@ def keyed_instants(scene: bpy.types.Scene) -> dict[str, float]:
     curve = next((c for c in compat.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
     if curve is None or not settings_of(scene).choose_t_star:
         return {}
-    folder = chosen.shot_folder(scene)
-    first, last = contents.read(folder).frame_range if folder else (scene.frame_start, scene.frame_end)
+    folder = selection.shot_folder(scene)
+    first, last = inventory.read(folder).frame_range if folder else (scene.frame_start, scene.frame_end)
     low, high = min(first, scene.frame_start), max(last, scene.frame_end)
     return {str(n): min(max(float(curve.evaluate(n)), first), last) for n in range(low, high + 1)}
 
@@ -81,7 +81,7 @@ def _with_rest(path: contract.CameraPath, old: contract.CameraPath) -> contract.
 
 def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.FreezeParams | None:
     """What a take was asked for with, from its take.json, to render what it lacks; None if it was never finished."""
-    facts = contents.read(shot).takes.get(take)
+    facts = inventory.read(shot).takes.get(take)
     if facts is None:
         return None
     return contract.FreezeParams(
@@ -111,7 +111,7 @@ def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool
         frames: only these are asked for, as far as the clip or the take's camera has them; None: all between the
             take's first and last.
     """
-    facts = contents.read(shot).takes.get(take)
+    facts = inventory.read(shot).takes.get(take)
     if facts is None:
         return False
     if frames is None:
@@ -119,12 +119,12 @@ def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool
     else:
         can = _possible(shot, facts)
         wanted = [n for n in frames if n in can]
-    return not contents.missing_frames(shot, take, wanted)
+    return not inventory.missing_frames(shot, take, wanted)
 
 
 def may_be_stale(shot: Path, take: str) -> bool:
     """True if a take's run was trained on after the take was frozen: the backend can tell which frames that changed."""
-    facts = contents.read(shot).takes.get(take, {})
+    facts = inventory.read(shot).takes.get(take, {})
     there = contract.ShotFolder(shot)
     trained = contract.RunFolder(there.runs / str(facts.get("run", ""))).checkpoint
     told = contract.TakeFolder(there.takes / take).facts
@@ -143,13 +143,13 @@ def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
     path = _path_of(shot, facts)
     if path and Path(path).is_file():
         return {f.frame for f in contract.CameraPath.load(path).frames}
-    first, last = (facts["first"], facts["last"]) if path else contents.read(shot).frame_range
+    first, last = (facts["first"], facts["last"]) if path else inventory.read(shot).frame_range
     return set(range(first, last + 1))
 
 
 def read_camera(scene: bpy.types.Scene, step: str) -> contract.FreezeParams | None:
     """What a step asks for from the artist's camera, read all at once; None if none is chosen."""
-    name, folder = own_camera.name_of(scene), chosen.shot_folder(scene)
+    name, folder = own_camera.name_of(scene), selection.shot_folder(scene)
     if not name or folder is None:
         return None
     turns = own_camera.sample_path(scene, name, folder, _asked(scene, step).width)
@@ -162,15 +162,15 @@ def read_camera(scene: bpy.types.Scene, step: str) -> contract.FreezeParams | No
 
 def read_in_turns(scene: bpy.types.Scene, shot: Path, step: str) -> None:
     """Has the artist's camera read by the timer; then the take is begun, by the step freeze or bake."""
-    supervisor.watch_of(shot).notes.clear()
+    job_timer.watch_of(shot).notes.clear()
     turns = own_camera.sample_path(scene, own_camera.name_of(scene), shot, _asked(scene, step).width)
     total = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
-    supervisor.work(shot, step, reading(scene.name, shot, step, turns, total))
+    job_timer.work(shot, step, reading(scene.name, shot, step, turns, total))
 
 
 def reading(
     scene_name: str, shot: Path, step: str, turns: Generator[int, None, contract.CameraPath], total: int
-) -> Iterator[supervisor.Progress]:
+) -> Iterator[job_timer.Progress]:
     """A camera read by `turns`, `own_camera.sample_path`, for part of a turn of the timer each; then its take begun."""
     done, path = 0, None
     while path is None:
@@ -178,14 +178,14 @@ def reading(
         try:
             while time.monotonic() < until:
                 done = next(turns)
-            yield supervisor.Progress(f"Reading the camera, frame {done} of {total}", done, total)
+            yield job_timer.Progress(f"Reading the camera, frame {done} of {total}", done, total)
         except StopIteration as end:
             path = end.value
     found = bpy.data.scenes.get(scene_name)
     if found is None:
         return
-    if chosen.shot_folder(found) != shot:
+    if selection.shot_folder(found) != shot:
         raise contract.JobError(
             "Another shot was chosen while the camera was read.", "Choose this one and freeze again."
         )
-    supervisor.follow(step, begin.begin(found, step, freeze_from(found, path, step)))
+    job_timer.follow(step, begin.begin(found, step, freeze_from(found, path, step)))

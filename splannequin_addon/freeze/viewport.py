@@ -22,7 +22,7 @@ from mathutils import Matrix
 from ...torch_backend import contract
 from ..access import scene_in, settings_of
 from ..process import backend
-from ..shot import chosen, made
+from ..shot import scene_objects, selection
 from . import live, own_camera
 
 TICK_SECONDS = 1 / 60
@@ -60,7 +60,7 @@ def begin(scene: bpy.types.Scene) -> None:
     global _session, _handler, _told
     if bpy.app.background:
         raise contract.JobError("There is no view to draw in.", "Use Freeze.", contract.ExitCode.USAGE)
-    shot, run = chosen.shot_folder(scene), settings_of(scene).run_name
+    shot, run = selection.shot_folder(scene), settings_of(scene).run_name
     if shot is None or not contract.RunFolder(contract.ShotFolder(shot).runs / run).checkpoint.is_file():
         raise contract.JobError(f"There is no trained run {run!r}.", "Train first.", contract.ExitCode.USAGE)
     end()
@@ -92,7 +92,7 @@ def end() -> None:
 
 def _show_points(scene: bpy.types.Scene, shot: Path, shown: bool) -> None:
     """Opens or closes the eye of our point cloud: its dots would cover the picture."""
-    cloud = made.part(scene, shot, "points")
+    cloud = scene_objects.part(scene, shot, "points")
     for layer in scene.view_layers:
         if cloud is not None and cloud.name in layer.objects:
             cloud.hide_set(not shown, view_layer=layer)
@@ -159,7 +159,7 @@ def _tick() -> float | None:
         _told = _session.failure
         end()
         return None
-    scenes = [s for s in bpy.data.scenes if chosen.shot_folder(s) == _session.shot]
+    scenes = [s for s in bpy.data.scenes if selection.shot_folder(s) == _session.shot]
     if not any(settings_of(s).run_name == _session.run for s in scenes):
         end()  # another file, another shot or another run
         return None
@@ -235,7 +235,7 @@ def _draw() -> None:
     """One region's part: ask for what it shows, draw what has arrived."""
     context = bpy.context
     scene, region, view = scene_in(context), context.region, context.region_data
-    if _session is None or view is None or chosen.shot_folder(scene) != _session.shot:
+    if _session is None or view is None or selection.shot_folder(scene) != _session.shot:
         return
     t_star = instant(scene)
     if t_star is None:
@@ -246,7 +246,7 @@ def _draw() -> None:
     if quick is None or sharp is None:
         return
     # Through the clip's camera the picture stands before the plate, and is exposed like it.
-    if view.view_perspective == "CAMERA" and scene.camera == made.part(scene, _session.shot, "camera"):
+    if view.view_perspective == "CAMERA" and scene.camera == scene_objects.part(scene, _session.shot, "camera"):
         quick.exposed_like = sharp.exposed_like = float(scene.frame_current)
     quick.view = sharp.view = key
     sharp.detail = settings_of(scene).detail and sharp.show == "color"
@@ -254,7 +254,7 @@ def _draw() -> None:
     _ask(key, quick, sharp)
     frame = _session.frames.get(key)
     if frame is not None:
-        _paint(key, frame, view, made.depth_scale(scene, _session.shot))
+        _paint(key, frame, view, scene_objects.depth_scale(scene, _session.shot))
 
 
 def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:

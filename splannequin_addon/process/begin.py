@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...torch_backend import contract
 from ..scene import scene_setup
-from ..shot import chosen, contents, markers
+from ..shot import inventory, markers, selection
 from . import backend, jobs, steps
 
 if TYPE_CHECKING:
@@ -29,11 +29,11 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
     try:
         jobs.refuse_second_writer(folder)
         if steps.STEPS[step].makes_shot:
-            contents.create(folder)
+            inventory.create(folder)
         job = jobs.new_job(folder, steps.STEPS[step].kind, params)
         (job.folder / contract.STEP_FILE).write_text(step, encoding="utf-8")
     except OSError as error:
-        raise contents.unwritable(folder, error, "Choose another shot folder.") from error
+        raise inventory.unwritable(folder, error, "Choose another shot folder.") from error
     try:
         backend.start(job)
     except contract.JobError:
@@ -45,11 +45,11 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
 
 def needed(scene: bpy.types.Scene, step: str) -> Path:
     """The scene's shot folder, which a step needs to be there unless it makes it. JobError says what to do."""
-    folder = chosen.shot_folder(scene)
+    folder = selection.shot_folder(scene)
     if folder is None:
         raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
     if not steps.STEPS[step].makes_shot and not os.path.isfile(contract.ShotFolder(folder).info_path):
-        if chosen.missing(scene, None):
+        if selection.missing(scene, None):
             message, hint = f"The shot folder {folder} is not there any more.", "Press Locate and choose it."
             raise contract.JobError(message, hint, contract.ExitCode.USAGE)
         raise contract.JobError(f"{folder} is no shot folder.", steps.STEPS[step].needs, contract.ExitCode.USAGE)
@@ -61,7 +61,7 @@ def remove_all(scene: bpy.types.Scene, shot: Path) -> list[str]:
 
     What another shot of the scene needs stays: its own things, and the settings of the scene.
     """
-    others = [f for f in chosen.folders(scene) if f is not None and f != shot]
+    others = [f for f in selection.folders(scene) if f is not None and f != shot]
     others = [f for f in others if any(step.stands(scene, f) for step in steps.STEPS.values())]
     done: list[str] = []
     for step in reversed(steps.STEPS.values()):

@@ -10,7 +10,7 @@ import bpy
 
 from .. import compat
 from . import paths
-from .mark import TAG
+from .ownership import TAG
 
 _ahead: set[str] = set()
 """Files that `read_ahead` has just had read: the next `load_sequence` takes them as they are."""

@@ -8,14 +8,14 @@ from typing import Any
 
 from ...torch_backend import contract
 from ...torch_backend.contract import RunFolder
-from . import kept
+from . import file_cache
 
 
 def facts(path: Path) -> dict[str, Any]:
     """The facts that the backend stored in a checkpoint, read from the file's header; empty if there is none. Not to be
     changed: they are remembered."""
     try:
-        return kept.of(path, _facts)
+        return file_cache.of(path, _facts)
     except OSError:
         return {}
 
@@ -92,8 +92,8 @@ def other_cameras(shot: Path, run: Path) -> bool:
     try:
         if cameras.stat().st_mtime <= there.checkpoint.stat().st_mtime:
             return False
-        told = kept.of(there.config, contract.read_json)["solve"]
-        return kept.of(cameras, _key) != told
+        told = file_cache.of(there.config, contract.read_json)["solve"]
+        return file_cache.of(cameras, _key) != told
     except (OSError, ValueError, KeyError):
         return False
 

@@ -19,8 +19,8 @@ from bpy.app.handlers import persistent
 from ...torch_backend import contract
 from ..access import settings_of
 from ..scene import paths
-from ..scene.mark import TAG
-from . import chosen, contents, made
+from ..scene.ownership import TAG
+from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
 _SETTINGS = ("clip", "shot_path", "cameras_path", "shot_seen")
@@ -46,16 +46,16 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
         contract.JobError: there is no shot in it.
     """
     try:
-        state = contents.read(folder)
+        state = inventory.read(folder)
     except (OSError, ValueError, KeyError) as error:
         raise contract.JobError(f"{folder} cannot be read: {error}", "", contract.ExitCode.USAGE) from error
     if not state.info:
         hint = "Choose the folder that holds shot.json; its name ends with .splannequin unless it was renamed."
         raise contract.JobError(f"{folder} is no shot folder.", hint, contract.ExitCode.USAGE)
-    held, before = settings_of(scene), chosen.folder_of(settings_of(scene))
-    entry = made.of(scene, before) if before is not None else None
-    if entry is not None and made.of(scene, folder) in (None, entry):
-        entry.name, entry.folder = made.name_of(folder), paths.blend_path(folder)
+    held, before = settings_of(scene), selection.folder_of(settings_of(scene))
+    entry = scene_objects.of(scene, before) if before is not None else None
+    if entry is not None and scene_objects.of(scene, folder) in (None, entry):
+        entry.name, entry.folder = scene_objects.name_of(folder), paths.blend_path(folder)
     for image in bpy.data.images:
         path = Path(paths.absolute(image.filepath))
         if before is not None and image.get(TAG) and before in path.parents and not path.exists():
@@ -133,7 +133,7 @@ def _known(path: Path, name: str) -> bool:
     """True if what the setting `name` is about is there; of a clip its shot is enough."""
     try:
         if name in ("clip", "cameras_path"):
-            return _there(path) or (name == "clip" and contract.ShotFolder(chosen.beside(path)).info_path.is_file())
+            return _there(path) or (name == "clip" and contract.ShotFolder(selection.beside(path)).info_path.is_file())
         return contract.ShotFolder(path).info_path.is_file()
     except OSError:
         return False
@@ -148,7 +148,7 @@ _HANDLERS = (
 
 
 def register() -> None:
-    """Listens to saving and loading; before the supervisor, which looks at the shots of a file once it is loaded."""
+    """Listens to saving and loading; before the job timer, which looks at the shots of a file once it is loaded."""
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
 

@@ -19,10 +19,10 @@ from mathutils import Matrix
 
 from ...torch_backend import contract
 from ..access import OperatorBase, Outcome, camera_of, mesh_of, present, scene_in
-from ..process import steps, supervisor
+from ..process import job_timer, steps
 from ..properties import BoolProperty, FloatProperty, FloatVectorProperty
 from ..scene import axes
-from ..shot import chosen, made
+from ..shot import scene_objects, selection
 from ..translations import tr
 from . import alignment, cameras, points
 
@@ -64,14 +64,14 @@ def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
         shot: shot folder; its root is there.
         change: [4, 4], multiplied onto the root from the left.
     """
-    root, before = present(cameras.find(scene, shot, "EMPTY")), made.depth_scale(scene, shot)
+    root, before = present(cameras.find(scene, shot, "EMPTY")), scene_objects.depth_scale(scene, shot)
     scale = root.scale[:]
     uniform = max(scale) - min(scale) <= 1e-5 * max(scale)
     root.matrix_world = Matrix((change @ np.array(root.matrix_world, dtype=np.float64)).tolist())
     if uniform:  # to the last bit, whatever the decomposition left
         root.scale = [sum(root.scale[:]) / 3.0] * 3
     bpy.context.view_layer.update()
-    grown = made.depth_scale(scene, shot) / before
+    grown = scene_objects.depth_scale(scene, shot) / before
     if abs(grown - 1.0) < 1e-6:
         return []
     camera = cameras.find(scene, shot, "CAMERA")
@@ -84,7 +84,7 @@ def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
 
 def _shot_of(scene: bpy.types.Scene) -> Path:
     """The scene's shot; `poll` has seen to it that there is one."""
-    shot = chosen.shot_folder(scene)
+    shot = selection.shot_folder(scene)
     assert shot is not None
     return shot
 
@@ -108,7 +108,7 @@ class _Aligns(OperatorBase):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without the solve in the scene."""
-        shot = chosen.shot_folder(scene_in(context))
+        shot = selection.shot_folder(scene_in(context))
         if shot is None or cameras.find(scene_in(context), shot, "EMPTY") is None:
             cls.poll_message_set(tr("Load the camera of this shot first"))
             return False
@@ -139,7 +139,7 @@ class _Aligns(OperatorBase):
             told = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
             self.report({"ERROR"}, told)
             return {"CANCELLED"}
-        supervisor.watch_of(shot).notes["solve"] = notes
+        job_timer.watch_of(shot).notes["solve"] = notes
         for note in notes:
             self.report({"INFO"}, note)
         return {"FINISHED"}
@@ -324,7 +324,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Moves the root; from now on the scale is known."""
         outcome = super().execute(context)
-        entry = made.of(scene_in(context), _shot_of(scene_in(context)))
+        entry = scene_objects.of(scene_in(context), _shot_of(scene_in(context)))
         if outcome == {"FINISHED"} and entry is not None:
             entry.scaled = True
         return outcome
@@ -349,8 +349,8 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
 
 def scaled(scene: bpy.types.Scene, shot: Path) -> bool:
     """True if somebody gave a shot its scale: by Set Scale, or by hand on its root."""
-    entry = made.of(scene, shot)
-    return (entry is not None and entry.scaled) or abs(made.depth_scale(scene, shot) - 1.0) > 1e-5
+    entry = scene_objects.of(scene, shot)
+    return (entry is not None and entry.scaled) or abs(scene_objects.depth_scale(scene, shot) - 1.0) > 1e-5
 
 
 def view_under(window: bpy.types.Window, x: int, y: int) -> tuple[Any, Any] | None:

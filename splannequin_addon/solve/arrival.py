@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..footage import arrival, plate
-from ..scene import intact
-from ..shot import chosen, contents
+from ..scene import rollback
+from ..shot import inventory, selection
 from . import cameras
 
 if TYPE_CHECKING:
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """Brings the solve into the scene. FileNotFoundError if there is none."""
-    state = contents.read(shot)
-    chosen.see(scene, state)
-    with intact.scene_of(scene):
+    state = inventory.read(shot)
+    selection.see(scene, state)
+    with rollback.scene_of(scene):
         camera = cameras.build(scene, shot)
         changes = arrival.fit(scene, state, force_k=True)
     plate.remove(scene, shot)

@@ -18,8 +18,8 @@ from mathutils import Matrix, Quaternion
 from ...torch_backend import contract
 from .. import compat
 from ..access import camera_of, present
-from ..scene import axes, intact, sequences
-from ..shot import contents, made
+from ..scene import axes, rollback, sequences
+from ..shot import inventory, scene_objects
 from . import alignment, guesses
 
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
@@ -78,14 +78,14 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
     xyz, rgb = _points(shot)
     floor, unsolved = _floor(shot), guesses.ranges(path, guesses.solved(shot, path))
-    with intact.scene_of(scene):
+    with rollback.scene_of(scene):
         # All that can fail comes before what was there is taken away.
         camera, cloud = _new_camera(shot, path), _new_points(shot, xyz, rgb)
         _place(scene, shot, camera, cloud, scene_from_solve(path, xyz, floor), _extent(path))
         lens = camera_of(camera)
-        lens.clip_start, lens.clip_end = (v * made.depth_scale(scene, shot) for v in _clip(path, xyz))
+        lens.clip_start, lens.clip_end = (v * scene_objects.depth_scale(scene, shot) for v in _clip(path, xyz))
         guesses.mark(scene, shot, unsolved)
-        made.keep_camera(scene)
+        scene_objects.keep_camera(scene)
         scene.camera = camera
     return camera
 
@@ -108,15 +108,15 @@ def _place(
         stands: where the root is put if there is none, [4, 4].
         size: of that root.
     """
-    name = made.name_of(shot)
+    name = scene_objects.name_of(shot)
     _clear(scene, shot, but=("root",))  # what the artist hung on the root, and where it stands, stays
-    entry = made.new(scene, shot)
+    entry = scene_objects.new(scene, shot)
     collection = entry.collection
     if collection is None or collection not in scene.collection.children_recursive:
         collection = entry.collection = bpy.data.collections.new(f"Splannequin {name}")
         scene.collection.children.link(collection)
 
-    root = made.part(scene, shot, "root")
+    root = scene_objects.part(scene, shot, "root")
     if root is None:
         root = entry.root = bpy.data.objects.new(f"{name} root", None)
         root.empty_display_type = "ARROWS"
@@ -136,7 +136,7 @@ def _place(
 
 def _new_camera(shot: Path, path: contract.CameraPath) -> bpy.types.Object:
     """The solved camera with its keys and the plate behind it, in no scene yet."""
-    name = made.name_of(shot)
+    name = scene_objects.name_of(shot)
     data = bpy.data.cameras.new(f"{name} camera")
     camera = bpy.data.objects.new(f"{name} camera", data)
     data.display_size = max(_extent(path) * 0.5, 0.05)
@@ -147,7 +147,7 @@ def _new_camera(shot: Path, path: contract.CameraPath) -> bpy.types.Object:
 
 def _new_points(shot: Path, xyz: np.ndarray, rgb: np.ndarray) -> bpy.types.Object:
     """The sparse points as an object, in no scene yet."""
-    name = f"{made.name_of(shot)} points"
+    name = f"{scene_objects.name_of(shot)} points"
     cloud = bpy.data.objects.new(name, _point_mesh(name, xyz, rgb))
     cloud.hide_render = True
     cloud.display_type = "BOUNDS"  # Blender draws loose points black, whatever their colour: points.py draws them
@@ -157,7 +157,7 @@ def _new_points(shot: Path, xyz: np.ndarray, rgb: np.ndarray) -> bpy.types.Objec
 def find(scene: bpy.types.Scene, shot: Path, kind: str) -> bpy.types.Object | None:
     """Our object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points). Never a copy that
     the artist made of it."""
-    return made.part(scene, shot, _PARTS[kind])
+    return scene_objects.part(scene, shot, _PARTS[kind])
 
 
 def remove(scene: bpy.types.Scene, shot: Path) -> bool:
@@ -165,26 +165,26 @@ def remove(scene: bpy.types.Scene, shot: Path) -> bool:
 
     What the artist hung on the root or put into the collection stays where it is in the scene.
     """
-    if made.of(scene, shot) is None:
+    if scene_objects.of(scene, shot) is None:
         return False
-    was, ours = scene.camera is not None, scene.camera == made.part(scene, shot, "camera")
+    was, ours = scene.camera is not None, scene.camera == scene_objects.part(scene, shot, "camera")
     _clear(scene, shot)
-    made.drop(scene, shot)
+    scene_objects.drop(scene, shot)
     if was and ours:
-        made.give_camera_back(scene)
+        scene_objects.give_camera_back(scene)
     return True
 
 
 def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> None:
     """Removes what was built for a shot, except for the named parts and, with them, the collection."""
-    entry = made.of(scene, shot)
+    entry = scene_objects.of(scene, shot)
     if entry is None:
         return
     guesses.unmark(scene, shot)
-    for item in [getattr(entry, name) for name in made.PARTS if name not in but]:
+    for item in [getattr(entry, name) for name in scene_objects.PARTS if name not in but]:
         if item is None or (item.users_scene and scene not in item.users_scene):
             continue
-        for child in [c for c in item.children if c not in [getattr(entry, name) for name in made.PARTS]]:
+        for child in [c for c in item.children if c not in [getattr(entry, name) for name in scene_objects.PARTS]]:
             stood = child.matrix_world.copy()
             child.parent = None
             child.matrix_world = stood
@@ -238,7 +238,7 @@ def _animate(camera: bpy.types.Object, path: contract.CameraPath) -> None:
 
 def _show_plate(data: bpy.types.Camera, shot: Path, name: str) -> None:
     """The undistorted plate behind the camera, fitting the sensor; frame n of the scene shows file n."""
-    span = contents.plate_range(shot)
+    span = inventory.plate_range(shot)
     if span is None:
         return
     first, last = span

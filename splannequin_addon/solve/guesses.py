@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...torch_backend import contract
 from ..access import present, settings_of
-from ..shot import made
+from ..shot import scene_objects
 
 if TYPE_CHECKING:
     import bpy
@@ -49,7 +49,7 @@ def ranges(path: contract.CameraPath, solved: set[int]) -> list[tuple[int, int]]
 
 def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) -> None:
     """Puts a marker where each such range begins, which are `ranges`. After `made.new`."""
-    entry = present(made.of(scene, shot))
+    entry = present(scene_objects.of(scene, shot))
     others = [e for e in settings_of(scene).made if e != entry]
     put: list[list[str | int]] = []
     for first, last in unsolved:
@@ -61,7 +61,7 @@ def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) ->
 
 def unmark(scene: bpy.types.Scene, shot: Path) -> bool:
     """Takes those markers away, but what the artist renamed or moved. True if there was one."""
-    entry, taken = made.of(scene, shot), False
+    entry, taken = scene_objects.of(scene, shot), False
     marks: list[tuple[str, int]] = json.loads(entry.marks or "[]") if entry is not None else []
     for name, frame in marks:
         marker = next((m for m in scene.timeline_markers if m.name == name and m.frame == frame), None)

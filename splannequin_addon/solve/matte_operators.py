@@ -9,9 +9,9 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import OperatorBase, Outcome, scene_in
-from ..process import supervisor
+from ..process import job_timer
 from ..scene import sequences
-from ..shot import chosen, contents
+from ..shot import inventory, selection
 from ..translations import tr
 from ..ui import icons
 from . import mattes
@@ -39,8 +39,8 @@ class _Matte(OperatorBase):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a solve."""
-        folder = chosen.shot_folder(scene_in(context))
-        state = supervisor.watch_of(folder).state if folder else None
+        folder = selection.shot_folder(scene_in(context))
+        state = job_timer.watch_of(folder).state if folder else None
         if state is None or not state.solve:
             cls.poll_message_set(tr("Solve the camera first"))
             return False
@@ -48,7 +48,7 @@ class _Matte(OperatorBase):
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Does it; a refusal is reported."""
-        shot = chosen.shot_folder(scene_in(context))
+        shot = selection.shot_folder(scene_in(context))
         if shot is None:
             return {"CANCELLED"}
         try:
@@ -134,7 +134,7 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
         try:
             gone = mattes.clear_paint(shot, frame)
         except OSError as error:
-            raise contents.unwritable(
+            raise inventory.unwritable(
                 mattes.painted_file(shot, frame), error, "Close it elsewhere, then try again."
             ) from error
         if not gone:

@@ -18,7 +18,7 @@ import numpy as np
 from ...torch_backend import contract
 from ..access import pixels_of, size_of
 from ..scene import paths, sequences
-from ..shot import contents, made
+from ..shot import inventory, scene_objects
 
 _FRAME, _SHOT = "splannequin_matte", "splannequin_matte_shot"
 """Properties of the images that are painted on: frame number, and shot folder as a .blend holds it."""
@@ -39,13 +39,13 @@ def load_sequence(shot: Path) -> tuple[Any, int, int]:
     frames = sorted(int(p.stem) for p in contract.ShotFolder(shot).motion.glob("*.png") if p.stem.isdecimal())
     if not frames:
         raise no_matte(shot)
-    image = sequences.load_sequence(found_file(shot, frames[0]), f"Motion {made.name_of(shot)}", "srgb")
+    image = sequences.load_sequence(found_file(shot, frames[0]), f"Motion {scene_objects.name_of(shot)}", "srgb")
     return image, frames[0], frames[-1]
 
 
 def no_matte(shot: Path) -> contract.JobError:
     """The sentence for a shot that was solved before there were mattes."""
-    message = f"{made.name_of(shot)} has no motion matte here."
+    message = f"{scene_objects.name_of(shot)} has no motion matte here."
     return contract.JobError(message, "Solve the camera again: its last part finds it.", contract.ExitCode.USAGE)
 
 
@@ -60,7 +60,7 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
     path = next((p for p in (painted_file(shot, frame), found_file(shot, frame)) if p.is_file()), None)
     if path is None:
         raise contract.JobError(
-            f"Frame {frame} of {made.name_of(shot)} has no motion matte.",
+            f"Frame {frame} of {scene_objects.name_of(shot)} has no motion matte.",
             "Go to a frame of the clip, or solve the camera again.",
             contract.ExitCode.USAGE,
         )
@@ -71,7 +71,7 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
             pixels = np.where(pixels[..., 3:] > 0.5, pixels, below)
     pixels[..., 3] = 1.0
     height, width = pixels.shape[:2]
-    image = bpy.data.images.new(f"Motion {made.name_of(shot)} {frame}", width, height)
+    image = bpy.data.images.new(f"Motion {scene_objects.name_of(shot)} {frame}", width, height)
     pixels_of(image).foreach_set(pixels.ravel())
     image.update()
     image[_FRAME], image[_SHOT] = frame, paths.blend_path(shot)
@@ -108,7 +108,7 @@ def save_paint(image: bpy.types.Image) -> Path:
     try:
         _write(path, data)
     except OSError as error:
-        raise contents.unwritable(
+        raise inventory.unwritable(
             path, error, "Make room, or see to it that the shot's folder can be written."
         ) from error
     image.filepath_raw, image.file_format = paths.blend_path(path), "PNG"

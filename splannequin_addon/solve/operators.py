@@ -10,9 +10,9 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in
-from ..process import children, supervisor
+from ..process import children, job_timer
 from ..properties import BoolProperty, EnumProperty, IntProperty, StringProperty
-from ..shot import chosen
+from ..shot import selection
 from ..translations import tr
 from ..ui import step_operator
 from . import arrival, exchange, stmaps
@@ -42,8 +42,8 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a solve."""
-        folder = chosen.shot_folder(scene_in(context))
-        state = supervisor.watch_of(folder).state if folder else None
+        folder = selection.shot_folder(scene_in(context))
+        state = job_timer.watch_of(folder).state if folder else None
         if state is None or not state.solve:
             cls.poll_message_set(tr("Solve the camera first"))
             return False
@@ -56,7 +56,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Has the backend write; in a window the panel tells when it is done."""
-        shot = chosen.shot_folder(scene_in(context))
+        shot = selection.shot_folder(scene_in(context))
         if shot is None or not self.directory:
             self.report({"ERROR"}, "No folder was given")
             return {"CANCELLED"}
@@ -70,8 +70,8 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
         except contract.JobError as error:
             self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
             return {"CANCELLED"}
-        supervisor.watch_of(shot).failures.pop("solve", None)
-        supervisor.when_answered(asked, lambda: tell(shot, lambda: [exchange.exported(asked, folder)]))
+        job_timer.watch_of(shot).failures.pop("solve", None)
+        job_timer.when_answered(asked, lambda: tell(shot, lambda: [exchange.exported(asked, folder)]))
         return {"FINISHED"}
 
 
@@ -95,7 +95,7 @@ class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
         """Builds camera and points."""
         outcome = step_operator.edit(self, context, "solve", arrival.load_camera)
         if outcome == {"FINISHED"} and context.window is not None:
-            supervisor.look_through_camera(context.window)
+            job_timer.look_through_camera(context.window)
         return outcome
 
 
@@ -114,8 +114,8 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a solve, while a step runs, and while the maps are being written."""
-        folder = chosen.shot_folder(scene_in(context))
-        watch = supervisor.watch_of(folder) if folder else None
+        folder = selection.shot_folder(scene_in(context))
+        watch = job_timer.watch_of(folder) if folder else None
         if watch is None or watch.state is None or not watch.state.solve:
             cls.poll_message_set(tr("Solve the camera first"))
             return False
@@ -129,7 +129,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Starts the backend; headless, waits for it."""
-        folder = chosen.shot_folder(scene_in(context))
+        folder = selection.shot_folder(scene_in(context))
         if folder is None:
             return {"CANCELLED"}
         try:
@@ -137,7 +137,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         except contract.JobError as error:
             self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
             return {"CANCELLED"}
-        watch = supervisor.watch_of(folder)
+        watch = job_timer.watch_of(folder)
         watch.failures.pop("solve", None)
         if not bpy.app.background:
             watch.notes["solve"] = ["Writing the ST maps."]
@@ -165,12 +165,12 @@ def follow_stmaps(shot: Path, asked: children.Question) -> None:
         tell(shot, lambda: stmaps.sentences(stmaps.answer(asked)))
 
     writing.add(shot)
-    supervisor.when_answered(asked, written)
+    job_timer.when_answered(asked, written)
 
 
 def tell(shot: Path, say: Callable[[], list[str]]) -> None:
     """Puts what the backend answered, as `say` tells it or why it cannot, where the panel of the step shows it."""
-    watch = supervisor.watch_of(shot)
+    watch = job_timer.watch_of(shot)
     watch.notes.pop("solve", None)
     try:
         watch.notes["solve"] = say()

@@ -14,7 +14,7 @@ from gpu_extras.batch import batch_for_shader  # pyright: ignore[reportUnknownVa
 from .. import compat
 from ..access import mesh_of, named, scene_in
 from ..process import children
-from ..shot import chosen, made
+from ..shot import scene_objects, selection
 
 _SIZE = 3.0
 """Pixels of a point."""
@@ -43,8 +43,8 @@ def _draw() -> None:
     context = bpy.context
     if context.space_data is None or not context.space_data.overlay.show_overlays:
         return
-    shot = chosen.shot_folder(scene_in(context))
-    cloud = made.part(scene_in(context), shot, "points") if shot is not None else None
+    shot = selection.shot_folder(scene_in(context))
+    cloud = scene_objects.part(scene_in(context), shot, "points") if shot is not None else None
     if cloud is None or cloud.display_type != "BOUNDS" or not cloud.visible_get():
         return
     mesh = mesh_of(cloud)

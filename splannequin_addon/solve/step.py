@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
 from ..footage import plate
-from ..process import jobs, supervisor
+from ..process import job_timer, jobs
 from ..process.steps import Step, View
-from ..shot import chosen, made
+from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
 from . import align_operators, arrival, cameras, exchange, guesses, matte_operators, operators, panel, points
 
@@ -31,7 +31,7 @@ class Solve(Step):
 
     def params(self, scene: bpy.types.Scene) -> contract.SolveParams:
         """The lens, and where cameras come from."""
-        return exchange.params(scene, chosen.shot_folder(scene))
+        return exchange.params(scene, selection.shot_folder(scene))
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Camera: how good the solve is."""
@@ -51,7 +51,7 @@ class Solve(Step):
 
     def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
         """Through the solved camera."""
-        supervisor.look_through_camera(window)
+        job_timer.look_through_camera(window)
 
     def logs(self, job: jobs.Job) -> list[Path]:
         """The job's own log, and what COLMAP said."""
@@ -59,7 +59,7 @@ class Solve(Step):
 
     def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
         """True if camera, points or plate of a shot are in the scene."""
-        return made.of(scene, shot) is not None
+        return scene_objects.of(scene, shot) is not None
 
     def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
         """Takes camera, points and plate out of the file."""

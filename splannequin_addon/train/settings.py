@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
 from ..access import scene_holding
-from ..process import supervisor
+from ..process import job_timer
 from ..properties import EnumProperty, IntProperty, StringProperty
-from ..shot import chosen
+from ..shot import selection
 from ..translations import tr
 
 if TYPE_CHECKING:
@@ -20,8 +20,8 @@ PRESETS: list[tuple[str, str, str]] = contract.panel(contract.TrainParams, "pres
 
 def runs_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
     """(name, what it is) of the runs of the shot that `props` names, for the field's list."""
-    folder = chosen.shot_folder(scene_holding(props))
-    state = supervisor.watch_of(folder).state if folder else None
+    folder = selection.shot_folder(scene_holding(props))
+    state = job_timer.watch_of(folder).state if folder else None
     runs = state.runs.items() if state is not None else ()
     return [
         (name, tr(f"{run.get('heldout_psnr_db') or 0:.1f} dB, {run.get('gaussians', 0):,} Gaussians"))

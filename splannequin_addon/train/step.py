@@ -8,7 +8,7 @@ from ...torch_backend import contract
 from ..access import settings_of
 from ..process import backend, jobs
 from ..process.steps import Step, View
-from ..shot import chosen, contents
+from ..shot import inventory, selection
 from ..shot.shot_state import ShotState
 from . import operators, panel, pictures, training
 
@@ -30,8 +30,8 @@ class Train(Step):
 
     def params(self, scene: bpy.types.Scene) -> contract.TrainParams:
         """The preset, or how a run that is there goes on."""
-        props, folder = settings_of(scene), chosen.shot_folder(scene)
-        state = contents.read(folder) if folder is not None else None
+        props, folder = settings_of(scene), selection.shot_folder(scene)
+        state = inventory.read(folder) if folder is not None else None
         return training.params(state, props.run_name, props.preset, props.extend_steps, backend.device())
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:

@@ -6,9 +6,9 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in
-from ..process import jobs, steps, supervisor
+from ..process import job_timer, jobs, steps
 from ..properties import StringProperty
-from ..shot import chosen
+from ..shot import selection
 from ..translations import tr
 
 
@@ -26,8 +26,8 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Asks the job to stop."""
-        folder = chosen.shot_folder(scene_in(context))
-        watch = supervisor.watch_of(folder) if folder else None
+        folder = selection.shot_folder(scene_in(context))
+        watch = job_timer.watch_of(folder) if folder else None
         job = watch.jobs.get(steps.current(self.step) or watch.running() or "") if watch else None
         if job is None or job.ended:
             self.report({"WARNING"}, "Nothing is running")
@@ -51,8 +51,8 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Opens it."""
-        folder = chosen.shot_folder(scene_in(context))
-        job = supervisor.watch_of(folder).jobs.get(steps.current(self.step)) if folder else None
+        folder = selection.shot_folder(scene_in(context))
+        job = job_timer.watch_of(folder).jobs.get(steps.current(self.step)) if folder else None
         log = steps.STEPS[steps.current(self.step)].log(job) if job is not None else None
         if log is None:
             self.report({"WARNING"}, "There is no log")

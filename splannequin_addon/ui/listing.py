@@ -1,4 +1,4 @@
-"""Runs and takes of a shot side by side, to compare and to pick one. Drawn from what the supervisor keeps."""
+"""Runs and takes of a shot side by side, to compare and to pick one. Drawn from what the job timer keeps."""
 
 from __future__ import annotations
 

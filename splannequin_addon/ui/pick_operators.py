@@ -9,16 +9,16 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import OperatorBase, Outcome, scene_in
-from ..process import jobs, steps, supervisor
-from ..shot import chosen
+from ..process import job_timer, jobs, steps
+from ..shot import selection
 from ..translations import tr
 from . import listing
 
 
-def known(context: bpy.types.Context) -> tuple[supervisor.Watch | None, Any]:
+def known(context: bpy.types.Context) -> tuple[job_timer.Watch | None, Any]:
     """The shot's watch and what its folder holds."""
-    folder = chosen.shot_folder(scene_in(context))
-    watch = supervisor.watch_of(folder) if folder else None
+    folder = selection.shot_folder(scene_in(context))
+    watch = job_timer.watch_of(folder) if folder else None
     return watch, watch.state if watch else None
 
 
@@ -72,8 +72,8 @@ class Remove(Pick):
         if refusal:
             self.report({"ERROR"}, refusal)
             return {"CANCELLED"}
-        supervisor.refresh(watch)
-        supervisor.redraw()
+        job_timer.refresh(watch)
+        job_timer.redraw()
         return {"FINISHED"}
 
 

@@ -9,7 +9,7 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Icon, Outcome, layout_of
-from ..process import backend, children, environment, supervisor
+from ..process import backend, children, environment, job_timer
 from ..properties import EnumProperty, StringProperty
 from ..translations import tr
 from .sentences import wrap
@@ -151,7 +151,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
             return {"CANCELLED"}
         _findings.clear()
         if not bpy.app.background:
-            supervisor.meanwhile(_follow_setup)
+            job_timer.meanwhile(_follow_setup)
             return {"FINISHED"}
         if _setup.process is not None:
             _setup.process.wait()
@@ -199,7 +199,7 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
                 self.report({"INFO"}, tr(line))
             return {"FINISHED"}
         _checks.append(asked)
-        supervisor.when_answered(asked, lambda: _take_in(asked))
+        job_timer.when_answered(asked, lambda: _take_in(asked))
         return {"FINISHED"}
 
 

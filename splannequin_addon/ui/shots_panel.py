@@ -8,10 +8,10 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Outcome, layout_of, scene_in, settings_of
-from ..process import begin, supervisor
+from ..process import begin, job_timer
 from ..properties import BoolProperty, StringProperty
 from ..scene import paths
-from ..shot import chosen, places
+from ..shot import places, selection
 from ..translations import tr
 
 
@@ -32,10 +32,10 @@ class SPLANNEQUIN_UL_shots(bpy.types.UIList):
         index: int,
     ) -> None:
         """Name, and whether a step of it runs."""
-        one = chosen.settings(scene_in(context))[index]
-        folder = chosen.folder_of(one)
-        running = supervisor.watch_of(folder).running() if folder is not None else None
-        layout.label(text=chosen.label(one), icon="SORTTIME" if running else "FILE_MOVIE", translate=False)
+        one = selection.settings(scene_in(context))[index]
+        folder = selection.folder_of(one)
+        running = job_timer.watch_of(folder).running() if folder is not None else None
+        layout.label(text=selection.label(one), icon="SORTTIME" if running else "FILE_MOVIE", translate=False)
 
 
 class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
@@ -48,14 +48,14 @@ class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off while the chosen shot has no clip: it is a new one."""
-        if chosen.shot_folder(scene_in(context)) is None:
+        if selection.shot_folder(scene_in(context)) is None:
             cls.poll_message_set(tr("Choose a clip for this shot first"))
             return False
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Adds and chooses it."""
-        chosen.add(scene_in(context))
+        selection.add(scene_in(context))
         return {"FINISHED"}
 
 
@@ -88,11 +88,11 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Removes it."""
         scene = scene_in(context)
-        folder = chosen.shot_folder(scene)
+        folder = selection.shot_folder(scene)
         if self.things and folder is not None:
             for note in begin.remove_all(scene, folder):
                 self.report({"INFO"}, note)
-        chosen.remove(scene, settings_of(scene).loaded_shot)
+        selection.remove(scene, settings_of(scene).loaded_shot)
         return {"FINISHED"}
 
 
@@ -110,7 +110,7 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Has the folder chosen, beginning where it was."""
-        folder = chosen.shot_folder(scene_in(context))
+        folder = selection.shot_folder(scene_in(context))
         if folder is not None:
             there = next((p for p in folder.parents if p.is_dir()), None)
             self.directory = f"{there}/" if there is not None else ""
@@ -142,7 +142,7 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
         props = settings_of(scene_in(context))
         row = layout_of(self).row()
         if len(props.shots) < 2:
-            row.label(text=chosen.label(props), icon="FILE_MOVIE", translate=False)
+            row.label(text=selection.label(props), icon="FILE_MOVIE", translate=False)
             row.operator("splannequin.shot_add", icon="ADD")
             return
         row.template_list(
@@ -167,7 +167,7 @@ class SPLANNEQUIN_PT_layout(bpy.types.Panel):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Now and then."""
-        return supervisor.lay_out()
+        return job_timer.lay_out()
 
     def draw(self, context: bpy.types.Context) -> None:
         """Nothing."""

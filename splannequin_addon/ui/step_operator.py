@@ -12,8 +12,8 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import OperatorBase, Outcome, scene_in
-from ..process import begin, jobs, steps, supervisor
-from ..shot import chosen
+from ..process import begin, job_timer, jobs, steps
+from ..shot import selection
 from ..translations import tr
 
 
@@ -25,8 +25,8 @@ class StepOperator(OperatorBase):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off while a step of this shot runs."""
-        folder = chosen.shot_folder(scene_in(context))
-        if folder is not None and supervisor.watch_of(folder).running():
+        folder = selection.shot_folder(scene_in(context))
+        if folder is not None and job_timer.watch_of(folder).running():
             cls.poll_message_set(tr("A step of this shot is running"))
             return False
         return True
@@ -36,7 +36,7 @@ class StepOperator(OperatorBase):
         scene = scene_in(context)
         try:
             job = begin.begin(scene, self.step, self.params(scene))
-            supervisor.follow(self.step, job)
+            job_timer.follow(self.step, job)
             if not bpy.app.background:
                 return {"FINISHED"}
             begin.wait(job)
@@ -45,10 +45,10 @@ class StepOperator(OperatorBase):
             self.report({"WARNING"}, "Cancelled: finished work is kept")
             return {"CANCELLED"}
         except (contract.JobError, ValueError, OSError, RuntimeError) as error:
-            folder = chosen.shot_folder(scene)
+            folder = selection.shot_folder(scene)
             sentence = getattr(error, "message", str(error))
             if folder is not None:
-                supervisor.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
+                job_timer.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
             self.report({"ERROR"}, tr(f"{sentence} {getattr(error, 'hint', '')}".strip()))
             return {"CANCELLED"}
         for note in notes:
@@ -71,7 +71,7 @@ def edit(
     change: Callable[[bpy.types.Scene, Path], list[str]],
 ) -> Outcome:
     """Runs a change of the scene; says what was done or why not."""
-    folder = chosen.shot_folder(scene_in(context))
+    folder = selection.shot_folder(scene_in(context))
     if folder is None:
         operator.report({"ERROR"}, "No shot is chosen: import a clip first")
         return {"CANCELLED"}
@@ -80,8 +80,8 @@ def edit(
     except (contract.JobError, OSError, ValueError) as error:
         operator.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
         return {"CANCELLED"}
-    supervisor.watch_of(folder).notes[step] = notes
-    supervisor.redraw()
+    job_timer.watch_of(folder).notes[step] = notes
+    job_timer.redraw()
     for note in notes:
         operator.report({"INFO"}, tr(note))
     return {"FINISHED"}

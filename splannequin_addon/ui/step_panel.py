@@ -1,6 +1,6 @@
 """The sidebar tab "Splannequin" in the 3D view: five steps in order, each with its state and what comes next.
 
-Drawing only reads what the supervisor keeps; it touches the disk when a shot is met for the first time.
+Drawing only reads what the job timer keeps; it touches the disk when a shot is met for the first time.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..access import PanelBase, layout_of, scene_in
-from ..process import steps, supervisor
-from ..shot import chosen
+from ..process import job_timer, steps
+from ..shot import selection
 from ..translations import tr
 from . import icons
 from .sentences import wrap
@@ -31,13 +31,13 @@ class StepPanel(PanelBase):
     folds = ""
     """What its parts that can be folded are called in the files that keep how they stand."""
 
-    def _watch(self, context: bpy.types.Context) -> supervisor.Watch | None:
-        folder = chosen.shot_folder(scene_in(context))
-        return supervisor.watch_of(folder) if folder else None
+    def _watch(self, context: bpy.types.Context) -> job_timer.Watch | None:
+        folder = selection.shot_folder(scene_in(context))
+        return job_timer.watch_of(folder) if folder else None
 
     def _view(self, context: bpy.types.Context) -> steps.View:
         watch = self._watch(context)
-        if watch is not None and chosen.missing(scene_in(context), watch.state):
+        if watch is not None and selection.missing(scene_in(context), watch.state):
             return steps.View(
                 False,
                 steps.STEPS[self.step].makes_shot,
@@ -117,7 +117,7 @@ class StepPanel(PanelBase):
         step = steps.STEPS[self.step]
         return step.again if view.done else step.button
 
-    def _progress(self, context: bpy.types.Context, watch: supervisor.Watch) -> None:
+    def _progress(self, context: bpy.types.Context, watch: job_timer.Watch) -> None:
         layout = layout_of(self)
         work = watch.work
         if work is not None:
@@ -136,7 +136,7 @@ class StepPanel(PanelBase):
         wrap(layout, context, ", ".join(tr(part) for part in detail) if detail else "The backend is starting.", "INFO")
 
     def _own_progress(
-        self, layout: bpy.types.UILayout, context: bpy.types.Context, now: supervisor.Progress | None
+        self, layout: bpy.types.UILayout, context: bpy.types.Context, now: job_timer.Progress | None
     ) -> None:
         """How far work is that Blender does itself."""
         if now is None:
@@ -147,7 +147,7 @@ class StepPanel(PanelBase):
             wrap(layout, context, now.hint, "INFO")
 
     def _outcome(
-        self, context: bpy.types.Context, layout: bpy.types.UILayout, watch: supervisor.Watch | None, said: list[str]
+        self, context: bpy.types.Context, layout: bpy.types.UILayout, watch: job_timer.Watch | None, said: list[str]
     ) -> None:
         """What went wrong, or what was changed, unless it was `said` above."""
         if watch is None:

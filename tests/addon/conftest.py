@@ -54,7 +54,7 @@ def contract(package: types.ModuleType) -> types.ModuleType:
 
 @pytest.fixture(autouse=True)
 def new_file(package: types.ModuleType, addon) -> None:
-    addon("process.supervisor").forget()
+    addon("process.job_timer").forget()
     bpy.ops.wm.read_homefile(use_factory_startup=True)
 
 

@@ -125,7 +125,7 @@ def test_no_solve_no_alignment(scene):
 
 def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, built, shot):
     cameras = addon("solve.cameras")
-    state = addon("shot.contents").read(shot)
+    state = addon("shot.inventory").read(shot)
     addon("bake.insertion").insert_freeze(built, shot, "freeze")
     assert addon("bake.freeze_group").shown(built) == (shot / "takes" / "freeze", pytest.approx(1.0))
     places = world(addon, built, shot)[[0, 1]]
@@ -134,7 +134,7 @@ def test_depth_in_the_compositor_and_the_view_follow_the_scale(addon, contract, 
     assert addon("bake.freeze_group").shown(built)[1] == pytest.approx(3.0, rel=1e-4) and not addon(
         "bake.shown_take"
     ).stale_scale(built, shot)
-    assert "compositor follows" in addon("process.supervisor").watch_of(shot).notes["solve"][0]
+    assert "compositor follows" in addon("process.job_timer").watch_of(shot).notes["solve"][0]
     root = cameras.find(built, shot, "EMPTY")
     root.scale = (5.0, 5.0, 5.0)  # by hand
     bpy.context.view_layer.update()

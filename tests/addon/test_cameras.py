@@ -153,7 +153,7 @@ def test_second_build_replaces_and_keeps_the_roots_place(addon, scene, shot):
     ]
     assert tuple(cameras.find(scene, shot, "EMPTY").location) == (1.0, 2.0, 3.0)
     bpy.context.view_layer.update()
-    assert addon("shot.made").depth_scale(scene, shot) == pytest.approx(2.0)
+    assert addon("shot.scene_objects").depth_scale(scene, shot) == pytest.approx(2.0)
 
 
 def test_remove_leaves_nothing(addon, scene, shot):

@@ -48,7 +48,7 @@ def files_of(shot: Path) -> list[Path]:
 def look(addon, scene):
     """look(shot) does all that Blender does with a shot that is chosen, and returns every text that it would draw."""
     supervisor, jobs, steps, listing = (
-        addon("process.supervisor"),
+        addon("process.job_timer"),
         addon("process.jobs"),
         addon("process.steps").STEPS,
         addon("ui.listing"),
@@ -87,7 +87,7 @@ def look(addon, scene):
 
 def test_a_whole_shot_is_not_damaged(look, full_shot, addon):
     assert not any("damaged" in text or "cannot be read" in text for text in look(full_shot))
-    state = addon("shot.contents").read(full_shot)
+    state = addon("shot.inventory").read(full_shot)
     assert state.listed("run") == ["main"] and state.listed("take") == ["freeze"] and len(state.runs["main"]["history"])
 
 
@@ -158,7 +158,7 @@ def test_files_that_are_none_hold_nothing_up(look, full_shot, what, tmp_path):
 
 
 def test_a_damaged_run_and_take_are_shown_as_such(look, full_shot, addon):
-    shots, listing = addon("shot.contents"), addon("ui.listing")
+    shots, listing = addon("shot.inventory"), addon("ui.listing")
     for file in (RUN, TAKE):
         told = json.loads((full_shot / file).read_text())
         (full_shot / file).write_text(json.dumps({**told, "run": ["main"]}))
@@ -174,7 +174,7 @@ def test_folders_that_cannot_be_shown_are_no_runs(full_shot, addon):
     for name in names if sys.platform == "linux" else names[1:2]:
         (full_shot / "runs" / name).mkdir()
         (full_shot / "runs" / name / "summary.json").write_text('{"gaussians": 3}')
-    assert addon("shot.contents").read(full_shot).listed("run") == ["main"]
+    assert addon("shot.inventory").read(full_shot).listed("run") == ["main"]
 
 
 def test_a_line_without_end_does_not_fill_the_memory(full_shot, addon, contract):

@@ -21,7 +21,7 @@ def python(addon) -> str:
 @pytest.fixture
 def empty_shot(addon, tmp_path: Path) -> Path:
     folder = tmp_path / "ünï shot.splannequin"
-    addon("shot.contents").create(folder)
+    addon("shot.inventory").create(folder)
     return folder
 
 
@@ -53,7 +53,7 @@ def test_a_job_is_followed_to_its_end(addon, start_import, clip):
     assert job.state == "done" and result is not None
     assert [e.seq for e in seen] == list(range(len(seen))), "every event once, in order"
     assert seen[-1].type == "done" and {e.type for e in seen} >= {"progress", "done"}
-    state = addon("shot.contents").read(job.shot)
+    state = addon("shot.inventory").read(job.shot)
     assert (state.frames, state.frame_range) == (8, (3, 10))
 
 

@@ -102,7 +102,7 @@ def test_switching_developing_is_asked_for_like_another_view(addon, contract):
 def test_a_view_that_came_to_rest_is_drawn_once_more_however_late_the_timer_is(addon, shot, scene, monkeypatch):
     viewport, drawn = addon("freeze.viewport"), []
     scene.splannequin.shot_path, scene.splannequin.run_name = str(shot), "main"
-    session = addon("freeze.live").Session(addon("shot.chosen").shot_folder(scene), "main")
+    session = addon("freeze.live").Session(addon("shot.selection").shot_folder(scene), "main")
     monkeypatch.setattr(viewport, "_session", session)
     monkeypatch.setattr(viewport, "_rested", set())
     monkeypatch.setattr(viewport, "_moved", {1: time.monotonic()})

@@ -115,7 +115,7 @@ def test_the_panels_choice_reaches_the_backend_and_a_bake_keeps_the_takes(addon,
     )
     scene.splannequin.take_name = "over"
     assert steps.STEPS["bake"].params(scene).overscan == -1.0
-    view = addon("process.steps").STEPS["freeze"].view(scene, addon("shot.contents").read(shot))
+    view = addon("process.steps").STEPS["freeze"].view(scene, addon("shot.inventory").read(shot))
     assert "Overscan: 2 pixels on each side, 1 above and below" in view.state
 
 
@@ -159,7 +159,7 @@ def mapped(tree, picture, path: Path):
 def test_blenders_map_uv_undistorts_and_gives_the_original_back(addon, scene, lens_shot, tmp_path, pictures):
     scene.splannequin.shot_path = str(lens_shot)
     assert bpy.ops.splannequin.write_stmaps() == {"FINISHED"}
-    notes = addon("process.supervisor").watch_of(lens_shot).notes["solve"]
+    notes = addon("process.job_timer").watch_of(lens_shot).notes["solve"]
     assert "stmap_undistort.exr and stmap_redistort.exr are in" in notes[0] and "overscan" in notes[1]
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     original = np.stack([0.5 + 0.4 * np.sin(x / 11.0), 0.5 + 0.4 * np.cos(y / 9.0), (x + y) / 300.0], axis=2)
@@ -198,12 +198,12 @@ def test_a_lens_that_folds_over_is_said_on_the_panel(addon, scene, lens_shot):
     scene.splannequin.shot_path = str(lens_shot)
     with pytest.raises(RuntimeError, match="folds over"):
         bpy.ops.splannequin.write_stmaps()
-    assert "folds over" in addon("process.supervisor").watch_of(lens_shot).failures["solve"][0]
+    assert "folds over" in addon("process.job_timer").watch_of(lens_shot).failures["solve"][0]
     assert not list((lens_shot / "solve").glob("*.exr"))
 
 
 def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_shot):
-    operators, supervisor = addon("solve.operators"), addon("process.supervisor")
+    operators, supervisor = addon("solve.operators"), addon("process.job_timer")
     watch = supervisor.watch_of(lens_shot)
     scene.splannequin.shot_path = str(lens_shot)
     asked = addon("solve.stmaps").begin(lens_shot)

@@ -19,7 +19,7 @@ def test_points_come_from_the_runs_metrics(addon, shot):
     lines = [{"seconds": 1.0, "heldout_psnr_db": 20.0}, {"seconds": 2.0, "heldout_psnr_db": None}, {"other": 1}]
     text = "\n".join(json.dumps(line) for line in [*lines, {"seconds": 3.0, "heldout_psnr_db": 22.5}])
     (shot / "runs" / "main" / "metrics.jsonl").write_text(text + '\n{"seconds": 4')
-    run = addon("shot.contents").read(shot).runs["main"]
+    run = addon("shot.inventory").read(shot).runs["main"]
     assert run["history"] == [(1.0, 20.0), (3.0, 22.5)]
     assert run["preview"] is None
 

@@ -42,7 +42,7 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     blend(project)
     there = moved(project)
     scene = opened(there)
-    assert addon("shot.chosen").shot_folder(scene) == there / "people.splannequin"
+    assert addon("shot.selection").shot_folder(scene) == there / "people.splannequin"
     assert addon("scene.paths").absolute(scene.splannequin.clip) == str(there / "people.mp4")
     assert addon("process.steps").STEPS["import"].params(scene).source == str(there / "people.mp4")
     assert addon("solve.cameras").find(scene, there / "people.splannequin", "CAMERA") == scene.camera
@@ -50,7 +50,7 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     assert (
         addon("process.steps")
         .STEPS["solve"]
-        .view(scene, addon("shot.contents").read(there / "people.splannequin"))
+        .view(scene, addon("shot.inventory").read(there / "people.splannequin"))
         .done
     )
 
@@ -59,7 +59,7 @@ def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
     blend(project)
     copy = Path(shutil.copytree(project, project.with_name("copy")))
     scene = opened(copy)
-    assert addon("shot.chosen").shot_folder(scene) == copy / "people.splannequin"
+    assert addon("shot.selection").shot_folder(scene) == copy / "people.splannequin"
     assert addon("solve.cameras").find(scene, copy / "people.splannequin", "CAMERA") == scene.camera
 
 
@@ -72,7 +72,7 @@ def test_an_older_file_that_holds_whole_paths_is_found_beside(addon, project):
         bpy.context.preferences.filepaths.use_relative_paths = True
     there = moved(project)
     scene = opened(there)
-    assert addon("shot.chosen").shot_folder(scene) == there / "people.splannequin"
+    assert addon("shot.selection").shot_folder(scene) == there / "people.splannequin"
 
 
 def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_path):
@@ -80,12 +80,14 @@ def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_pa
     (tmp_path / "other").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "copy.blend"), copy=True)
     scene = bpy.context.scene
-    assert addon("shot.chosen").shot_folder(scene) == project / "people.splannequin", "the open file stays where it is"
+    assert addon("shot.selection").shot_folder(scene) == project / "people.splannequin", (
+        "the open file stays where it is"
+    )
     assert scene.splannequin.clip == "//people.mp4"
     blend(tmp_path / "other")
-    assert addon("shot.chosen").shot_folder(bpy.context.scene) == project / "people.splannequin"
+    assert addon("shot.selection").shot_folder(bpy.context.scene) == project / "people.splannequin"
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "other" / "copy.blend"))
-    assert addon("shot.chosen").shot_folder(bpy.context.scene) == project / "people.splannequin"
+    assert addon("shot.selection").shot_folder(bpy.context.scene) == project / "people.splannequin"
 
 
 def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
@@ -94,8 +96,8 @@ def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     before, there = project / "people.splannequin", project / "renamed.splannequin"
     before.rename(there)
     scene = opened(project)
-    watch = addon("process.supervisor").watch_of(before)
-    assert addon("shot.chosen").missing(scene, watch.state)
+    watch = addon("process.job_timer").watch_of(before)
+    assert addon("shot.selection").missing(scene, watch.state)
     for step in ("solve", "train", "freeze", "bake"):
         with pytest.raises(contract.JobError, match="is not there any more") as told:
             addon("process.begin").begin(scene, step)
@@ -106,31 +108,33 @@ def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     with pytest.raises(RuntimeError, match="is no shot folder"):
         bpy.ops.splannequin.locate_shot(directory=str(project))
     assert bpy.ops.splannequin.locate_shot(directory=f"{there}/") == {"FINISHED"}
-    assert addon("shot.chosen").shot_folder(scene) == there and scene.splannequin.shot_path == "//renamed.splannequin"
+    assert (
+        addon("shot.selection").shot_folder(scene) == there and scene.splannequin.shot_path == "//renamed.splannequin"
+    )
     assert addon("solve.cameras").find(scene, there, "CAMERA") == scene.camera
     assert plate_file() == there / "frames" / "000005.png"
     assert addon("bake.shown_take").shown(scene, there) == "freeze", "the compositor's frames followed"
-    assert not addon("shot.chosen").missing(scene, addon("shot.contents").read(there))
+    assert not addon("shot.selection").missing(scene, addon("shot.inventory").read(there))
 
 
 def test_a_shot_that_is_yet_to_be_made_is_not_missed(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "new.mp4")
-    folder = addon("shot.chosen").shot_folder(scene)
-    assert not addon("shot.chosen").missing(scene, addon("shot.contents").read(folder))
+    folder = addon("shot.selection").shot_folder(scene)
+    assert not addon("shot.selection").missing(scene, addon("shot.inventory").read(folder))
 
 
 def test_the_timer_remembers_a_shot_that_was_chosen(addon, scene, shot):
     scene.splannequin.shot_path = str(shot)
-    addon("process.supervisor").watch_of(shot)
-    addon("process.supervisor").tick()
+    addon("process.job_timer").watch_of(shot)
+    addon("process.job_timer").tick()
     shot.rename(shot.with_name("gone"))
-    assert addon("shot.chosen").missing(scene, addon("shot.contents").read(shot))
+    assert addon("shot.selection").missing(scene, addon("shot.inventory").read(shot))
 
 
 def test_the_footage_of_a_moved_shot_is_found_beside_it(addon, scene, shot, clip, tmp_path):
     info = json.loads((shot / "shot.json").read_text())
     (shot / "shot.json").write_text(json.dumps(info | {"source": "/nowhere/footage/people.mp4"}))
-    places, shots = addon("shot.places"), addon("shot.contents")
+    places, shots = addon("shot.places"), addon("shot.inventory")
     assert places.source_of(shots.read(shot)) == ""
     (tmp_path / "footage").mkdir()
     shutil.copy(clip, tmp_path / "footage" / "people.mp4")
@@ -160,7 +164,7 @@ def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, sc
     wrong = tmp_path / "text.mp4"
     wrong.write_text("no video")
     scene.splannequin.clip = str(wrong)
-    supervisor = addon("process.supervisor")
+    supervisor = addon("process.job_timer")
     job = addon("process.begin").begin(scene, "import")
     supervisor.follow("import", job)
     job.process.wait()
@@ -198,9 +202,9 @@ def test_a_folder_that_cannot_be_is_one_sentence(addon, scene, clip, tmp_path, w
     with pytest.raises(RuntimeError, match="Cannot write to") as told:
         bpy.ops.splannequin.import_clip()
     assert str(told.value).strip().count("\n") == 0
-    watch = addon("process.supervisor").watch_of(folder)
+    watch = addon("process.job_timer").watch_of(folder)
     assert "Cannot write to" in watch.failures["import"][0]
-    addon("process.supervisor").tick()
+    addon("process.job_timer").tick()
     for step in addon("process.steps").STEPS.values():
         step.view(scene, watch.state)
     capfd.readouterr()

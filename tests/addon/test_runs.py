@@ -37,7 +37,7 @@ def with_runs(scene, shot):
 
 
 def plan(addon, scene):
-    state = addon("shot.contents").read(addon("shot.chosen").shot_folder(scene))
+    state = addon("shot.inventory").read(addon("shot.selection").shot_folder(scene))
     return addon("train.training").plan(state, scene.splannequin.run_name, scene.splannequin.preset)
 
 
@@ -56,7 +56,7 @@ def test_the_button_says_what_it_will_do(addon, with_runs, shot):
     grown = [{"from_iteration": 900, "steps": 300}]
     checkpoint(shot / "runs" / "main" / "extension.safetensors", iteration=1000, extensions=grown)
     assert (plan(addon, with_runs).kind, plan(addon, with_runs).button) == ("extension", "Resume")
-    assert addon("shot.contents").read(shot).runs["main"]["extension"] == {"done": 100, "steps": 300}
+    assert addon("shot.inventory").read(shot).runs["main"]["extension"] == {"done": 100, "steps": 300}
     grown[0]["from_iteration"] = 600
     checkpoint(shot / "runs" / "main" / "extension.safetensors", iteration=700, extensions=grown)
     assert plan(addon, with_runs).kind == "extend", "it was begun on a run that is no longer there"
@@ -64,7 +64,7 @@ def test_the_button_says_what_it_will_do(addon, with_runs, shot):
 
 def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, shot):
     """The backend trains other settings in the run's folder `next`: the run is still listed as it is."""
-    props, shots = with_runs.splannequin, addon("shot.contents")
+    props, shots = with_runs.splannequin, addon("shot.inventory")
     config, before = {**CONFIG, "preset": "final", "seed": 9}, shots.stamp(shot)
     work = shot / "runs" / "main" / "next" / "0123456789abcdef"
     checkpoint(work / "checkpoint.safetensors", key="other", iteration=450, config=config)
@@ -133,12 +133,12 @@ def test_broken_checkpoints_are_passed_over(addon, shot, tmp_path):
         assert read(tmp_path / "bad") == {}
     (shot / "runs" / "odd").mkdir()
     (shot / "runs" / "odd" / "checkpoint.safetensors").write_bytes(b"odd")
-    assert addon("shot.contents").read(shot).unfinished == {}
+    assert addon("shot.inventory").read(shot).unfinished == {}
 
 
 def test_runs_and_takes_stand_side_by_side(addon, with_runs, shot, new_take):
     new_take(shot, "second")
-    state, listing = addon("shot.contents").read(shot), addon("ui.listing")
+    state, listing = addon("shot.inventory").read(shot), addon("ui.listing")
     assert listing.run_rows(state) == [
         ("better", "paused at 33 %"),
         ("main", "24.00", "12.3k", "5%", "2m"),
@@ -166,7 +166,7 @@ def test_a_click_picks_a_run_with_its_preset_and_a_take(addon, with_runs, shot, 
 
 def test_removing_a_run_removes_its_folder_and_nothing_else(addon, with_runs, shot):
     kept = sorted(p for p in shot.rglob("*") if "better" not in p.parts)
-    watch = addon("process.supervisor").watch_of(shot)
+    watch = addon("process.job_timer").watch_of(shot)
     assert set(watch.state.unfinished) == {"better"}
     assert bpy.ops.splannequin.remove_run(name="better") == {"FINISHED"}
     assert sorted(shot.rglob("*")) == kept, "nor is there a trash left"
@@ -191,7 +191,7 @@ def test_a_take_that_the_compositor_shows_is_not_removed(addon, with_runs, shot,
 
 def test_nothing_is_picked_or_removed_while_a_step_runs(addon, contract, with_runs, shot):
     addon("process.jobs").new_job(shot, "train", contract.TrainParams())
-    assert addon("process.supervisor").watch_of(shot).running() == "train"
+    assert addon("process.job_timer").watch_of(shot).running() == "train"
     for name in ("pick_run", "pick_take", "remove_run", "remove_take"):
         assert not getattr(bpy.ops.splannequin, name).poll(), name
 
@@ -215,7 +215,7 @@ _WORLD = "import sys; from pathlib import Path; from tests.backend.conftest impo
 
 
 def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root, tmp_path, capfd):
-    jobs, shots, python = addon("process.jobs"), addon("shot.contents"), addon("process.backend").python()
+    jobs, shots, python = addon("process.jobs"), addon("shot.inventory"), addon("process.backend").python()
     subprocess.run([python, "-c", _WORLD.format(str(tmp_path))], cwd=root, check=True)
     shot = tmp_path / "tiny.splannequin"
     (shot / "solve" / "solve.json").write_text('{"version": 1, "quality": "true"}')
@@ -234,7 +234,7 @@ def test_train_pause_resume_and_train_on_with_a_real_backend(addon, scene, root,
     assert plan(addon, scene).button == "Resume"
     state = shots.read(shot)
     assert state.runs["main"]["iterations"] == 150 and 20 <= state.runs["main"]["extension"]["done"] < 200
-    addon("process.supervisor").forget()
+    addon("process.job_timer").forget()
     assert bpy.ops.splannequin.train() == {"FINISHED"}
     run = shots.read(shot).runs["main"]
     assert (run["iterations"], run["extension"]) == (350, None)

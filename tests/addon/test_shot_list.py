@@ -29,7 +29,7 @@ def two(addon, scene, shot, other):
 
 
 def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
-    props, shot_list = scene.splannequin, addon("shot.chosen")
+    props, shot_list = scene.splannequin, addon("shot.selection")
     assert not bpy.ops.splannequin.shot_add.poll(), "there is no first shot yet"
     props.shot_path, props.clip = str(shot), "//first.mov"
     own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
@@ -49,10 +49,10 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     assert (props.clip, props.shot_path, props.run_name, props.path_camera) == ("", "", "main", None)
     assert props.set_up_scene, "what is the scene's own stays"
     props.shot_path, props.t_star = str(other), 7
-    assert shot_list.folders(scene) == [shot, other] and addon("shot.chosen").shot_folder(scene) == other
+    assert shot_list.folders(scene) == [shot, other] and addon("shot.selection").shot_folder(scene) == other
     assert [shot_list.label(one) for one in shot_list.settings(scene)] == ["my shot é", "second"]
     props.active_shot = 0
-    assert addon("shot.chosen").shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
+    assert addon("shot.selection").shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
     assert shot_list.folders(scene) == [shot, other]
     props.active_shot = 1
     assert (props.shot_path, props.t_star, props.run_name) == (str(other), 7, "main")
@@ -190,7 +190,7 @@ def test_removing_one_shot_leaves_the_other(addon, scene, shot, other):
     addon("solve.arrival").load_camera(scene, other)
     assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
     assert things(scene) == before
-    assert not len(props.shots) and addon("shot.chosen").shot_folder(scene) == shot
+    assert not len(props.shots) and addon("shot.selection").shot_folder(scene) == shot
     assert scene.camera == addon("solve.cameras").find(scene, shot, "CAMERA")
     bpy.context.view_layer.update()
     np.testing.assert_array_equal(scene.camera.matrix_world, pose)
@@ -211,7 +211,7 @@ def test_removing_the_baked_shot_takes_its_group_out(addon, two, shot, other):
 
 
 def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other, new_take):
-    shots = addon("shot.contents")
+    shots = addon("shot.inventory")
     addon("bake.insertion").insert_freeze(two, other, "freeze")
     assert addon("process.steps").STEPS["bake"].view(two, shots.read(other)).done
     two.splannequin.active_shot = 0
@@ -227,13 +227,13 @@ def test_the_panel_says_which_shot_the_compositor_shows(addon, two, shot, other,
 def test_undo_brings_a_shot_back(addon, two, shot, other):
     bpy.ops.ed.undo_push(message="two shots")
     assert bpy.ops.splannequin.shot_remove("EXEC_DEFAULT", True) == {"FINISHED"}
-    assert addon("shot.chosen").folders(bpy.context.scene) == [shot]
+    assert addon("shot.selection").folders(bpy.context.scene) == [shot]
     bpy.ops.ed.undo()
     scene = bpy.context.scene
-    assert addon("shot.chosen").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
+    assert addon("shot.selection").folders(scene) == [shot, other] and scene.splannequin.active_shot == 1
     assert scene.camera == addon("solve.cameras").find(scene, other, "CAMERA")
     scene.splannequin.active_shot = 0
-    assert addon("shot.chosen").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
+    assert addon("shot.selection").shot_folder(scene) == shot and scene.splannequin.run_name == "first run"
 
 
 def ended(addon, contract, folder, step, kind, params, result):
@@ -241,7 +241,7 @@ def ended(addon, contract, folder, step, kind, params, result):
     jobs = addon("process.jobs")
     job = jobs.new_job(folder, kind, params)
     (job.folder / "step").write_text(step)
-    addon("process.supervisor").follow(step, job)
+    addon("process.job_timer").follow(step, job)
     event = contract.Event("done", 1, 1.0, {"result": result})
     (job.folder / contract.EVENTS_FILE).write_text(json.dumps(event.__dict__) + "\n")
     status = contract.Status(job.folder.name, "done", 1, 1.0, 2.0, 2.0, fraction=1.0)
@@ -250,7 +250,7 @@ def ended(addon, contract, folder, step, kind, params, result):
 
 
 def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene, shot, other):
-    props, supervisor, cameras = scene.splannequin, addon("process.supervisor"), addon("solve.cameras")
+    props, supervisor, cameras = scene.splannequin, addon("process.job_timer"), addon("solve.cameras")
     props.shot_path, props.t_star = str(shot), 2
     bpy.ops.splannequin.shot_add()
     props.shot_path, props.t_star = str(other), 3
@@ -279,7 +279,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
 
 
 def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, other):
-    supervisor = addon("process.supervisor")
+    supervisor = addon("process.job_timer")
     read = addon("freeze.takes").reading(two.name, other, "freeze", iter_path(contract), 1)
     supervisor.work(other, "freeze", read)
     two.splannequin.active_shot = 0

@@ -20,7 +20,7 @@ def test_the_import_button_brings_the_clip_in(addon, scene, clip, tmp_path):
     props.clip, props.shot_path = str(clip), str(tmp_path / "s.splannequin")
     props.use_range, props.first, props.last = True, 2, 9
     assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
-    state = addon("shot.contents").read(tmp_path / "s.splannequin")
+    state = addon("shot.inventory").read(tmp_path / "s.splannequin")
     assert state.frames == 8 and state.frame_range == (2, 9)
     assert (scene.frame_start, scene.frame_end) == (2, 9), "a new scene takes the clip's range"
     assert (scene.render.resolution_x, scene.render.resolution_y) == state.size
@@ -43,7 +43,7 @@ def test_a_button_says_what_is_wrong(addon, scene, tmp_path):
     scene.splannequin.clip = str(wrong)
     with pytest.raises(RuntimeError, match=r"text\.mp4"):
         bpy.ops.splannequin.import_clip()
-    watch = addon("process.supervisor").watch_of(tmp_path / "text.splannequin")
+    watch = addon("process.job_timer").watch_of(tmp_path / "text.splannequin")
     assert watch.jobs["import"].state == "failed"
 
 
@@ -68,13 +68,13 @@ def test_a_folder_of_no_shot_is_refused(scene, tmp_path):
 
 def test_the_shot_folder_stands_beside_the_clip(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a clip.mov")
-    assert addon("shot.chosen").shot_folder(scene) == tmp_path / "a clip.splannequin"
+    assert addon("shot.selection").shot_folder(scene) == tmp_path / "a clip.splannequin"
 
 
 def test_relative_paths_follow_the_blend(addon, scene, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.context.scene.splannequin.shot_path = "//x.splannequin"
-    assert addon("shot.chosen").shot_folder(bpy.context.scene) == tmp_path / "x.splannequin"
+    assert addon("shot.selection").shot_folder(bpy.context.scene) == tmp_path / "x.splannequin"
 
 
 def test_load_camera_is_one_undo_step(with_shot, shot, addon):
@@ -94,7 +94,7 @@ def test_insert_and_remove_buttons_leave_the_file_as_it_was(addon, with_shot, sh
     bpy.ops.splannequin.load_camera()
     bpy.ops.splannequin.insert_freeze()
     assert scene.view_settings.view_transform == "Standard" and scene.render.dither_intensity == 0.0
-    notes = addon("process.supervisor").watch_of(shot).notes
+    notes = addon("process.job_timer").watch_of(shot).notes
     assert notes["solve"] and notes["bake"]
     assert bpy.ops.splannequin.remove_shot() == {"FINISHED"}
     assert set(notes) == {"bake"}, "nothing says any more that the shot's camera is the scene's"
@@ -153,7 +153,7 @@ def test_the_timer_applies_a_job_that_ended_and_gives_each_step_its_words(addon,
     props.clip, props.shot_path = str(clip), str(tmp_path / "t.splannequin")
     props.use_range, props.first, props.last = True, 1, 8
     job = addon("process.begin").begin(scene, "import")
-    supervisor = addon("process.supervisor")
+    supervisor = addon("process.job_timer")
     supervisor.follow("import", job)
     watch = supervisor.watch_of(job.shot)
     assert watch.running() == "import"
@@ -183,7 +183,7 @@ def test_each_step_says_what_comes_next(addon, scene, step):
 
 
 def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
-    steps, state = addon("process.steps").STEPS, addon("shot.contents").read(shot)
+    steps, state = addon("process.steps").STEPS, addon("shot.inventory").read(shot)
     shown = {name: step.view(with_shot, state) for name, step in steps.items()}
     assert shown["import"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
     assert shown["solve"].state == ["A good solve."] and "load it" in shown["solve"].advice
@@ -209,8 +209,8 @@ def test_every_button_and_setting_has_a_tooltip(addon):
 def test_a_newer_shot_is_refused_in_words(addon, contract, tmp_path: Path):
     (tmp_path / "shot.json").write_text('{"version": 99, "name": "x"}')
     with pytest.raises(ValueError, match="version 99"):
-        addon("shot.contents").read(tmp_path)
-    watch = addon("process.supervisor").watch_of(tmp_path)
+        addon("shot.inventory").read(tmp_path)
+    watch = addon("process.job_timer").watch_of(tmp_path)
     assert "version 99" in watch.failures["import"][0], "the panel shows it instead of breaking"
 
 
@@ -221,7 +221,7 @@ def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_pat
         props.clip = str(shutil.copy(clip, tmp_path / name))
         addon("process.begin").run(scene, "import")
     assert {p.name for p in tmp_path.glob("*.splannequin")} == {"first.splannequin", "second.splannequin"}
-    assert addon("shot.chosen").shot_folder(scene) == tmp_path / "second.splannequin"
+    assert addon("shot.selection").shot_folder(scene) == tmp_path / "second.splannequin"
 
 
 def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, shot, tmp_path):
@@ -231,7 +231,7 @@ def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, sh
     with_shot.render.filepath = str(tmp_path / "file" / "######")
     with pytest.raises(RuntimeError, match="Blender did not render the scene"):
         bpy.ops.splannequin.render()
-    assert addon("process.supervisor").watch_of(shot).running() is None
+    assert addon("process.job_timer").watch_of(shot).running() is None
 
 
 def test_bake_asks_for_a_ramp_or_a_path_as_it_was_made(addon, shot):
@@ -261,12 +261,12 @@ def test_a_job_found_again_belongs_to_the_step_that_asked_for_it(addon, contract
     job = jobs.new_job(shot, "freeze", contract.FreezeParams())
     assert steps.step_of(job) == "freeze", "a job of the backend's own command line names no step"
     (job.folder / "step").write_text("bake")
-    watch = addon("process.supervisor").watch_of(shot)
+    watch = addon("process.job_timer").watch_of(shot)
     assert watch.running() == "bake" and watch.jobs["bake"].folder == job.folder
 
 
 def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path, capfd):
-    supervisor = addon("process.supervisor")
+    supervisor = addon("process.job_timer")
     broken, sound = supervisor.watch_of(tmp_path), supervisor.watch_of(shot)
     broken.jobs["train"] = types.SimpleNamespace(ended=False)
     sound.redraw = True

@@ -44,7 +44,7 @@ def test_scrubbing_can_be_stopped_while_a_job_runs_and_when_the_shot_is_gone(add
     nothing = addon("process.steps").View(False, False, [], "")
     assert addon("freeze.panel").can_scrub(nothing, "train")
     shot.rename(shot.with_name("gone"))
-    addon("process.supervisor").forget()
+    addon("process.job_timer").forget()
     assert bpy.ops.splannequin.live.poll()
     assert bpy.ops.splannequin.live() == {"FINISHED"} and viewport.session() is None
     assert not addon("freeze.panel").can_scrub(nothing, "train") and not addon("freeze.panel").can_scrub(nothing, None)
@@ -97,7 +97,7 @@ def test_the_rate_of_a_sequence_is_the_one_that_was_set(addon, scene, tmp_path, 
         pictures.write(tmp_path / f"f.{n:04d}.png", np.ascontiguousarray(wide[:, 8 * n : 8 * n + 160]))
     scene.splannequin.clip, scene.splannequin.fps = str(tmp_path / "f.0001.png"), 30.0
     assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
-    assert addon("shot.contents").read(addon("shot.chosen").shot_folder(scene)).info["fps"] == 30.0
+    assert addon("shot.inventory").read(addon("shot.selection").shot_folder(scene)).info["fps"] == 30.0
 
 
 def test_after_the_import_the_clip_is_seen_and_nothing_else_is_touched(addon, with_shot, with_raw):
@@ -145,7 +145,7 @@ def test_a_listing_that_is_broken_shows_no_plate(addon, with_shot, with_raw):
 
 
 def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
-    supervisor = addon("process.supervisor")
+    supervisor = addon("process.job_timer")
     monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))
     assert "does not exist" in supervisor.backend_trouble().message
@@ -159,7 +159,7 @@ def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
 
 
 def test_the_sidebar_is_laid_out_once_after_each_change(addon):
-    supervisor = addon("process.supervisor")
+    supervisor = addon("process.job_timer")
     supervisor.redraw()
     supervisor.redraw()
     first = supervisor.lay_out()

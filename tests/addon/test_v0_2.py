@@ -50,7 +50,7 @@ def test_names_defaults_and_choices_of_saved_properties_are_what_they_were(scene
 def test_an_old_shot_is_shown_whole(addon, tmp_path):
     root = tmp_path / "old.splannequin"
     shutil.copytree(OLD / "shot", root)
-    state = addon("shot.contents").read(root)
+    state = addon("shot.inventory").read(root)
     assert (state.frames, state.frame_range, state.size) == (74, (1, 74), (640, 480))
     assert state.runs["tiny"]["gaussians"] == 100 and state.takes["freeze"]["frame_count"] == 2
     assert not state.damaged["run"] and not state.damaged["take"] and not state.unfinished
@@ -76,20 +76,20 @@ def test_an_old_shot_is_shown_whole(addon, tmp_path):
 def test_a_job_of_an_old_shot_belongs_to_its_step(addon, contract, tmp_path, kind, told, step):
     """What 0.2.0 wrote into job folders: its names of the steps."""
     shot = tmp_path / "a.splannequin"
-    addon("shot.contents").create(shot)
+    addon("shot.inventory").create(shot)
     params = contract.ImportParams("a.mp4") if kind == "import" else contract.PARAMS[kind]()
     job = addon("process.jobs").new_job(shot, kind, params)
     (job.folder / contract.STEP_FILE).write_text(told)
     assert addon("process.steps").step_of(job) == step
-    assert set(addon("process.supervisor").watch_of(shot).jobs) == {step}
+    assert set(addon("process.job_timer").watch_of(shot).jobs) == {step}
 
 
 def test_buttons_take_the_old_names_of_steps(addon, contract, scene, tmp_path):
     shot = tmp_path / "a.splannequin"
-    addon("shot.contents").create(shot)
+    addon("shot.inventory").create(shot)
     job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
     scene.splannequin.shot_path = str(shot)
-    assert addon("process.supervisor").watch_of(shot).running() == "solve"
+    assert addon("process.job_timer").watch_of(shot).running() == "solve"
     assert bpy.ops.splannequin.cancel(step="camera") == {"FINISHED"}
     assert (job.folder / contract.CANCEL_FILE).exists()
 

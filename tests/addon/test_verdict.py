@@ -20,7 +20,7 @@ def add(path, **more):
 
 
 def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_under_bake(addon, with_shot, shot):
-    shots = addon("shot.contents")
+    shots = addon("shot.inventory")
     add(shot / "runs" / "main" / "summary.json", verdict=RUN)
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE, detail={"plate_share": 0.98})
     state = shots.read(shot)
@@ -44,7 +44,7 @@ def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_un
 
 def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):
     add(shot / "runs" / "main" / "summary.json", quality="Poor")
-    lines = addon("process.steps").STEPS["train"].view(with_shot, addon("shot.contents").read(shot)).state
+    lines = addon("process.steps").STEPS["train"].view(with_shot, addon("shot.inventory").read(shot)).state
     assert lines[2:] == ["It is poor: take a range in which nobody walks, or solve the camera again."]
 
 
@@ -52,7 +52,7 @@ def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):
 def test_a_damaged_verdict_is_left_out(addon, with_shot, shot, damaged):
     for path in (shot / "runs" / "main" / "summary.json", shot / "takes" / "freeze" / "take.json"):
         add(path, verdict=damaged)
-    state = addon("shot.contents").read(shot)
+    state = addon("shot.inventory").read(shot)
     assert len(addon("process.steps").STEPS["train"].view(with_shot, state).state) == 2
     assert len(addon("process.steps").STEPS["freeze"].view(with_shot, state).state) == 2
 

@@ -9,8 +9,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 FREE = (
     "bake.node_names", "bake.take_files", "freeze.live", "process.children", "process.environment", "process.jobs",
-    "process.steps", "scene.axes", "scene.mark", "scene.numbered", "scene.scene_setup", "shot.checkpoints",
-    "shot.contents", "shot.kept", "shot.markers", "shot.shot_state", "solve.alignment", "train.estimates",
+    "process.steps", "scene.axes", "scene.ownership", "scene.numbered", "scene.scene_setup", "shot.checkpoints",
+    "shot.inventory", "shot.file_cache", "shot.markers", "shot.shot_state", "solve.alignment", "train.estimates",
     "train.training", "ui.icons",
 )  # fmt: skip
 IMPORTS = """
@@ -42,7 +42,7 @@ def test_modules_that_need_no_blender_are_imported_without_one():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("name", ["compat", "shot.chosen"])
+@pytest.mark.parametrize("name", ["compat", "shot.selection"])
 def test_a_module_that_needs_blender_is_seen(name: str):
     done = imported(name)
     assert done.returncode != 0 and "is Blender's" in done.stderr

@@ -385,7 +385,7 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
 
 
 def _supervisor():
-    return addon_module("process.supervisor")
+    return addon_module("process.job_timer")
 
 
 def addon_module(name: str):

@@ -153,7 +153,7 @@ def _time(viewport: Any, told: dict[str, Any]) -> dict[str, list[float]]:
         return call
 
     viewport._draw, viewport._tick = timed("draw", viewport._draw), timed("live tick", viewport._tick)
-    supervisor = press.addon_module("process.supervisor")
+    supervisor = press.addon_module("process.job_timer")
     bpy.app.timers.unregister(supervisor.tick)
     supervisor.tick = timed("tick", supervisor.tick)
     bpy.app.timers.register(supervisor.tick, persistent=True)

@@ -112,9 +112,9 @@ def _watch_calls(calls: list[tuple[str, float]]) -> None:
         "compat",
         "bake.compositor",
         "solve.guesses",
-        "shot.made",
+        "shot.scene_objects",
         "scene.scene_setup",
-        "process.supervisor",
+        "process.job_timer",
     ):
         module = press.addon_module(part)
         for name, function in list(vars(module).items()):

@@ -214,7 +214,7 @@ def _moved(work: Path, told: dict[str, Any]) -> Iterator[float]:
     there = (work / "project").rename(work / "moved")
     yield from _opened(there / "work.blend")
     scene = bpy.context.scene
-    folder = press.addon_module("shot.chosen").shot_folder(scene)
+    folder = press.addon_module("shot.selection").shot_folder(scene)
     camera = press.addon_module("solve.cameras").find(scene, folder, "CAMERA")
     told["moved"] = folder == there / "tiny.splannequin" and camera is not None and scene.camera == camera
     yield from press._shoot(work, "11-moved")
@@ -228,7 +228,9 @@ def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     before.rename(there)
     watch = press._supervisor().watch_of(before)
     yield from _until(
-        lambda: press.addon_module("shot.chosen").missing(bpy.context.scene, watch.state), 10, "the shot to be missed"
+        lambda: press.addon_module("shot.selection").missing(bpy.context.scene, watch.state),
+        10,
+        "the shot to be missed",
     )
     yield 1.0
     told["missed"] = not before.exists()
@@ -245,7 +247,7 @@ def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield 2.0
     scene = bpy.context.scene
     camera = press.addon_module("solve.cameras").find(scene, there, "CAMERA")
-    told["located"] = press.addon_module("shot.chosen").shot_folder(scene) == there and camera == scene.camera
+    told["located"] = press.addon_module("shot.selection").shot_folder(scene) == there and camera == scene.camera
     yield from press._shoot(work, "11-located")
 
 

@@ -87,7 +87,7 @@ def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
     yield 1.0
     yield from press._scroll_down()
     yield from press._shoot(work, "10-runs")
-    watch = module("process.supervisor").watch_of(work / "tiny.splannequin")
+    watch = module("process.job_timer").watch_of(work / "tiny.splannequin")
     yield from press._click("splannequin.train")
     shown: dict[str, int] = {}
     while len(shown) < 4 and watch.running() == "train":

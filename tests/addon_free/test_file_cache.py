@@ -47,7 +47,7 @@ def long_shot(shot) -> Path:
 
 
 def test_what_did_not_change_is_not_opened_again(addon, long_shot, opened):
-    read = addon("shot.contents").read
+    read = addon("shot.inventory").read
     first, names = opened(read, long_shot)
     assert {"shot.json", "frames.json", "cameras.json", "solve.json", "summary.json", "take.json"} <= set(names)
     again, names = opened(read, long_shot)
@@ -56,7 +56,7 @@ def test_what_did_not_change_is_not_opened_again(addon, long_shot, opened):
 
 
 def test_what_changed_is_read_again_and_only_that(addon, long_shot, opened):
-    read = addon("shot.contents").read
+    read = addon("shot.inventory").read
     read(long_shot)
     (long_shot / "takes" / "freeze" / "000008.exr").touch()
     grown, names = opened(read, long_shot)
@@ -71,14 +71,14 @@ def test_what_changed_is_read_again_and_only_that(addon, long_shot, opened):
 
 
 def test_what_a_reader_adds_is_not_remembered(addon, long_shot):
-    shots = addon("shot.contents")
+    shots = addon("shot.inventory")
     shots.read(long_shot).takes["freeze"]["mine"] = True
     shots.read(long_shot).info["mine"] = True
     assert "mine" not in shots.read(long_shot).takes["freeze"] and "mine" not in shots.read(long_shot).info
 
 
 def test_only_so_much_is_remembered(addon, tmp_path, monkeypatch):
-    kept = addon("shot.kept")
+    kept = addon("shot.file_cache")
     monkeypatch.setattr(kept, "_MOST", 3)
     for n in range(6):
         (tmp_path / str(n)).write_text(str(n))

@@ -18,7 +18,7 @@ from ...torch_backend import contract
 from .. import compat
 from ..access import OneShot, settings_of
 from ..scene import paths, scene_setup
-from . import made
+from . import scene_objects
 from .shot_state import ShotState
 
 _T_STAR = "splannequin.t_star"
@@ -62,7 +62,7 @@ def folders(scene: bpy.types.Scene) -> list[Path | None]:
 def label(one: OneShot) -> str:
     """What a shot is called: as its folder, which is called as its clip."""
     folder = folder_of(one)
-    return made.name_of(folder) if folder is not None else "New shot"
+    return scene_objects.name_of(folder) if folder is not None else "New shot"
 
 
 def add(scene: bpy.types.Scene) -> None:
@@ -90,7 +90,7 @@ def choose(scene: bpy.types.Scene, index: int) -> None:
         scene_setup.put_back(scene, held.shots[index].scene_settings)
         _rename(scene, {_T_STAR: _path(before), _path(index): _T_STAR})
         folder = folder_of(held)
-        camera = made.part(scene, folder, "camera") if folder is not None else None
+        camera = scene_objects.part(scene, folder, "camera") if folder is not None else None
         if camera is not None:
             scene.camera = camera
     if held.active_shot != index:
@@ -149,7 +149,7 @@ def missing(scene: bpy.types.Scene, state: ShotState | None) -> bool:
     folder = folder_of(settings_of(scene))
     if folder is None or (state is not None and state.info):
         return False
-    return paths.absolute(settings_of(scene).shot_seen) == str(folder) or made.of(scene, folder) is not None
+    return paths.absolute(settings_of(scene).shot_seen) == str(folder) or scene_objects.of(scene, folder) is not None
 
 
 def see(scene: bpy.types.Scene, state: ShotState | None) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 @pytest.fixture
 def supervisor(addon):
-    return addon("process.supervisor")
+    return addon("process.job_timer")
 
 
 @pytest.fixture

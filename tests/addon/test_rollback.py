@@ -7,7 +7,7 @@ import pytest
 def test_a_change_that_fails_takes_back_what_it_made_and_set(addon, scene):
     scene.render.resolution_x, scene.frame_end = 640, 40
     camera, objects = scene.camera, set(bpy.data.objects)
-    with pytest.raises(OSError, match="gone"), addon("scene.intact").scene_of(scene):
+    with pytest.raises(OSError, match="gone"), addon("scene.rollback").scene_of(scene):
         scene.render.resolution_x, scene.frame_end = 1280, 80
         scene["splannequin_note"] = 1
         made = bpy.data.objects.new("made", bpy.data.cameras.new("made"))
@@ -20,7 +20,7 @@ def test_a_change_that_fails_takes_back_what_it_made_and_set(addon, scene):
 
 
 def test_a_change_that_succeeds_stays(addon, scene):
-    with addon("scene.intact").scene_of(scene):
+    with addon("scene.rollback").scene_of(scene):
         scene.frame_end = 77
         bpy.data.objects.new("made", None)
     assert scene.frame_end == 77 and "made" in bpy.data.objects

@@ -16,7 +16,7 @@ from typing import Any, cast
 from ...torch_backend import contract
 from ...torch_backend.contract import ShotFolder
 from ..scene import numbered
-from . import checkpoints, kept
+from . import checkpoints, file_cache
 from .shot_state import ShotState
 
 
@@ -38,7 +38,7 @@ def read(folder: Path) -> ShotState:
         return state
     state.info = _typed(_Info, there.info_path)
     if there.listing.is_file():
-        state.frames, state.beside = kept.of(there.listing, _listed)
+        state.frames, state.beside = file_cache.of(there.listing, _listed)
     if there.cameras.is_file():
         state.solve = _typed(_Solve, there.solve_record)
     state.runs = _named(_Run, there.runs, contract.SUMMARY_FILE, state.damaged["run"])
@@ -56,11 +56,11 @@ def read(folder: Path) -> ShotState:
             run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
             run["anew"]["history"] = _history(contract.RunFolder(run["anew"]["folder"]).metrics)
         run["other_cameras"] = checkpoints.other_cameras(folder, place.root)
-        run["history"] = kept.of(place.metrics, _history) if place.metrics.is_file() else []
+        run["history"] = file_cache.of(place.metrics, _history) if place.metrics.is_file() else []
         run["preview"] = max(place.previews.glob("*.png"), default=None)
     state.takes = _named(_Take, there.takes, contract.TAKE_FILE, state.damaged["take"])
     for name, take in state.takes.items():
-        take["frame_count"] = kept.of(there.takes / name, _frame_count)
+        take["frame_count"] = file_cache.of(there.takes / name, _frame_count)
     return state
 
 
@@ -194,7 +194,7 @@ def _typed(kind: type, path: Path) -> dict[str, Any]:
 
     OSError if there is none.
     """
-    return dict(kept.of(path, _read_typed, kind))
+    return dict(file_cache.of(path, _read_typed, kind))
 
 
 def _read_typed(path: Path, kind: type, longest: int = contract.SHORT_JSON) -> dict[str, Any]:

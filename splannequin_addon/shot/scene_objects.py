@@ -15,7 +15,7 @@ from ...torch_backend import contract
 from ..access import named, settings_of
 from ..properties import BoolProperty, PointerProperty, StringProperty
 from ..scene import paths
-from ..scene.mark import TAG
+from ..scene.ownership import TAG
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""

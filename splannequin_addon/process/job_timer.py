@@ -20,7 +20,7 @@ from bpy.app.handlers import persistent
 from ...torch_backend import contract
 from ..access import settings_of
 from ..scene import sequences
-from ..shot import chosen, contents, made, markers
+from ..shot import inventory, markers, scene_objects, selection
 from ..shot.shot_state import ShotState
 from ..translations import tr
 from . import backend, children, jobs, steps
@@ -184,11 +184,11 @@ def refresh(watch: Watch) -> bool:
     """Reads the shot folder again if something in it changed. True if it did."""
     watch.looked = time.monotonic()
     try:
-        stamp = contents.stamp(watch.shot)
+        stamp = inventory.stamp(watch.shot)
         if stamp == watch.stamp and watch.state is not None:
             return False
         watch.stamp = stamp
-        watch.state = contents.read(watch.shot)
+        watch.state = inventory.read(watch.shot)
     except (OSError, ValueError, KeyError) as error:
         watch.state = ShotState(watch.shot)
         why = getattr(error, "strerror", None) or error
@@ -227,10 +227,10 @@ def tick() -> float:
 def _turn(watch: Watch, until: float) -> bool:
     """One shot's part of a tick, `until` a time of `time.monotonic`; True if its panel should be drawn again."""
     changed, watch.redraw = watch.redraw, False
-    for scene in chosen.scenes_of(watch.shot):
+    for scene in selection.scenes_of(watch.shot):
         changed |= markers.follow(scene)
-        made.tidy(scene)
-        chosen.see(scene, watch.state)
+        scene_objects.tidy(scene)
+        selection.see(scene, watch.state)
     if watch.work is not None and watch.work.turns is not None:
         _work_on(watch, watch.work)
         return True
@@ -247,13 +247,13 @@ def _turn(watch: Watch, until: float) -> bool:
             continue
         if job.ended:
             _ended(watch, step, job)
-    if watch.pending and chosen.scenes_of(watch.shot):
+    if watch.pending and selection.scenes_of(watch.shot):
         for step, job in watch.pending.items():
             _apply_late(watch, step, job)
         watch.pending.clear()
         changed = True
     if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
-        if watch.running() is None and not chosen.scenes_with(watch.shot):
+        if watch.running() is None and not selection.scenes_with(watch.shot):
             del _watches[watch.shot]  # a path that was typed and left again
             return changed
         changed |= refresh(watch)
@@ -264,7 +264,7 @@ def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
     """A job has ended just now: its scenes are changed, at once, in turns, or when its shot is chosen."""
     steps.STEPS[step].ended(job)
     refresh(watch)
-    scenes = chosen.scenes_of(watch.shot)
+    scenes = selection.scenes_of(watch.shot)
     if job.state != "done":
         return
     if not scenes:
@@ -311,7 +311,9 @@ def look_through_camera(window: bpy.types.Window, camera: bpy.types.Object | Non
             space: Any = area.spaces.active
             if camera is not None:
                 space.use_local_camera, space.camera = True, camera
-            elif space.use_local_camera and (space.camera is None or made.is_plate(space.camera)):  # or it is gone
+            elif space.use_local_camera and (
+                space.camera is None or scene_objects.is_plate(space.camera)
+            ):  # or it is gone
                 space.use_local_camera = False
             space.region_3d.view_perspective = "CAMERA"
             return
@@ -336,7 +338,7 @@ def window_of(scene: bpy.types.Scene) -> bpy.types.Window | None:
 def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]], only: str = "") -> None:
     """Changes the scenes that work on a shot, or the one of them that is named `only`: as one undo step each in a
     window. Notes what was changed or why not."""
-    for scene in [s for s in chosen.scenes_of(watch.shot) if only in ("", s.name)]:
+    for scene in [s for s in selection.scenes_of(watch.shot) if only in ("", s.name)]:
         window = window_of(scene)
         try:
             if window is None:
@@ -367,9 +369,9 @@ def _on_load(*_: object) -> None:
     markers.forget()
     sequences.forget_ahead()
     for scene in bpy.data.scenes:
-        folder = chosen.shot_folder(scene)
+        folder = selection.shot_folder(scene)
         if folder is not None:
-            made.adopt(scene, folder)
+            scene_objects.adopt(scene, folder)
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     redraw()

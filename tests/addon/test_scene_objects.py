@@ -35,7 +35,7 @@ def test_copies_of_ours_are_the_artists(addon, built, shot):
     assert {kind: cameras.find(built, shot, kind) for kind in ours} == ours
     copies["aa renamed"].scale = (3.0, 3.0, 3.0)
     bpy.context.view_layer.update()
-    assert addon("shot.made").depth_scale(built, shot) == pytest.approx(1.0)
+    assert addon("shot.scene_objects").depth_scale(built, shot) == pytest.approx(1.0)
     names = sorted(c.name for c in copies.values())
     cameras.build(built, shot)
     assert sorted(c.name for c in copies.values()) == names, "a second build spares them"
@@ -67,7 +67,7 @@ def test_what_hangs_on_the_root_stays_where_it_is(addon, built, shot):
 
 
 def test_what_the_artist_deleted_is_let_go(addon, built, shot):
-    cameras, supervisor = addon("solve.cameras"), addon("process.supervisor")
+    cameras, supervisor = addon("solve.cameras"), addon("process.job_timer")
     bpy.ops.object.select_all(action="DESELECT")
     cameras.find(built, shot, "CAMERA").select_set(True)
     bpy.ops.object.delete()
@@ -96,7 +96,7 @@ def test_ours_are_found_after_saving_and_in_a_full_copy_of_the_scene(addon, buil
 
 
 def test_two_shots_of_one_name_are_two(addon, built, shot, tmp_path):
-    cameras, made = addon("solve.cameras"), addon("shot.made")
+    cameras, made = addon("solve.cameras"), addon("shot.scene_objects")
     other = tmp_path / "elsewhere" / shot.name
     shutil.copytree(shot, other)
     assert cameras.find(built, other, "CAMERA") is None
@@ -130,7 +130,7 @@ def test_the_camera_that_was_there_before_comes_back(addon, built, shot):
     bpy.ops.object.select_all(action="DESELECT")
     own.select_set(True)
     bpy.ops.object.delete()
-    addon("shot.made").tidy(built)
+    addon("shot.scene_objects").tidy(built)
     cameras.remove(built, shot)
     assert built.camera is None and not own.users, "the file does not keep it"
 
@@ -150,7 +150,7 @@ def test_another_shots_camera_takes_the_place_of_a_removed_one(addon, built, sho
 
 def test_a_file_of_0_2_0_is_taken_over(addon, built, shot, tmp_path):
     cameras = addon("solve.cameras")
-    name = addon("shot.made").name_of(shot)
+    name = addon("shot.scene_objects").name_of(shot)
     for kind in ("EMPTY", "CAMERA", "MESH"):  # as 0.2.0 left it: marks, no pointers
         cameras.find(built, shot, kind)["splannequin"] = name
     built.splannequin.made[0].collection["splannequin"] = name
