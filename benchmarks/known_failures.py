@@ -186,7 +186,7 @@ TRAINING: list[tuple[str, list[str], str]] = [
         [
             "test_scene.py::test_normalisation_keeps_every_pixel_and_leads_back",
             "test_scene.py::test_a_camera_that_stands_still_is_refused",
-            "solve/test_solving.py::test_points_are_filtered",
+            "solve/test_points.py::test_points_are_filtered",
             "solve/test_solving.py::test_models_that_nothing_could_be_trained_on_are_refused",
         ],
         "",
