@@ -21,7 +21,7 @@ from mathutils import Matrix
 
 from ...torch_backend import contract
 from ..access import scene_in, settings_of
-from ..process import backend
+from ..process import backend, job_timer
 from ..shot import scene_objects, selection
 from . import live, own_camera
 
@@ -68,7 +68,7 @@ def begin(scene: bpy.types.Scene) -> None:
     _session = live.open_session(shot, run, backend.python(), backend.package_root())
     _show_points(scene, shot, False)
     _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
-    bpy.app.timers.register(_tick, first_interval=TICK_SECONDS, persistent=True)
+    job_timer.pulse(_tick)
 
 
 def end() -> None:
@@ -85,8 +85,7 @@ def end() -> None:
     _shown.clear()
     _moved.clear()
     _rested.clear()
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
+    job_timer.drop(_tick)
     redraw()
 
 

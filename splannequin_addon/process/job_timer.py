@@ -97,6 +97,10 @@ class Watch:
 _watches: dict[Path, Watch] = {}
 _meanwhile: list[Callable[[], bool]] = []
 """What is looked after beside the shots, until it says that it is done."""
+_pulses: list[Callable[[], float | None]] = []
+"""What is called more often than jobs are looked at."""
+_jobs_next = 0.0
+"""When jobs are looked at again while something pulses, monotonic seconds."""
 _layout = (False, False)
 """Whether the empty panel of `lay_out` stands, and whether it is to be turned about."""
 _backend: tuple[contract.JobError | None, float] = (None, 0.0)
@@ -197,8 +201,53 @@ def refresh(watch: Watch) -> bool:
     return True
 
 
+def pulse(turn: Callable[[], float | None]) -> None:
+    """Calls `turn` from the timer, as soon again as it says (seconds), until it says None or is dropped.
+
+    For what is drawn while it changes; jobs are still looked at as often as without.
+    """
+    drop(turn)
+    _pulses.append(turn)
+    if bpy.app.timers.is_registered(tick):  # its next turn may be far for a picture
+        bpy.app.timers.unregister(tick)
+        bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
+
+
+def drop(turn: Callable[[], float | None]) -> None:
+    """Calls it no longer."""
+    if turn in _pulses:
+        _pulses.remove(turn)
+
+
 def tick() -> float:
-    """One turn of the timer: reads what jobs wrote, applies those that ended, redraws what shows them."""
+    """One turn of the timer, that of jobs or of what pulses faster; returns the seconds until the next."""
+    global _jobs_next
+    soonest = _pulse()
+    if soonest is None:
+        return _follow_jobs()
+    if time.monotonic() >= _jobs_next:
+        _jobs_next = time.monotonic() + _follow_jobs()
+    return min(soonest, max(0.0, _jobs_next - time.monotonic()))
+
+
+def _pulse() -> float | None:
+    """Calls what pulses; the least seconds that any of it asks for, None if nothing does."""
+    asked: list[float] = []
+    for turn in list(_pulses):
+        try:
+            seconds = turn()
+        except Exception:  # as in `_follow_jobs`
+            traceback.print_exc()
+            seconds = None
+        if seconds is None:
+            drop(turn)
+        else:
+            asked.append(seconds)
+    return min(asked, default=None)
+
+
+def _follow_jobs() -> float:
+    """Reads what jobs wrote, applies those that ended, redraws what shows them; returns when to do so again."""
     until = time.monotonic() + BUDGET_SECONDS
     changed = False
     for watch in list(_watches.values()):
@@ -384,6 +433,7 @@ def forget() -> None:
     """Drops all that is known; the shots' folders tell it again when asked."""
     _watches.clear()
     _meanwhile.clear()
+    _pulses.clear()
 
 
 def register() -> None:

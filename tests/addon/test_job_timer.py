@@ -104,3 +104,33 @@ def test_another_file_ends_what_blender_itself_was_doing(supervisor, watch, shot
     supervisor.work(shot, "freeze", iter([None, None]))
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     assert watch.work is None
+
+
+def test_what_pulses_sets_the_pace_and_jobs_keep_theirs(supervisor, watch, monkeypatch):
+    looks, pulses = [], []
+    monkeypatch.setattr(supervisor, "_jobs_next", 0.0)
+    monkeypatch.setattr(supervisor, "_turn", lambda *_: bool(looks.append(1)))
+
+    def turn():
+        pulses.append(1)
+        return 0.01 if len(pulses) < 5 else None
+
+    supervisor.pulse(turn)
+    supervisor.pulse(turn)  # once, however often it is asked for
+    try:
+        waits = [supervisor.tick() for _ in range(4)]
+        assert len(pulses) == 4 and len(looks) == 1, "jobs were looked at a moment ago"
+        assert all(0.0 <= wait <= 0.01 for wait in waits)
+        assert supervisor.tick() == supervisor.TICK_SECONDS, "it said None: the timer is the jobs' again"
+        assert supervisor.tick() == supervisor.TICK_SECONDS and len(pulses) == 5
+    finally:
+        supervisor.drop(turn)
+
+
+def test_a_pulse_that_fails_does_not_stop_the_timer(supervisor, watch, capsys):
+    def broken():
+        raise RuntimeError("of no use")
+
+    supervisor.pulse(broken)
+    assert supervisor.tick() == supervisor.TICK_SECONDS
+    assert "of no use" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from ..torch_types import norm
 from .bands import look_up_near
 from .detail_config import DetailConfig
 from .posed import PosedFrame, displacements, parallax
-from .reproject import blurred, look_up, narrowed, project, resized, unproject
+from .reproject import blurred, look_up, narrowed, project, resized, unproject, widened
 from .sightings import Sighting, Sightings
 
 WHOLE = 0.999
@@ -60,33 +60,47 @@ def fillers_of(
         return None
     chosen = _chosen(sightings, config, posed, matte, leading, usable)
     moved, unknown = displacements(sightings, posed, chosen)
-    seen = [
-        sightings.seen(frame, posed.points if frame == posed.t else posed.points + way)
-        for frame, way in zip(chosen, moved, strict=True)
-    ]
-    shown = [blurred(narrowed(sighting.visible, config.rough), float(config.rough)) for sighting in seen]
-    agreed = _agreed(sightings, config, posed, chosen, seen)
+    shown = _shown(sightings, config, posed, chosen, moved)
+    agreed = _agreed(sightings, config, posed, chosen, moved)
     return Fillers(chosen, moved, unknown, shown, agreed, [sightings.residual(frame) for frame in chosen])
 
 
+def _shown(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], moved: list[Tensor]
+) -> list[Tensor]:
+    """[h, w] in 0..1 for each plate: it shows what is seen and what is around that; of use where something moves."""
+    near = widened(_uneasy(posed.motion, posed.doubt) > 0.0, 4 * config.rough + 1)  # elsewhere it is not asked for
+    points, out = posed.points[near], list[Tensor]()
+    for frame, way in zip(chosen, moved, strict=True):
+        visible = torch.ones_like(posed.depth)
+        visible[near] = sightings.seen(frame, points if frame == posed.t else points + way[near]).visible
+        out.append(blurred(narrowed(visible, config.rough), float(config.rough)))
+    return out
+
+
+def _uneasy(motion: Tensor, doubt: Tensor) -> Tensor:
+    """[...] in 0..1: how far edges of what moves may be near."""
+    return torch.maximum(motion, doubt).clamp(0.0, 1.0)
+
+
 def _agreed(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], seen: list[Sighting]
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], moved: list[Tensor]
 ) -> list[Tensor]:
     """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
     h, w = posed.depth.shape
     if posed.t not in chosen:
         return [torch.ones_like(posed.depth) for _ in chosen]
-    pixels = [sighting.pixels[::2, ::2] for sighting in seen]  # a quarter of the work: it is low-passed
-    visible = [sighting.visible[::2, ::2] for sighting in seen]
-    of_truth = chosen.index(posed.t)
-    shown_at_t = look_up(sightings.view(posed.t).picture.float(), pixels[of_truth])
+    points = posed.points[::2, ::2]  # a quarter of the work: it is low-passed
+    truth = sightings.seen(posed.t, points)
+    shown_at_t = look_up(sightings.view(posed.t).picture.float(), truth.pixels)
     out: list[Tensor] = []
-    for n, frame in enumerate(chosen):
+    for frame, way in zip(chosen, moved, strict=True):
         if frame == posed.t:
             out.append(torch.ones_like(posed.depth))
             continue
-        says = look_up(sightings.view(frame).picture.float(), pixels[n])
-        both = (visible[of_truth] * visible[n])[..., None]
+        sighting = sightings.seen(frame, points + way[::2, ::2])
+        says = look_up(sightings.view(frame).picture.float(), sighting.pixels)
+        both = (truth.visible * sighting.visible)[..., None]
         off = sightings.difference(says * both, shown_at_t * both, 0.5)
         out.append(resized(torch.exp(-(off / config.agreement).square()), w, h))
     return out
@@ -110,7 +124,7 @@ def fill(
         [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
     )
     doubt = look_up(posed.doubt, small)
-    uneasy = torch.maximum(motion, doubt).clamp(0.0, 1.0)
+    uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
     untold = 1.0 - unknown
     truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
