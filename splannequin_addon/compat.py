@@ -13,6 +13,8 @@ import bpy
 import numpy as np
 from mathutils import Color
 
+from ..torch_backend.contract import PROBE
+
 if TYPE_CHECKING:
     from bpy.stub_internal.rna_enums import PropertyFlagItems
 
@@ -289,19 +291,19 @@ def set_png(settings: bpy.types.ImageFormatSettings) -> None:
     settings.compression = 15
 
 
-_PROBE = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n" + bytes((200, 100, 50, 128))
-"""A picture of one pixel, 0.78, 0.39 and 0.20, as a file."""
+_PROBE = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n" + bytes((*(int(256 * v) for v in PROBE), 128))
+"""A picture of one pixel, `PROBE`, as a file."""
 _LIKELY = {
     "linear": ("Linear Rec.709", "Linear Rec.709 (sRGB)", "lin_rec709", "Utility - Linear - sRGB", "Linear"),
     "srgb": ("sRGB", "sRGB - Texture", "sRGB Encoded Rec.709 (sRGB)", "Utility - sRGB - Texture", "sRGB EOTF"),
 }
 """What colour configurations call these spaces: looked at first, and believed where none can be told by its effect."""
-_spaces: dict[str, str] = {}
+_spaces: dict[str | tuple[float, ...], str] = {}
 """Encoding -> colour space. The configuration is chosen once, when Blender starts."""
 
 
-def set_image_colour(image: bpy.types.Image, encoding: str) -> None:
-    """States the encoding of an image's file: "linear" (Rec.709 primaries) or "srgb". ValueError as `colour_space`."""
+def set_image_colour(image: bpy.types.Image, encoding: str | tuple[float, ...]) -> None:
+    """States the encoding of an image's file, as `colour_space`."""
     name = colour_space(encoding)
     space = _space_of(image)
     if space.name != name:
@@ -313,13 +315,29 @@ def _space_of(image: bpy.types.Image) -> Any:
     return image.colorspace_settings
 
 
-def colour_space(encoding: str) -> str:
-    """Name that Blender's colour configuration (its own, or that of $OCIO) gives an encoding: "linear" or "srgb".
+def set_data(image: bpy.types.Image) -> None:
+    """States that an image's file holds numbers, not colours."""
+    _space_of(image).is_data = True
+
+
+def knows_colour(encoding: str | tuple[float, ...]) -> bool:
+    """True if `colour_space` finds one."""
+    try:
+        return bool(colour_space(encoding))
+    except ValueError:
+        return False
+
+
+def colour_space(encoding: str | tuple[float, ...]) -> str:
+    """Name that Blender's colour configuration (its own, or that of $OCIO) gives an encoding.
 
     The space is known by what it does to a pixel, so it may be called anything. ValueError if there is none.
+
+    Args:
+        encoding: "linear" (Rec.709 primaries), "srgb", or the linear Rec.709 light that `contract.PROBE` means.
     """
     if encoding not in _spaces:
-        likely = _LIKELY[encoding]
+        likely = _LIKELY[encoding] if isinstance(encoding, str) else ()
         image = bpy.data.images.new("Splannequin Probe", 1, 1)
         try:
             space = _space_of(image)
@@ -329,14 +347,18 @@ def colour_space(encoding: str) -> str:
             image.source = "FILE"
             space.is_data = True
             value = Color(_first_pixel(image))
-            to_scene = Color.from_rec709_linear_to_scene_linear, Color.from_srgb_to_scene_linear
-            wanted = tuple(to_scene[encoding == "srgb"](value)[:])
+            if encoding == "srgb":
+                wanted = tuple(value.from_srgb_to_scene_linear()[:])
+            else:
+                light = Color(encoding) if isinstance(encoding, tuple) else value
+                wanted = tuple(light.from_rec709_linear_to_scene_linear()[:])
             found = (n for n in [*first, *known] if _reads_as(image, n, wanted))
             name = next(found, next((n for n in first if n in likely), ""))
         finally:
             bpy.data.images.remove(image)
         if not name:
-            told = {"linear": "scene-linear Rec.709", "srgb": "sRGB"}[encoding]
+            names = {"linear": "scene-linear Rec.709", "srgb": "sRGB"}
+            told = names[encoding] if isinstance(encoding, str) else "these pictures"
             raise ValueError(
                 f"The colour configuration that Blender was started with (OCIO) has no colour space for {told}. "
                 "Start Blender without it, or add one to it."
@@ -348,7 +370,8 @@ def colour_space(encoding: str) -> str:
 def _reads_as(image: bpy.types.Image, name: str, wanted: Sequence[float]) -> bool:
     """True if a picture is read as the wanted scene-linear colour in the named space. Its space is set."""
     _space_of(image).name = name
-    return max(abs(a - b) for a, b in zip(_first_pixel(image), wanted, strict=True)) < 2e-3
+    near = 2e-3 * max(1.0, *(abs(value) for value in wanted))
+    return max(abs(a - b) for a, b in zip(_first_pixel(image), wanted, strict=True)) < near
 
 
 def _first_pixel(image: bpy.types.Image) -> tuple[float, float, float]:

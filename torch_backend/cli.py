@@ -103,6 +103,8 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
     folder = args.clip if args.command == "freeze" else args.shot
     shot = _begun(folder) if kind == "import" else Shot.open(folder)
     result = run_station(shot, kind, params, console)
+    if kind == "import":
+        print_reading(result, console)
     if kind in ("train", "freeze"):
         print_verdict(result, console)
     return ExitCode.OK
@@ -123,6 +125,8 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
         since = time.perf_counter()
         results[kind] = run_station(shot, kind, params, console)
         stages[kind] = round(time.perf_counter() - since, 2)
+        if kind == "import":
+            print_reading(results[kind], console)
         info = shot.info()
         if args.t_star is not None and not info.first <= args.t_star <= info.last:  # said before hours of training
             raise ValueError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
@@ -168,6 +172,13 @@ def print_verdict(facts: dict[str, Any], console: Console) -> None:
     if not console.as_json:
         for line in contract.verdict_lines(facts):
             print(line, file=console.stream, flush=True)
+
+
+def print_reading(facts: dict[str, Any], console: Console) -> None:
+    """How an import read the footage, and what of that was assumed."""
+    if not console.as_json:
+        for line in facts["read_as"]:
+            print(f"  {contract.printable(line)}", file=console.stream, flush=True)
 
 
 def modelled_table(rows: list[dict[str, Any]]) -> str:

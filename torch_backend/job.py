@@ -301,7 +301,7 @@ def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
 def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
     from .solve import SolveConfig, solve_shot
 
-    config = SolveConfig(camera_model=params.camera_model, overlap=params.overlap)
+    config = SolveConfig(**{name: value for name, value in vars(params).items() if name != "cameras"})
     return solve_shot(shot, config, report, params.cameras)
 
 

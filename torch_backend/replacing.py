@@ -19,6 +19,7 @@ from .contract import (
     CAMERAS_FILE,
     COLMAP_FOLDER,
     FRAMES_FOLDER,
+    MASK_KINDS,
     POINTS_FILE,
     SOLVE_FILE,
     SOLVE_FOLDER,
@@ -30,7 +31,9 @@ from .contract import (
 _NEXT, _PARTIAL = "next", "next.partial"
 _LAST = (SOLVE_FILE, CAMERAS_FILE, POINTS_FILE)
 """What is moved after all others, the last one first here: they tell a reader that there is a solve."""
-_TARGETS = (Path(FRAMES_FOLDER), Path(SOLVE_FOLDER), Path(SOLVE_FOLDER, COLMAP_FOLDER))
+_WHOLE = (COLMAP_FOLDER, *MASK_KINDS)
+"""Folders of the solve that hold nothing else: what the new one has not goes."""
+_TARGETS = (Path(FRAMES_FOLDER), Path(SOLVE_FOLDER), *(Path(SOLVE_FOLDER, name) for name in _WHOLE))
 """Folders of the shot that a solve has files in; to no other one anything is moved."""
 
 
@@ -58,7 +61,8 @@ def replacing_solve(shot: ShotFolder) -> Generator[Staged]:
         make_folder(folder)
     try:
         yield staged
-        _drop_stale(shot.colmap, staged.solve / COLMAP_FOLDER)
+        for name in _WHOLE:
+            _drop_stale(shot.solve / name, staged.solve / name)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise

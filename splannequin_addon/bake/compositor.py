@@ -18,10 +18,10 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import present, size_of
+from ..access import present
 from ..scene import numbered, sequences
 from ..scene.ownership import TAG
-from . import fitting, freeze_group, group_inside, placing, warp_nodes
+from . import fitting, freeze_group, group_inside, original_plate, placing, warp_nodes
 from .node_names import GAP, GROUP_NAME
 from .take_files import WARP_FOLDER, Take
 
@@ -62,7 +62,7 @@ def insert(
     wanted = freeze_group.wants_warp(scene) if warp is None else warp
     frozen, flow, stream = _frozen_image(take), _warp_image(take) if wanted else None, None
     if plate is not None and freeze_group.shows_plate(scene):
-        stream = sequences.load_sequence(plate, _plate_name(plate), "srgb")
+        stream = original_plate.plate_of(take, _shot_of(take), plate)
     enabled = compat.compositor_enabled(scene)
     before = {**compat.compositor_switches(scene), "made_tree": False}
     tree = compat.compositor_tree(scene)
@@ -92,13 +92,18 @@ def insert(
     changes += freeze_group.lacking(node)
     if stream is not None:
         _show_plate(scene, tree, node, stream, take)
+        changes += stream.said
     return changes
+
+
+def _shot_of(take: Take) -> Path:
+    return take.folder.parent.parent
 
 
 def _frozen_image(take: Take) -> bpy.types.Image:
     """The take's frames as a data-block. ValueError if they lack a layer."""
     image = sequences.load_sequence(
-        numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear"
+        numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", take.light
     )
     return _with_layers(image, take, _LAYERS)
 
@@ -172,8 +177,7 @@ def remove(scene: bpy.types.Scene) -> bool:
     if group.users == 0:  # another scene may show it
         bpy.data.node_groups.remove(group)
     for ours in [n for n in tree.nodes if n.get(TAG)]:
-        images += [ours.image] if isinstance(ours, bpy.types.CompositorNodeImage) and ours.image else []
-        tree.nodes.remove(ours)
+        images += original_plate.drop(ours)
     if before.get("made_tree") and not [n for n in tree.nodes if n.bl_idname not in _OUTPUTS]:
         compat.drop_compositor_tree(scene)
     compat.restore_compositor_switches(scene, before)
@@ -188,23 +192,21 @@ def remove(scene: bpy.types.Scene) -> bool:
 
 def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Iterator[None]:
     """Has Blender read what `insert` needs, one picture a turn: it does so while its window stands still."""
-    wanted = [(numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", "linear")]
+    wanted: list[tuple[Path, str, sequences.Encoding]] = [
+        (numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", take.light)
+    ]
     if warp and any(take.plate_size):
         wanted.append(_warp_picture(take))
     if plate is not None:
-        wanted.append((plate, _plate_name(plate), "srgb"))
+        wanted.append(original_plate.to_read(take, _shot_of(take), plate))
     for path, name, encoding in wanted:
         sequences.read(path, name, encoding, take.first, take.last)
         yield
 
 
-def _warp_picture(take: Take) -> tuple[Path, str, str]:
+def _warp_picture(take: Take) -> tuple[Path, str, sequences.Encoding]:
     """File, name and encoding of a take's warp."""
-    return numbered.frame_path(take.folder / WARP_FOLDER, take.first), f"Warp {take.folder.name}", "linear"
-
-
-def _plate_name(plate: Path) -> str:
-    return f"Plate {plate.parent.parent.stem}"
+    return numbered.frame_path(take.folder / WARP_FOLDER, take.first), f"Warp {take.folder.name}", take.light
 
 
 _OUTPUTS = ("CompositorNodeComposite", "NodeGroupOutput", "NodeGroupInput")
@@ -214,22 +216,27 @@ def _show_plate(
     scene: bpy.types.Scene,
     tree: bpy.types.NodeTree,
     node: bpy.types.CompositorNodeGroup,
-    image: bpy.types.Image,
+    plate: original_plate.Plate,
     take: Take,
 ) -> None:
     """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
+    shown = [plate.image, plate.map]
     for old in [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]:
-        tree.nodes.remove(old)
+        for image in original_plate.drop(old):
+            if image.users == 0 and image not in shown:
+                bpy.data.images.remove(image)
     image_node = tree.nodes.new("CompositorNodeImage")
     image_node[TAG] = True
     image_node.name = image_node.label = "Plate"
-    sequences.show_sequence(image_node, image, take.first, take.last)
+    sequences.show_sequence(image_node, plate.image, take.first, take.last)
     stream = image_node.outputs["Image"]
     # The tree is ours: in a row, left to right.
     end = present(present(compat.output_socket(tree)).node)
     end.location = (node.location.x + node.width + 60.0, node.location.y)
-    image_node.location = (node.location.x - 2 * GAP, node.location.y)
-    fit = compat.new_fit_node(tree, fitting.how_it_fits(scene, size_of(image)))
+    image_node.location = (node.location.x - (2 if plate.map is None else 3) * GAP, node.location.y)
+    if plate.map is not None:
+        stream = original_plate.undistorted(tree, stream, plate.map, (node.location.x - 2 * GAP, node.location.y))
+    fit = compat.new_fit_node(tree, fitting.how_it_fits(scene, plate.size))
     fit[TAG] = True
     fit.label = "Fit Plate"
     fit.location = (node.location.x - GAP, node.location.y)

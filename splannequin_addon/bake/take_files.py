@@ -30,6 +30,8 @@ class Take:
     """Pixels beyond the frame on the left and right, and above and below: overscan."""
     plate_size: tuple[int, int] = (0, 0)
     """Width and height in pixels of the plate that the take's warp is for; (0, 0): it has none."""
+    light: str | tuple[float, ...] = "linear"
+    """What light its frames hold, as `compat.colour_space` has it."""
 
 
 def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
@@ -37,8 +39,10 @@ def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
     numbers = numbered.frame_numbers(folder)
     if not numbers:
         raise FileNotFoundError(f"{folder} holds no frozen frames (NNNNNN.exr)")
-    windows = exr_windows(numbered.frame_path(folder, numbers[0]))
-    return Take(folder, numbers[0], numbers[-1], depth_scale, *windows, _plate_size(folder, numbers))
+    first = numbered.frame_path(folder, numbers[0])
+    light = _exr_value(_exr_header(first), "splannequin:probe", "v3f", "<3f") or "linear"
+    size, margin = exr_windows(first)
+    return Take(folder, numbers[0], numbers[-1], depth_scale, size, margin, _plate_size(folder, numbers), light)
 
 
 def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:

@@ -33,19 +33,26 @@ def frozen(
         size: width and height of the plate that the warp is for.
     """
     there = {node.name for node in tree.nodes}
-    plate = compat.sized(tree, plate, size)
-    s, t = compat.new_coordinates(tree, warp["ST"])
-    (left, right, across), (low, high, up) = (_between(tree, v, n) for v, n in zip((s, t), size, strict=True))
-    below, above = (
-        _mixed(tree, across, compat.new_look_up(tree, plate, left, y), compat.new_look_up(tree, plate, right, y))
-        for y in (low, high)
-    )
-    shown = _mixed(tree, up, below, above)
+    shown = looked_up(tree, plate, warp["ST"], size)
     whole = _mixed(tree, 1.0, _mixed(tree, 1.0, shown, warp["Matte"], "MULTIPLY"), warp["Combined"], "ADD")
     whole = compat.with_alpha(tree, whole, warp["Alpha"])
     for column, node in enumerate(n for n in tree.nodes if n.name not in there):
         node.location = (_WIDE * (column % 8 - 3), -1700.0 - _WIDE * (column // 8))
     return whole
+
+
+def looked_up(
+    tree: bpy.types.NodeTree, plate: bpy.types.NodeSocket, st: bpy.types.NodeSocket, size: tuple[int, int]
+) -> bpy.types.NodeSocket:
+    """Socket of a plate of `size` seen through an ST map, bilinear, as large as the map."""
+    plate = compat.sized(tree, plate, size)
+    s, t = compat.new_coordinates(tree, st)
+    (left, right, across), (low, high, up) = (_between(tree, v, n) for v, n in zip((s, t), size, strict=True))
+    below, above = (
+        _mixed(tree, across, compat.new_look_up(tree, plate, left, y), compat.new_look_up(tree, plate, right, y))
+        for y in (low, high)
+    )
+    return _mixed(tree, up, below, above)
 
 
 def _between(

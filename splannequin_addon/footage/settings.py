@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ...torch_backend import contract
 from .. import compat
-from ..properties import BoolProperty, FloatProperty, IntProperty, StringProperty
+from ..properties import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 
 class ImportSettings:
@@ -48,5 +48,27 @@ class ImportSettings:
         **contract.panel(contract.ImportParams, "fps"),
         min=0.0,
         soft_max=120.0,
+        options=set(),
+    )
+    colour_space = StringProperty(
+        **contract.panel(contract.ImportParams, "colour_space"),
+        options=set(),
+    )
+    layer = StringProperty(
+        **contract.panel(contract.ImportParams, "layer"),
+        options=set(),
+    )
+    pixel_aspect = FloatProperty(
+        **contract.panel(contract.ImportParams, "pixel_aspect"),
+        min=0.0,
+        max=4.0,
+        options=set(),
+    )
+    matrix = EnumProperty(
+        **contract.panel(contract.ImportParams, "matrix"),
+        options=set(),
+    )
+    levels = EnumProperty(
+        **contract.panel(contract.ImportParams, "levels"),
         options=set(),
     )

@@ -34,7 +34,10 @@ class Import(Step):
         if not props.clip:
             raise contract.JobError("No clip is chosen.", "Choose a video or image sequence.", contract.ExitCode.USAGE)
         span = (props.first, props.last) if props.use_range else (None, None)
-        return contract.ImportParams(paths.absolute(props.clip), *span, step=props.solve_step, fps=props.fps)
+        params = contract.ImportParams(paths.absolute(props.clip), *span, step=props.solve_step, fps=props.fps)
+        params.colour_space, params.layer = props.colour_space.strip(), props.layer.strip()
+        params.pixel_aspect, params.matrix, params.levels = round(props.pixel_aspect, 6), props.matrix, props.levels
+        return params
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Footage: what was imported."""
@@ -42,7 +45,11 @@ class Import(Step):
             chosen = bool(settings_of(scene).clip)
             return View(False, True, [], "Import the clip." if chosen else "Choose a clip of people holding still.")
         (width, height), (first, last) = state.size, state.frame_range
-        lines = [f"{state.frames} frames, {first} to {last}", f"{width} x {height}, {state.info.get('fps', 0):g} fps"]
+        lines = [
+            f"{state.frames} frames, {first} to {last}",
+            f"{width} x {height}, {state.info.get('fps', 0):g} fps",
+            *state.read_as,
+        ]
         return View(True, True, lines, "Next: solve the camera.")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:

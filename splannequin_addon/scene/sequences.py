@@ -9,9 +9,12 @@ from typing import Any
 import bpy
 
 from .. import compat
+from ..access import size_of
 from . import paths
 from .ownership import TAG
 
+Encoding = str | tuple[float, ...]
+"""How a file's numbers are meant, as `compat.colour_space` has it."""
 _ahead: set[str] = set()
 """Files that `read_ahead` has just had read: the next `load_sequence` takes them as they are."""
 
@@ -21,24 +24,36 @@ def forget_ahead() -> None:
     _ahead.clear()
 
 
-def read(path: Path, name: str, encoding: str, first: int, last: int) -> None:
+def read(path: Path, name: str, encoding: Encoding, first: int, last: int) -> None:
     """Has a picture of a sequence read, whose frames go from `first` to `last`: a node does it for the frame that it
     shows."""
     _ahead.discard(os.path.abspath(path))
-    image = load_sequence(path, name, encoding)
-    reader = bpy.data.node_groups.new("Splannequin Reader", "CompositorNodeTree")
-    try:
-        show_sequence(reader.nodes.new("CompositorNodeImage"), image, first, last)
-    finally:
-        bpy.data.node_groups.remove(reader)
+    shown_size(load_sequence(path, name, encoding), first, last)
     _ahead.add(os.path.abspath(path))
 
 
-def load_sequence(path: Path, name: str, encoding: str) -> bpy.types.Image:
-    """An image sequence as a data-block, reused by path; `encoding` is "linear" or "srgb"."""
+def shown_size(image: bpy.types.Image, first: int, last: int) -> tuple[int, int]:
+    """Width and height of the pictures of a sequence, whose frames go from `first` to `last`, as a node shows them.
+
+    (0, 0) of those with several layers. A sequence that no node shows has none.
+    """
+    reader = bpy.data.node_groups.new("Splannequin Reader", "CompositorNodeTree")
+    try:
+        show_sequence(reader.nodes.new("CompositorNodeImage"), image, first, last)
+        return size_of(image)
+    finally:
+        bpy.data.node_groups.remove(reader)
+
+
+def load_sequence(path: Path, name: str, encoding: Encoding) -> bpy.types.Image:
+    """An image sequence or a video as a data-block, reused by path.
+
+    ValueError if the colour configuration has no such encoding, RuntimeError if Blender cannot read the file.
+    """
     wanted = os.path.abspath(path)
     for image in bpy.data.images:
         if image.get(TAG) and os.path.abspath(bpy.path.abspath(image.filepath)) == wanted:
+            compat.set_image_colour(image, encoding)  # another import may have made it of other light
             if wanted not in _ahead:
                 image.reload()
             _ahead.discard(wanted)
@@ -46,9 +61,25 @@ def load_sequence(path: Path, name: str, encoding: str) -> bpy.types.Image:
     compat.colour_space(encoding)  # before anything is made: a configuration may have none
     image = bpy.data.images.load(wanted)
     image.name = name
-    image.source = "SEQUENCE"
+    if image.source != "MOVIE":
+        image.source = "SEQUENCE"
     image[TAG] = True
     compat.set_image_colour(image, encoding)
+    image.filepath = paths.blend_path(path)
+    return image
+
+
+def load_numbers(path: Path, name: str) -> bpy.types.Image:
+    """A picture of numbers, not colours, as a data-block, reused by path."""
+    wanted = os.path.abspath(path)
+    for known in bpy.data.images:
+        if known.get(TAG) and os.path.abspath(bpy.path.abspath(known.filepath)) == wanted:
+            known.reload()
+            return known
+    image = bpy.data.images.load(wanted)
+    image.name = name
+    image[TAG] = True
+    compat.set_data(image)
     image.filepath = paths.blend_path(path)
     return image
 

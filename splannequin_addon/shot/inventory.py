@@ -38,7 +38,7 @@ def read(folder: Path) -> ShotState:
         return state
     state.info = _typed(_Info, there.info_path)
     if there.listing.is_file():
-        state.frames, state.beside = file_cache.of(there.listing, _listed)
+        state.frames, state.beside, state.read_as = file_cache.of(there.listing, _listed)
     if there.cameras.is_file():
         state.solve = _typed(_Solve, there.solve_record)
     state.runs = _named(_Run, there.runs, contract.SUMMARY_FILE, state.damaged["run"])
@@ -87,10 +87,11 @@ def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
     return [n for n in frames if n not in there]
 
 
-def _listed(path: Path) -> tuple[int, str]:
-    """Of frames.json: how many frames there are, and `ShotState.beside`."""
+def _listed(path: Path) -> tuple[int, str, list[str]]:
+    """Of frames.json: how many frames there are, `ShotState.beside` and `ShotState.read_as`."""
     told = _read_typed(path, _Listing, contract.LONGEST_JSON)
-    return len(told["frames"]), told["beside"]
+    read_as = [contract.printable(line, 300) for line in told["read_as"][:_MOST_SENTENCES] if isinstance(line, str)]
+    return len(told["frames"]), told["beside"], read_as
 
 
 def _frame_count(take: Path) -> int:
@@ -142,6 +143,7 @@ class _Listing:
 
     frames: list[Any]
     beside: str = ""
+    read_as: list[Any] = field(default_factory=list[Any])
 
 
 @dataclass
@@ -222,6 +224,7 @@ def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
     return {**data, **values}
 
 
+_MOST_SENTENCES = 4
 _LARGEST = 1 << 31
 """Blender's whole numbers end there."""
 _LONGEST_HISTORY = 1 << 24

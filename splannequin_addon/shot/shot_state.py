@@ -17,6 +17,8 @@ class ShotState:
     """shot.json; empty if there is no shot."""
     frames: int = 0
     """Imported frames, 0 before the import."""
+    read_as: list[str] = field(default_factory=list[str])
+    """How the footage was read, in sentences; empty for one of an earlier version."""
     beside: str = ""
     """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
     solve: dict[str, Any] = field(default_factory=dict[str, Any])

@@ -28,6 +28,9 @@ def params(scene: bpy.types.Scene, shot: Path | None) -> contract.SolveParams:
     """
     props = settings_of(scene)
     asked = contract.SolveParams(camera_model=props.camera_model)
+    asked.focal_mm = _said(props.focal_mm)
+    if asked.focal_mm:
+        asked.sensor_mm, asked.refine_focal = _said(props.sensor_mm), props.refine_focal
     if props.cameras_from == "FILE":
         if not props.cameras_path:
             raise contract.JobError(
@@ -45,6 +48,11 @@ def params(scene: bpy.types.Scene, shot: Path | None) -> contract.SolveParams:
         contract.write_json(file, data, parents=False)
         asked.cameras = str(file)
     return asked
+
+
+def _said(value: float) -> float:
+    """A number as it was typed: Blender's has 32 bits, and 23.976 becomes 23.9759998."""
+    return float(f"{value:.7g}")
 
 
 def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:

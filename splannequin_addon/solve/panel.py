@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...torch_backend import contract
 from ..access import layout_of, scene_in, settings_of
 from ..process import steps
 from ..ui import icons, step_panel
@@ -29,6 +30,9 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
         """The step's body, and where the solve stands in the scene."""
         super().draw(context)
         watch = self._watch(context)
+        body = step_panel.sub_panel(layout_of(self), "camera_masks", "Masks")
+        if body is not None:
+            self._masks(context, body)
         body = step_panel.sub_panel(layout_of(self), "camera_motion", "Motion Matte")
         if body is not None:
             matte_operators.draw(body)
@@ -46,6 +50,10 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
         """The lens, where cameras come from, and where they go."""
         props = settings_of(scene_in(context))
         layout.prop(props, "camera_model")
+        layout.prop(props, "focal_mm")
+        if props.focal_mm > 0.0:
+            for name in ("sensor_mm", "refine_focal"):
+                layout.prop(props, name)
         layout.prop(props, "cameras_from")
         if props.cameras_from == "FILE":
             layout.prop(props, "cameras_path", text="")
@@ -53,6 +61,15 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
             layout.prop(props, "tracking_clip", text="")
         for name in ("splannequin.export_cameras", "splannequin.write_stmaps"):
             layout.operator(name, icon=icons.of(name))
+
+    def _masks(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
+        """What is ignored, and what alone may move."""
+        props = settings_of(scene_in(context))
+        for kind in contract.MASK_KINDS:
+            layout.prop(props, f"{kind}_from")
+            shown = {"FILE": "path", "DRAWN": "drawn"}.get(getattr(props, f"{kind}_from"))
+            if shown is not None:
+                layout.prop(props, f"{kind}_{shown}", text="")
 
     def _button(
         self, context: bpy.types.Context, layout: bpy.types.UILayout, view: steps.View, running: str | None

@@ -6,14 +6,39 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..properties import EnumProperty, PointerProperty, StringProperty
+from ..properties import BoolProperty, EnumProperty, FloatProperty, PointerProperty, StringProperty
+
+MASK_SOURCES = [
+    ("NONE", "None", "No mask"),
+    ("FILE", "File", "A picture for all frames, a picture of a numbered sequence, or a video"),
+    ("ALPHA", "Alpha", "The alpha of the clip, which is a sequence: ignored is what is transparent, people are opaque"),
+    ("DRAWN", "Drawn", "A mask of this file, drawn over the clip in the Movie Clip editor"),
+]
+"""Where a mask may come from. In the order that .blend files keep: new ones go last."""
 
 
 class SolveSettings:
-    """The lens of a shot, and where its cameras come from."""
+    """The lens of a shot, where its cameras come from, and what is masked."""
 
     camera_model = EnumProperty(
         **contract.panel(contract.SolveParams, "camera_model"),
+        options=set(),
+    )
+    focal_mm = FloatProperty(
+        **contract.panel(contract.SolveParams, "focal_mm"),
+        min=0.0,
+        max=5000.0,
+        soft_max=300.0,
+        options=set(),
+    )
+    sensor_mm = FloatProperty(
+        **contract.panel(contract.SolveParams, "sensor_mm"),
+        min=1.0,
+        max=200.0,
+        options=set(),
+    )
+    refine_focal = BoolProperty(
+        **contract.panel(contract.SolveParams, "refine_focal"),
         options=set(),
     )
     cameras_from = EnumProperty(
@@ -30,6 +55,40 @@ class SolveSettings:
         **contract.panel(contract.SolveParams, "cameras"),
         subtype="FILE_PATH",
         options=compat.PATH_OPTIONS,
+    )
+    ignore_from = EnumProperty(
+        **contract.panel(contract.SolveParams, "ignore_mask", "NONE"),
+        items=MASK_SOURCES,
+        options=set(),
+    )
+    ignore_path = StringProperty(
+        name="Mask to Ignore",
+        description="White is ignored: one picture for all frames, a picture of a numbered sequence, or a video",
+        subtype="FILE_PATH",
+        options=compat.PATH_OPTIONS,
+    )
+    ignore_drawn = PointerProperty(
+        name="Drawn Mask to Ignore",
+        description="What is inside is ignored",
+        type=bpy.types.Mask,
+        options=set(),
+    )
+    people_from = EnumProperty(
+        **contract.panel(contract.SolveParams, "people_mask", "NONE"),
+        items=MASK_SOURCES,
+        options=set(),
+    )
+    people_path = StringProperty(
+        name="Mask of People",
+        description="White may move: one picture for all frames, a picture of a numbered sequence, or a video",
+        subtype="FILE_PATH",
+        options=compat.PATH_OPTIONS,
+    )
+    people_drawn = PointerProperty(
+        name="Drawn Mask of People",
+        description="What is inside may move",
+        type=bpy.types.Mask,
+        options=set(),
     )
     tracking_clip = PointerProperty(
         name="Tracked Clip",

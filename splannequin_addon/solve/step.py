@@ -11,7 +11,7 @@ from ..process import job_timer, jobs
 from ..process.steps import Step, View
 from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
-from . import align_operators, arrival, cameras, exchange, guesses, matte_operators, operators, panel, points
+from . import align_operators, arrival, cameras, exchange, guesses, masks, matte_operators, operators, panel, points
 
 if TYPE_CHECKING:
     import bpy
@@ -30,8 +30,11 @@ class Solve(Step):
     parts = (points, align_operators, operators)
 
     def params(self, scene: bpy.types.Scene) -> contract.SolveParams:
-        """The lens, and where cameras come from."""
-        return exchange.params(scene, selection.shot_folder(scene))
+        """The lens, where cameras come from, and what is masked."""
+        shot = selection.shot_folder(scene)
+        asked = exchange.params(scene, shot)
+        asked.ignore_mask, asked.people_mask = masks.sources(scene, shot)
+        return asked
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Camera: how good the solve is."""

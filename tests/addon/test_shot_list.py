@@ -40,7 +40,11 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
     values |= {"detail": False, "develop": False}
     values |= {"cameras_from": "FILE", "cameras_path": "//model", "tracking_clip": tracked}
-    values |= {"shot_seen": "//first.splannequin", "solve_step": 2, "fps": 25.0}
+    values |= {"shot_seen": "//first.splannequin", "solve_step": 2, "fps": 25.0, "colour_space": "x"}
+    values |= {"layer": "left", "pixel_aspect": 2.0, "matrix": "bt2020", "levels": "full"}
+    values |= {"ignore_from": "FILE", "ignore_path": "//logo.png", "people_from": "DRAWN", "people_path": "//m.png"}
+    values |= {"ignore_drawn": bpy.data.masks.new("a"), "people_drawn": bpy.data.masks.new("b")}
+    values |= {"focal_mm": 24.0, "sensor_mm": 13.5, "refine_focal": False}
     for name, value in values.items():
         setattr(props, name, value)
     assert set(shot_list.names()) == {*values, "clip", "shot_path"}, "a setting that is not tested here"

@@ -100,6 +100,32 @@ def test_the_rate_of_a_sequence_is_the_one_that_was_set(addon, scene, tmp_path, 
     assert addon("shot.inventory").read(addon("shot.selection").shot_folder(scene)).info["fps"] == 30.0
 
 
+def test_the_colour_space_that_was_named_is_asked_for(addon, scene, tmp_path):
+    scene.splannequin.clip, scene.splannequin.colour_space = str(tmp_path / "a.mp4"), " ARRI LogC3 (EI800) "
+    asked = addon("process.steps").STEPS["import"].params(scene)
+    assert asked.colour_space == "ARRI LogC3 (EI800)"
+
+
+def test_what_a_person_says_of_the_footage_is_asked_for(addon, scene, tmp_path):
+    props = scene.splannequin
+    props.clip = str(tmp_path / "a.mp4")
+    plain = addon("process.steps").STEPS["import"].params(scene)
+    assert (plain.layer, plain.pixel_aspect, plain.matrix, plain.levels) == ("", 0.0, "auto", "auto")
+    props.layer, props.pixel_aspect, props.matrix, props.levels = " left ", 1.333, "bt601", "full"
+    asked = addon("process.steps").STEPS["import"].params(scene)
+    assert (asked.layer, asked.pixel_aspect, asked.matrix, asked.levels) == ("left", 1.333, "bt601", "full")
+
+
+def test_the_panel_says_how_the_footage_was_read(addon, with_shot):
+    shot = addon("shot.selection").shot_folder(with_shot)
+    listing = shot / "frames" / "frames.json"
+    told = json.loads(listing.read_text())
+    told["read_as"] = ["Read as 64 x 48, 24 fps.", 7, "Assumed, for the footage does not say: matrix."]
+    listing.write_text(json.dumps(told))
+    view = addon("process.steps").STEPS["import"].view(with_shot, addon("shot.inventory").read(shot))
+    assert view.state[-2:] == [told["read_as"][0], told["read_as"][2]]
+
+
 def test_after_the_import_the_clip_is_seen_and_nothing_else_is_touched(addon, with_shot, with_raw):
     scene, plate = with_shot, addon("footage.plate")
     mine, objects = scene.camera, set(scene.objects)

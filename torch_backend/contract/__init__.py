@@ -12,6 +12,7 @@
     writing         atomic files and folders
     camera_path     a pinhole camera over frames
     live_messages   what Blender and a live session say to each other
+    colour          a colour by which two programs know that they mean the same space
     frame_layers    what the layers of a frozen frame hold
     checkpoint_header   what a checkpoint says of itself
     results         verdicts and the figures of a run
@@ -30,6 +31,7 @@ from .camera_path import (
 from .checkpoint_header import (
     checkpoint_facts,
 )
+from .colour import PROBE
 from .command_line import (
     as_json,
     command_line,
@@ -104,6 +106,7 @@ from .lock import (
     read_writer,
 )
 from .option_table import (
+    MASK_ALPHA,
     SWITCH,
     Limit,
     Option,
@@ -169,6 +172,7 @@ from .shot_folder import (
     JOBS_FOLDER,
     LAYERS,
     LIVE_LOG,
+    MASK_KINDS,
     METRICS_FILE,
     MOTION_FILE,
     MOTION_FOLDER,
@@ -190,6 +194,7 @@ from .shot_folder import (
     TAKE_PREVIEW_FOLDER,
     TAKE_REDISTORT,
     TAKE_STATE_FILE,
+    TAKE_UNDISTORT,
     TAKES_FOLDER,
     VIDEO_FILE,
     WARP_FOLDER,
@@ -267,6 +272,8 @@ __all__ = [
     "LOG_FILE",
     "LONGEST_JSON",
     "LONGEST_LINE",
+    "MASK_ALPHA",
+    "MASK_KINDS",
     "METHODS",
     "METRICS_FILE",
     "MOTION_FILE",
@@ -282,6 +289,7 @@ __all__ = [
     "PRESET_STEPS",
     "PRESET_WIDTHS",
     "PREVIEWS_FOLDER",
+    "PROBE",
     "QUERIES",
     "RAW_FOLDER",
     "REQUEST_FILE",
@@ -302,6 +310,7 @@ __all__ = [
     "TAKE_PREVIEW_FOLDER",
     "TAKE_REDISTORT",
     "TAKE_STATE_FILE",
+    "TAKE_UNDISTORT",
     "VERBS",
     "VERDICT_WORDS",
     "VIDEO_FILE",

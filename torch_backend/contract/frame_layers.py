@@ -39,7 +39,7 @@ FRAME_LAYERS = (
         ("R", "G", "B", "A"),
         "half",
         "R G B A",
-        "scene-linear, Rec.709 primaries, premultiplied",
+        "scene-linear, premultiplied; primaries: in the header, the footage's (ACEScg, ...) or Rec.709's",
         output="Image",
         tip="Frozen frame, scene-linear",
         socket="NodeSocketColor",

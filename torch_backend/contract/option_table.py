@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -123,6 +124,15 @@ def overscan(text: str) -> float:
     if text != "lens" and not 0.0 <= value <= 100.0:
         raise ValueError(f"overscan is 0 to 100 percent, or lens, got {text!r}")
     return value
+
+
+MASK_ALPHA = "alpha"
+"""Of a mask: the alpha of the footage, in the place of a file."""
+
+
+def mask_path(text: str) -> str:
+    """A mask as a command line gives it: an absolute path, or `MASK_ALPHA`."""
+    return text if text in ("", MASK_ALPHA) else os.path.abspath(text)
 
 
 SWITCH = ("on", "off")

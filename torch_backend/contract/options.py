@@ -8,7 +8,7 @@ from typing import Any
 
 from .files import is_json_object
 from .hosts import host_names
-from .option_table import SWITCH, Limit, Option, limits_of, option, overscan
+from .option_table import SWITCH, Limit, Option, limits_of, mask_path, option, overscan
 
 LAST_FRAME = 1_048_574
 """Blender's last frame number: no scene reaches further."""
@@ -16,7 +16,7 @@ PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
 PRESET_WIDTHS = {"preview": 320, "standard": 960, "final": 0}
 """Width in pixels of each preset's training images, never above the working frames'; 0: theirs."""
-CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV")
+CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
 """What `SolveParams.camera_model` may be."""
 HOSTS = host_names()
 """Hosts of the deformation, as their files in deformation/ name themselves."""
@@ -115,8 +115,67 @@ class ImportParams:
         metavar="NAME",
         help="layer or part of an EXR sequence, by its name or the end of it",
         words="the picture itself",
+        label="Layer",
+        tip="Layer or part of an EXR sequence to freeze, by its name or the end of it; empty: the picture itself",
     )
     """Layer or part of a sequence's pictures to take, by its name or the end of it; empty: the picture itself."""
+    colour_space: str = option(
+        "",
+        flag="--colour-space",
+        metavar="NAME",
+        help="colour space of the footage, by its name in the OCIO configuration (`$OCIO`, else the built-in ACES "
+        "studio configuration)",
+        words="what the files say",
+        label="Colour Space",
+        tip="Colour space of the footage, by its name in the OCIO configuration ($OCIO, else the built-in ACES studio "
+        "configuration: ACEScg, ARRI LogC3 (EI800), ADX10, ...); empty: what the files say",
+    )
+    """Colour space of the footage as the OCIO configuration names it; empty: what the files say."""
+    pixel_aspect: float = option(
+        0.0,
+        flag="--pixel-aspect",
+        metavar="A",
+        help="how many times as wide as high the footage's pixels are",
+        words="what the files say, else square",
+        limit=Limit("pixel aspect", 0.25, 4.0, {0: "what the files say"}),
+        label="Pixel Aspect",
+        tip="How many times as wide as high the footage's pixels are, 2 for most anamorphic lenses; "
+        "0: what the files say",
+    )
+    """Width of the footage's pixels over their height; 0: what the files say, else 1."""
+    matrix: str = option(
+        "auto",
+        flag="--matrix",
+        choices=("auto", "bt709", "bt601", "bt2020"),
+        help="YCbCr matrix of a video: `auto` (what the file says, else by its size), `bt709`, `bt601`, `bt2020`",
+        label="Matrix",
+        tip="How a video's YCbCr becomes RGB: greens and reds are off where it is the wrong one",
+        items={
+            "auto": (
+                "As Tagged",
+                "What the file says; where it says nothing, BT.709 from 1280 columns on, else BT.601",
+            ),
+            "bt709": ("BT.709", "High definition"),
+            "bt601": ("BT.601", "Standard definition"),
+            "bt2020": ("BT.2020", "Ultra high definition"),
+        },
+    )
+    """YCbCr matrix of a video: auto, bt709, bt601 or bt2020."""
+    levels: str = option(
+        "auto",
+        flag="--levels",
+        choices=("auto", "video", "full"),
+        help="range of a video's codes: `auto` (what the file says, else video), `video` (16 to 235), "
+        "`full` (0 to 255)",
+        label="Levels",
+        tip="Which codes of a video are black and white: it looks washed out or crushed where they are the wrong ones",
+        items={
+            "auto": ("As Tagged", "What the file says; where it says nothing, video levels"),
+            "video": ("Video", "Black is 16 and white 235 of 255"),
+            "full": ("Full", "Black is 0 and white 255"),
+        },
+    )
+    """Range of a video's codes: auto, video or full."""
 
 
 @dataclass
@@ -127,15 +186,72 @@ class SolveParams:
         "SIMPLE_RADIAL",
         flag="--camera-model",
         choices=CAMERA_MODELS,
-        help="lens: `SIMPLE_RADIAL`, or `OPENCV` for strong distortion",
+        help="lens: `SIMPLE_RADIAL`, `OPENCV` for strong distortion, or `OPENCV_FISHEYE`",
         label="Lens",
         tip="How the lens bends straight lines",
         items={
             "SIMPLE_RADIAL": ("Ordinary", "One coefficient: phones, most cameras"),
             "OPENCV": ("Strong", "Four coefficients: action cameras, very wide lenses"),
+            "OPENCV_FISHEYE": ("Fisheye", "A lens that bends straight lines on purpose, up to 150 degrees wide"),
         },
     )
-    """COLMAP camera model: SIMPLE_RADIAL or OPENCV (strong or tangential distortion)."""
+    """COLMAP camera model: SIMPLE_RADIAL, OPENCV (strong or tangential distortion) or OPENCV_FISHEYE."""
+    focal_mm: float = option(
+        0.0,
+        flag="--focal-mm",
+        metavar="MM",
+        help="focal length that the lens has, for the sensor of `--sensor-mm`; the solve begins with it",
+        words="found by the solve",
+        limit=Limit("focal length in mm", 1, 5000, {0: "one that the solve finds"}),
+        label="Focal Length",
+        tip="Focal length of the lens in millimetres, for the sensor below; 0: the solve finds it",
+    )
+    """Focal length in mm with which the solve begins; 0: it finds it."""
+    sensor_mm: float = option(
+        36.0,
+        flag="--sensor-mm",
+        metavar="MM",
+        help="width of the part of the sensor that the picture shows, for `--focal-mm`; 36: full frame",
+        limit=Limit("width of the sensor in mm", 1, 200),
+        label="Sensor Width",
+        tip="Width in millimetres of the part of the sensor that the picture shows; 36 is full frame",
+    )
+    """Width in mm of what the picture shows of the sensor, along its width; for `focal_mm`."""
+    refine_focal: bool = option(
+        True,
+        flag="--hold-focal",
+        switch=True,
+        help="hold the focal length of `--focal-mm` as it is; else the solve refines it",
+        label="Refine",
+        tip="Let the solve correct the focal length. Off: it is held as it is given",
+    )
+    """Refine `focal_mm`; else it is held."""
+    ignore_mask: str = option(
+        "",
+        flag="--ignore-mask",
+        metavar="MASK",
+        parse=mask_path,
+        help="what is no part of the scene (a logo, dirt, the crew), white: a picture for all frames, a sequence, "
+        "a video, or `alpha`: where the footage is transparent",
+        words="none",
+        label="Ignore",
+        tip="Mask of what is no part of the scene, white: a logo, dirt, the hands of the crew. It is not matched, not "
+        "learnt and not used to fill. One picture for all frames, a picture of a sequence, or a video",
+    )
+    """Mask of what is ignored, in white: a picture, a sequence, a video, or `MASK_ALPHA`. Empty: none."""
+    people_mask: str = option(
+        "",
+        flag="--people-mask",
+        metavar="MASK",
+        parse=mask_path,
+        help="the only places where something may move, white: as `--ignore-mask`; `alpha`: where the footage is "
+        "opaque",
+        words="everywhere",
+        label="People",
+        tip="Mask of what may move, white: the camera is solved from the rest, and everything outside stands still. "
+        "One picture for all frames, a picture of a sequence, or a video",
+    )
+    """Mask of what alone may move, in white; the camera is not matched on it. Empty: everything may."""
     overlap: int = option(15, limit=Limit("number of following frames that are matched", 1, 1000))
     """Each solved frame is matched with this many following ones (and with quadratically spaced ones beyond)."""
     cameras: str = option(

@@ -6,6 +6,7 @@ frames/NNNNNN.png                undistorted plates
 frames/frames.json, frames/raw/  listing of the imported frames, and themselves
 solve/                           cameras.json, solve.json, points.npz, colmap/, colmap.log, ST maps of the lens
 solve/motion/                    mattes of what moves, as found; motion_paint/ as painted
+solve/ignore/, solve/people/     masks that the solve was given, undistorted; masks/ as drawn in Blender
 runs/NAME/                       a run: `RunFolder`
 takes/NAME/                      frozen frames: `TakeFolder`
 jobs/ID/                         requests and what became of them: `jobs`
@@ -31,6 +32,9 @@ STMAP_FILES = ("stmap_undistort.exr", "stmap_redistort.exr")
 """Of the solve: from the distorted frames to the undistorted ones, and back."""
 MOTION_FOLDER, MOTION_FILE, MOTION_UNFINISHED_FILE = "motion", "motion.json", "unfinished.json"
 PAINTED_FOLDER = "motion_paint"
+MASK_KINDS = ("ignore", "people")
+"""Masks that a solve may be given: what is no part of the scene, and what alone may move."""
+DRAWN_FOLDER = "masks"
 CHECKPOINT_FILE, EXTENSION_FILE = "checkpoint.safetensors", "extension.safetensors"
 """Of a run: itself, and steps that are added to it and are not done."""
 CONFIG_FILE, METRICS_FILE, SUMMARY_FILE = "config.json", "metrics.jsonl", "summary.json"
@@ -41,6 +45,8 @@ TAKE_PREVIEW_FOLDER, WARP_FOLDER = "preview", "warp"
 CONTACT_SHEET_FILE, VIDEO_FILE, PLY_FILE = "contact_sheet.png", "video.mp4", "frozen.ply"
 TAKE_REDISTORT = Path("stmap") / "redistort.exr"
 """Of a take with overscan: the way back through the lens."""
+TAKE_UNDISTORT = Path("stmap") / "undistort.exr"
+"""Of a take: from the footage as it was filmed to the plate without the lens, as large as the footage."""
 LIVE_LOG = "live.log"
 PICTURE, LAYERS = ".png", ".exr"
 """Suffixes of plates, mattes and previews; of frozen frames."""
@@ -118,6 +124,18 @@ class ShotFolder:
     def painted_matte(self, frame: int) -> Path:
         """The painted matte of a frame."""
         return self.painted / frame_file(frame, PICTURE)
+
+    def masks(self, kind: str) -> Path:
+        """Masks of one of `MASK_KINDS`, undistorted as the plates are."""
+        return self.solve / kind
+
+    def mask(self, kind: str, frame: int) -> Path:
+        """The mask of a frame."""
+        return self.masks(kind) / frame_file(frame, PICTURE)
+
+    def drawn_masks(self, kind: str) -> Path:
+        """Masks of one of `MASK_KINDS` as they were drawn in Blender, over the footage as it was filmed."""
+        return self.root / DRAWN_FOLDER / kind
 
     @property
     def runs(self) -> Path:

@@ -10,13 +10,15 @@ Footage comes in other encodings too: `InputSpace` brings each of them to displa
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import linear_solution
+from ..contract import PROBE
 
 SRGB_KNEE = np.float32(0.04045)
 """Encoded value where the linear segment ends."""
@@ -131,6 +133,35 @@ def to_rec709(chromaticities: Chromaticities) -> NDArray[np.float64]:
     return linear_solution(ours, adapted)
 
 
+LIGHTS = ("rec709", "rec2020", "p3d65", "ap1", "ap0")
+"""Primaries, as `PRIMARIES` names them, in whose linear light frozen frames may leave; the first is ours."""
+
+
+def light_matrix(light: str) -> NDArray[np.float32] | None:
+    """[3, 3] for row vectors, from linear Rec.709 to linear light of one of `LIGHTS`; None: it is that.
+
+    ValueError for primaries that are none of them.
+    """
+    if light not in LIGHTS:
+        raise ValueError(f"frames leave in the light of {', '.join(LIGHTS)}, not {light!r}")
+    if light == LIGHTS[0]:
+        return None
+    return np.linalg.inv(to_rec709(PRIMARIES[light][1])).T.astype(np.float32)
+
+
+def in_light(pixels: NDArray[Any], matrix: NDArray[np.float32] | None) -> NDArray[Any]:
+    """Pixels [..., 3 or more], the first three linear colour, through a matrix of `light_matrix`; the rest stays."""
+    if matrix is None:
+        return pixels
+    return np.concatenate([np.asarray(pixels[..., :3], np.float32) @ matrix, pixels[..., 3:]], axis=-1)
+
+
+def light_of_chromaticities(values: Sequence[float] | None) -> str:
+    """Which of `LIGHTS` a file's chromaticities mean; ours for those that mean none of them."""
+    known = (x for x in LIGHTS if values is not None and np.allclose(values, PRIMARIES[x][1], atol=2e-3))
+    return next(known, LIGHTS[0])
+
+
 def cineon_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
     """Cineon log (printing density, 10 bits as 0..1) to scene-linear: black at code 95 is 0, white at 685 is 1.
 
@@ -218,6 +249,26 @@ class InputSpace:
     def as_it_stands(self) -> bool:
         """True if pictures are taken for sRGB without a change."""
         return self.transfer in _DISPLAY and self.transfer != "g18" and self._wide is None
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """What the record of an import says beside the name: where that comes from, if not from here."""
+        return {}
+
+    @property
+    def light(self) -> str:
+        """In which of `LIGHTS` frames made of such footage leave: in its own, where it holds that."""
+        return self.primaries if self.transfer == "lin" and self.primaries in LIGHTS else LIGHTS[0]
+
+    @property
+    def probe(self) -> tuple[float, ...]:
+        """Linear Rec.709 light that `contract.PROBE` means in this space."""
+        return tuple(float(value) for value in self.to_linear(np.array([[PROBE]], np.float32))[0, 0])
+
+    @property
+    def rows(self) -> int:
+        """Rows of a picture that are best converted at a time: float32 takes four times what codes do."""
+        return 64
 
     @property
     def _wide(self) -> Chromaticities | None:

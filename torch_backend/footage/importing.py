@@ -27,8 +27,11 @@ from ..contract import (
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .images import is_whole_png, resize, working_size, write_png
+from .ocio import Colours
 from .opening import open_source
-from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, SourceInfo, footage_error, frame_words
+from .reading import read_as
+from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, SourceInfo, footage_error, frame_words, told_in
+from .timecode import later
 
 FRAMES_VERSION = 1
 LEAST_FRAMES = 8
@@ -66,11 +69,11 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     one takes its place once it is whole, and the solve made from it is removed; files that are not ours stay.
 
     Returns {frames, solved_frames, first, last, step, width, height, fps, colour, reading,
-    source}.
+    read_as, source}.
     Raises JobError (FOOTAGE, DISK) in one sentence, and Cancelled; either leaves no half import behind.
     """
     _check(config)
-    opened = open_source(source, config.fps, config.layer)
+    opened = open_source(source, config.fps, config.layer, Colours(config.colour_space), told_in(config))
     _check_range(opened, config)
     key = import_key(opened.info, config)
     restore_folder(shot.frames)
@@ -126,6 +129,17 @@ def load_frames(shot: Shot) -> dict[str, Any]:
     if not whole:
         raise footage_error(f"{path} is damaged.", "Import the clip again.")
     return record
+
+
+def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
+    """Where a shot's footage may lie: as it was named, beside the shot with which it was moved, in the same folder."""
+    named, beside = shot.info().source, str(record.get("beside") or "")
+    places = [named] if named else []
+    if beside:
+        places.append(str((shot.root / beside).resolve()))
+    if named:
+        places.append(str(shot.root.parent / re.split(r"[\\/]", named)[-1]))
+    return list(dict.fromkeys(places))
 
 
 def _check(config: FootageConfig) -> None:
@@ -184,9 +198,11 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
     def collect() -> None:
         nonlocal distinct
         one = pending.popleft().result()
-        if not flag_duplicate(one, distinct):
-            distinct = one
-        one.luma = one.luma if one is distinct else np.zeros((0, 0), np.float32)
+        repeats = flag_duplicate(one, distinct)
+        spent = one if repeats else distinct  # only the last one that is no repeat is compared with
+        if spent is not None:
+            spent.luma = np.zeros((0, 0), np.float32)
+        distinct = distinct if repeats else one
         measures.append(one)
         report.progress("import", len(measures), max(total, len(measures)), f"frame {one.frame}")
 
@@ -297,7 +313,9 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
             f"A step of {step} leaves {len(solved)} frames to solve, at least {LEAST_FRAMES} are needed.",
             "Choose a smaller step.",
         )
-    start = extracted.seconds[0]
+    start, timecode = extracted.seconds[0], str(info.reading.get("timecode", ""))
+    # The source's first frame has it. Slower than a frame in two seconds nothing can be counted.
+    timecode = later(timecode, measures[0].frame - info.first, info.fps) if timecode and round(info.fps) else ""
     frames = [
         {
             "frame": m.frame,
@@ -317,6 +335,8 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "fps": info.fps,
         "colour": info.colour,
         "reading": info.reading,
+        "read_as": read_as(info, timecode),
+        "timecode": timecode,
         "bits": 16 if info.deep else 8,
         "source_size": [info.width, info.height],
         "extended": info.extended,
@@ -395,5 +415,6 @@ def _result(shot: Shot, record: dict[str, Any]) -> dict[str, Any]:
         "last": frames[-1]["frame"],
         **{name: record[name] for name in ("step", "width", "height", "fps", "colour")},
         "reading": record.get("reading", {}),
+        "read_as": record.get("read_as", []),
         "source": shot.info().source,
     }

@@ -13,6 +13,12 @@ def channel_names(spec: oiio.ImageSpec) -> tuple[str, ...]:
     return cast(Any, spec).channelnames
 
 
+def bits_of(spec: oiio.ImageSpec) -> int:
+    """Bits of a channel as the file stores it."""
+    stored = attribute(spec, "oiio:BitsPerSample")
+    return int(stored) if isinstance(stored, int) and stored > 0 else 8 * int(cast(Any, spec.format).basesize())
+
+
 def open_output(output: oiio.ImageOutput, file: Path, spec: oiio.ImageSpec) -> bool:
     """Begins a file that holds one picture; False if that failed."""
     return cast(Any, output).open(str(file), spec)

@@ -23,8 +23,8 @@ _HALF_MAX = np.float32(65504.0)
 def half_of(pixels: NDArray[np.float32], space: InputSpace) -> NDArray[np.float16]:
     """[H, W, 3] as read, in `space`, to float16 codes."""
     out = np.empty(pixels.shape, np.float16)
-    for top in range(0, len(pixels), ROWS):
-        out[top : top + ROWS] = space.to_linear(pixels[top : top + ROWS])
+    for top in range(0, len(pixels), space.rows):
+        out[top : top + space.rows] = space.to_linear(pixels[top : top + space.rows])
     return out
 
 

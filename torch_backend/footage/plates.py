@@ -6,8 +6,8 @@ than the working frames do, these are the plates.
 
 from __future__ import annotations
 
-import re
 from collections import OrderedDict
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -22,9 +22,10 @@ from ..solve.undistort import BandUndistorter
 from ..torch_types import from_numpy
 from . import plate_encoding
 from .images import read_frame, read_png, resize_float, working_size
-from .importing import FootageConfig, import_key, load_frames
+from .importing import FootageConfig, import_key, load_frames, source_places
+from .ocio import Colours
 from .opening import open_source
-from .sources import Known, Source
+from .sources import Known, Source, SourceInfo, told_in
 
 PLATES_VERSION = 1
 _KEPT, _KEPT_BYTES = 11, 150e6
@@ -32,7 +33,9 @@ _NO_LARGER = 720
 """Import leaves clips of fewer lines than this at their size unless it is told otherwise."""
 _AGREE = 4.0 / 255.0
 _DISAGREE_SHARE = 1e-3
-"""A plate is of another picture than its working frame if more than this share of values is farther off than that."""
+"""A plate is of another picture than its working frame if more than this share of pixels is farther off than that, or
+one of its colours on the mean."""
+_LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 class Plates:
@@ -99,6 +102,19 @@ class Plates:
         """Plates held now."""
         return len(self._held)
 
+    def original(self) -> SourceInfo | None:
+        """The footage, where it is there and what was imported; also where working frames hold as much."""
+        record = load_frames(self._shot)
+        config = _config(record)
+        for _, source in self._opened(record, config):
+            return source.info if self._is_imported(source, record, config) else None
+        return None
+
+    def lens(self) -> PlateLens | None:
+        """The lens of all frames; None where frames have lenses of their own, or it is not told."""
+        lenses = set(self._lenses.values()) if isinstance(self._lenses, dict) else set[PlateLens]()
+        return next(iter(lenses)) if len(lenses) == 1 else None
+
     def close(self) -> None:
         """Frees what is held; plates are read anew if they are asked for again."""
         self._held.clear()
@@ -152,17 +168,24 @@ class Plates:
         if isinstance(self._lenses, str):
             return None, f"{self._lenses} {stays}"
         config = _config(record)
-        for place in source_places(self._shot, record):
-            try:
-                source = open_source(place, config.fps, config.layer)
-            except (JobError, OSError):
-                continue
+        for place, source in self._opened(record, config):
             if not source.info.extended and (source.info.width, source.info.height) == self._working:
                 return None, ""
             if self._is_imported(source, record, config):
                 return source, ""
             return None, f"The footage {place} is not what was imported any more. {stays}"
         return None, f"The footage {self._shot.info().source or 'of this shot'} cannot be read. {stays}"
+
+    def _opened(self, record: dict[str, Any], config: FootageConfig) -> Iterator[tuple[str, Source]]:
+        """Where footage lies that can be opened, and itself, read as it was imported."""
+        # By the configuration of the import: another one of today would read other colours.
+        reading: dict[str, Any] = record.get("reading") or {}
+        colours = Colours(config.colour_space, str(reading.get("ocio", "")))
+        for place in source_places(self._shot, record):
+            try:
+                yield place, open_source(place, config.fps, config.layer, colours, told_in(config))
+            except (JobError, OSError):
+                continue
 
     def _is_imported(self, source: Source, record: dict[str, Any], config: FootageConfig) -> bool:
         """True if the footage is by its key, or by its first, middle and last picture, what was imported."""
@@ -196,19 +219,10 @@ class Plates:
             small = resize_float(np.clip(plate_encoding.display(picture), 0.0, 1.0), width, height)
         else:
             small = plate_encoding.display(plate_encoding.resize_plate(picture, width, height))
-        off = np.abs(np.clip(small, 0.0, 1.0) - plate_encoding.display(raw))
-        return bool((off > _AGREE).mean() < _DISAGREE_SHARE)
-
-
-def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
-    """Where a shot's footage may lie: as it was named, beside the shot with which it was moved, in the same folder."""
-    named, beside = shot.info().source, str(record.get("beside") or "")
-    places = [named] if named else []
-    if beside:
-        places.append(str((shot.root / beside).resolve()))
-    if named:
-        places.append(str(shot.root.parent / re.split(r"[\\/]", named)[-1]))
-    return list(dict.fromkeys(places))
+        off = np.clip(small, 0.0, 1.0) - plate_encoding.display(raw)
+        # By brightness: colour at edges depends on how chroma was scaled up, which changed between versions.
+        alike = (np.abs(off @ _LUMA) > _AGREE).mean() < _DISAGREE_SHARE
+        return bool(alike and np.abs(off.mean(axis=(0, 1))).max() < _AGREE)
 
 
 def _config(record: dict[str, Any]) -> FootageConfig:

@@ -50,6 +50,11 @@ class DecodedVideo(Protocol):
         """A decoded frame as a plate."""
         ...
 
+    @property
+    def run_up(self) -> float:
+        """Seconds before a frame from which decoding has to begin for the same picture."""
+        ...
+
 
 class VideoReader:
     """See `sources.PlateReader`. Holds up to `_KEPT` frames as decoded: at most 25 MB each at 3840 x 2160, 10 bit."""
@@ -113,7 +118,7 @@ class VideoReader:
     def _sought(self, number: int) -> NDArray[Any] | None:
         """The plate by way of the key frame before it; None, once and for all, if this file cannot be sought in."""
         for earlier in _EARLIER:
-            if not self._jump(self._time_of(number) - earlier):
+            if not self._jump(self._time_of(number) - earlier - self._source.run_up):
                 break
             frame = self._forward(number)
             if frame is not None:

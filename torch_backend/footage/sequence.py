@@ -18,10 +18,11 @@ from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
 from . import plate_encoding
-from .color import InputSpace, named_space, space_of_chromaticities
+from .color import LIGHTS, InputSpace, named_space, space_of_chromaticities
 from .images import error_of, resize
 from .layers import Layer, find_layer, shown
-from .oiio_types import attribute, channel_names
+from .ocio import Colours
+from .oiio_types import attribute, bits_of, channel_names
 from .sources import (
     FASTEST_FPS,
     SLOWEST_FPS,
@@ -34,6 +35,7 @@ from .sources import (
     frame_words,
     square_size,
 )
+from .timecode import parse_timecode
 
 PICTURES = {
     ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
@@ -89,7 +91,14 @@ def _sequence_of_file(path: Path) -> FileSequence:
 class SequenceSource:
     """A numbered sequence. Frame numbers are those of the files; missing and unreadable ones are left out."""
 
-    def __init__(self, sequence: FileSequence, fps: float = 0.0, layer: str = "") -> None:
+    def __init__(
+        self,
+        sequence: FileSequence,
+        fps: float = 0.0,
+        layer: str = "",
+        colours: Colours | None = None,
+        told_aspect: Fraction | None = None,
+    ) -> None:
         self.warnings: list[tuple[str, str]] = []
         frame_set = sequence.frameSet()
         numbers = sorted(int(n) for n in frame_set) if frame_set else []
@@ -99,8 +108,9 @@ class SequenceSource:
             raise footage_error(f"{sequence} holds fewer than {FEW} pictures.", "Choose a longer sequence.")
         first, spec, self._layer, names = self._first_readable(layer)
         self._channels = channel_names(spec)
-        self._space = _input_space(first, spec, self.warnings)
-        self._aspect = believable_aspect(_pixel_aspect(spec), self.warnings)
+        self._space = _input_space(first, spec, colours or Colours(), self.warnings)
+        aspect = told_aspect or _pixel_aspect(spec)
+        self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
         self._stored = spec.full_width, spec.full_height
         width, height = square_size(*self._stored, self._aspect)
         self._describe(names, layer, (width, height))
@@ -109,7 +119,7 @@ class SequenceSource:
             rate = rate[0] / rate[1] if rate[1] else 0.0
         rate = rate if isinstance(rate, (int, float)) and SLOWEST_FPS <= rate <= FASTEST_FPS else 0.0
         space, light = self._space, self._space.is_light
-        reading_key = [space.name, self._layer.name, float(self._aspect), "straight"]
+        reading_key = [space.name, self._layer.name, float(self._aspect), "straight", *space.origin.values()]
         ordinary = space.as_it_stands or space == InputSpace("lin", declared=space.declared)
         ordinary = ordinary and self._aspect == 1 and self._layer.alpha is None and len(names) == 1
         stats = [f.stat() for f in self._files.values()]
@@ -129,12 +139,20 @@ class SequenceSource:
             reading={
                 "colour": space.name,
                 "colour_told": space.declared,
+                **space.origin,
+                **({"light": space.light} if space.light != LIGHTS[0] else {}),
                 "layer": self._layer.name,
                 "layers": names,
                 "alpha": self._layer.alpha is not None,
                 "pixel_aspect": float(self._aspect),
+                "pixel_aspect_told": aspect is not None,
                 "fps_told": bool(fps or rate),
+                "timecode": parse_timecode(str(spec.get_string_attribute("smpte:TimeCode"))),
+                "bits": bits_of(spec),
             },
+            file=str(first),
+            probe=space.probe,
+            unlike=_unlike(spec, len(names), self._aspect),
         )
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
@@ -146,7 +164,10 @@ class SequenceSource:
         ]
         if missing:
             self.warnings.append(
-                (f"The sequence lacks {frame_words(missing)}.", "Those frames are left out of the shot.")
+                (
+                    f"The sequence lacks {frame_words(missing)}.",
+                    "They are frozen through cameras between those of their neighbours, over two seconds at most.",
+                )
             )
         unreadable: list[int] = []
         findings = _Findings()
@@ -289,6 +310,17 @@ def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
     return spec, buffer, (error_of(buffer) or "it is damaged") if buffer.has_error else ""
 
 
+def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction) -> str:
+    """Why other programs show such pictures otherwise, see `SourceInfo.unlike`."""
+    if aspect != 1:
+        return "its pixels are not square"
+    if layers > 1:
+        return "its pictures have several layers"
+    if _data_window(spec) != (slice(0, spec.full_height), slice(0, spec.full_width)) or spec.full_x or spec.full_y:
+        return "its pictures fill only a part of their frame"
+    return "" if (spec.width, spec.height) == (spec.full_width, spec.full_height) else "its pictures exceed their frame"
+
+
 def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:
     """Rows and columns of the picture's frame that the file holds."""
     left, top = spec.x - spec.full_x, spec.y - spec.full_y
@@ -306,19 +338,24 @@ def _straight(rgb: NDArray[Any], alpha: NDArray[Any], opaque: float) -> NDArray[
     return colour if rgb.dtype == np.float32 else np.rint(np.clip(colour, 0, opaque)).astype(rgb.dtype)
 
 
-def _pixel_aspect(spec: oiio.ImageSpec) -> Fraction:
-    """Width of a pixel over its height; 1 where the file does not say."""
+def _pixel_aspect(spec: oiio.ImageSpec) -> Fraction | None:
+    """Width of a pixel over its height; None where the file does not say."""
     value = spec.getattribute("PixelAspectRatio")
-    if not isinstance(value, (int, float)) or not np.isfinite(value) or value <= 0 or abs(value - 1.0) < 1e-3:
+    if not isinstance(value, (int, float)) or not np.isfinite(value) or value <= 0:
+        return None
+    if abs(value - 1.0) < 1e-3:
         return Fraction(1)
     return Fraction(value).limit_denominator(10_000)
 
 
-def _input_space(file: Path, spec: oiio.ImageSpec, warnings: list[tuple[str, str]]) -> InputSpace:
-    """What the numbers of a picture mean, as its file says or, if it does not, as such files mostly mean it."""
+def _input_space(file: Path, spec: oiio.ImageSpec, colours: Colours, warnings: list[tuple[str, str]]) -> InputSpace:
+    """What a picture's numbers mean, as a person, its file or a rule of $OCIO says, or as such files mostly mean it."""
+    chosen = colours.space()
+    if chosen is not None:
+        return chosen
     suffix, name = file.suffix.lower(), str(spec.getattribute("oiio:ColorSpace") or "")
     if suffix in (".dpx", ".cin"):
-        return _film_space(suffix, str(spec.getattribute("dpx:Transfer") or ""), warnings)
+        return colours.by_rules(file) or _film_space(suffix, str(spec.getattribute("dpx:Transfer") or ""), warnings)
     named = named_space(name)
     primaries = attribute(spec, "chromaticities")
     if isinstance(primaries, tuple) and len(primaries) == 8 and (named is None or named.transfer == "lin"):
@@ -333,16 +370,25 @@ def _input_space(file: Path, spec: oiio.ImageSpec, warnings: list[tuple[str, str
         )
     if named is not None:
         return named
+    known = _known_to_ocio(file, name, colours)
+    if known is not None:
+        return known
     is_light = str(spec.format) in ("half", "float", "double") or suffix in (".exr", ".hdr")
     assumed = InputSpace("lin" if is_light or "lin" in name.lower() else "srgb", declared=False)
     if name and name.lower() not in ("unknown", "data"):
         warnings.append(
             (
                 f"The pictures' colour space {name!r} is not known here: taken as {assumed.name}.",
-                "Convert them to sRGB or scene-linear Rec.709 if the picture looks wrong.",
+                "Name their colour space (--colour-space) if the picture looks wrong.",
             )
         )
     return assumed
+
+
+def _known_to_ocio(file: Path, name: str, colours: Colours) -> InputSpace | None:
+    """The space that a file names as the OCIO configuration does, or that its rules give the file."""
+    found = colours.known(name) if name and name.lower() != "unknown" else None
+    return found or colours.by_rules(file)
 
 
 def _film_space(suffix: str, transfer: str, warnings: list[tuple[str, str]]) -> InputSpace:
@@ -351,7 +397,7 @@ def _film_space(suffix: str, transfer: str, warnings: list[tuple[str, str]]) -> 
         warnings.append(
             (
                 "The pictures are Cineon log: read with black at code 95, white at 685 and Rec.709 primaries.",
-                "Convert them to scene-linear EXR if they are another log.",
+                "Name their colour space (--colour-space), such as ADX10, if they are another log.",
             )
         )
         return InputSpace("cineon")
@@ -362,7 +408,7 @@ def _film_space(suffix: str, transfer: str, warnings: list[tuple[str, str]]) -> 
     warnings.append(
         (
             "The pictures do not say how their colour is encoded: taken as Rec.709 video, not as log.",
-            "Convert them to scene-linear EXR if they look flat.",
+            "Name their colour space (--colour-space) if they look flat.",
         )
     )
     return InputSpace("g24", declared=False)

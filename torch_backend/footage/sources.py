@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from ..contract import ExitCode, JobError
+from ..contract import ExitCode, ImportParams, JobError
 
 LONGEST_PIXEL = 4
 """Anamorphic pixels are at most about 2 times as wide as high."""
@@ -59,6 +59,30 @@ class SourceInfo:
     """What tells this footage from another: names, sizes, modification times."""
     reading: dict[str, Any] = field(default_factory=dict[str, Any])
     """How it is read, and what of that was assumed: the record in frames.json says so."""
+    file: str = ""
+    """The video, or the first picture of the sequence."""
+    probe: tuple[float, ...] = ()
+    """Linear Rec.709 light that `contract.PROBE` means in its files."""
+    unlike: str = ""
+    """Why another program would show the files otherwise than they are read here, a clause; empty if it would not."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a person says of the footage in place of its files."""
+
+    matrix: str = ""
+    """One of `frame_rgb.MATRIX_OVERRIDES`; empty: what the file says, or players assume."""
+    levels: str = ""
+    """One of `frame_rgb.RANGE_OVERRIDES`; empty: what the file says, or players assume."""
+    pixel_aspect: Fraction | None = None
+    """Width of a pixel over its height; None: what the files say, else square."""
+
+
+def told_in(config: ImportParams) -> Told:
+    """What of it an import was asked for."""
+    matrix, levels = ("" if value == "auto" else value for value in (config.matrix, config.levels))
+    return Told(matrix, levels, Fraction(config.pixel_aspect).limit_denominator(10_000) or None)
 
 
 class Source(Protocol):

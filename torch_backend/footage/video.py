@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -11,25 +11,29 @@ from typing import Any
 import av
 import numpy as np
 from av.error import FFmpegError
-from av.video.reformatter import Colorspace, Interpolation
 from numpy.typing import NDArray
 
 from . import plate_encoding
 from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
+from .decoding import Noticed, decoded, stored_frames, time_of
+from .frame_rgb import BT601, MATRICES, RGB, Coding, coding_of, depth_of, exact_rgb, rgb_codes
 from .images import resize
+from .ocio import Colours
 from .seeking import VideoReader
 from .sources import (
     Known,
     PlateReader,
     SourceFrame,
     SourceInfo,
+    Told,
     believable_aspect,
     footage_error,
     frame_words,
     square_size,
 )
+from .timecode import parse_timecode
 
 NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
 """FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
@@ -45,11 +49,6 @@ TRANSFERS = {
 PRIMARIES = {1: "rec709", 9: "rec2020", 10: "ciexyzd65", 11: "p3dci", 12: "p3d65"}
 NEAR_REC709 = {4: "BT.470 M", 5: "BT.601 625", 6: "BT.601 525", 7: "SMPTE 240M", 22: "EBU 3213"}
 """Primaries of standard definition: taken as Rec.709's, as editors and Blender do; the difference is small."""
-MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9, 10: 9}
-"""YCbCr matrix of the stream -> FFmpeg's scaler's. BT.2020's constant luminance is taken as the other, nearly it."""
-LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
-"""Shares of red and blue in luma, by matrix."""
-BT709, BT601, RGB, FULL_RANGE = 1, 5, 0, 2
 
 
 class VideoSource:
@@ -58,35 +57,38 @@ class VideoSource:
     A file that ends before what it announces, and a picture that changes its size midway, are told by name.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, colours: Colours | None = None, told: Told | None = None) -> None:
         self.path = path
         self.warnings: list[tuple[str, str]] = []
+        told = told or Told()
         with self._open() as container:
             stream = _best_stream(container, path)
             frame = _first_frame(container, stream, path)
             self._quarter_turns = round(_rotation(frame) / 90.0) % 4
-            self._aspect = believable_aspect(_pixel_aspect(stream), self.warnings)
-            self._space = _input_space(frame, self.warnings)
-            self._deep = max(c.bits for c in frame.format.components) > 8 or self._space.is_light
+            aspect = told.pixel_aspect or _pixel_aspect(stream)
+            self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
+            self._space = _chosen_space(path, colours or Colours()) or _input_space(frame, self.warnings)
+            self._coding = coding_of(frame, told.matrix, told.levels)
+            self._deep = depth_of(frame) > 8 or self._space.is_light
             width, height = square_size(frame.width, frame.height, self._aspect)
             if self._quarter_turns % 2:
                 width, height = height, width
-            rate = stream.average_rate or stream.guessed_rate or Fraction(24)
+            rate = stream.average_rate or stream.guessed_rate
+            rate_told, rate = bool(rate), rate or Fraction(24)
             count = stream.frames or _count_from_duration(container, stream, rate)
-            self._warn_about(frame)
+            self._interlaced = bool(frame.interlaced_frame)
             self._size = frame.width, frame.height
             self._promise = _promise(container, stream, rate)
-            matrix = RGB if frame.format.is_rgb else int(frame.colorspace)
+            self._warn_about(frame)
             reading = {
-                "colour": self._space.name,
-                "colour_told": self._space.declared,
-                "primaries": NEAR_REC709.get(int(frame.color_primaries), PRIMARIES_READ[self._space.primaries][0]),
-                "matrix": Colorspace(_matrix(frame)).name if matrix != RGB else "RGB",
-                "matrix_told": matrix in MATRICES or matrix == RGB,
-                "range": "full" if int(frame.color_range) == FULL_RANGE else "video",
-                "range_told": int(frame.color_range) in (1, FULL_RANGE),
+                **_reading(frame, self._space, self._coding),
+                "fps_told": rate_told,
                 "pixel_aspect": float(self._aspect),
-                "bits": max(c.bits for c in frame.format.components),
+                "pixel_aspect_told": aspect is not None,
+                "alpha": any(component.is_alpha for component in frame.format.components),
+                "interlaced": self._interlaced,
+                "timecode": _timecode(container, stream),
+                "turned": 90 * self._quarter_turns,
             }
         stat = path.stat()
         self.info = SourceInfo(
@@ -99,19 +101,38 @@ class VideoSource:
             extended=not self._space.as_it_stands,
             colour="linear" if self._space.is_light else "srgb",
             # What is read otherwise than it used to be is imported again; all else keeps its key.
-            key=[path.name, stat.st_size, stat.st_mtime_ns, *([] if self._space.as_it_stands else [self._space.name])],
+            key=[path.name, stat.st_size, stat.st_mtime_ns, *_reading_key(self._space)]
+            + (["deinterlaced"] if self._interlaced else []),
             reading=reading,
+            file=str(path),
+            probe=self._space.probe,
+            unlike=self._unlike(frame),
         )
+
+    def _unlike(self, frame: av.VideoFrame) -> str:
+        """Why other programs show the clip otherwise, see `SourceInfo.unlike`."""
+        tagged = coding_of(frame)
+        if self._aspect != 1:
+            return "its pixels are not square"
+        if self._quarter_turns:
+            return "it is turned by its header"
+        if self._interlaced:
+            return "it is interlaced, and frames are made of its fields here"
+        if (tagged.matrix, tagged.is_full) != (self._coding.matrix, self._coding.is_full):
+            return "its matrix or range was set by hand"
+        if not tagged.matrix_told and tagged.matrix != BT601:  # what FFmpeg, and so Blender, takes such a clip for
+            return "it does not say by which matrix its colours are stored"
+        return ""
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
         """See `Source.frames`."""
         begin = 1 if first is None else first
-        number, got, seen = 0, 0, _Seen()
+        number, got, seen, noticed = 0, 0, _Seen(), Noticed()
         lost: list[int] = []
         with self._open() as container:
             stream = _best_stream(container, self.path)
             stream.thread_type = "AUTO"
-            for frame in _decoded(container, stream, seen.damaged):
+            for frame in decoded(container, stream, noticed):
                 number += 1
                 if last is not None and number > last:
                     break
@@ -126,11 +147,13 @@ class VideoSource:
                 seen.add(number, seconds)
                 if number >= begin:
                     got += 1
-                    corrupt = bool(frame.is_corrupt) or frame.pts in seen.damaged
+                    corrupt = bool(frame.is_corrupt) or time_of(frame) in noticed.damaged
                     pixels, clipped = self._upright(frame)
                     yield SourceFrame(number, seconds, pixels, corrupt, clipped)
             else:
                 self._check_promise(seen, begin, last)
+        if noticed.interlaced and not self._interlaced:
+            self.warnings.append(_deinterlaced_words(f"{noticed.interlaced} frames of the clip are interlaced: each"))
         lost = [n for n in lost if begin <= n < seen.number]
         if lost:
             words = frame_words(lost).capitalize()
@@ -150,15 +173,20 @@ class VideoSource:
         if (frame.width, frame.height) != self._size:
             raise footage_error(f"{self.path.name} is not the clip that was imported: its size changes.")
         if self._space.as_it_stands:
-            pixels = _rgb(frame, "rgb48le" if self._deep else "rgb24")
+            pixels = rgb_codes(frame, self._coding, deep=self._deep)
         else:
-            pixels = plate_encoding.half_of(_exact_rgb(frame), self._space)
+            pixels = plate_encoding.half_of(exact_rgb(frame, self._coding), self._space)
         pixels = plate_encoding.resize_plate(pixels, *square_size(frame.width, frame.height, self._aspect))
         return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
 
     def decode(self, container: Any, stream: Any) -> Iterator[Any]:
         """Frames from where a container of `open` stands, and errors in the place of what cannot be decoded."""
-        return _decoded(container, stream)
+        return decoded(container, stream)
+
+    @property
+    def run_up(self) -> float:
+        """Seconds before a frame from which decoding has to begin for the same picture: deinterlacing looks back."""
+        return 1.5 / self.info.fps if self._interlaced else 0.0
 
     def open(self, threads: int) -> tuple[Any, Any]:
         """The container and its stream, to be decoded by at most so many threads. JobError if it cannot be opened."""
@@ -208,9 +236,9 @@ class VideoSource:
     def _upright(self, frame: av.VideoFrame) -> tuple[NDArray[Any], float]:
         """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels."""
         if self._space.as_it_stands:
-            pixels, clipped = _rgb(frame, "rgb48le" if self._deep else "rgb24"), 0.0
+            pixels, clipped = rgb_codes(frame, self._coding, deep=self._deep), 0.0
         else:
-            values, clipped = self._space.to_srgb(_exact_rgb(frame))
+            values, clipped = self._space.to_srgb(exact_rgb(frame, self._coding))
             values = np.rint(values * np.float32(65535.0 if self._deep else 255.0))
             pixels = values.astype(np.uint16 if self._deep else np.uint8)
         width, height = square_size(frame.width, frame.height, self._aspect)
@@ -228,10 +256,10 @@ class VideoSource:
             )
         elif not space.as_it_stands:
             self.warnings.append((f"The clip is {space.name}: converted to Rec.709.", ""))
-        if frame.interlaced_frame:
-            self.warnings.append(
-                ("The clip is interlaced: its fields are not separated.", "Deinterlace it before import.")
-            )
+        if self._interlaced:
+            self.warnings.append(_deinterlaced_words("The clip is interlaced: each frame"))
+        if any(component.is_alpha for component in frame.format.components):
+            self.warnings.append(("The clip has alpha: its colour is taken, its alpha is not.", ""))
 
 
 @dataclass
@@ -244,13 +272,16 @@ class _Seen:
     """Its time."""
     gap: float = 0.0
     """Longest time between two frames, beyond the second: rates may vary."""
-    damaged: set[int | None] = field(default_factory=set[int | None])
-    """Time stamps of packets that the container knows to be incomplete."""
 
     def add(self, number: int, seconds: float) -> None:
         if self.number:
             self.gap = max(self.gap, seconds - self.seconds)
         self.number, self.seconds = number, seconds
+
+
+def _deinterlaced_words(which: str) -> tuple[str, str]:
+    message = f"{which} becomes a whole picture of its first field."
+    return message, "Film progressive where you can: half of its lines are interpolated."
 
 
 def _no_video(path: Path) -> Exception:
@@ -275,55 +306,10 @@ def _best_stream(container: Any, path: Path) -> Any:
 
 
 def _first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:
-    for frame in _decoded(container, stream):
+    for frame in stored_frames(container, stream):
         if not isinstance(frame, FFmpegError):
             return frame
     raise _no_video(path)
-
-
-def _decoded(container: Any, stream: Any, damaged: set[int | None] | None = None) -> Iterator[Any]:
-    """Frames, and in the place of a packet that cannot be decoded its error. Ends where the file breaks off.
-
-    `damaged` receives the time stamps of packets that are decoded although they are not whole.
-    """
-    for packet in _packets(container, stream):
-        if isinstance(packet, FFmpegError):
-            yield packet
-            continue
-        if damaged is not None and packet.is_corrupt and packet.pts is not None:
-            damaged.add(packet.pts)
-        try:
-            yield from packet.decode()
-        except FFmpegError as error:
-            yield error
-
-
-def _packets(container: Any, stream: Any) -> Iterator[Any]:
-    """Packets, the last of them empty: it asks the decoder for what it still holds. An error ends the file early.
-
-    The packet in the middle of which a file ends is left out: it would be half a picture, and its error would cost
-    those that the decoder has not given out yet.
-    """
-    packets: Iterator[Any] = container.demux(stream)
-    held: Any = None
-    while True:
-        error = None
-        try:
-            packet = next(packets, None)
-        except FFmpegError as failure:
-            packet, error = None, failure
-        if packet is not None and not packet.size and packet.dts is not None:
-            continue  # a repeat of the frame before, in an AVI: to a decoder it means the end
-        at_end = packet is None or not packet.size
-        if held is not None and not (at_end and held.is_corrupt):
-            yield held
-        if at_end:
-            if error is not None:
-                yield error
-            elif packet is not None:
-                yield packet
-            return
-        held = packet
 
 
 def _rotation(frame: Any) -> float:
@@ -331,35 +317,41 @@ def _rotation(frame: Any) -> float:
     return float(getattr(frame, "rotation", 0) or 0)
 
 
-def _pixel_aspect(stream: Any) -> Fraction:
+def _pixel_aspect(stream: Any) -> Fraction | None:
+    """Width of a pixel over its height; None if the file does not say."""
     aspect = stream.sample_aspect_ratio
-    return Fraction(aspect) if aspect and aspect > 0 else Fraction(1)
+    return Fraction(aspect) if aspect and aspect > 0 else None
 
 
-def _rgb(frame: av.VideoFrame, kind: str) -> NDArray[Any]:
-    """R'G'B' [H, W, 3] as FFmpeg's scaler makes it: quick, and up to 1 of 255 off."""
-    return frame.reformat(format=kind, src_colorspace=_matrix(frame), interpolation=Interpolation.BICUBIC).to_ndarray()
+def _reading(frame: av.VideoFrame, space: InputSpace, coding: Coding) -> dict[str, Any]:
+    """How the colours of a clip are read, for the record of the import."""
+    return {
+        "colour": space.name,
+        "colour_told": space.declared,
+        **space.origin,
+        "primaries": _primaries_read(frame, space),
+        "matrix": coding.matrix_name,
+        "matrix_told": coding.matrix_told,
+        "range": coding.range_name,
+        "range_told": coding.range_told,
+        "bits": depth_of(frame),
+    }
 
 
-def _exact_rgb(frame: av.VideoFrame) -> NDArray[np.float32]:
-    """R'G'B' [H, W, 3], white 1, as steep curves need it; values beyond 0 and 1 are kept."""
-    luma = LUMA.get(int(_matrix(frame)))
-    if frame.format.is_rgb or luma is None:
-        return _rgb(frame, "rgb48le").astype(np.float32) * np.float32(1.0 / 65535.0)
-    even = frame.reformat(format="yuv444p16le", interpolation=Interpolation.BICUBIC)
-    planes: Any = even.planes
-    y, cb, cr = (
-        np.frombuffer(plane, np.uint16).reshape(plane.height, -1)[:, : plane.width].astype(np.float32)
-        for plane in planes
-    )
-    if int(frame.color_range) == FULL_RANGE:
-        y, cb, cr = y / 65535, (cb - 32768) / 65535, (cr - 32768) / 65535
-    else:
-        y, cb, cr = (y / 256 - 16) / 219, (cb / 256 - 128) / 224, (cr / 256 - 128) / 224
-    kr, kb = luma
-    red, blue = y + 2 * (1 - kr) * cr, y + 2 * (1 - kb) * cb
-    green = (y - kr * red - kb * blue) / (1 - kr - kb)
-    return np.stack([red, green, blue], axis=-1).astype(np.float32, copy=False)
+def _chosen_space(path: Path, colours: Colours) -> InputSpace | None:
+    """What a person says that a clip's colours are, or a rule of $OCIO for its path."""
+    return colours.space() or colours.by_rules(path)
+
+
+def _reading_key(space: InputSpace) -> list[str]:
+    return [] if space.as_it_stands else [space.name, *space.origin.values()]
+
+
+def _primaries_read(frame: av.VideoFrame, space: InputSpace) -> str:
+    """Name of the primaries that a frame's colours are read with."""
+    if not space.primaries:
+        return space.name
+    return NEAR_REC709.get(int(frame.color_primaries), PRIMARIES_READ[space.primaries][0])
 
 
 def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> InputSpace:
@@ -387,10 +379,11 @@ def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> Input
     return InputSpace(TRANSFERS.get(transfer, "g24"), gamut, declared=declared)
 
 
-def _matrix(frame: av.VideoFrame) -> Colorspace:
-    """YCbCr matrix: as tagged, else what players assume: BT.709 from 720 lines on, BT.601 below."""
-    assumed = BT709 if max(frame.width, frame.height) >= 1280 else BT601
-    return Colorspace(MATRICES.get(int(frame.colorspace), assumed))
+def _timecode(container: Any, stream: Any) -> str:
+    """Of the first frame; empty if the file carries none."""
+    tables = [stream.metadata, container.metadata, *(one.metadata for one in container.streams)]
+    said = (parse_timecode(str(value)) for table in tables for key, value in table.items() if key.lower() == "timecode")
+    return next((code for code in said if code), "")
 
 
 def _promise(container: Any, stream: Any, rate: Fraction) -> tuple[int, float]:

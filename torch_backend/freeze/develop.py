@@ -20,6 +20,7 @@ from ..scene import Scene
 from ..torch_types import backward, floats, integers
 from ..train import LoadedRun
 from ..train.adam import FusedAdam
+from ..train.average import ParameterMean
 from ..train.losses import photometric
 from ..train.model import render
 from .frozen import FrozenGaussians
@@ -33,7 +34,7 @@ Check = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class DevelopConfig:
-    """How an instant is developed. Rates are those of a run's end (`TrainConfig`), in scene units."""
+    """How an instant is developed. Rates are in scene units."""
 
     steps: int = 300
     """Training steps, of one frame each."""
@@ -53,17 +54,21 @@ class DevelopConfig:
     dssim: float = 0.2
     """As in `TrainConfig`."""
     lr_means: float = 1e-4
-    """Start rate of means; all rates fall to a tenth."""
+    """Start rate of means."""
     lr_quats: float = 2e-3
     """Of quaternions."""
-    lr_scales: float = 8e-3
+    lr_scales: float = 1.2e-2
     """Of log-scales."""
     lr_opacities: float = 2e-2
     """Of opacity logits."""
-    lr_sh0: float = 4e-3
+    lr_sh0: float = 6e-3
     """Of the constant colour."""
-    lr_sh_rest: float = 2e-4
+    lr_sh_rest: float = 1e-3
     """Of the other harmonics."""
+    lr_end: float = 0.3
+    """Share of its start that each rate has at the end."""
+    average: float = 0.3
+    """Share of the steps, the last ones, whose mean is kept."""
     warm: float = 0.15
     """Share of the steps over which the rates rise: Adam has no memory of the gradients at first."""
     opacity_weight: float = 1e-3
@@ -120,18 +125,26 @@ class _Darkroom:
     def run(self, check: Check | None) -> FrozenGaussians:
         """All steps, and the judgement."""
         order: list[int] = []
+        mean = ParameterMean()
         steps, before = self.config.steps, self._judged()
         for n in range(steps):
             if check is not None:
                 check(n, steps)
             for group in self.optimizer.param_groups:
-                group["lr"] = group["first"] * 0.1 ** (n / steps) * min(1.0, (n + 1) / (self.config.warm * steps + 1))
+                group["lr"] = (
+                    group["first"]
+                    * self.config.lr_end ** (n / steps)
+                    * min(1.0, (n + 1) / (self.config.warm * steps + 1))
+                )
             if float(torch.rand(1, generator=self.generator, device="cpu")) < self.config.instant_share:
                 frame = self.instants[n % len(self.instants)]
             else:
                 order = order or integers(torch.randperm(len(self.frames), generator=self.generator, device="cpu"))
                 frame = self.frames[order.pop()]
             self._step(frame)
+            if n >= steps - round(self.config.average * steps):
+                mean.add(self.params)
+        mean.put_into(self.params)
         after = self._judged()
         if after[0] < before[0] + self.config.gain or after[1] <= before[1]:
             state = dict(self.frozen.state)
@@ -179,10 +192,11 @@ class _Darkroom:
 
     def _learnt(self, frame: int, mover: Tensor) -> Tensor:
         """bool [H, W]: which pixels of a frame say what the frozen scene should show there."""
-        matte = self.plates.matte(frame)
+        matte, ignored = self.plates.matte(frame), self.plates.ignored(frame)
+        learnt = (matte < 0.5) & (mover < 0.1)
         if frame in self.instants:
-            return torch.ones_like(matte, dtype=torch.bool)
-        return (matte < 0.5) & (mover < 0.1)
+            learnt = torch.ones_like(learnt)
+        return learnt if ignored is None else learnt & ~ignored
 
     def _optimizer(self) -> FusedAdam:
         c, p = self.config, self.params

@@ -26,6 +26,8 @@ import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
 from ..contract import FRAME_LAYERS, channels_of, layers_of
+from ..footage.color import LIGHTS, PRIMARIES, InputSpace, in_light, light_matrix, light_of_chromaticities
+from ..footage.timecode import parse_timecode, smpte_bits
 from ..shot import atomic_path
 
 CHANNELS = channels_of("")
@@ -38,8 +40,8 @@ HALF_MAX = 65504.0
 """Largest finite half float; brighter colour is clamped to it."""
 EXR_VERSION = 1
 """Version of the `splannequin:` attributes."""
-COLOR_SPACE = "lin_rec709_scene"
-"""Scene-linear, Rec.709 / sRGB primaries, D65 (ASWF colour interop id, written as `colorInteropID`)."""
+COLOR_SPACE = "lin_{}_scene"
+"""Scene-linear of some primaries (ASWF colour interop id, written as `colorInteropID`)."""
 
 _STORAGE = {"half": oiio.HALF, "float": oiio.FLOAT}
 _FORMATS, _GRAIN_FORMATS, _DETAIL_FORMATS = (
@@ -52,7 +54,6 @@ _MORE = {layer.name: layer for layer in FRAME_LAYERS if layer.part not in _PARTS
 _CHANNELS_OF = {"rgba": (4,), "splat": (4,), "grain": (3,)}
 _ROWS = 64
 _PLATE_STEPS = 256.0
-_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -68,12 +69,16 @@ class FrameMetadata:
     """[4,4] world-to-camera, OpenCV axes, column vectors (p_camera = viewmat @ p_world)."""
     K: NDArray[np.float32]
     """[3,3] intrinsics in pixels of the frame (without a margin), pixel centres at +0.5."""
+    timecode: str = ""
+    """SMPTE timecode of the clip's frame; empty if the clip carries none."""
     depth_units: str = "solve units"
     """Unit of depth and of the translation in `viewmat`."""
     version: int = EXR_VERSION
     """Version of these attributes."""
     key: str = ""
     """What the frame was rendered from, to tell a stale one; empty in frames of before it was noted."""
+    light: str = LIGHTS[0]
+    """Primaries of the light in the file, one of `LIGHTS`. Arrays here are Rec.709's, whatever it is."""
 
 
 class Rows(Protocol):
@@ -151,10 +156,13 @@ def write_frozen_exr(
     which takes a third off what it adds to the file (0.74 instead of 1.25 MB at 640 x 480). `splat` keeps 8 bits, four
     times finer than 8-bit sRGB, and `plate` steps of 1/256: with `source` they add 0.95 MB instead of 1.29.
 
-    Attributes: `chromaticities` and `colorInteropID` (Rec.709); `worldToCamera`, the OpenEXR standard matrix, in the
-    renderer axes of Blender and Nuke (x right, y up, looking along -z) for Imath's row vectors (p_camera = p_world @
-    M, translation in the last row); `splannequin:viewmat` and `splannequin:K`, row-major as in `FrameMetadata`;
-    `splannequin:frame`, `:tStarFrame`, `:depthUnits`, `:version`, `:key`. Half channels are clamped to +-65504.
+    Colours are converted from Rec.709 to the light that `metadata` names.
+
+    Attributes: `chromaticities` and `colorInteropID` of that light, and `splannequin:probe` (see `contract.PROBE`) if
+    it is not Rec.709's; `worldToCamera`, the OpenEXR standard matrix, in the renderer axes of Blender and Nuke (x
+    right, y up, looking along -z) for Imath's row vectors (p_camera = p_world @ M, translation in the last row);
+    `splannequin:viewmat` and `splannequin:K`, row-major as in `FrameMetadata`; `splannequin:frame`, `:tStarFrame`,
+    `:depthUnits`, `:version`, `:key`. Half channels are clamped to +-65504.
 
     With a `margin` the arrays are the data window, and the display window, in whose pixels K counts, is the frame
     inside of them. Blender 4.2 to 5.2 reads the whole data window and puts its middle in the middle of the render,
@@ -178,7 +186,8 @@ def write_frozen_exr(
         row = _MORE[name]
         layers[name] = layer
         names, formats = names + row.channels, formats + (_STORAGE[row.stored],) * len(row.channels)
-    parts = [_changed(layer, _STORED[name]) if name in _STORED else layer for name, layer in _checked(layers).items()]
+    matrix = light_matrix(metadata.light)
+    parts = [_stored(name, layer, matrix) for name, layer in _checked(layers).items()]
     spec = _spec(parts[0].shape[1], parts[0].shape[0], names, formats, metadata)
     set_margin(spec, margin)
     return write_exr(path, spec, parts)
@@ -261,21 +270,25 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
         image.close()
     order = [names.index(name) for name in CHANNELS]
     pixels = np.asarray(pixels, dtype=np.float32)
+    forth = light_matrix(metadata.light)
+    back = None if forth is None else np.linalg.inv(forth)
     depth, support, motion = (np.ascontiguousarray(pixels[..., i]) for i in order[4:])
     beyond = (spec.full_x - spec.x, spec.full_y - spec.y)
     grain = None
     if all(name in names for name in GRAIN_CHANNELS):
-        grain = np.ascontiguousarray(pixels[..., [names.index(name) for name in GRAIN_CHANNELS[:3]]])
+        grain = np.ascontiguousarray(in_light(pixels[..., [names.index(name) for name in GRAIN_CHANNELS[:3]]], back))
     detail = None
     if all(name in names for name in DETAIL_CHANNELS):
         found = pixels[..., [names.index(name) for name in DETAIL_CHANNELS]]
+        found = in_light(found, back)
         detail = DetailLayers(*(np.ascontiguousarray(found[..., i]) for i in (slice(0, 4), 4, 5)))
-    rgba = np.ascontiguousarray(pixels[..., order[:4]])
+    rgba = np.ascontiguousarray(in_light(pixels[..., order[:4]], back))
     more: dict[str, NDArray[np.float32]] = {}
     for name, row in _MORE.items():
         if set(row.channels) <= set(names):
             at = [names.index(channel) for channel in row.channels]
-            more[name] = np.ascontiguousarray(pixels[..., at if len(at) > 1 else at[0]])
+            layer = in_light(pixels[..., at], back) if len(at) > 1 else pixels[..., at[0]]
+            more[name] = np.ascontiguousarray(layer)
     return FrozenFrame(rgba, depth, support, motion, metadata, beyond, grain, detail, more)
 
 
@@ -317,8 +330,12 @@ _STORED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
 """What becomes of a layer's rows as they are written."""
 
 
-def _changed(layer: Rows, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Made:
-    return Made(layer.shape, lambda rows: change(layer[rows]))
+def _stored(name: str, layer: Rows, matrix: NDArray[np.float32] | None) -> Rows:
+    """A layer as its file has it: colours in the file's light, rounded as the layer's kind is."""
+    change = _STORED.get(name, lambda rows: rows)
+    if matrix is not None and len(layer.shape) == 3:
+        return Made(layer.shape, lambda rows: change(in_light(layer[rows], matrix)))
+    return Made(layer.shape, lambda rows: change(layer[rows])) if name in _STORED else layer
 
 
 def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
@@ -373,29 +390,40 @@ def _spec(
             raise ValueError(f"metadata.{name} should be a finite matrix of shape {shape}, got {matrix.tolist()}")
     if not math.isfinite(metadata.t_star_frame):
         raise ValueError(f"metadata.t_star_frame should be finite, got {metadata.t_star_frame}")
-    spec = linear_spec(width, height, names, formats)
+    spec = linear_spec(width, height, names, formats, metadata.light)
     spec.attribute("worldToCamera", oiio.TypeDesc("matrix"), _flat((_FLIP_YZ @ viewmat).T))
     spec.attribute("splannequin:viewmat", oiio.TypeDesc("matrix"), _flat(viewmat))
     spec.attribute("splannequin:K", oiio.TypeDesc("matrix33"), _flat(intrinsics))
     spec.attribute("splannequin:frame", int(metadata.frame))
     spec.attribute("splannequin:tStarFrame", float(metadata.t_star_frame))
     spec.attribute("splannequin:depthUnits", metadata.depth_units)
+    if metadata.timecode:
+        spec.attribute("smpte:TimeCode", oiio.TypeDesc("timecode"), smpte_bits(metadata.timecode))
     spec.attribute("splannequin:version", int(metadata.version))
     if metadata.key:
         spec.attribute("splannequin:key", metadata.key)
     return spec
 
 
-def linear_spec(width: int, height: int, names: tuple[str, ...], formats: tuple[oiio.BASETYPE, ...]) -> oiio.ImageSpec:
-    """What a ZIP-compressed EXR of `COLOR_SPACE` with these channels begins with."""
+def linear_spec(
+    width: int, height: int, names: tuple[str, ...], formats: tuple[oiio.BASETYPE, ...], light: str = LIGHTS[0]
+) -> oiio.ImageSpec:
+    """What a ZIP-compressed EXR of scene-linear light, one of `LIGHTS`, with these channels begins with."""
     spec = oiio.ImageSpec(width, height, len(names), formats[0])
     spec.channelnames = names
     if len(set(formats)) > 1:  # else the writer passes over them
         spec.channelformats = formats
     spec.attribute("compression", "zip")
-    spec.attribute("oiio:ColorSpace", COLOR_SPACE)
-    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), _REC709)
+    spec.attribute("oiio:ColorSpace", COLOR_SPACE.format(light))
+    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), PRIMARIES[light][1])
+    if light != LIGHTS[0]:
+        spec.attribute("splannequin:probe", oiio.TypeDesc("vector"), InputSpace("lin", light).probe)
     return spec
+
+
+def read_light(spec: oiio.ImageSpec) -> str:
+    """Which of `LIGHTS` a file of `linear_spec` holds."""
+    return light_of_chromaticities(cast(Any, spec).getattribute("chromaticities"))
 
 
 def _flat(matrix: NDArray[Any]) -> tuple[float, ...]:
@@ -418,6 +446,8 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> FrameMetadata:
         depth_units=str(values["depthUnits"]),
         version=int(values["version"]),
         key=str(spec.getattribute("splannequin:key") or ""),
+        light=read_light(spec),
+        timecode=parse_timecode(str(spec.get_string_attribute("smpte:TimeCode"))),
     )
 
 

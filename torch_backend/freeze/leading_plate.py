@@ -56,7 +56,11 @@ def leading_matte(
     st, within = _places(sightings, posed, leading, own, size)
     if own and leading != output.frame:  # its own plate is withheld
         return torch.zeros(rows, columns, device="cpu"), st, own
+    free = _free(sightings, posed, leading) if own else None
     if own and leading == output.t_star:  # its own plate shows the instant itself
+        if free is not None:
+            posed.moved = torch.maximum(posed.motion, 1.0 - free)
+            within = within * resized(free, columns, rows)
         return within, st, own
     wrong = torch.maximum(posed.motion, lead.moving) > 0.5
     if own:
@@ -65,11 +69,23 @@ def leading_matte(
     let_go = blurred(posed.doubt, config.feather * sightings.unit)
     matte = 1.0 - let_go
     if own:
+        if free is not None:
+            matte, let_go = matte * free, torch.maximum(let_go, 1.0 - free)
         posed.moved = torch.maximum(posed.motion, let_go)
     else:
         error = parallax(sightings, config, posed, leading, posed.depth)
         matte = matte * lead.visible * torch.exp(-error.square())
     return resized(matte, columns, rows) * within, st, own
+
+
+def _free(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor | None:
+    """[h, w] in 0..1: what of a frame's own plate is part of the scene; None: all of it."""
+    ignored = sightings.view(frame).ignored
+    if ignored is None:
+        return None
+    free = torch.ones_like(posed.depth)
+    free[_middle(ignored, posed.depth)] = 1.0 - ignored[..., 0]
+    return free
 
 
 def _let_go(

@@ -19,13 +19,16 @@ from torch import Tensor
 
 from ..gaussians.model import SH_C0
 from ..scene import Scene, evenly_spaced, read_image, resize_intrinsics
+from ..shot import Shot
 from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.exposure import Exposure
 from ..train.model import gathered
 from .frozen import FrozenGaussians, FrozenImage, render_frozen
+from .ignored import ignore_mattes
 from .instant_depth import DepthConfig, Region, View, inverse_depth, own_motion
 from .instant_track import Track, TrackConfig, swing, tracks
+from .reproject import resized
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a motion matte (`solve/motion.py`)."""
@@ -174,6 +177,9 @@ class _Bench:
         self.Ks = resize_intrinsics(scene.Ks, scene.width, scene.height, self.width, self.height)
         self._views: dict[int, View] = {}
         self.view = self.at(index)
+        mask = ignore_mattes(Shot(scene.folder.parent))(scene.frames[index])
+        self._ignored = None if mask is None else resized(mask, self.width, self.height).numpy() > 0.0
+        """[h, w] bool what of plate t* is no part of the scene: nothing is missing there."""
 
     def at(self, index: int) -> View:
         """Delivered frame `index`: its plate and camera. Kept."""
@@ -225,8 +231,11 @@ class _Bench:
 
     def difference(self, image: FrozenImage) -> NDArray[np.float32]:
         """Low-passed difference [h, w] between plate and render, beyond what misplaced edges explain."""
-        c = self.config
-        return low_difference(self.view.picture, image.color.numpy(), c.blur * self.unit, c.shift * self.unit)
+        c, shown = self.config, image.color.numpy()
+        plate = (
+            self.view.picture if self._ignored is None else np.where(self._ignored[..., None], shown, self.view.picture)
+        )
+        return low_difference(plate, shown, c.blur * self.unit, c.shift * self.unit)
 
 
 def low_difference(

@@ -19,6 +19,7 @@ from ..solve.motion import MOVING, UNKNOWN, load_motion
 from ..torch_types import from_numpy
 from ..train import LoadedRun
 from .frozen import FrozenGaussians, FrozenImage, render_frozen
+from .ignored import ignore_mattes
 from .regions import grown
 from .reproject import blurred, inside, look_up, pixel_centres, project, resized, same_surface, widened
 from .travel import Stage
@@ -76,6 +77,8 @@ class PlateView:
     """[M, 3] means of the open Gaussians in that frame, scene units."""
     shown: Tensor | None
     """[h, w, 3] float16, the model's own render of it, where plates are no larger than decisions; else None."""
+    ignored: Tensor | None
+    """[h, w, 1] in 0..1: what of it is no part of the scene, as if something stood in front; None: nothing."""
 
 
 @dataclass
@@ -138,6 +141,7 @@ class Sightings:
         """
         self.run, self.scene, self.plates = run, scene, plates
         self.moving = moving or motion_mattes(Shot(scene.folder.parent))
+        self.ignored = ignore_mattes(Shot(scene.folder.parent))
         self.config = config or SightingConfig()
         self.index = {frame: i for i, frame in enumerate(scene.frames)}
         have = set(plates.frames)
@@ -202,6 +206,8 @@ class Sightings:
         within = inside(pixels, *self.size)
         shown, moving, explained = look_up(view.surface, pixels).unbind(-1)
         visible = same_surface(depth, shown, self.config.depth_tolerance) * within
+        if view.ignored is not None:
+            visible = visible * (1.0 - look_up(view.ignored, pixels)[..., 0])
         return Sighting(pixels, depth, visible, within, moving, explained)
 
     def whole(self, moving: Tensor, off: Tensor, least: float = 0.0) -> Tensor:
@@ -225,13 +231,17 @@ class Sightings:
             shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
         plate = self.plates.display(frame)
         out = torch.empty(height, width, 3, dtype=torch.float16, device="cpu")
-        if fine == 1.0:
+        ignored = self.view(frame).ignored
+        if fine == 1.0 and ignored is None:
             return torch.sub(plate, shown).half()
         for top in range(0, height, _ROWS):  # a second picture of 4K would be another 100 MB
             rows = plate[top : top + _ROWS]
             at = pixel_centres(width, len(rows))
             at[..., 1] += top
-            out[top : top + _ROWS] = (rows - look_up(shown, at * fine)).half()
+            missed = rows - look_up(shown, at * fine)
+            if ignored is not None:
+                missed = missed * (1.0 - look_up(ignored, at * (self.size[0] / width)))
+            out[top : top + _ROWS] = missed.half()
         return out
 
     def _own_render(self, frame: int, width: int, height: int) -> tuple[FrozenGaussians, FrozenImage]:
@@ -247,6 +257,9 @@ class Sightings:
         moving = image.motion if matte is None else resized(matte, width, height)
         # The working frame will do, and need not be decoded from 4K footage.
         plate = read_image(self.scene.image_path(self.index[frame]), width, height)
+        ignored = self._ignored(frame)
+        if ignored is not None:  # there is nothing that the model could miss
+            plate = torch.lerp(plate, image.color, ignored)
         missed = self.difference(plate, image.color)
         off = self.difference(plate, image.color, 1.0)
         region = round(self.config.region * self.unit)
@@ -259,7 +272,16 @@ class Sightings:
             missed.half(),
             frozen.state["means"].cpu()[self.rows],
             image.color.half() if self.size == (self.plates.width, self.plates.height) else None,
+            ignored,
         )
+
+    def _ignored(self, frame: int) -> Tensor | None:
+        """As in `PlateView`: widened as mattes are, with a soft edge."""
+        mask = self.ignored(frame)
+        if mask is None or not bool((mask > 0).any()):
+            return None
+        margin = max(1, round(self.config.margin * self.unit))
+        return blurred(widened(resized(mask, *self.size), 2 * margin), 0.5 * margin).clamp(0.0, 1.0)[..., None]
 
 
 def motion_mattes(shot: Shot) -> MovingOf:

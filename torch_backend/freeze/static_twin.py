@@ -4,9 +4,10 @@ A field is trained to explain every frame at its own time. Time standing still a
 how the world of t* looks from the other poses, the wall behind a person, say, that the field let fade while she stood
 there. The static twin of a frozen scene has the same Gaussians, the open ones at the mean of the times at which they
 were seen. Scene and twin are held against plates: that of t*, and the still pixels of others, all over the clip. A
-Gaussian is closed where the others are worse for it by more than plate t* gains. It is asked of neighbours together:
-errors are noisy, and things move in pieces. Where it makes no difference it stays open: mattes miss what sways, and to
-such pixels, which they call still, a mean is always nearer.
+Gaussian is closed where the others are worse for it by more than plate t* gains; where the mattes see nothing move at
+t*, by more than a third of that. It is asked of neighbours together: errors are noisy, and things move in pieces. Where
+it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call still, a mean is
+always nearer.
 """
 
 from __future__ import annotations
@@ -43,6 +44,9 @@ class TwinConfig:
     """Pixels of pictures 640 wide around what moves that do not count as still."""
     neighbours: int = 16
     """So many nearest open Gaussians are asked together."""
+    doubted: float = 3.0
+    """So many times what the others lose must plate t* gain where the mattes say that nothing moves at t*: a field also
+    bends to what is wrong with the camera of that one plate, the edge of a desk for instance."""
     rounds: int = 2
     """Comparisons: what stays open is held against the twin again without what was closed."""
 
@@ -73,7 +77,8 @@ def settled(
         pair = _Pair(run, plates, frozen, held_still(run, frozen, left), left, movers)
         near = _nearest(frozen.state["means"][left], config.neighbours)
         gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
-        stays = (harm <= 0.0) | (gain > harm)
+        least = torch.where(movers[left] > 0.5, harm, config.doubted * harm)
+        stays = (harm <= 0.0) | (gain > least)
         if bool(stays.all()):
             break
         frozen = held_still(run, frozen, left[~stays])
@@ -119,6 +124,8 @@ class _Pair:
         errors: list[Tensor] = []
         paints: list[Tensor] = []
         counts = self.plates.matte(frame) < 0.5 if still else torch.ones(plate.shape[:2], device=plate.device) > 0
+        ignored = self.plates.ignored(frame)
+        counts = counts if ignored is None else counts & ~ignored
         for scene in self.scenes:
             picture, marks = self._shown(scene, frame)
             errors.append((picture - plate).square().mean(-1))

@@ -22,7 +22,6 @@ from ..contract import (
     TAKE_REDISTORT,
     TAKE_STATE_FILE,
     VIDEO_FILE,
-    CameraPath,
     ExitCode,
     FreezeParams,
     JobError,
@@ -32,9 +31,11 @@ from ..contract import (
     read_json,
     verdict_of,
 )
-from ..footage.color import premultiplied_srgb_to_linear
+from ..footage.color import LIGHTS, premultiplied_srgb_to_linear
 from ..footage.images import read_png, write_png
+from ..footage.importing import load_frames
 from ..footage.plates import Plates
+from ..footage.timecode import later, parse_timecode
 from ..gaussians.ply import write_ply
 from ..scene import Scene, frame_table, load_scene
 from ..shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, write_json
@@ -48,9 +49,11 @@ from .contact_sheet import write_contact_sheet
 from .detail import DetailedFrame, Detailer
 from .developed_instants import Instants
 from .exr import DetailLayers, FrameMetadata, Made, read_frozen_exr, read_key, write_frozen_exr
+from .footage_facts import footage_facts, footage_light
 from .frozen import FrozenGaussians, FrozenImage, OutputFrame, render_frozen, suggest_t_star
 from .grain import Brush, Grain, measure_plate
 from .reproject import resized
+from .take_cameras import in_range, intrinsics, output_size, plan
 from .transfer import to_display
 from .verdict import judge_take, unsure
 from .video import write_video
@@ -87,8 +90,10 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
     spec = FrameSpec(
-        run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail)
-    )
+        run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail),
+        footage_light(shot),
+        _start(shot),
+    )  # fmt: skip
     keys = {f.frame: spec.key(f) for f in whole}
     key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))
     done = _prepare(folder, keys, key, params, detail is not None)
@@ -132,6 +137,15 @@ class FrameSpec:
     """Makes the frames of plates; None: splats alone."""
     detail_key: str = ""
     """Identifies the plates and mattes that it uses; empty without it."""
+    light: str = LIGHTS[0]
+    """Primaries of the light in which frames leave, one of `LIGHTS`: the footage's own."""
+    start: tuple[str, int, float] = ("", 0, 0.0)
+    """Timecode of one of the clip's frames, that frame's number, and frames per second; no code: the clip has none."""
+
+    def timecode(self, frame: int) -> str:
+        """Of a frame, as its file carries it: empty without one, and beyond 40 frames per second, which EXR cannot."""
+        code, at, fps = self.start
+        return later(code, frame - at, fps) if code and 1 <= round(fps) <= 40 else ""
 
     @property
     def whole(self) -> tuple[int, int]:
@@ -158,6 +172,7 @@ class FrameSpec:
             floats(output.K.flatten()),
             *([self.beyond] if any(self.beyond) else []),
             *([self.detail_key] if self.detail_key else []),
+            *([self.light] if self.light != LIGHTS[0] else []),
             *([self.instants.keys[output.t_star]] if output.t_star in self.instants.keys else []),
         )
 
@@ -219,58 +234,10 @@ def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams
     return nearest
 
 
-def output_size(shot: Shot, scene: Scene, params: FreezeParams) -> tuple[int, int]:
-    """(width, height) of the frozen frames: as wide as the footage unless asked otherwise, shaped like clip or path."""
-    plates = Plates(shot)
-    if not params.camera_path and params.width in (0, plates.width):
-        return plates.width, plates.height
-    width = min(max(16, params.width or plates.width), 16_384)
-    shape = CameraPath.load(params.camera_path) if params.camera_path else scene
-    return width, max(16, round(shape.height * width / shape.width))
-
-
-def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: int) -> list[OutputFrame]:
-    """All frames that a take can have: the clip's own poses, or a camera path in solve units."""
-    if params.camera_path:
-        viewmats, Ks, numbers = _path_cameras(scene, CameraPath.load(params.camera_path), width, height)
-    else:
-        viewmats, Ks, numbers = scene.viewmats, scene.camera_at(width, height), scene.frames
-    ramp = {int(k): float(v) for k, v in params.t_star_per_frame.items()}
-    frames: list[OutputFrame] = []
-    for i, n in enumerate(numbers):
-        at = ramp.get(n, float(t_star))
-        frames.append(OutputFrame(n, viewmats[i], Ks[i], at, at if params.camera_path else float(n)))
-    return frames
-
-
-def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFrame]:
-    """Those of ascending frames that are asked for now: first, last and step. JobError if there is none."""
-    numbers = [f.frame for f in frames]
-    first = numbers[0] if params.first is None else params.first
-    last = numbers[-1] if params.last is None else params.last
-    chosen_numbers = range(first, last + 1, max(1, params.step))
-    chosen = [f for f in frames if f.frame in chosen_numbers]
-    if not chosen:
-        raise JobError(
-            f"No frame lies between {first} and {last}.", f"The path has frames {numbers[0]} to {numbers[-1]}.",
-            ExitCode.FREEZE,
-        )  # fmt: skip
-    return chosen
-
-
-def intrinsics(frames: list[OutputFrame]) -> np.ndarray:
-    """[F, 4]: fx, fy, cx, cy of the frames, pixels of the output size."""
-    return np.array([[f.K[0, 0], f.K[1, 1], f.K[0, 2], f.K[1, 2]] for f in frames], np.float64)
-
-
-def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tuple[Tensor, Tensor, list[int]]:
-    """A Blender path, in solve units and its own resolution, as scene cameras of the output size."""
-    if not path.frames:
-        raise JobError("The camera path has no frames.", "Send at least one pose.", ExitCode.FREEZE)
-    viewmats = np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4)
-    x, y = width / path.width, height / path.height
-    Ks = [[[f.K[0] * x, 0, f.K[2] * x], [0, f.K[1] * y, f.K[3] * y], [0, 0, 1]] for f in path.frames]
-    return scene.from_solve(viewmats), torch.tensor(Ks, device="cpu").float(), [f.frame for f in path.frames]
+def _start(shot: Shot) -> tuple[str, int, float]:
+    """See `FrameSpec.start`."""
+    record = load_frames(shot)
+    return parse_timecode(str(record.get("timecode", ""))), int(record["frames"][0]["frame"]), float(record["fps"])
 
 
 def take_key(
@@ -393,7 +360,15 @@ def _write_frame(
         Made(size, depth),
         image.support.numpy(),
         image.motion.numpy(),
-        FrameMetadata(output.frame, output.t_star, viewmat.float().numpy(), output.K.numpy(), key=key),
+        FrameMetadata(
+            output.frame,
+            output.t_star,
+            viewmat.float().numpy(),
+            output.K.numpy(),
+            timecode=spec.timecode(output.frame),
+            key=key,
+            light=spec.light,
+        ),
         spec.beyond,
         None if spec.grain is None else _grain(spec.grain, output.frame, image, spec),
         layers,
@@ -441,7 +416,7 @@ def _write_warp(folder: Path, output: OutputFrame, made: DetailedFrame, spec: Fr
         made.matte,
         made.fill,
         made.alpha,
-        WarpMetadata(output.frame, made.leading, output.t_star, plates.width, plates.height, key),
+        WarpMetadata(output.frame, made.leading, output.t_star, plates.width, plates.height, key, light=spec.light),
         spec.beyond,
     )
 
@@ -529,6 +504,7 @@ def _finish(
         "fps": shot.info().fps,
         "scale": scene.scale,
         "grain": None if spec.grain is None else spec.grain.to_json(),
+        "footage": footage_facts(shot, folder),
         "exr_dir": str(folder),
         "contact_sheet": str(sheet),
         "video": str(folder / VIDEO_FILE),
@@ -582,8 +558,11 @@ def _contact_sheet(
     shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int,
     verdict: Verdict | None,
 ) -> Path:  # fmt: skip
+    seen = [i for i, n in enumerate(numbers) if shot.plate(n).is_file()]  # all but those that the footage lacks
+    own_poses = not params.camera_path and bool(seen)
+    if own_poses:
+        previews, numbers = [previews[i] for i in seen], [numbers[i] for i in seen]
     plates = [shot.plate(n) for n in numbers]
-    own_poses = not params.camera_path and all(p.is_file() for p in plates)
     path = shot.take(params.take) / CONTACT_SHEET_FILE
     note, doubt = ("", set[int]()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
     write_contact_sheet(

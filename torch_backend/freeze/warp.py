@@ -32,8 +32,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..contract import WARP_FOLDER
+from ..footage.color import LIGHTS, in_light, light_matrix
 from ..torch_types import from_numpy
-from .exr import channel_names, check_finite, linear_spec, set_margin, write_exr
+from .exr import channel_names, check_finite, linear_spec, read_light, set_margin, write_exr
 
 FOLDER = WARP_FOLDER
 """Folder of the warps in a take's."""
@@ -64,6 +65,8 @@ class WarpMetadata:
     """Its height."""
     key: str = ""
     """What it was made from, to tell a stale one: the frame's."""
+    light: str = LIGHTS[0]
+    """Primaries of the light in the file, one of `LIGHTS`. The fill here is Rec.709's, whatever it is."""
     version: int = WARP_VERSION
     """Version of these attributes."""
 
@@ -162,11 +165,12 @@ def write_warp(
             raise ValueError(f"{name} should be {[*shape, *beyond]} like matte, got shape {list(arrays[name].shape)}")
     for name, layer in arrays.items():
         check_finite(name, layer)
-    spec = linear_spec(shape[1], shape[0], CHANNELS, _FORMATS)
+    spec = linear_spec(shape[1], shape[0], CHANNELS, _FORMATS, metadata.light)
     _describe(spec, metadata)
     set_margin(spec, margin)
     ones = np.broadcast_to(np.float32(1.0), (*shape, 1))
-    parts = [arrays["fill"], arrays["alpha"][..., None], arrays["st"], ones, arrays["matte"][..., None]]
+    fill_in_light = in_light(arrays["fill"], light_matrix(metadata.light))
+    parts = [fill_in_light, arrays["alpha"][..., None], arrays["st"], ones, arrays["matte"][..., None]]
     return write_exr(Path(path), spec, parts)
 
 
@@ -198,6 +202,9 @@ def read_warp(path: str | Path) -> Warp:
         found[..., [names.index(name) for name in part]].squeeze(-1)
         for part in (CHANNELS[:3], CHANNELS[3:4], CHANNELS[4:6], CHANNELS[7:])
     )
+    forth = light_matrix(metadata.light)
+    if forth is not None:
+        fill = from_numpy(in_light(fill.numpy(), np.linalg.inv(forth)))
     return Warp(st, matte, fill, alpha, metadata, (spec.full_x - spec.x, spec.full_y - spec.y))
 
 
@@ -231,5 +238,6 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> WarpMetadata:
         plate_width=int(values["plateWidth"]),
         plate_height=int(values["plateHeight"]),
         key=str(spec.getattribute("splannequin:key") or ""),
+        light=read_light(spec),
         version=int(values["version"]),
     )

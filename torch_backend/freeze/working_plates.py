@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from ..scene import Scene, read_image
+from ..shot import Shot
 from ..train.model import gathered
 from .frozen import FrozenGaussians
+from .ignored import ignore_mattes
 from .reproject import resized, widened
 from .sightings import MovingOf
 
@@ -28,6 +30,7 @@ class WorkingPlates:
         self._Ks, self._viewmats = scene.camera_at(self.width, self.height).to(device), scene.viewmats.to(device)
         self._pictures: dict[int, Tensor] = {}
         self._mattes: dict[int, Tensor] = {}
+        self._ignored = ignore_mattes(Shot(scene.folder.parent))
 
     def camera(self, frame: int) -> tuple[Tensor, Tensor, int, int]:
         """(world-to-camera [4, 4], K [3, 3], width, height) of a frame, as `render` wants them."""
@@ -49,6 +52,13 @@ class WorkingPlates:
             found = resized(found.float(), self.width, self.height)
             self._mattes[frame] = widened(found, self.margin).half()
         return self._mattes[frame].to(self.device).float()
+
+    def ignored(self, frame: int) -> Tensor | None:
+        """bool [H, W]: what of a frame is no part of the scene, and around it; None: nothing."""
+        mask = self._ignored(frame)
+        if mask is None:
+            return None
+        return (widened(resized(mask, self.width, self.height), max(1, self.margin)) > 0.0).to(self.device)
 
     def moving_share(self, frozen: FrozenGaussians, frame: int) -> Tensor:
         """[N] in 0..1: of what a frame's camera sees of each Gaussian, the share that lies in what moves there."""

@@ -7,6 +7,7 @@ holes that densification must fill from the rims (measured on the bundled clip: 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,7 @@ def initialise(
     config: InitConfig,
     generator: torch.Generator,
     budget: int,
+    ignored: Mapping[int, Tensor] | None = None,
 ) -> Gaussians:
     """Gaussians from sparse points and seeds, on the CPU, where the scene is.
 
@@ -57,13 +59,16 @@ def initialise(
         indices: [I] frame of the scene that each image shows.
         bins: time bins of the support bitmap.
         budget: most Gaussians to start with; a random choice is kept.
+        ignored: frame of the scene -> bool [H, W] which pixels of it are no part of the scene: none of them is lifted.
     """
     points, colors = scene.points, scene.colors
     opacity = torch.full((len(points),), config.opacity, device="cpu")
     if config.seeds > 0:
         picked = evenly_spaced(len(indices), config.frames)
         each = min(config.seeds // len(picked), images.shape[1] * images.shape[2] // _PIXELS_PER_SEED)
-        seeds = [_lift_seeds(scene, images[n], indices[n], each, generator) for n in picked]
+        seeds = [
+            _lift_seeds(scene, images[n], indices[n], each, generator, (ignored or {}).get(indices[n])) for n in picked
+        ]
         points = torch.cat([points, *(s[0] for s in seeds)])
         colors = torch.cat([colors, *(s[1] for s in seeds)])
         opacity = torch.cat([opacity, opacity.new_full((len(points) - len(opacity),), config.seed_opacity)])
@@ -105,9 +110,12 @@ def neighbour_distance(points: Tensor) -> Tensor:
 
 
 def _lift_seeds(
-    scene: Scene, image: Tensor, index: int, count: int, generator: torch.Generator
+    scene: Scene, image: Tensor, index: int, count: int, generator: torch.Generator, ignored: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """`count` pixels of one frame, preferably far from sparse points, at a depth between their neighbours' in it."""
+    """`count` pixels of one frame, preferably far from sparse points, at a depth between their neighbours' in it.
+
+    Fewer if some of them are `ignored`, bool [H, W].
+    """
     height, width = image.shape[:2]
     K = scene.camera_at(width, height)[index]
     viewmat = scene.viewmats[index]
@@ -130,4 +138,7 @@ def _lift_seeds(
     local = rays * depth.float()[:, None]
     world = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
     rows, columns = chosen[:, 1].long().clamp(0, height - 1), chosen[:, 0].long().clamp(0, width - 1)
+    if ignored is not None:
+        free = ~ignored[rows, columns]
+        world, rows, columns = world[free], rows[free], columns[free]
     return world, image[rows, columns].float().cpu()

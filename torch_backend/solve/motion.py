@@ -27,8 +27,9 @@ from ..contract import (
     read_json,
 )
 from ..footage.images import is_whole_png
-from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
+from ..shot import Shot, content_key, make_folder, need_disk, write_json
 from .flow import FlowConfig
+from .masks import IGNORE, PEOPLE, limited, load_mask, masks_key, write_grey
 from .moving import Clip, mattes
 from .stored import load_cameras
 
@@ -72,6 +73,7 @@ def find_motion(shot: Shot, report: Reporter, config: FlowConfig | None = None) 
     for n in written:
         shares[n] = _shares(_read_found(files[clip.frames[n]]))
     for count, (n, labels) in enumerate(mattes(clip, config, written, report), start=len(written) + 1):
+        limited(labels, *(load_mask(shot, kind, clip.frames[n]) for kind in (IGNORE, PEOPLE)))
         write_matte(files[clip.frames[n]], labels)
         shares[n] = _shares(labels)
         report.progress("solve: motion", count, len(files), f"frame {clip.frames[n]}")
@@ -101,12 +103,12 @@ def _shares(labels: NDArray[np.uint8]) -> tuple[float, float, float]:
 
 
 def _solve_key(shot: Shot, config: FlowConfig) -> str:
-    """Identifies the cameras and frames that a matte is made from; of a shot without them, what it has."""
+    """Identifies the cameras, frames and masks that a matte is made from; of a shot without them, what it has."""
     digests: list[str] = []
     for file in (shot.cameras, shot.listing):
         with contextlib.suppress(OSError, ValueError), open_regular(file) as handle:
             digests.append(hashlib.sha256(handle.read()).hexdigest())
-    return content_key(MOTION_VERSION, config, digests)
+    return content_key(MOTION_VERSION, config, digests, *masks_key(shot))
 
 
 def _record(path: Path) -> dict[str, Any]:
@@ -155,10 +157,7 @@ def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
 
 def write_matte(path: Path, labels: NDArray[np.uint8]) -> None:
     """Writes [H, W] uint8 as a grey PNG, whole or not at all."""
-    packed, data = cv2.imencode(".png", labels, [cv2.IMWRITE_PNG_COMPRESSION, 4])
-    if not packed:
-        raise OSError(f"the motion matte {path} cannot be packed as PNG")
-    write_atomic(path, data.tobytes())
+    write_grey(path, labels)
 
 
 def _read_found(path: Path) -> NDArray[np.uint8]:

@@ -20,6 +20,7 @@ from ..shot import Shot
 from .fleeting import Fleeting, Other, Shades, Sight, seeded
 from .flow import FlowConfig, Map, Mask, Matches, neighbours, sample
 from .leftover import Leftover
+from .masks import IGNORE, load_mask, painted_over
 from .still import Look, StillTest, evidence
 from .stored import load_cameras, load_points
 
@@ -91,6 +92,9 @@ class Clip:
         """Any frame: grey in the flow's size, as `picture`, and in colour on the grid, with its camera."""
         pixels = read_frame(self._shot.plate(self.frames[index]))
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+        ignored = load_mask(self._shot, IGNORE, self.frames[index])
+        if ignored is not None:
+            pixels = painted_over(pixels, ignored)
         grey = _sized(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8), self.flow_size)
         colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))
         return grey, Sight(Shades(colors), self._cameras[0][index], self._cameras[1][index])

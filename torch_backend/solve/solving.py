@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from ..array_types import save_arrays
 from ..contract import (
+    CAMERA_MODELS,
     CAMERAS_FILE,
     COLMAP_FOLDER,
+    MASK_KINDS,
     PICTURE,
     POINTS_FILE,
     REQUEST_FILE,
@@ -32,6 +34,7 @@ from ..contract import (
 )
 from ..footage import load_frames
 from ..footage.images import is_whole_png, read_frame, write_png
+from ..footage.masks import Mask, read_masks
 from ..footage.sources import frame_words
 from ..replacing import Staged, replacing_solve, settle_solve
 from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, write_json
@@ -39,14 +42,14 @@ from . import foreign
 from .child import run_worker
 from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
-from .lens import LEAST_DEG, MOST_DEG, view_deg
+from .lens_verdict import lens_remarks, refuse_lens
+from .masks import facts_of, given_masks, more_features, write_matching, write_undistorted
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
 from .stored import load_cameras, load_points, load_record
 from .undistort import Undistorter
 
 SOLVE_VERSION = 1
-CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV")
 LEAST_REGISTERED = 8
 REFUSED_SHARE = 0.5
 GOOD_SHARE, GOOD_ERROR_PX = 0.95, 1.2
@@ -59,7 +62,8 @@ class SolveConfig:
     """How cameras are found."""
 
     camera_model: str = "SIMPLE_RADIAL"
-    """COLMAP camera model, one camera for all frames: SIMPLE_RADIAL, or OPENCV for strong or tangential distortion."""
+    """COLMAP camera model, one camera for all frames: SIMPLE_RADIAL, OPENCV for strong or tangential distortion, or
+    OPENCV_FISHEYE."""
     overlap: int = 15
     """Each solved frame is matched with those 1, 2, 4, ... 2^overlap frames after it."""
     features: int = 4096
@@ -68,6 +72,16 @@ class SolveConfig:
     """Place frames that the step left out against the model, each by itself; else they are interpolated."""
     neighbours: int = 2
     """A frame to be placed is matched with this many registered frames on either side of it."""
+    ignore_mask: str = ""
+    """Mask of what is no part of the scene, as `footage.masks.read_masks` takes it; empty: none."""
+    people_mask: str = ""
+    """Mask of what alone may move; empty: everything may."""
+    focal_mm: float = 0.0
+    """Focal length of the lens in mm, with which the solve begins; 0: it is not known."""
+    sensor_mm: float = 36.0
+    """Width in mm of the part of the sensor that the picture shows."""
+    refine_focal: bool = True
+    """Refine `focal_mm`; else it is held."""
 
 
 class SolveResult(TypedDict):
@@ -113,12 +127,17 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
     _check(config)
-    for folder in (shot.frames, shot.colmap):  # where files of before are replaced
+    for folder in (
+        shot.frames,
+        shot.colmap,
+        *(shot.masks(kind) for kind in MASK_KINDS),
+    ):  # files of before are replaced
         shot.own(folder)
     settle_solve(shot)
     frames = load_frames(shot)
     source = [foreign.fingerprint(cameras)] if cameras else []
-    key = content_key(SOLVE_VERSION, config, frames.get("key"), *source)
+    masks = read_masks(shot, _mask_sources(config), report)
+    key = _key(config, frames, source, masks)
     done = _finished(shot, frames, key)
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
@@ -133,12 +152,12 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     make_folder(scratch)
     try:
         if taken is None:
-            answer = _ask_worker(shot, frames, config, scratch, report)
+            answer = _ask_worker(shot, frames, config, masks, scratch, report)
         else:
-            options = {"overlap": config.overlap, "features": config.features}
+            options = _matching(frames, config, masks, scratch)
             answer = take_over(shot, frames, taken, options, scratch, report)
         with replacing_solve(shot) as staged:
-            result = _finish(shot, frames, answer, scratch, staged, key, report)
+            result = _finish(shot, frames, answer, masks, config, scratch, staged, key, report)
     except JobError as error:
         error.add_note(_log_end(shot.colmap_log))
         raise
@@ -147,6 +166,21 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     result = _with_motion(shot, result, report)
     report.metric("solve", dict(result))
     return result
+
+
+def _mask_sources(config: SolveConfig) -> dict[str, str]:
+    """Kind of mask -> where it comes from."""
+    return dict(zip(MASK_KINDS, (config.ignore_mask, config.people_mask), strict=True))
+
+
+def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: dict[str, Mask]) -> str:
+    """Tells a solve from others. Masks count by what they cover, wherever they lie."""
+    settings = asdict(config)
+    new = ["ignore_mask", "people_mask"]  # solves of before had none of these
+    new += [] if config.focal_mm else ["focal_mm", "sensor_mm", "refine_focal"]
+    for name in new:
+        settings.pop(name)
+    return content_key(SOLVE_VERSION, settings, frames.get("key"), *source, *(mask.key for mask in masks.values()))
 
 
 def _with_motion(shot: Shot, result: SolveResult, report: Reporter) -> SolveResult:
@@ -180,6 +214,8 @@ def _log_end(log: Path) -> str:
 def _check(config: SolveConfig) -> None:
     if config.camera_model not in CAMERA_MODELS:
         raise ValueError(f"camera_model should be one of {', '.join(CAMERA_MODELS)}, got {config.camera_model!r}")
+    if config.focal_mm < 0 or config.sensor_mm <= 0:
+        raise ValueError(f"focal_mm and sensor_mm should be lengths, got {config.focal_mm} and {config.sensor_mm}")
     if not 1 <= config.overlap <= 31 or config.features < 128 or config.neighbours < 1:
         raise ValueError(
             "overlap should be 1 to 31, features at least 128 and neighbours at least 1, got "
@@ -197,7 +233,9 @@ def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | 
         load_points(shot)
     except (JobError, ValueError):
         return None
-    plates = [shot.plate(f["frame"]) for f in frames["frames"]]
+    numbers = [f["frame"] for f in frames["frames"]]
+    plates = [shot.plate(n) for n in numbers]
+    plates += [shot.mask(kind, n) for kind in given_masks(shot) for n in numbers]
     return record if all(is_whole_png(p) for p in plates) else None
 
 
@@ -212,8 +250,23 @@ def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
         )
 
 
+def _matching(frames: dict[str, Any], config: SolveConfig, masks: dict[str, Mask], scratch: Path) -> dict[str, Any]:
+    """What the worker is told of features and matches; writes its masks."""
+    options = {"overlap": config.overlap, "features": config.features}
+    if not masks:
+        return options
+    folder = scratch / "not_matched"
+    write_matching(masks, {f["frame"]: Path(f["file"]).name for f in frames["frames"]}, folder)
+    return {**options, "features": round(config.features * more_features(masks)), "masks": str(folder)}
+
+
 def _ask_worker(
-    shot: Shot, frames: dict[str, Any], config: SolveConfig, scratch: Path, report: Reporter
+    shot: Shot,
+    frames: dict[str, Any],
+    config: SolveConfig,
+    masks: dict[str, Mask],
+    scratch: Path,
+    report: Reporter,
 ) -> dict[str, Any]:
     names: dict[bool, list[str]] = {True: [], False: []}
     for frame in frames["frames"]:
@@ -223,8 +276,10 @@ def _ask_worker(
         "solved": names[True],
         "others": names[False],
         "camera_model": config.camera_model,
-        "overlap": config.overlap,
-        "features": config.features,
+        "size": [frames["width"], frames["height"]],
+        "focal_px": config.focal_mm / config.sensor_mm * frames["width"],
+        "hold_focal": not config.refine_focal,
+        **_matching(frames, config, masks, scratch),
         "neighbours": config.neighbours if config.localise else 0,
         "threads": max(1, min(os.cpu_count() or 1, 16)),
     }
@@ -267,7 +322,7 @@ def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
             _range_hint(parts, solved, frames["step"]),
             ExitCode.SOLVE,
         )
-    _refuse_lens(answer)
+    refuse_lens(answer)
     refuse_narrow(angle)
     if answer["points"] < LEAST_POINTS:
         raise JobError(
@@ -275,47 +330,6 @@ def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
             "Choose a sharper range, or film with more light and texture in view.",
             ExitCode.SOLVE,
         )
-
-
-def _refuse_lens(answer: dict[str, Any]) -> None:
-    """JobError for a lens that no camera has."""
-    lens = answer["lens"]
-    angle = view_deg(lens["width"], lens["height"], answer["focal_px"])
-    if not LEAST_DEG <= angle <= MOST_DEG:
-        raise JobError(
-            f"The solve found a lens that no camera has: {angle:.1f} degrees wide ({answer['focal_px']:.0f} px).",
-            "Choose a longer range, in which the camera travels more and less of the picture moves by itself.",
-            ExitCode.SOLVE,
-        )
-
-
-def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
-    """(sentence, hint) for a lens that is doubtful, or was put in the place of one that is."""
-    lens = answer["lens"]
-    found, taken = (view_deg(lens["width"], lens["height"], px) for px in (lens["found_px"], answer["focal_px"]))
-    if lens["held"]:
-        off = "found one that folds the picture over" if lens["doubt"] == "bent" else f"ran off to {found:.0f} degrees"
-        return [
-            (
-                f"The clip does not tell its lens (the solve {off}): a usual one of {taken:.0f} degrees was taken.",
-                "Depth may look stretched; a range in which the camera travels more tells the lens.",
-            )
-        ]
-    if lens["doubt"] == "bent":
-        return [
-            (
-                "The lens that the solve found bends the picture more than lenses do, or folds it over at its corners.",
-                "Try the other camera model; a range in which the camera travels more tells the lens.",
-            )
-        ]
-    if lens["doubt"]:
-        return [
-            (
-                f"The lens that the solve found is unusual: {taken:.0f} degrees wide.",
-                "If yours is not, choose a range in which the camera travels more.",
-            )
-        ]
-    return []
 
 
 def _spans(solved: list[int], names: list[str]) -> list[tuple[int, int, int]]:
@@ -350,6 +364,8 @@ def _finish(
     shot: Shot,
     frames: dict[str, Any],
     answer: dict[str, Any],
+    masks: dict[str, Mask],
+    config: SolveConfig,
     scratch: Path,
     staged: Staged,
     key: str,
@@ -366,7 +382,7 @@ def _finish(
         points = filter_points({name: data[name] for name in data.files}, _centres(path))
     if "given" in answer:
         refuse_misfit(answer, len(points["xyz"]))
-    _undistort_all(shot, frames, lenses, maps, staged.frames, report)
+    _undistort_all(shot, frames, lenses, maps, masks, staged, report)
     with atomic_path(staged.solve / POINTS_FILE) as beside:
         save_arrays(beside, points)
     (scratch / "model").rename(staged.solve / COLMAP_FOLDER)
@@ -394,6 +410,7 @@ def _finish(
         "cameras_from": answer.get("given", "solve"),
         "agreement": answer.get("agreement"),
         "floor": floor_of(path, points["xyz"]),
+        "masks": facts_of(masks, _mask_sources(config)),
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,
     }
@@ -447,19 +464,31 @@ def _centres(path: CameraPath) -> NDArray[np.float64]:
 
 
 def _undistort_all(
-    shot: Shot, frames: dict[str, Any], lenses: list[int], maps: list[Path], into: Path, report: Reporter
+    shot: Shot,
+    frames: dict[str, Any],
+    lenses: list[int],
+    maps: list[Path],
+    masks: dict[str, Mask],
+    into: Staged,
+    report: Reporter,
 ) -> None:
-    """Writes the undistorted frames to a folder, lens by lens: a map takes 128 bytes per pixel."""
+    """Writes the undistorted frames and masks, lens by lens: a map takes 128 bytes per pixel."""
     done = 0
     for number, file in enumerate(maps):
         rows = [frame for frame, lens in zip(frames["frames"], lenses, strict=True) if lens == number]
         if rows:
-            _undistort(shot, rows, file, into, (done, len(lenses)), report)
+            _undistort(shot, rows, file, masks, into, (done, len(lenses)), report)
         done += len(rows)
 
 
 def _undistort(
-    shot: Shot, listed: list[dict[str, Any]], file: Path, into: Path, counts: tuple[int, int], report: Reporter
+    shot: Shot,
+    listed: list[dict[str, Any]],
+    file: Path,
+    masks: dict[str, Mask],
+    into: Staged,
+    counts: tuple[int, int],
+    report: Reporter,
 ) -> None:
     """Frames of one lens; `counts` are the frames done before these, and all there are."""
     before, total = counts
@@ -468,7 +497,9 @@ def _undistort(
 
     def one(frame: dict[str, Any]) -> int:
         pixels = read_frame(shot.frames / frame["file"])
-        write_png(into / frame_file(frame["frame"], PICTURE), undistort(pixels))
+        write_png(into.frames / frame_file(frame["frame"], PICTURE), undistort(pixels))
+        if masks:
+            write_undistorted(masks, frame["frame"], undistort, into.solve)
         return frame["frame"]
 
     with ThreadPoolExecutor(_WRITERS) as pool:

@@ -20,6 +20,7 @@ from ..contract import STMAP_FILES, TAKE_REDISTORT, ExitCode, FreezeParams, JobE
 from ..footage.oiio_types import open_output
 from ..shot import Shot, atomic_path, disk_error, is_disk_full, need_disk
 from .lens import Lens, load_lens
+from .plate_lens import PlateLens
 
 UNDISTORT, REDISTORT = STMAP_FILES
 """Names of the maps in a shot's solve/."""
@@ -161,13 +162,36 @@ def write_take_map(
     return write_map(path, pixels)
 
 
-def write_map(path: Path, pixels: NDArray[np.float32]) -> Path:
+def write_plate_map(path: Path, lens: PlateLens, width: int, height: int, key: str) -> Path:
+    """The map from footage of `width` x `height` to the plate of that size without its lens, unless it is there.
+
+    `key` tells whether a file that is there is this map. JobError (DISK), OSError.
+    """
+    known = oiio.ImageInput.open(str(path)) if path.is_file() else None
+    if known is not None:
+        try:
+            if known.spec().getattribute("splannequin:key") == key:
+                return path
+        finally:
+            known.close()
+    need_disk(path.parent, width * height * 12.0, "the map")
+    pixels = np.ones((height, width, 3), np.float32)
+    where = lens.where(width, height)
+    np.divide(where[..., 0], np.float32(width), out=pixels[..., 0])
+    np.subtract(np.float32(1.0), where[..., 1] / np.float32(height), out=pixels[..., 1])
+    path.parent.mkdir(exist_ok=True)
+    return write_map(path, pixels, key)
+
+
+def write_map(path: Path, pixels: NDArray[np.float32], key: str = "") -> Path:
     """A map [H, W, 3] as a 32-bit float EXR, whole or not at all. JobError (DISK) if the disk is full, else OSError."""
     height, width = pixels.shape[:2]
     spec = oiio.ImageSpec(width, height, 3, oiio.FLOAT)
     spec.channelnames = ("R", "G", "B")
     spec.attribute("compression", "zip")
     spec.attribute("oiio:ColorSpace", "data")
+    if key:
+        spec.attribute("splannequin:key", key)
     try:
         with atomic_path(path) as beside:
             output = oiio.ImageOutput.create(str(beside))

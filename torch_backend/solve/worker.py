@@ -21,6 +21,7 @@ import json
 import os
 import sys
 import threading
+from bisect import bisect
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,7 +33,7 @@ from numpy.typing import NDArray
 
 from ..contract import POINTS_FILE
 from . import colmap_types as colmap
-from .lens import doubtful
+from .lens_verdict import FISHEYE, FISHEYE_START, angle_deg, doubt_of, impossible
 
 SEED = 0
 STILL_SHARE = 0.008
@@ -45,6 +46,9 @@ LOCALISE_LEAST_RATIO = 0.4
 HELD_SHARE, HELD_WORSE, HELD_ERROR_PX = 0.9, 1.25, 1.0
 """A usual lens is taken instead of a doubtful one if it places this share of the frames, with errors no more than so
 many times as large, or no more than so many pixels."""
+MASKED_INLIERS = (50, 15)
+"""Matches that a first pair and a further image need where masks leave few, half of COLMAP's: what would mislead is
+masked. A room of which 70 % of 320 x 240 pixels were masked: 26 of 30 images instead of 4."""
 WIDEST_ZOOM = 16.0
 TRIANGULATE_LEAST_DEG = 1.0
 """Smallest angle under which a point is triangulated from known cameras."""
@@ -66,6 +70,13 @@ class Request:
         self.features: int = data["features"]
         self.neighbours: int = data["neighbours"]
         self.threads: int = data["threads"]
+        self.size: list[int] = data.get("size", [0, 0])
+        """Pixels of the images, for a lens that is told beforehand."""
+        self.focal: float = data.get("focal_px", 0.0)
+        """Focal length that the lens is known to have, pixels; 0: not known."""
+        self.hold_focal: bool = bool(self.focal) and bool(data.get("hold_focal"))
+        self.masks = data.get("masks", "")
+        """Folder of COLMAP's masks; empty: nothing is masked."""
         self.known: dict[str, Any] | None = data.get("known")
 
 
@@ -92,8 +103,8 @@ def main(path: str) -> int:
     if not models:
         say(failure="turning" if turning_share(request) > TURNING_SHARE else "no_pair", flow_px=flow)
         return 0
-    doubt = lens_doubt(models[0])
-    found, held = first_camera(models[0]).mean_focal_length(), False
+    doubt = lens_doubt(request, models[0])
+    first, held = first_camera(models[0]), False
     if doubt:
         again = build(request, hold_lens=True)
         held = bool(again) and as_good(again[0], models[0])
@@ -115,7 +126,17 @@ def main(path: str) -> int:
             "flow_px": flow,
             "turning": turning_share(request) > TURNING_SHARE,
             "localised": len(poses) - model.num_reg_images(),
-            "lens": {"doubt": doubt, "held": held, "found_px": found, "width": camera.width, "height": camera.height},
+            "lens": {
+                "doubt": doubt,
+                "held": held,
+                "found_px": first.mean_focal_length(),
+                "found_deg": angle_deg(*lens_of(first)),
+                "view_deg": angle_deg(*lens_of(camera)),
+                "impossible": impossible(*lens_of(camera)),
+                "given_px": request.focal,
+                "width": camera.width,
+                "height": camera.height,
+            },
         }
     )
     return 0
@@ -219,6 +240,9 @@ def extract(
     """SIFT features of `names` into the database; one camera for all, an existing one if `camera_id` is given."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = request.camera_model
+    reader.camera_params = start_params(request)
+    if request.masks:
+        reader.mask_path = request.masks
     if camera_id is not None:
         reader.existing_camera_id = camera_id
     options = pycolmap.FeatureExtractionOptions()
@@ -292,11 +316,31 @@ def posed(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [image for image in colmap.images(model).values() if image.has_pose]
 
 
-def lens_doubt(model: pycolmap.Reconstruction) -> str:
-    """`lens.doubtful` of a model's lens."""
-    camera = first_camera(model)
-    k1, k2 = [*(float(camera.params[i]) for i in camera.extra_params_idxs()), 0.0][:2]
-    return doubtful(camera.width, camera.height, (camera.focal_length_x, camera.focal_length_y), k1, k2)
+def start_params(request: Request) -> str:
+    """The lens before any picture was seen, as COLMAP's parameters in a row; empty: COLMAP's own guess.
+
+    With it pairs are verified through the lens: the epipolar lines of a fisheye are bent.
+    """
+    focal, (width, height) = request.focal, request.size
+    if not focal and request.camera_model == FISHEYE:
+        focal = FISHEYE_START * width
+    if not focal:
+        return ""
+    single = request.camera_model == "SIMPLE_RADIAL"
+    params = (
+        [focal, 0.5 * width, 0.5 * height, 0.0] if single else [focal, focal, 0.5 * width, 0.5 * height, *[0.0] * 4]
+    )
+    return ", ".join(repr(value) for value in params)
+
+
+def lens_of(camera: pycolmap.Camera) -> tuple[str, int, int, list[float]]:
+    """Model, width, height and parameters of a camera, as `lens_verdict` wants them."""
+    return camera.model_name, camera.width, camera.height, [float(value) for value in camera.params]
+
+
+def lens_doubt(request: Request, model: pycolmap.Reconstruction) -> str:
+    """`lens_verdict.doubt_of` a model's lens."""
+    return doubt_of(*lens_of(first_camera(model)), request.focal)
 
 
 def as_good(held: pycolmap.Reconstruction, free: pycolmap.Reconstruction) -> bool:
@@ -323,9 +367,12 @@ def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruc
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
     options.ba_global_max_refinements = 2
     options.ba_local_max_refinements = 1
+    if request.masks:
+        options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = MASKED_INLIERS
+    if hold_lens or request.hold_focal:
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
     if hold_lens:
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
     folder = request.scratch / ("models_held" if hold_lens else "models")
     folder.mkdir()
     total = len(request.solved)
@@ -361,7 +408,7 @@ def localise(request: Request, model: pycolmap.Reconstruction) -> dict[str, dict
     missing = [name for name in request.order if name not in ids]
     if not missing or request.neighbours < 1:
         return poses
-    pairs = {name: _nearest_registered(request, name, ids) for name in missing}
+    pairs = _nearest_registered(request, missing, ids)
     new = [name for name in request.others if name in pairs]
     if new:
         extract(request, new, next(iter(colmap.cameras(model))))
@@ -375,11 +422,16 @@ def localise(request: Request, model: pycolmap.Reconstruction) -> dict[str, dict
     return poses
 
 
-def _nearest_registered(request: Request, name: str, ids: dict[str, int]) -> list[str]:
-    at = request.order.index(name)
-    before = [other for other in request.order[:at] if other in ids][-request.neighbours :]
-    after = [other for other in request.order[at + 1 :] if other in ids][: request.neighbours]
-    return before + after
+def _nearest_registered(request: Request, missing: list[str], ids: dict[str, int]) -> dict[str, list[str]]:
+    """The nearest registered frames on either side of each frame that is not."""
+    at = {name: i for i, name in enumerate(request.order)}
+    known = [i for i, name in enumerate(request.order) if name in ids]
+    pairs: dict[str, list[str]] = {}
+    for name in missing:
+        after = bisect(known, at[name])
+        near = known[max(0, after - request.neighbours) : after + request.neighbours]
+        pairs[name] = [request.order[i] for i in near]
+    return pairs
 
 
 def _match_pairs(request: Request, pairs: dict[str, list[str]]) -> None:

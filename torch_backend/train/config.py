@@ -21,8 +21,8 @@ from .stopping import StoppingConfig
 class TrainConfig:
     """One run. Learning rates are per scene unit of camera extent 1; shares are of the run's length.
 
-    The Gaussians' rates are those of 3000 steps; `config_from_params` scales them to the run's length by the root of
-    the ratio, which meets the published ones at their 30,000.
+    The Gaussians' rates are those of 3000 steps, tuned on the bundled clip (docs/benchmarks.md); `config_from_params`
+    scales them to the run's length by the root of the ratio.
     """
 
     preset: str = "preview"
@@ -49,20 +49,24 @@ class TrainConfig:
     """Highest SH degree."""
     sh_every: float = 0.15
     """The SH degree rises by one every this share of the run."""
-    lr_means: float = 1e-3
+    lr_means: float = 1.6e-3
     """Start learning rate of means (3DGS 1.6e-4 over 30,000 steps; shorter runs need longer ones)."""
     lr_means_end: float = 6e-6
     """End learning rate of means."""
-    lr_scales: float = 2.2e-2
+    lr_scales: float = 2.8e-2
     """Learning rate of log-scales (3DGS: 5e-3)."""
     lr_quats: float = 5.6e-3
     """Learning rate of quaternions (3DGS: 1e-3)."""
     lr_opacities: float = 6e-2
     """Learning rate of opacity logits (3DGS: 5e-2)."""
-    lr_sh0: float = 8e-3
+    lr_sh0: float = 1e-2
     """Learning rate of the constant colour (3DGS: 2.5e-3)."""
-    lr_sh_rest: float = 4e-4
+    lr_sh_rest: float = 5e-3
     """Learning rate of the other harmonics (3DGS: 2.5e-3 / 20)."""
+    lr_end: float = 0.2
+    """Share of its start that each of these rates, but that of means, has at the end."""
+    average: float = 0.04
+    """Share of the run, its end, whose steps' mean the run keeps (`average.py`); 0: the last step."""
     opacity_weight: float = 2e-3
     """Weight of the mean opacity: keeps what no image needs from staying (3DGS-MCMC: 1e-2)."""
     scale_weight: float = 2e-3
@@ -190,8 +194,10 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
     values: dict[str, Any] = {
         "needs": {},
         "poses": {},
+        "lr_end": 0.1,
+        "average": 0.0,
         **data,
-    }  # earlier runs decided nothing; a finished one is only read
+    }  # earlier runs decided nothing, and kept their last step; a finished one is only read
     if "hexplane" in values:  # written before there were other hosts
         values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))
     if "rounds" in values.get("gate", {}):  # written before the gate opened on trial, and HexPlane bent by SiLU

@@ -132,7 +132,9 @@ def _inspect_frame(
         background=torch.cat([trainer.background, motion.new_zeros(2)]), with_depth=False, with_contributions=False,
     )  # fmt: skip
     shown = model.exposure.apply(out.colors[0, ..., :3], time)
-    plate = image.to(trainer.device, torch.float32)
+    plate, ignored = image.to(trainer.device, torch.float32), trainer.ignored_at(index)
+    if ignored is not None:  # nothing there is asked of the run
+        plate = torch.where(ignored[..., None], shown, plate)
     off = unexplained(plate, shown)
     far, share = out.colors[0, ..., 3:].cpu().unbind(-1)
     travels = torch.where(share > MOVING_SHARE, far / share.clamp_min(MOVING_SHARE), 0.0).clamp_min(0.0)

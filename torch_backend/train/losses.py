@@ -16,8 +16,15 @@ _C1, _C2 = 0.01**2, 0.03**2
 _WINDOW, _SIGMA = compiled_ssim.WINDOW, compiled_ssim.SIGMA
 
 
-def photometric(image: Tensor, target: Tensor, dssim: float) -> Tensor:
-    """(1 - dssim) * L1 + dssim * (1 - SSIM) of [H, W, 3] images (3DGS: dssim 0.2)."""
+def photometric(image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None = None) -> Tensor:
+    """(1 - dssim) * L1 + dssim * (1 - SSIM) of [H, W, 3] images (3DGS: dssim 0.2).
+
+    Pixels `ignored`, bool [H, W], teach nothing: the image stands there in the place of the target, and no gradient
+    leaves it.
+    """
+    if ignored is not None:
+        shown = image.detach()
+        image, target = (torch.where(ignored[..., None], shown, one) for one in (image, target))
     loss = (image - target).abs().mean()
     if dssim > 0 and min(image.shape[:2]) >= _WINDOW:
         loss = (1.0 - dssim) * loss + dssim * (1.0 - ssim(image, target))
@@ -40,9 +47,10 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     return applied(_TorchSsim, image, target)
 
 
-def psnr(image: Tensor, target: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of images in [0, 1]; `image` is clamped for display first."""
-    error = (image.clamp(0.0, 1.0).double() - target.double()).square().mean()
+def psnr(image: Tensor, target: Tensor, ignored: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of images in [0, 1] without pixels `ignored`; `image` is clamped first."""
+    squares = (image.clamp(0.0, 1.0).double() - target.double()).square()
+    error = squares.mean() if ignored is None else squares[~ignored].mean()
     return float(-10.0 * torch.log10(error.clamp_min(1e-12)))
 
 

@@ -22,10 +22,13 @@ def optimizer_of(model: DynamicModel, poses: Poses, config: TrainConfig) -> Fuse
     """Adam over the Gaussians, the exposure and, where they are refined, the poses; a field joins by `add_field`."""
     c, p = config, model.gaussians.params
     rates = {
-        "means": (c.lr_means, c.lr_means_end), "quats": (c.lr_quats, 0.1 * c.lr_quats),
-        "log_scales": (c.lr_scales, 0.1 * c.lr_scales), "opacity_logits": (c.lr_opacities, 0.1 * c.lr_opacities),
-        "sh0": (c.lr_sh0, 0.1 * c.lr_sh0), "shN": (c.lr_sh_rest, 0.1 * c.lr_sh_rest),
-    }  # fmt: skip
+        "means": (c.lr_means, c.lr_means_end),
+        "quats": (c.lr_quats, c.lr_end * c.lr_quats),
+        "log_scales": (c.lr_scales, c.lr_end * c.lr_scales),
+        "opacity_logits": (c.lr_opacities, c.lr_end * c.lr_opacities),
+        "sh0": (c.lr_sh0, c.lr_end * c.lr_sh0),
+        "shN": (c.lr_sh_rest, c.lr_end * c.lr_sh_rest),
+    }
     groups: list[dict[str, Any]] = [
         {"params": [p[name]], "lr": start, "lr_start": start, "lr_end": end, "name": name, "rows": True}
         for name, (start, end) in rates.items()

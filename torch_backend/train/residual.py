@@ -49,6 +49,9 @@ def signed_residual(run: RunView, rows: Tensor) -> tuple[Tensor, Tensor]:
         image = run.images[n].to(model.device, torch.float32).permute(2, 0, 1)
         image = F.interpolate(image[None], (height, width), mode="area")[0].permute(1, 2, 0)
         lack = (image - model.exposure.apply(out.colors[0, ..., :3].detach(), run.times[n])).mean(-1).detach()
+        ignored = run.ignored_at(index)
+        if ignored is not None:
+            lack = lack * (F.interpolate(ignored[None, None].float(), (height, width), mode="area")[0, 0] == 0.0)
         if out.weight_sum is None:
             raise RuntimeError("the frame was rendered without contributions")
         (pulled,) = torch.autograd.grad(out.colors[0, ..., 3], ink, lack)

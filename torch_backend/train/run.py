@@ -20,6 +20,7 @@ from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import HELD_BYTES, Scene, load_images, load_scene, split_frames
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
+from ..solve.masks import IGNORE, load_mask, masks_key
 from ..solve.motion import load_motion, motion_key
 from . import adam
 from .anew import SUMMARY_FILE, drop_begun, finish_replacing, folder_for, replace_run
@@ -28,6 +29,7 @@ from .config import TrainConfig, config_from_json, config_from_params, config_to
 from .device import choose_device, unused_card
 from .evidence import gather_evidence
 from .extend import EXTENSION_FILE, pending
+from .ignored import load_ignored
 from .model import DynamicModel, restore_model
 from .modelled import modelled
 from .movers import Mattes, load_movers
@@ -82,7 +84,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     motion = motion_of(shot, config)
-    key = content_key(config_to_json(config), solve_key(shot), train, test)
+    key = content_key(config_to_json(config), solve_key(shot), train, test, *masks_key(shot, IGNORE))
     if motion and not trained_without(shot, run, key):
         key = content_key(key, motion)
     else:
@@ -103,7 +105,8 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     images = place_images(load_images(scene, train + test, width, height, report, folder), device)
     identity = {"key": key, "solve": solve_key(shot), "motion": motion}
     movers = load_movers(functools.partial(load_motion, shot), scene, train, width, height) if motion else None
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers)
+    ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, width, height)
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored)
     checkpoint = folder / CHECKPOINT_FILE
     resumed = _resume(trainer, checkpoint, params.resume, report)
     for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
@@ -160,7 +163,8 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     identity = {"key": facts["key"], "solve": facts["solve"], "motion": motion}
     movers = load_movers(functools.partial(load_motion, shot), scene, train, *size) if motion else None
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers)
+    ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, *size)
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored)
     begun = pending(folder, facts) if params.resume else None
     if before["iterations"] != facts["iteration"]:  # it was killed between its last two files: only figures are missing
         trainer.restore(checkpoint)

@@ -55,6 +55,10 @@ class RunView(Protocol):
         """[3] what shows where nothing covers when a frame is measured or shown."""
         ...
 
+    def ignored_at(self, index: int) -> Tensor | None:
+        """bool [H, W] which pixels of frame `index` of the scene teach nothing, on the device; None: all do."""
+        ...
+
     def bin_of_frame(self, frame: int) -> int:
         """Time bin of the support bitmap for the trained frame at position `frame`."""
         ...

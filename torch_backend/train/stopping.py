@@ -29,7 +29,7 @@ import numpy as np
 from torch import Tensor
 
 _LEAST_PROBES, _MOST_PROBES = 3, 12
-_GROWN = 1.2
+_GROWN = 1.5
 """Growth is judged over measurements between which the Gaussians grew by this factor, at least `_POINTS` of them."""
 _POINTS = 4
 
@@ -87,12 +87,14 @@ def newest_gain(measured: list[tuple[int, int, float]], since: int) -> float | N
     return max(after) - max(before) if before and after else None
 
 
-def lasting(since: float, now: float) -> float:
+def lasting(since: float, now: float, rates_end: float) -> float:
     """How far harmonics that learn since a share of the run will go by its end, over how far they came until `now`.
 
-    Adam moves a parameter by about a rate per step, and the rate falls tenfold over the run.
+    Adam moves a parameter by about a rate per step, and the rate falls to a share `rates_end` over the run.
     """
-    return (0.1**since - 0.1) / max(1e-6, 0.1**since - 0.1**now)
+    if rates_end >= 1.0:
+        return (1.0 - since) / max(1e-6, now - since)
+    return (rates_end**since - rates_end) / max(1e-6, rates_end**since - rates_end**now)
 
 
 class Probe(Protocol):
@@ -153,6 +155,8 @@ class RunSchedule:
     """Share at which the gate's trial is over, whatever moved."""
     sh_every: float
     """The SH degree rises by one every this share; 0: it is the highest from the start."""
+    rates_end: float
+    """Share of the harmonics' learning rate that is left at the end."""
 
 
 @dataclass(frozen=True)
@@ -337,7 +341,7 @@ class StoppingPolicy:
         if whole is None or cut is None:
             return False
         self.degrees[degree] = whole - cut
-        return (whole - cut) * lasting(degree * every, probe.progress) <= self.config.sh_gain
+        return (whole - cut) * lasting(degree * every, probe.progress, self.schedule.rates_end) <= self.config.sh_gain
 
     def judge_cameras(self, probe: Probe, refined: Tensor) -> None:
         """What refined cameras [F, 4, 4] are worth, as they are about to replace those of the run."""

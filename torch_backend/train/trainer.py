@@ -20,6 +20,7 @@ from ..raster import RasterOutput
 from ..scene import Scene
 from ..supervision import Anchored, bin_of, bin_times, draw_anchored, mark_hidden, mark_seen, stillness, support_loss
 from ..torch_types import backward, integers, norm_of_all
+from .average import ParameterMean
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
@@ -53,6 +54,7 @@ class Trainer:
         identity: JSON-able facts that say which run a checkpoint belongs to; stored in it.
         device: where it trains.
         movers: bool [I, H, W] what the motion mattes call moving in the training frames; None: there are no mattes.
+        ignored: index of a frame of the scene -> bool [H, W] which of its pixels teach nothing, and are not measured.
     """
 
     def __init__(
@@ -65,10 +67,12 @@ class Trainer:
         identity: dict[str, Any] | None = None,
         device: torch.device | str = "cpu",
         movers: Tensor | None = None,
+        ignored: dict[int, Tensor] | None = None,
     ) -> None:
         self.identity, self.device = identity or {}, torch.device(device)
         self.scene, self.images, self.train_ids, self.config, self.report = scene, images, train, config, report
         self.movers = movers if config.decides else None
+        self.ignored = ignored or {}
         self.height, self.width = images.shape[1:3]
         self.viewmats = scene.viewmats.to(self.device)
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
@@ -80,12 +84,15 @@ class Trainer:
         self._bins = [bin_of(centres, time) for time in self.times]
         self.centres = centres.to(self.device)
         budget = config.densify.budget
-        gaussians = initialise(scene, images, train, len(self.centres), config.init, self.generator, budget)
+        count = len(self.centres)
+        gaussians = initialise(scene, images, train, count, config.init, self.generator, budget, self.ignored)
         gaussians = gaussians.to(self.device)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
         self.initial = len(gaussians)
         gate, densify = config.gate, config.densify
-        schedule = RunSchedule(config.iterations, densify.every, densify.stop, gate.give_up, config.sh_every)
+        schedule = RunSchedule(
+            config.iterations, densify.every, densify.stop, gate.give_up, config.sh_every, config.lr_end
+        )
         self.policy = StoppingPolicy(config.needs, len(train) if config.decides else 0, schedule)
         self.extensions: list[Extension] = []
         self.iteration = 0
@@ -100,6 +107,7 @@ class Trainer:
         self.poses = Poses(self.times, config.poses, self.device)
         self._refined = False
         self.optimizer = optimizer_of(self.model, self.poses, config)
+        self.mean = ParameterMean()
         self.densifier = Densifier(config.densify, len(gaussians), self.device)
         self._bad = torch.zeros(2, dtype=torch.int32, device=self.device)
         self._saved_at = time.perf_counter()
@@ -157,6 +165,7 @@ class Trainer:
                 self.schedule_events()
                 loss = self.step()
                 self.iteration += 1
+                self._average(length)
                 self.trained_seconds = time.perf_counter() - since
                 if (self.iteration - begin) % every == 0:
                     evaluate(self)
@@ -193,7 +202,7 @@ class Trainer:
         if paper:
             state["means"].retain_grad()
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
-        loss = photometric(exposed, self.image_of(frame), self.config.dssim)
+        loss = photometric(exposed, self.image_of(frame), self.config.dssim, self.ignored_at(self.train_ids[frame]))
         total = loss + self._regularisers(rows)
         if deltas is not None and supervision.preset == "support":
             price = stillness(deltas, len(self.model.gaussians), loss, self.progress, supervision)
@@ -253,6 +262,11 @@ class Trainer:
     def image_of(self, frame: int) -> Tensor:
         """[H, W, 3] float32, the trained frame at position `frame`, on the device."""
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
+
+    def ignored_at(self, index: int) -> Tensor | None:
+        """bool [H, W] which pixels of frame `index` of the scene teach nothing, on the device; None: all do."""
+        ignored = self.ignored.get(index)
+        return None if ignored is None else ignored.to(self.device, non_blocking=True)
 
     def schedule_events(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
@@ -355,7 +369,8 @@ class Trainer:
         def loss(state: dict[str, Tensor], frame: int) -> Tensor:
             self.report.check_cancelled()
             out = self.render_trained(state, frame, sh_degree=0, with_contributions=False)
-            return photometric(out.colors[0], self.image_of(frame), self.config.dssim)
+            ignored = self.ignored_at(self.train_ids[frame])
+            return photometric(out.colors[0], self.image_of(frame), self.config.dssim, ignored)
 
         points, colors = (t.to(self.device) for t in (self.scene.points, self.scene.colors))
         field.rehearse(Rehearsal(points, colors, self.times, steps, loss, self.generator))
@@ -461,6 +476,13 @@ class Trainer:
 
     # ------------------------------------------------------------------ optimiser
 
+    def _average(self, length: int) -> None:
+        """After a step of a run, or an extension, of so many: its last ones count, and in the end it is their mean."""
+        if self.iteration > self.end - round(self.config.average * length):
+            self.mean.add(self._named())
+        if self.iteration == self.end:
+            self.mean.put_into(self._named())
+
     def _schedule_rates(self) -> None:
         schedule = self.extensions[-1] if self.extensions else self.policy
         schedule_rates(self.optimizer, schedule.rate_progress(self.iteration, self.config.iterations))
@@ -493,7 +515,8 @@ class Trainer:
         values: list[float] = []
         for n, i in enumerate(indices):
             self.report.check_cancelled()
-            values.append(psnr(self.render_frame(i, **options), images[n].to(self.device, torch.float32)))
+            image = images[n].to(self.device, torch.float32)
+            values.append(psnr(self.render_frame(i, **options), image, self.ignored_at(i)))
         return values
 
     def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
@@ -531,6 +554,7 @@ class Trainer:
         tensors = {**self.model.gaussians.state(), **optimizer_state(self._named(), self.optimizer)}
         if self.model.field is not None:
             tensors.update(self.model.field.state())
+        tensors.update(self.mean.state())
         d = self.densifier
         tensors.update({"densify.gradient": d.gradient, "densify.seen": d.seen})
         tensors["generator"] = self.generator.get_state()
@@ -570,6 +594,7 @@ class Trainer:
         if self.config.poses.on:
             self.poses.values.data.copy_(tensors["poses"])
         restore_optimizer(self._named(), self.optimizer, tensors)
+        self.mean.restore(tensors, self.device)
         self.densifier = Densifier(self.config.densify, len(self.model.gaussians), self.device)
         for name in ("gradient", "seen"):
             setattr(self.densifier, name, tensors[f"densify.{name}"].to(self.device, copy=True))

@@ -5,6 +5,8 @@ detail/warp/, and the linear plates that they are made of, with values from -0.2
 
 Frame numbers 5 and 6. The left third is the plate as it is, the middle one the plate moved by parts of a pixel, the
 right one the plate at a share over something else. In float32, centres of 56 or 42 pixels are not where they should be.
+
+detail_ap1/ has frame 6 and its warp once more, as they leave for ACEScg footage.
 """
 
 from pathlib import Path
@@ -83,21 +85,24 @@ def main() -> None:
     from torch_backend.freeze.warp import WarpMetadata, snap, write_warp
 
     ones, size = np.ones((HEIGHT, WIDTH), np.float32), np.array([WIDTH, HEIGHT])
-    for frame in FRAMES:
+    for frame, folder, light in (*((n, FOLDER, "rec709") for n in FRAMES), (6, FOLDER.with_name("detail_ap1"), "ap1")):
+        (folder / "warp").mkdir(parents=True, exist_ok=True)
         color, share = frozen(frame).astype(np.float32), matte(frame) * alpha()
         st = (places(frame) + 0.5) / size
         st[..., 1] = 1.0 - st[..., 1]
         splat = np.concatenate([other(frame) * alpha()[..., None], alpha()[..., None]], axis=2)
         name = f"{frame:06d}.exr"
         write_frozen_exr(
-            FOLDER / name, np.concatenate([color, alpha()[..., None]], axis=2), frame * ones, ones, 0.5 * ones,
-            FrameMetadata(frame, 6.0, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)),
+            folder / name, np.concatenate([color, alpha()[..., None]], axis=2), frame * ones, ones, 0.5 * ones,
+            FrameMetadata(frame, 6.0, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), light=light),
             detail=DetailLayers(splat, share, source(frame)),
         )  # fmt: skip
-        fill, about = (alpha() - share)[..., None] * other(frame), WarpMetadata(frame, frame, 6.0, WIDTH, HEIGHT)
-        write_warp(FOLDER / "warp" / name, snap(torch.from_numpy(st), (WIDTH, HEIGHT)), share, fill, alpha(), about)
-        spec = linear_spec(WIDTH, HEIGHT, ("R", "G", "B"), (oiio.FLOAT,) * 3)
-        write_exr(FOLDER / "plate" / name, spec, [plate(frame)])
+        fill = (alpha() - share)[..., None] * other(frame)
+        about = WarpMetadata(frame, frame, 6.0, WIDTH, HEIGHT, light=light)
+        write_warp(folder / "warp" / name, snap(torch.from_numpy(st), (WIDTH, HEIGHT)), share, fill, alpha(), about)
+        if folder == FOLDER:
+            spec = linear_spec(WIDTH, HEIGHT, ("R", "G", "B"), (oiio.FLOAT,) * 3)
+            write_exr(FOLDER / "plate" / name, spec, [plate(frame)])
 
 
 if __name__ == "__main__":

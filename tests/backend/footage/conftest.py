@@ -84,3 +84,19 @@ def write_video():
             container.mux(stream.encode())
 
     return write
+
+
+@pytest.fixture
+def frame_of_planes():
+    """frame_of_planes(planes, format, size): a video frame with these codes, [h, w] for each plane, as they stand."""
+
+    def make(planes, kind, size=None):
+        width, height = size or planes[0].shape[::-1]
+        frame = av.VideoFrame(width, height, kind)
+        for plane, codes in zip(frame.planes, planes, strict=True):
+            rows = np.zeros((plane.height, plane.line_size // codes.itemsize), codes.dtype)
+            rows[:, : codes.shape[1]] = codes
+            plane.update(rows.tobytes())
+        return frame
+
+    return make

@@ -288,6 +288,31 @@ def test_the_listing_says_how_the_footage_was_read(shot, clip, sequence, recorde
     )  # fmt: skip
 
 
+def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, sequence, recorder):
+    told = import_footage(shot, clip, FootageConfig(), recorder())["read_as"]
+    assert (
+        told
+        == load_frames(shot)["read_as"]
+        == [
+            "Read as 64 x 48, square pixels, 10 fps, 8 bits, video, Rec.709, matrix BT.601, video levels, no alpha.",
+            "Assumed, for the footage does not say: pixel aspect, colour space, matrix, levels.",
+        ]
+    )
+    chosen = FootageConfig(step=1, matrix="bt709", levels="full", pixel_aspect=2.0)
+    assert import_footage(shot, clip, chosen, recorder())["read_as"] == [
+        "Read as 128 x 48, pixels 2 times as wide, 10 fps, 8 bits, video, Rec.709, matrix BT.709, full levels, "
+        "no alpha.",
+        "Assumed, for the footage does not say: colour space.",
+    ]
+    report = recorder()
+    told = import_footage(shot, str(sequence(1)), chosen, report)["read_as"]
+    assert told == [
+        "Read as 128 x 48, pixels 2 times as wide, 24 fps, 8 bits, sRGB, Rec.709, no alpha.",
+        "Assumed, for the footage does not say: rate.",
+    ]
+    assert "The matrix 'bt709' is passed over: pictures hold RGB as it is." in report.warnings
+
+
 def test_a_full_disk_is_told_before_the_work(shot, clip, recorder, monkeypatch):
     usage = shutil.disk_usage(shot.root)._replace(free=1 << 20)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)

@@ -270,6 +270,31 @@ def test_moved_and_copied_footage_is_found_other_footage_is_refused(tmp_path, pa
     assert "is not what was imported" in Plates(shot).note
 
 
+def test_an_import_whose_chroma_was_scaled_up_otherwise_is_known_again(tmp_path, write_video, shot_of):
+    """As an earlier version did: edges of colour are elsewhere, brightness is not. The file's time says nothing."""
+    rng = np.random.default_rng(0)
+    wide = gaussian_filter(rng.random((64, 140, 3)), (1.5, 1.5, 0))
+    wide = (255 * (wide - wide.min()) / (wide.max() - wide.min())).astype(np.uint8)
+    clip = tmp_path / "a.mp4"
+    write_video(clip, [np.ascontiguousarray(wide[:, 3 * n : 3 * n + 96]) for n in range(9)])
+    shot = shot_of(clip, working_height=32)
+    off = 0.0
+    for file in sorted(shot.raw.iterdir()):
+        picture = read_png(file).astype(np.float32)
+        luma = (picture @ np.array([0.2126, 0.7152, 0.0722], np.float32))[..., None]
+        chroma = picture - luma
+        other = np.clip(np.rint(luma + 0.5 * (chroma + np.roll(chroma, 1, axis=1))), 0, 255).astype(np.uint8)
+        off = max(off, float(np.abs(other - picture).max()))
+        write_png(file, other)
+    assert off > 12.0, "else nothing differs"
+    os.utime(clip, ns=(1, 1))
+    assert Plates(shot).note == ""
+    files = sorted(shot.raw.iterdir())
+    for file, picture in zip(files, [read_png(f) for f in (*files[1:], files[0])], strict=True):
+        write_png(file, picture)
+    assert "is not what was imported any more" in Plates(shot).note, "the next frame is another one"
+
+
 def test_a_file_that_breaks_meanwhile_is_named(tmp_path, shot_of):
     rng = np.random.default_rng(0)
     smooth = gaussian_filter(rng.random((48, 100, 3)), (2, 2, 0))

@@ -9,7 +9,7 @@ import pytest
 
 from torch_backend.contract import ExitCode, JobError
 from torch_backend.footage.opening import open_source
-from torch_backend.footage.sources import frame_words
+from torch_backend.footage.sources import Known, Told, frame_words
 
 
 def decoded(path, first=None, last=None):
@@ -71,15 +71,21 @@ def test_odd_sizes(tmp_path, pan, write_video):
     assert close(got[0].pixels, frames[0], 2)
 
 
-def test_ten_bit_video_keeps_its_depth(tmp_path, write_video):
-    ramp = np.linspace(8000, 56000, 64).astype(np.uint16)
-    frames = [np.tile(np.roll(ramp, i)[None, :, None], (48, 1, 3)) for i in range(8)]
-    write_video(tmp_path / "a.mkv", frames, codec="ffv1", pix_fmt="yuv444p10le")
+def test_ten_bit_video_keeps_its_depth(tmp_path, frame_of_planes):
+    """Planes of our own: FFmpeg's scaler writes what it reads, off by 1 of 256 both ways."""
+    luma = np.linspace(64, 940, 64).round().astype(np.uint16)
+    planes = [np.tile(luma, (48, 1)), *np.full((2, 48, 64), 512, np.uint16)]
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p10le"
+        for _ in range(3):
+            container.mux(stream.encode(frame_of_planes(planes, "yuv444p10le")))
+        container.mux(stream.encode())
     source, got = decoded(tmp_path / "a.mkv")
     assert source.info.deep
     assert got[0].pixels.dtype == np.uint16
     # 10 bits: one step is 64 of 65535; 8 bits would err by up to 128.
-    assert np.abs(got[0].pixels.astype(int) - frames[0].astype(int)).mean() < 64
+    assert np.abs(got[0].pixels[20, :, 0] - (luma - 64.0) * (65535 / 876)).max() < 16
 
 
 @pytest.mark.parametrize(("matrix", "tag"), [("bt709", 1), ("smpte170m", 6)])
@@ -100,6 +106,74 @@ def test_the_tagged_colour_matrix_is_used(tmp_path, matrix, tag):
         container.mux(stream.encode())
     _, got = decoded(tmp_path / "a.mp4")
     assert np.abs(got[0].pixels[24, 32].astype(int) - colour).max() <= 3
+
+
+@pytest.fixture
+def interlaced(tmp_path, frame_of_planes):
+    """interlaced(top_first): 12 H.264 frames of two instants each, of stripes that move; each fourth is a key frame.
+
+    Returns the file, and grey pictures [12, 96, 128] that a progressive camera would have taken with the first fields.
+    """
+
+    def picture(instant):
+        across = np.arange(128)[None, :] + np.arange(96)[:, None]
+        return np.rint(120 + 80 * np.sin((across + 12 * instant) / 15.0)).astype(np.uint8)
+
+    def make(top_first=True):
+        path, firsts = tmp_path / "fields.mkv", [picture(2 * i) for i in range(12)]
+        tagged = av.filter.Graph()
+        nodes = [
+            tagged.add_buffer(width=128, height=96, format="yuvj420p", time_base=Fraction(1, 25)),
+            tagged.add("setfield", "tff" if top_first else "bff"),
+            tagged.add("buffersink"),
+        ]
+        tagged.link_nodes(*nodes).configure()
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libx264", rate=25, options={"crf": "0", "x264-params": "interlaced=1"})
+            stream.width, stream.height, stream.pix_fmt, stream.codec_context.gop_size = 128, 96, "yuvj420p", 4
+            for i, first in enumerate(firsts):
+                both, later = first.copy(), int(top_first)
+                both[later::2] = picture(2 * i + 1)[later::2]
+                planes = [both, *np.full((2, 48, 64), 128, np.uint8)]
+                tagged.vpush(frame_of_planes(planes, "yuvj420p"))
+                container.mux(stream.encode(tagged.vpull()))
+            container.mux(stream.encode())
+        return path, np.stack(firsts).astype(float)
+
+    return make
+
+
+@pytest.mark.parametrize("top_first", [True, False])
+def test_interlaced_clips_become_whole_pictures_and_say_so(interlaced, top_first):
+    path, firsts = interlaced(top_first)
+    source, got = decoded(path)
+    assert [f.number for f in got] == list(range(1, 13))
+    assert np.allclose([f.seconds for f in got], np.arange(12) / 25, atol=1e-3)
+    pictures = np.stack([f.pixels[..., 1].astype(float) for f in got])
+    inner = np.s_[:, 4:-4]
+    assert np.abs(pictures - firsts)[inner].mean() < 1.0
+    assert np.abs(pictures - firsts)[inner].max() < 8.0, "a comb of the other field is 60 off"
+    assert [w[0] for w in source.warnings] == [
+        "The clip is interlaced: each frame becomes a whole picture of its first field."
+    ]
+    assert source.info.reading["interlaced"] and "deinterlaced" in source.info.key
+    assert source.info.unlike.startswith("it is interlaced")
+
+
+def test_a_plate_of_an_interlaced_clip_is_the_frame_that_was_imported(interlaced):
+    """Sought, so that decoding begins at a key frame: the filter needs the frame before, too."""
+    path, _ = interlaced()
+    source, got = decoded(path)
+    known = Known({f.number: f.seconds for f in got}, 0.0, lambda number, plate: True)
+    for number in (5, 9, 2, 12):
+        reader = source.plates(known)
+        reader.plate(number)
+        assert (reader.plate(number) == got[number - 1].pixels).all(), number
+        reader.close()
+    order = source.plates(known)
+    for number in (12, 5, 1, 9):
+        assert (order.plate(number) == got[number - 1].pixels).all(), number
+    order.close()
 
 
 def test_damaged_packets_are_skipped_with_a_warning_and_keep_their_numbers(tmp_path, pan, write_video):
@@ -370,3 +444,24 @@ def test_a_transfer_function_that_is_not_known_is_told(write_patches):
         "The clip's transfer function (number 9 of ITU-T H.273) is not known here: taken as video."
     )
     assert not source.info.reading["colour_told"]
+
+
+@pytest.mark.parametrize(
+    "size, tags, told, unlike",
+    [
+        ((48, 64), {}, {}, ""),
+        ((16, 1280), {}, {}, "it does not say by which matrix its colours are stored"),
+        ((16, 1280), {"colorspace": 1}, {}, ""),
+        ((48, 64), {}, {"matrix": "bt709"}, "its matrix or range was set by hand"),
+        ((48, 64), {"rotation": 90}, {}, "it is turned by its header"),
+        ((48, 64), {"aspect": Fraction(2)}, {}, "its pixels are not square"),
+    ],
+)
+def test_what_other_programs_would_show_otherwise_is_known(tmp_path, write_video, size, tags, told, unlike):
+    """FFmpeg, and so Blender, takes clips without a matrix as BT.601, however large they are."""
+    made = {name: tags[name] for name in ("rotation", "aspect") if name in tags}
+    frames = [np.full((*size, 3), 60, np.uint8)] * 3
+    write_video(
+        tmp_path / "a.mp4", frames, **made, **({"x264-params": "colormatrix=bt709"} if "colorspace" in tags else {})
+    )
+    assert open_source(str(tmp_path / "a.mp4"), told=Told(**told)).info.unlike == unlike

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation, map_coordinates
 
-from torch_backend.contract import CameraFrame, CameraPath
+from torch_backend.contract import CameraFrame, CameraPath, read_json
 from torch_backend.deformation import Deformation, Deltas
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png, write_png
@@ -24,6 +24,7 @@ from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
 from torch_backend.scene import Scene
 from torch_backend.shot import Shot, write_json
+from torch_backend.solve.masks import write_grey
 from torch_backend.solve.motion import MOVING, PAINTED, STILL, write_matte
 from torch_backend.train import LoadedRun
 from torch_backend.train.config import TrainConfig
@@ -132,8 +133,11 @@ class World:
         return seen(self.scene.viewmats[frame - 1], 99.0 if self.still else board_at(frame))
 
 
-def build(folder, report, still=False):
-    """A shot on disk as import, solve and a painter leave it: plates of 16 bits, working frames half as large."""
+def build(folder, report, still=False, logo=None):
+    """A shot on disk as import, solve and a painter leave it: plates of 16 bits, working frames half as large.
+
+    `logo` [H, W] bool is burnt into all plates, and the solve was given a mask of it.
+    """
     viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
     viewmats[:, 0, 3] = torch.linspace(0.35, -0.35, FRAMES)
     viewmats[:, 1, 3] = 0.05 * torch.sin(torch.arange(FRAMES) * 1.3)
@@ -141,12 +145,16 @@ def build(folder, report, still=False):
     source.mkdir()
     for n in range(1, FRAMES + 1):
         picture, on = seen(viewmats[n - 1], 99.0 if still else board_at(n))
+        if logo is not None:
+            picture = np.where(logo[..., None], [1.0, 0.0, 1.0], picture)
         write_png(source / f"{n:06d}.png", np.rint(picture * 65535).astype(np.uint16))
         matte = shot.root / PAINTED / f"{n:06d}.png"
         matte.parent.mkdir(exist_ok=True)
         write_matte(matte, np.where(on[::2, ::2], MOVING, STILL).astype(np.uint8))
     import_footage(shot, str(source), FootageConfig(working_height=H // 2), report)
     solved(shot, viewmats)
+    if logo is not None:
+        ignore(shot, logo[::2, ::2])
     width, height = W // 2, H // 2
     times = np.linspace(0, 1, FRAMES)
     K = torch.tensor([[FOCAL / 2, 0, width / 2], [0, FOCAL / 2, height / 2], [0, 0, 1.0]])
@@ -177,6 +185,14 @@ def solved(shot, viewmats):
     write_json(shot.solve / "solve.json", told)
     for n in range(1, len(viewmats) + 1):
         write_png(shot.frames / f"{n:06d}.png", read_png(shot.frames / "raw" / f"{n:06d}.png"))
+
+
+def ignore(shot, logo):
+    """What a solve with a mask leaves beside the cameras."""
+    write_json(shot.solve_record, {**read_json(shot.solve_record), "masks": {"ignore": {"key": "logo"}}})
+    shot.masks("ignore").mkdir()
+    for n in range(1, FRAMES + 1):
+        write_grey(shot.mask("ignore", n), np.where(logo, np.uint8(255), np.uint8(0)))
 
 
 @pytest.fixture(scope="module")
@@ -329,6 +345,23 @@ def test_far_from_plate_t_star_a_wrong_depth_is_made_up_for_by_the_own_plate(tmp
     )
     assert one.plate.numpy()[inner].min() > 0.5
     assert off(both.color, truth, inner) < 0.8 * off(one.color, truth, inner)
+
+
+def test_a_masked_logo_is_in_no_frozen_frame_and_what_is_behind_it_comes_from_other_plates(tmp_path, quiet):
+    logo = np.zeros((H, W), bool)
+    logo[150:170, 40:70] = True
+    world, plain = build(tmp_path, quiet(), still=True, logo=logo), tmp_path / "plain"
+    output = world.output(4, 9)
+    frame, (truth, _) = world.make(output), world.truth(output)
+    assert (frame.matte.numpy()[logo] == 0.0).all() and (frame.motion.numpy()[logo] > 0.999).all()
+    assert off(frame.color, truth, logo) < 0.03 < off(frame.splat, truth, logo)
+    assert (frame.plate.numpy()[logo] > 0.5).mean() > 0.9 and (frame.source.numpy()[logo] != 4).all()
+    away = ~widened(logo, 16)
+    assert (frame.matte.numpy()[away] == 1.0).all()
+    plain.mkdir()
+    unmasked = build(plain, quiet(), still=True, logo=logo)
+    write_json(unmasked.shot.solve_record, {**read_json(unmasked.shot.solve_record), "masks": {}})
+    assert off(unmasked.make(output).color, truth, logo) > 0.3
 
 
 def test_withheld_plates_are_not_used(tmp_path, quiet):

@@ -8,6 +8,7 @@ import OpenImageIO as oiio
 import pytest
 
 from torch_backend.contract import FrameLayer
+from torch_backend.footage.color import PRIMARIES, InputSpace
 from torch_backend.freeze import exr
 from torch_backend.freeze.exr import (
     CHANNELS,
@@ -188,6 +189,39 @@ def test_file_is_one_part_of_zipped_half_and_float_channels_in_linear_rec709(tmp
     assert spec.getattribute("compression") == "zip"
     assert spec.getattribute("oiio:ColorSpace") == "lin_rec709_scene"
     assert spec.getattribute("chromaticities") == pytest.approx((0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329))
+
+
+@pytest.mark.parametrize("light", ["ap1", "ap0", "rec2020", "p3d65"])
+def test_frames_leave_in_the_light_of_the_footage_and_come_back_as_rec709(tmp_path, light):
+    """Colours, grain and splats alike; what a program reads in that light is what it would read in Rec.709's."""
+    metadata = dataclasses.replace(METADATA, light=light)
+    rng = np.random.default_rng(1)
+    given = layers()
+    shape = given["rgba"].shape[:2]
+    grain = rng.normal(0.0, 0.02, (*shape, 3)).astype(np.float32)
+    splat = rng.uniform(0.0, 2.0, (*shape, 4)).astype(np.float32)
+    detail = DetailLayers(splat, np.ones(shape, np.float32), np.ones(shape, np.float32))
+    path = write_frozen_exr(tmp_path / "a.exr", metadata=metadata, grain=grain, detail=detail, **given)
+    image = oiio.ImageBuf(str(path))
+    spec = image.spec()
+    assert spec.getattribute("chromaticities") == pytest.approx(PRIMARIES[light][1], abs=1e-6)
+    assert spec.getattribute("oiio:ColorSpace") == f"lin_{light}_scene"
+    stored = np.asarray(image.get_pixels(oiio.FLOAT))[..., [spec.channelnames.index(c) for c in "RGB"]]
+    expected = InputSpace("lin", light).to_linear(stored)
+    scale = np.abs(given["rgba"][..., :3]).max()
+    assert np.abs(expected - given["rgba"][..., :3]).max() < 2e-3 * scale < np.abs(stored - expected).max()
+    read = read_frozen_exr(path)
+    assert read.metadata.light == light
+    np.testing.assert_allclose(read.rgba, given["rgba"], atol=2e-3 * scale)
+    np.testing.assert_allclose(read.grain, grain, atol=0.2 * np.abs(grain).max())
+    np.testing.assert_allclose(np.asarray(read.detail.splat), splat, atol=0.02)
+    np.testing.assert_array_equal(read.rgba[..., 3], read_frozen_exr(
+        write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, **given)).rgba[..., 3])  # fmt: skip
+
+
+def test_light_that_no_frame_leaves_in_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="not 'xyz'"):
+        write_frozen_exr(tmp_path / "a.exr", metadata=dataclasses.replace(METADATA, light="xyz"), **layers())
 
 
 def test_world_to_camera_is_imath_row_vectors_looking_along_minus_z(tmp_path):

@@ -14,6 +14,7 @@ import torch
 
 from torch_backend.contract import FreezeParams, TrainParams
 from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.footage.color import InputSpace
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze import freeze_shot
@@ -219,3 +220,26 @@ def test_light_beyond_white_and_below_black_is_the_plates(bright, quiet):
         graded = torch.from_numpy(source) * torch.tensor([2.0, 0.5, 1.0])
         again = apply_warp(graded, warp).numpy()
         np.testing.assert_allclose(again[still], graded.numpy()[still], rtol=1e-3, atol=1e-6)
+
+
+def test_acescg_footage_is_frozen_in_acescg(bright, quiet):
+    """The same frames, told of as ACEScg in the record: frames and warps leave in its light, and stale ones go."""
+    ask = FreezeParams(take="aces", t_star=108, first=103, last=103, develop="off", only_missing=True)
+    freeze_shot(bright, ask, quiet())
+    folder = bright.take("aces")
+    plain, plain_warp = read_frozen_exr(folder / "000103.exr"), read_warp(folder / "warp" / "000103.exr")
+    record = json.loads(bright.listing.read_text())
+    bright.listing.write_text(json.dumps({**record, "reading": {**record["reading"], "light": "ap1"}}))
+    try:
+        freeze_shot(bright, ask, quiet())
+    finally:
+        bright.listing.write_text(json.dumps(record))
+    for file, fill in (("000103.exr", plain.rgba[..., :3]), ("warp/000103.exr", plain_warp.fill.numpy())):
+        image = oiio.ImageBuf(str(folder / file))
+        assert image.spec().getattribute("oiio:ColorSpace") == "lin_ap1_scene"
+        stored = np.asarray(image.get_pixels(oiio.FLOAT))[..., :3]
+        expected = InputSpace("lin", "ap1").to_linear(stored)
+        assert np.abs(expected - fill).max() < 1e-3 * max(1.0, np.abs(fill).max())
+    again = read_frozen_exr(folder / "000103.exr")
+    np.testing.assert_allclose(again.rgba, plain.rgba, atol=0.05)
+    assert again.metadata.light == "ap1" and again.metadata.key != plain.metadata.key

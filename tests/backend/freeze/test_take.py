@@ -10,12 +10,16 @@ import torch
 from torch_backend.contract import NO_DEPTH, CameraFrame, CameraPath, Cancelled, FreezeParams, JobError, TrainParams
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
+from torch_backend.footage.timecode import later
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.freeze.take_cameras import plan
 from torch_backend.gaussians.ply import read_ply
-from torch_backend.shot import write_json
+from torch_backend.scene import load_scene
+from torch_backend.shot import Shot, write_json
 from torch_backend.train import load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
+from torch_backend.train.run import solve_key
 
 
 @pytest.fixture(scope="module")
@@ -177,6 +181,34 @@ def test_camera_path_of_its_own_size(trained, quiet, tmp_path):
     image = read_frozen_exr(world.shot.take("path") / "000001.exr")
     assert image.rgba.shape == (96, 128, 4)
     assert np.median(image.depth[30:60, 100:120]) == pytest.approx(4.3, rel=0.05)
+
+
+def test_frames_that_the_footage_lacks_are_frozen_through_a_camera_between(trained, quiet, tmp_path):
+    """107 and 109 are lost; a gap of more than two seconds stays one."""
+    world, _ = trained
+    shot = Shot(tmp_path / "lost.splannequin")
+    shutil.copytree(world.shot.root, shot.root, ignore=shutil.ignore_patterns("takes", "jobs"))
+    for file in (shot.listing, shot.cameras):
+        told = json.loads(file.read_text())
+        told["frames"] = [row for row in told["frames"] if row["frame"] not in (107, 109)]
+        told["timecode"] = "01:00:00:22"
+        file.write_text(json.dumps(told))
+        (shot.frames / "000107.png").unlink(missing_ok=True)
+    checkpoint = shot.run("main") / "checkpoint.safetensors"
+    tensors, meta = load_checkpoint(checkpoint)
+    save_checkpoint(checkpoint, tensors, {**meta, "solve": solve_key(shot)})
+    scene, params = load_scene(shot), FreezeParams(take="lost", t_star=105, develop="off", detail="off")
+    planned = {output.frame: output for output in plan(scene, params, 105, 96, 72)}
+    assert sorted(planned) == load_scene(world.shot).frames and 107 not in scene.frames
+    before, at, after = (torch.linalg.inv(planned[n].viewmat)[:3, 3] for n in (106, 107, 108))
+    assert torch.allclose(at, (before + after) / 2, atol=1e-5) and torch.dist(before, after) > 0.1
+    assert torch.equal(planned[107].K, planned[106].K)
+    assert freeze_shot(shot, params, quiet())["frames"] == 16
+    image = read_frozen_exr(shot.take("lost") / "000107.exr")
+    assert psnr(linear_to_srgb(image.rgba[..., :3]), world.image(6, 4 / 15).numpy()) > 18.0
+    assert image.metadata.timecode == later("01:00:00:22", 6, json.loads(shot.listing.read_text())["fps"])
+    scene.seconds[6:] += 3.0
+    assert 107 not in {output.frame for output in plan(scene, params, 105, 96, 72)}
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,11 @@ class Room:
         ideal = distorted.copy()
         for _ in range(30):  # fixed point of distorted = ideal (1 + k |ideal|^2)
             ideal = distorted / (1.0 + radial * (ideal**2).sum(-1, keepdims=True))
-        rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1).reshape(-1, 3) @ viewmat[:3, :3]
+        return self.cast(viewmat, np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1))
+
+    def cast(self, viewmat, rays):
+        """[H, W, 3] uint8: what is seen along rays [H, W, 3] of a camera's own axes."""
+        size, rays = rays.shape[1::-1], rays.reshape(-1, 3) @ viewmat[:3, :3]
         origin = -viewmat[:3, :3].T @ viewmat[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             grey = self._hit(origin, rays, self.low, self.high, inside=True)
@@ -164,12 +168,14 @@ def again(solved, tmp_path):
     return shot, str(tmp_path / "model")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def tools():
     """What the tests of this folder build with."""
 
     class Tools:
         recorder = Recorder
+        cancelled = Cancelled
+        handheld = staticmethod(handheld)
         room = staticmethod(the_room)
         look = staticmethod(look)
         write_clip = staticmethod(write_clip)

@@ -17,9 +17,10 @@ from torch_backend.shot import Shot, write_json
 from torch_backend.solve import SolveConfig, load_points, solve_shot
 from torch_backend.solve.child import run_worker
 from torch_backend.solve.floor import floor_of
+from torch_backend.solve.lens_verdict import lens_remarks
 from torch_backend.solve.motion import load_motion
 from torch_backend.solve.poses import camera_centre
-from torch_backend.solve.solving import lens_remarks, quality_words, refuse_poor
+from torch_backend.solve.solving import quality_words, refuse_poor
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -314,7 +315,7 @@ def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
     [
         ({"doubt": "", "held": False}, []),
         ({"doubt": "narrow", "held": False}, ["is unusual: 10 degrees wide."]),
-        ({"doubt": "bent", "held": False}, ["folds it over at its corners."]),
+        ({"doubt": "bent", "held": False}, ["bends the picture more than lenses do."]),
         ({"doubt": "narrow", "held": True}, ["(the solve ran off to 3 degrees): a usual one of 10 degrees was taken."]),
     ],
 )

@@ -53,3 +53,18 @@ def test_small_images_fall_back_to_l1():
 
 def test_psnr_value():
     assert psnr(torch.full((4, 4, 3), 0.6), torch.full((4, 4, 3), 0.5)) == pytest.approx(20.0, abs=1e-4)
+
+
+def test_ignored_pixels_teach_nothing_and_are_not_measured():
+    g = torch.Generator().manual_seed(2)
+    image = torch.rand(20, 24, 3, generator=g, requires_grad=True)
+    target = torch.rand(20, 24, 3, generator=g)
+    ignored = torch.zeros(20, 24, dtype=torch.bool)
+    ignored[5:12, 4:15] = True
+    loss = photometric(image, target, 0.2, ignored)
+    loss.backward()
+    assert image.grad is not None
+    assert (image.grad[ignored] == 0).all() and (image.grad[~ignored] != 0).all()
+    other = torch.where(ignored[..., None], 1.0 - target, target)
+    assert photometric(image, other, 0.2, ignored) == loss != photometric(image, other, 0.2)
+    assert psnr(image, other, ignored) == psnr(image, target, ignored) != psnr(image, target)

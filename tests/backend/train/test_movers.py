@@ -77,7 +77,7 @@ def test_what_lies_in_movers_goes_on_trial_and_nothing_else(painted_world, quiet
     trial = on_trial(trainer)
     rows = torch.nonzero(trial).flatten()
     assert 10 < len(rows) < 0.5 * len(trial)
-    assert float((centred_on_movers(trainer, 1) >= 3)[rows].float().mean()) > 0.95
+    assert float((centred_on_movers(trainer, 1) >= 3)[rows].float().mean()) > 0.9
     always = centred_on_movers(trainer, 0) == len(trainer.train_ids)
     assert float(trial[always].float().mean()) > 0.8
     assert int(moving_frames(trainer, 0.5).max()) == len(trainer.train_ids)

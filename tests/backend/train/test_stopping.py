@@ -80,10 +80,9 @@ def test_probes_are_spread_and_never_an_end():
 
 
 def test_growth_is_judged_per_tenth_and_only_when_there_was_some():
-    counts = [1000, 1100, 1210, 1331, 1464]
-    measured = [(100 * n, count, 20.0 + 0.2 * n) for n, count in enumerate(counts)]
+    measured = [(100 * n, round(1000 * 1.1**n), 20.0 + 0.2 * n) for n in range(6)]
     assert growth_gain(measured) == pytest.approx(0.2, rel=0.01)
-    flat = [*measured, (500, 1600, 20.8), (600, 1760, 20.79), (700, 1936, 20.8), (800, 2130, 20.8)]
+    flat = [*measured, *((100 * n, round(1000 * 1.1**n), 21.0 - 0.01 * (n % 2)) for n in range(6, 11))]
     assert growth_gain(flat) < 0.03  # what was gained before does not count any more
     assert growth_gain([(n, 1000 + n, 20.0 + n) for n in range(20)]) is None
     assert growth_gain(measured[:2]) is None
@@ -153,11 +152,13 @@ def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     assert not torch.equal(runs[0].model.gaussians.params["sh0"], runs[1].model.gaussians.params["sh0"])
 
 
-def test_what_harmonics_gained_is_scaled_by_what_they_may_still_learn():
-    steps = 0.1 ** (torch.arange(1000, dtype=torch.float64) / 1000)
+@pytest.mark.parametrize("rates_end", [0.1, 0.2, 1.0])
+def test_what_harmonics_gained_is_scaled_by_what_they_may_still_learn(rates_end):
+    steps = rates_end ** (torch.arange(1000, dtype=torch.float64) / 1000)
     for since, now in ((0.15, 0.3), (0.3, 0.45), (0.45, 0.6)):
         first, last = round(1000 * since), round(1000 * now)
-        assert lasting(since, now) == pytest.approx(float(steps[first:].sum() / steps[first:last].sum()), rel=0.01)
+        share = float(steps[first:].sum() / steps[first:last].sum())
+        assert lasting(since, now, rates_end) == pytest.approx(share, rel=0.01)
 
 
 def test_a_degree_that_gains_too_little_is_dropped_for_good(long_world, quiet, tmp_path):
@@ -195,7 +196,9 @@ def test_growth_is_not_judged_while_a_field_is_on_trial(long_world, quiet):
     opened = FieldOpened(30, 1.0)
     for facts in (RunFacts(), RunFacts(opened=opened), RunFacts(opened=opened, hardened=60)):
         trainer.policy.facts, trainer.policy.growth_ended = facts, None
-        trainer.policy.measured = [(n, round(500 * 1.1**n), 20.0 + 0.1 * n) for n in range(6)]
+        trainer.policy.measured = [
+            (n, round(trainer.gaussian_count * 1.2 ** (n - 6)), 20.0 + 0.1 * n) for n in range(6)
+        ]
         trainer.policy._measure(trainer)
         ended.append(trainer.policy.growth_ended is not None)
     assert ended == [True, False, True]
@@ -225,7 +228,7 @@ class Numbers:
 
 
 def policy_of(**changes):
-    return StoppingPolicy(StoppingConfig(**changes), 60, RunSchedule(100, 10, 0.6, 0.7, 0.15))
+    return StoppingPolicy(StoppingConfig(**changes), 60, RunSchedule(100, 10, 0.6, 0.7, 0.15, 0.2))
 
 
 def test_the_policy_yields_a_decision_and_changes_nothing_of_the_run():

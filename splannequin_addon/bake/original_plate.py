@@ -1,0 +1,170 @@
+"""The footage itself as the minimal tree's plate: the video or sequence as it was filmed, at its own size and depth.
+
+Its lens is taken away by the take's ST map. Where Blender would show the files otherwise than the freeze read them, the
+working frames stand in, and a sentence says why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from .. import compat
+from ..access import present, size_of
+from ..scene import sequences
+from ..scene.ownership import TAG
+from . import warp_nodes
+from .node_names import GAP
+from .take_files import Take
+
+LENS = "Splannequin Undistort"
+"""Name of the group that takes the lens away."""
+_IS_LENS = "splannequin_lens"
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What a take says of the footage that it was frozen from."""
+
+    file: Path
+    """The video, or a picture of the sequence."""
+    size: tuple[int, int]
+    """Width and height of its pictures in pixels."""
+    probe: tuple[float, ...]
+    """Linear Rec.709 light that `contract.PROBE` means in its files."""
+    space: str
+    """Name of its colour space."""
+    map: Path | None
+    """ST map from it to the plate without the lens; None: there is no lens."""
+
+
+@dataclass
+class Plate:
+    """The plate of a take as data-blocks."""
+
+    image: bpy.types.Image
+    """Video or sequence."""
+    map: bpy.types.Image | None
+    """ST map by which it is undistorted."""
+    said: list[str]
+    """What it is, a sentence each."""
+    size: tuple[int, int]
+    """Width and height of the plate in pixels."""
+
+
+def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
+    """The footage that a take was frozen from, or None and, if the take knows of it, why it cannot be shown."""
+    try:
+        told: dict[str, Any] = dict(contract.read_json(take.folder / contract.TAKE_FILE).get("footage") or {})
+        if not told:
+            return None, ""
+        name = Path(str(told["file"])).name
+        if told["unlike"]:
+            return None, f"{name}: {told['unlike']}"
+        places = [Path(str(told["file"])), *([shot / str(told["beside"])] if told["beside"] else [])]
+        file = next((place for place in places if place.is_file()), None)
+        if file is None:
+            return None, f"{name} is not there any more"
+        st = take.folder / str(told["map"]) if told["map"] else None
+        if st is not None and not st.is_file():
+            return None, "the take's ST map is gone"
+        width, height = (int(side) for side in told["size"])
+        probe = tuple(float(value) for value in told["probe"])
+        return Footage(file, (width, height), probe, str(told["space"]), st), ""
+    except (OSError, ValueError, TypeError, KeyError, contract.JobError):
+        return None, ""  # of an earlier version, or damaged
+
+
+def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
+    """What the tree shows as the plate: the footage, else the working frames. ValueError if neither can be shown."""
+    footage, why = footage_of(take, shot)
+    image = None
+    if footage is not None:
+        image, why = _image(footage, (take.first, take.last))
+    if footage is None or image is None:
+        said = [f"The compositor shows working frames as the plate, not the footage: {why}."] if why else []
+        image = sequences.load_sequence(stand_in, working_name(stand_in), "srgb")
+        return Plate(image, None, said, sequences.shown_size(image, take.first, take.last))
+    st = None
+    if footage.map is not None:
+        st = sequences.load_numbers(footage.map, f"Undistort {take.folder.name}")
+    width, height = footage.size
+    without = ", without its lens by the take's ST map" if st is not None else ""
+    return Plate(image, st, [f"The plate is {footage.file.name} itself, {width} x {height}{without}."], footage.size)
+
+
+def to_read(take: Take, shot: Path, stand_in: Path) -> tuple[Path, str, sequences.Encoding]:
+    """File, name and encoding of the picture that `plate_of` will have read."""
+    footage, _ = footage_of(take, shot)
+    if footage is None or not compat.knows_colour(footage.probe):
+        return stand_in, working_name(stand_in), "srgb"
+    return footage.file, _name(footage), footage.probe
+
+
+def working_name(plate: Path) -> str:
+    """Name of the data-block of a shot's working frames."""
+    return f"Plate {plate.parent.parent.stem}"
+
+
+def _name(footage: Footage) -> str:
+    return f"Plate {footage.file.stem}"
+
+
+def _image(footage: Footage, frames: tuple[int, int]) -> tuple[bpy.types.Image | None, str]:
+    """The footage as a data-block, or None and why Blender does not show it as it is."""
+    try:
+        image = sequences.load_sequence(footage.file, _name(footage), footage.probe)
+    except ValueError:
+        return None, f"Blender's colour configuration has no space like {footage.space}"
+    except RuntimeError:
+        return None, f"Blender cannot read {footage.file.name}"
+    image.alpha_mode = "NONE"  # a plate is opaque; its colour is taken as it stands in the file
+    size = sequences.shown_size(image, *frames)
+    if size == footage.size:
+        return image, ""
+    if image.users == 0:
+        bpy.data.images.remove(image)
+    shown = f"at {size[0]} x {size[1]}" if any(size) else "as several layers"
+    return None, f"Blender reads {footage.file.name} {shown}"
+
+
+def undistorted(
+    tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, st: bpy.types.Image, location: tuple[float, float]
+) -> bpy.types.NodeSocket:
+    """Socket of a picture seen through an ST map, by a group node of ours in a tree."""
+    group = bpy.data.node_groups.new(LENS, "CompositorNodeTree")
+    group[_IS_LENS] = True
+    compat.new_socket(group, "Image", "INPUT", "NodeSocketColor")
+    compat.new_socket(group, "Image", "OUTPUT", "NodeSocketColor")
+    enter, leave = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+    reader: Any = group.nodes.new("CompositorNodeImage")
+    reader.image = st
+    reader.name = reader.label = "ST Map"
+    shown = warp_nodes.looked_up(group, enter.outputs[0], reader.outputs["Image"], size_of(st))
+    group.links.new(shown, leave.inputs[0])
+    enter.location, reader.location, leave.location = (-3 * GAP, 0.0), (-3 * GAP, -300.0), (4 * GAP, 0.0)
+    node: Any = tree.nodes.new("CompositorNodeGroup")
+    node.node_tree = group
+    node[TAG] = True
+    node.name = node.label = "Undistort Plate"
+    node.location = location
+    tree.links.new(picture, node.inputs[0])
+    return node.outputs[0]
+
+
+def drop(node: bpy.types.Node) -> list[bpy.types.Image]:
+    """Removes a node of ours from its tree, and its group if it takes a lens away; returns the images it showed."""
+    images: list[bpy.types.Image] = []
+    if isinstance(node, bpy.types.CompositorNodeImage) and node.image:
+        images.append(node.image)
+    group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
+    present(node.id_data).nodes.remove(node)  # pyright: ignore
+    if group is not None and group.get(_IS_LENS):
+        images += [n.image for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
+        if group.users == 0:
+            bpy.data.node_groups.remove(group)
+    return images

@@ -1,0 +1,87 @@
+"""A mask drawn in Blender's Movie Clip or Image editor, rendered to pictures over the clip's frames for the backend."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from .. import compat
+from ..access import present
+from . import exchange
+
+
+def render(mask: bpy.types.Mask, shot: Path, kind: str) -> Path:
+    """Renders a mask for every frame of an imported shot; returns the folder, SHOT/masks/KIND, with a picture for each.
+
+    A frame of the scene is that of the clip which the Movie Clip editor shows there. Without a movie clip of the
+    shot's footage in this file the scene's frames are the clip's own.
+
+    JobError if the shot is not imported, or a picture was not written.
+    """
+    folder = contract.ShotFolder(shot)
+    try:
+        listing = contract.read_json(folder.listing)
+        numbers = [int(row["frame"]) for row in listing["frames"]]
+        size = int(listing["width"]), int(listing["height"])
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE) from error
+    into = folder.drawn_masks(kind)
+    into.mkdir(parents=True, exist_ok=True)
+    for old in into.glob("*.png"):
+        if old.stem.isdecimal():
+            old.unlink()
+    shift = _shift(folder)
+    with _stage(mask, size) as scene:
+        for number in numbers:
+            file = into / contract.frame_file(number, contract.PICTURE)
+            scene.frame_set(number + shift)
+            scene.render.filepath = str(file)
+            bpy.ops.render.render(scene=scene.name, write_still=True)
+            if not file.is_file():
+                raise contract.JobError(
+                    f"The mask {mask.name} was not written to {file}.",
+                    "Make room, or see to it that the shot's folder can be written.",
+                    contract.ExitCode.DISK,
+                )
+    return into
+
+
+@contextlib.contextmanager
+def _stage(mask: bpy.types.Mask, size: tuple[int, int]) -> Generator[bpy.types.Scene]:
+    """A scene of its own, gone afterwards, whose compositor shows the mask alone."""
+    scene = bpy.data.scenes.new("Splannequin Mask")
+    camera: Any = bpy.data.objects.new("Splannequin Mask", bpy.data.cameras.new("Splannequin Mask"))
+    try:
+        scene.collection.objects.link(camera)
+        scene.camera = camera  # nothing is rendered through it, but Blender asks for one
+        tree = compat.new_compositor_tree(scene, "Splannequin Mask")
+        compat.enable_compositor(scene)
+        node: Any = tree.nodes.new("CompositorNodeMask")
+        node.mask = mask
+        tree.links.new(node.outputs[0], present(compat.output_socket(tree)))
+        render = scene.render
+        render.resolution_x, render.resolution_y, render.resolution_percentage = *size, 100
+        compat.set_png(render.image_settings)
+        yield scene
+    finally:
+        data = camera.data
+        compat.drop_compositor_tree(scene)
+        bpy.data.objects.remove(camera)
+        bpy.data.cameras.remove(data)
+        bpy.data.scenes.remove(scene)
+
+
+def _shift(folder: contract.ShotFolder) -> int:
+    """What to add to a frame number of the shot to get the scene's frame at which its movie clip shows it."""
+    source = Path(str(contract.read_json(folder.info_path).get("source", "")))
+    for clip in bpy.data.movieclips:
+        file = Path(bpy.path.abspath(clip.filepath)).absolute()
+        sequence = clip.source == "SEQUENCE" and file.parent in (source, source.parent)
+        if file == source or sequence:
+            return int(clip.frame_start) - exchange.first_number(clip)
+    return 0

@@ -1,0 +1,92 @@
+"""Masks on the panel: what the solve is asked for, and a mask drawn in Blender as pictures over the clip's frames."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+
+def read(path) -> np.ndarray:
+    """[H, W] float32 of a picture's red, top row first."""
+    image = bpy.data.images.load(str(path))
+    try:
+        width, height = image.size
+        pixels = np.empty(width * height * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+        return pixels.reshape(height, width, 4)[::-1, :, 0]
+    finally:
+        bpy.data.images.remove(image)
+
+
+@pytest.fixture
+def drawn():
+    """A mask of a rectangle in the left half of the picture."""
+    mask = bpy.data.masks.new("people é")
+    spline = mask.layers.new(name="one").splines.new()
+    spline.use_cyclic = True
+    spline.points.add(3)
+    for point, (x, y) in zip(spline.points, ((0.05, 0.3), (0.35, 0.3), (0.35, 0.7), (0.05, 0.7)), strict=True):
+        point.co = x, y
+        point.handle_type = "VECTOR"
+    return mask
+
+
+def test_the_solve_is_asked_for_the_masks_that_are_chosen(addon, contract, scene, shot, tmp_path):
+    props, step = scene.splannequin, addon("process.steps").STEPS["solve"]
+    props.shot_path = str(shot)
+    props.ignore_from, props.people_from = "FILE", "ALPHA"
+    with pytest.raises(contract.JobError, match="Nothing is chosen for the mask Ignore"):
+        step.params(scene)
+    props.ignore_path = str(tmp_path / "x" / ".." / "logo.png")
+    asked = step.params(scene)
+    assert (asked.ignore_mask, asked.people_mask) == (str(tmp_path / "logo.png"), "alpha")
+    props.ignore_from = props.people_from = "NONE"
+    assert step.params(scene) == contract.SolveParams()
+    props.people_from = "DRAWN"
+    with pytest.raises(contract.JobError, match="Nothing is chosen for the mask People"):
+        step.params(scene)
+
+
+def test_a_focal_length_is_asked_for_as_it_was_typed(addon, contract, scene):
+    props, step = scene.splannequin, addon("process.steps").STEPS["solve"]
+    props.sensor_mm, props.refine_focal = 23.6, False
+    assert step.params(scene) == contract.SolveParams(), "without a focal length they say nothing"
+    props.focal_mm = 24.3
+    assert step.params(scene) == contract.SolveParams(focal_mm=24.3, sensor_mm=23.6, refine_focal=False)
+
+
+def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file(addon, contract, scene, shot, drawn):
+    props = scene.splannequin
+    props.shot_path, props.people_from, props.people_drawn = str(shot), "DRAWN", drawn
+    (shot / "masks" / "people").mkdir(parents=True)
+    (shot / "masks" / "people" / "000099.png").write_bytes(b"of another range")
+    before = {kind: len(getattr(bpy.data, kind)) for kind in ("scenes", "objects", "cameras", "node_groups", "images")}
+    asked = addon("process.steps").STEPS["solve"].params(scene)
+    assert Path(asked.people_mask) == shot / "masks" / "people"
+    assert sorted(p.name for p in Path(asked.people_mask).iterdir()) == ["000005.png", "000006.png", "000007.png"]
+    found = read(shot / "masks" / "people" / "000006.png")
+    listing = json.loads((shot / "frames" / "frames.json").read_text())
+    assert found.shape == (listing["height"], listing["width"])
+    height, width = found.shape
+    inside = np.zeros(found.shape, bool)
+    inside[round(0.45 * height) : round(0.55 * height), round(0.15 * width) : round(0.25 * width)] = True
+    assert (found[inside] > 0.6).all() and (found[:, width // 2 :] < 0.1).all() and (found[0] < 0.1).all()
+    assert {kind: len(getattr(bpy.data, kind)) for kind in before} == before
+    assert bpy.context.scene == scene
+
+
+def test_a_mask_follows_the_frames_that_its_clip_shows(addon, scene, shot, drawn, tmp_path, pictures):
+    """The shot's frame 5 is the first file of the sequence, which the movie clip shows at frame 1 of the scene."""
+    for number in (5, 6, 7):
+        pictures.write(tmp_path / f"take.{number:04d}.png", np.zeros((12, 16, 3), np.uint8))
+    info = shot / "shot.json"
+    info.write_text(json.dumps({**json.loads(info.read_text()), "source": str(tmp_path / "take.0005.png")}))
+    shift = addon("solve.drawn_masks")._shift
+    folder = addon("solve.drawn_masks").contract.ShotFolder(shot)
+    assert shift(folder) == 0
+    clip = bpy.data.movieclips.load(str(tmp_path / "take.0005.png"))
+    assert shift(folder) == -4
+    clip.frame_start = 5
+    assert shift(folder) == 0

@@ -1,0 +1,217 @@
+"""A bake into a scene without a compositor of its own: the plate is the footage itself, not a copy of it."""
+
+import importlib.util
+import json
+import shutil
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+DATA = Path(__file__).resolve().parent / "data"
+
+
+def _load(name: str):
+    spec = importlib.util.spec_from_file_location(f"_{name}", DATA / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+made, levels = _load("make_detail"), _load("make_levels")
+SIZE = made.WIDTH, made.HEIGHT
+SRGB = tuple(float(((v + 0.055) / 1.055) ** 2.4) for v in (0.78125, 0.390625, 0.1953125))
+LINEAR = (0.78125, 0.390625, 0.1953125)
+
+
+@pytest.fixture
+def footage(scene, shot, tmp_path):
+    """footage(...): the shot, its take `detail` of an EXR sequence beside it, and what take.json says of that."""
+    folder = tmp_path / "the plate"
+    shutil.copytree(DATA / "detail" / "plate", folder)
+    take = shot / "takes" / "detail"
+    shutil.copytree(DATA / "detail", take, ignore=shutil.ignore_patterns("plate"))
+    scene.render.resolution_x, scene.render.resolution_y = SIZE
+
+    def tell(**told):
+        facts = {"version": 1, "take": "detail", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 2}
+        facts |= {"width": SIZE[0], "height": SIZE[1], "first": 5, "last": 6, "camera_path": ""}
+        facts["footage"] = {
+            "file": str(folder / "000005.exr"), "beside": "../the plate/000005.exr", "size": list(SIZE), "first": 5,
+            "last": 6, "probe": list(LINEAR), "space": "linear, Rec.709", "map": "", "unlike": "", **told,
+        }  # fmt: skip
+        (take / "take.json").write_text(json.dumps(facts))
+        return shot
+
+    return tell
+
+
+def node_of(addon, scene):
+    return addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
+
+
+def render(scene, folder, frame, size=SIZE):
+    """[H, W, 3] float32, what leaves the compositor."""
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *size, 100
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_depth, settings.color_mode = "OPEN_EXR", "32", "RGBA"
+    scene.render.filepath = str(folder / f"{frame}.exr")
+    scene.frame_set(frame)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    image.colorspace_settings.is_data = True
+    image.alpha_mode = "CHANNEL_PACKED"
+    pixels = np.array(image.pixels[:], np.float32).reshape(size[1], size[0], 4)[::-1, :, :3]
+    bpy.data.images.remove(image)
+    return pixels
+
+
+def st_map(path: Path, places: np.ndarray) -> None:
+    """Writes a map that looks at these places [H, W, 2], pixels from the top left, of a picture of that size."""
+    height, width = places.shape[:2]
+    pixels = np.ones((height, width, 4), np.float32)
+    pixels[..., 0] = (places[..., 0] + 0.5) / width
+    pixels[..., 1] = 1.0 - (places[..., 1] + 0.5) / height
+    image = bpy.data.images.new("map", width, height, float_buffer=True, is_data=True)
+    image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1]).ravel())
+    path.parent.mkdir(exist_ok=True)
+    image.filepath_raw, image.file_format = str(path), "OPEN_EXR"
+    image.save()
+    bpy.data.images.remove(image)
+
+
+def test_mix_0_is_the_footage_bit_for_bit_and_no_copy_is_shown(addon, scene, footage, tmp_path):
+    said = addon("bake.insertion").insert_freeze(scene, footage(), "detail")
+    assert "The plate is 000005.exr itself, 56 x 42." in said
+    shown = [Path(bpy.path.abspath(image.filepath)) for image in bpy.data.images if image.name.startswith("Plate")]
+    assert [path.suffix for path in shown] == [".exr"] and "the plate" in str(shown[0])
+    node_of(addon, scene).inputs["Mix"].default_value = 0.0
+    for frame in (5, 6):
+        assert np.array_equal(render(scene, tmp_path, frame), made.plate(frame))
+
+
+def test_acescg_footage_is_brought_to_the_scenes_light(addon, scene, footage, tmp_path):
+    """Under Blender's own configuration, where light is Rec.709's."""
+    matrix = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
+    said = addon("bake.insertion").insert_freeze(scene, footage(probe=(matrix @ LINEAR).tolist()), "detail")
+    assert "The plate is 000005.exr itself, 56 x 42." in said
+    node_of(addon, scene).inputs["Mix"].default_value = 0.0
+    found, expected = render(scene, tmp_path, 6), made.plate(6) @ matrix.T
+    assert float((np.abs(found - expected).max(-1) / np.abs(expected).max(-1)).max()) < 1e-3
+
+
+def test_the_freeze_as_a_warp_works_on_the_footage_itself(addon, scene, footage, tmp_path):
+    """Values from -0.2 to 50, which no PNG holds."""
+    addon("bake.insertion").insert_freeze(scene, footage(), "detail", warp=True)
+    found, delivered = render(scene, tmp_path, 6), made.frozen(6)
+    assert delivered.max() > 40
+    assert float((np.abs(found - delivered) / np.maximum(np.abs(delivered), 0.01)).max()) < 1e-3
+
+
+def test_its_lens_is_taken_away_by_the_takes_map(addon, scene, footage, tmp_path):
+    shot = footage(map="stmap/undistort.exr")
+    st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(6))
+    said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
+    assert "The plate is 000005.exr itself, 56 x 42, without its lens by the take's ST map." in said
+    node_of(addon, scene).inputs["Mix"].default_value = 0.0
+    found, expected = render(scene, tmp_path, 6), made.moved(made.plate(6), 6)
+    assert float((np.abs(found - expected) / np.maximum(np.abs(expected), 0.05)).max()) < 2e-3
+
+
+def test_bakes_replace_each_other_and_leave_nothing(addon, scene, footage):
+    shot = footage(map="stmap/undistort.exr")
+    kinds = ("images", "node_groups", "textures")
+    before = {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds}
+    st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(6))
+    bake = addon("bake.insertion")
+    bake.insert_freeze(scene, shot, "detail")
+    once = {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds}
+    bake.insert_freeze(scene, shot, "detail")
+    assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == once
+    footage()
+    bake.insert_freeze(scene, shot, "detail")
+    assert not [g.name for g in bpy.data.node_groups if "Undistort" in g.name]
+    assert not [i.name for i in bpy.data.images if "Undistort" in i.name]
+    footage(map="stmap/undistort.exr")
+    bake.insert_freeze(scene, shot, "detail")
+    assert bake.remove(scene)
+    assert {kind: set(getattr(bpy.data, kind).keys()) for kind in kinds} == before
+
+
+def test_what_is_read_ahead_is_the_footage(addon, scene, footage):
+    bake, shot = addon("bake.insertion"), footage()
+    assert len(list(bake.read_ahead(scene, shot, "detail"))) == 2
+    bake.insert(scene, shot, "detail")
+    assert not addon("scene.sequences")._ahead, "it is taken as it was read"
+    assert [i.name for i in bpy.data.images if i.name.startswith("Plate")] == ["Plate 000005"]
+
+
+def test_a_video_shows_frame_n_at_frame_n(addon, scene, footage, tmp_path):
+    """Its n-th picture, as bright as its luma says."""
+    size = levels.WIDTH, levels.HEIGHT
+    told = {"file": str(DATA / "levels.mp4"), "size": list(size), "first": 1, "last": levels.FRAMES}
+    shot = footage(**told, probe=list(SRGB), space="video, Rec.709")
+    scene.render.resolution_x, scene.render.resolution_y = size
+    said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
+    assert "The plate is levels.mp4 itself, 64 x 48." in said
+    node_of(addon, scene).inputs["Mix"].default_value = 0.0
+    for frame in (5, 6):
+        light = render(scene, tmp_path, frame, size)[20, 30]
+        shown = 255.0 * np.where(light < 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        assert np.abs(shown - (levels.level(frame) - 16) / 219 * 255).max() < 1.2
+
+
+@pytest.mark.parametrize(
+    "told, why",
+    [
+        ({"unlike": "its pixels are not square"}, "000005.exr: its pixels are not square"),
+        ({"file": "/nowhere/a.0001.exr", "beside": ""}, "a.0001.exr is not there any more"),
+        ({"size": [64, 48]}, "Blender reads 000005.exr at 56 x 42"),
+        ({"probe": [7.0, 0.3, 0.2], "space": "a log"}, "Blender's colour configuration has no space like a log"),
+        ({"map": "stmap/undistort.exr"}, "the take's ST map is gone"),
+    ],
+)
+def test_working_frames_stand_in_and_a_sentence_says_why(addon, scene, footage, told, why):
+    said = addon("bake.insertion").insert_freeze(scene, footage(**told), "detail")
+    assert f"The compositor shows working frames as the plate, not the footage: {why}." in said
+    shown = [image for image in bpy.data.images if image.name.startswith("Plate")]
+    assert len(shown) == 1 and shown[0].filepath.endswith(".png")
+
+
+def test_footage_moved_together_with_the_shot_is_found(addon, scene, footage):
+    shot = footage(file="/nowhere/000005.exr")
+    assert "The plate is 000005.exr itself, 56 x 42." in addon("bake.insertion").insert_freeze(scene, shot, "detail")
+
+
+def test_a_take_of_before_shows_the_working_frames_as_it_did(addon, scene, shot):
+    said = addon("bake.insertion").insert_freeze(scene, shot, "freeze")
+    assert not [line for line in said if "plate" in line.lower() and "footage" in line]
+    assert [i.filepath[-4:] for i in bpy.data.images if i.name.startswith("Plate")] == [".png"]
+
+
+def test_colour_spaces_are_known_by_any_light_they_give(addon, contract):
+    compat = addon("compat")
+    assert compat.colour_space(contract.PROBE) == compat.colour_space("linear")
+    assert compat.colour_space(SRGB) == compat.colour_space("srgb")
+    ap1 = (1.07292, 0.34180, 0.15606)  # by the published matrix of ACEScg
+    assert "ACEScg" in compat.colour_space(ap1)
+    assert not compat.knows_colour((3.0, 0.1, 7.0))
+
+
+@pytest.mark.parametrize("warp", [False, True])
+def test_frames_and_warps_of_acescg_footage_are_read_in_their_light(addon, scene, footage, tmp_path, warp):
+    """Also where the same place held Rec.709's before."""
+    shot, bake = footage(), addon("bake.insertion")
+    bake.insert_freeze(scene, shot, "detail", warp=warp)
+    take = shot / "takes" / "detail"
+    shutil.copytree(DATA / "detail_ap1", take, dirs_exist_ok=True)
+    for stale in (take / "000005.exr", take / "warp" / "000005.exr"):
+        stale.unlink()
+    bake.insert_freeze(scene, shot, "detail", warp=warp)
+    for _ in range(2):
+        found, expected = render(scene, tmp_path, 6), made.frozen(6)
+        assert float((np.abs(found - expected).max(-1) / np.maximum(np.abs(expected).max(-1), 0.01)).max()) < 1e-3
+        bake.insert_freeze(scene, shot, "detail", warp=warp)

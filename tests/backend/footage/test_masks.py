@@ -1,0 +1,141 @@
+"""Masks as artists hand them over: one picture, a sequence, a video, an alpha; and what does not fit is refused."""
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from torch_backend.contract import ExitCode, JobError
+from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.footage.images import write_png
+from torch_backend.footage.masks import read_masks
+from torch_backend.shot import Shot
+
+FRAMES = range(101, 111)
+COVERED = np.zeros((48, 64), bool)
+COVERED[10:20, 30:50] = True
+
+
+@pytest.fixture
+def shot(tmp_path, pan, recorder):
+    """Ten frames of 64 x 48, numbered 101 to 110."""
+    (tmp_path / "clip").mkdir()
+    for number, pixels in zip(FRAMES, pan(10), strict=True):
+        write_png(tmp_path / "clip" / f"f.{number}.png", pixels)
+    made = Shot.create(tmp_path / "a.splannequin")
+    import_footage(made, str(tmp_path / "clip"), FootageConfig(), recorder())
+    return made
+
+
+def white(covered):
+    return np.repeat(np.where(covered, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def write_masks(folder, numbers, covered=COVERED):
+    """A mask that goes a pixel to the right at each frame."""
+    folder.mkdir()
+    for n, number in enumerate(numbers):
+        write_png(folder / f"m.{number:04d}.png", white(np.roll(covered, n, axis=1)))
+    return str(folder)
+
+
+def write_rgba(file, rgb, alpha):
+    """A PNG with straight alpha: [h, w, 3] and [h, w] uint8."""
+    buffer = oiio.ImageBuf(np.ascontiguousarray(np.dstack([rgb, alpha])))
+    buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)
+    buffer.specmod().alpha_channel = 3
+    assert buffer.write(str(file))
+
+
+def masks_of(shot, recorder, **sources):
+    return read_masks(shot, {kind: str(source) for kind, source in sources.items()}, recorder())
+
+
+def test_one_picture_masks_all_frames(shot, recorder, tmp_path):
+    write_png(tmp_path / "logo.png", white(COVERED))
+    mask = masks_of(shot, recorder, ignore=tmp_path / "logo.png")["ignore"]
+    assert list(mask.packed) == list(FRAMES)
+    assert all((mask.of(frame) == COVERED).all() for frame in FRAMES)
+    assert mask.share == pytest.approx(COVERED.mean())
+
+
+def test_a_sequence_goes_by_number_and_may_have_more_frames(shot, recorder, tmp_path):
+    report = recorder()
+    mask = read_masks(shot, {"people": write_masks(tmp_path / "m", range(99, 120))}, report)["people"]
+    assert all((mask.of(frame) == np.roll(COVERED, frame - 99, axis=1)).all() for frame in FRAMES)
+    assert not report.warnings
+
+
+def test_as_many_pictures_as_frames_are_taken_in_order_and_that_is_said(shot, recorder, tmp_path):
+    report = recorder()
+    mask = read_masks(shot, {"people": write_masks(tmp_path / "m", range(10))}, report)["people"]
+    assert (mask.of(110) == np.roll(COVERED, 9, axis=1)).all()
+    assert "is numbered 0 to 9, the frames 101 to 110: its pictures are taken in order" in report.warnings[0]
+
+
+def test_a_larger_mask_is_brought_to_the_frames_size(shot, recorder, tmp_path):
+    write_png(tmp_path / "logo.png", np.kron(white(COVERED), np.ones((4, 4, 1), np.uint8)))
+    assert (masks_of(shot, recorder, ignore=tmp_path / "logo.png")["ignore"].of(105) == COVERED).all()
+
+
+def test_a_video_masks_by_its_own_count(shot, recorder, tmp_path, write_video):
+    write_video(tmp_path / "m.mp4", [white(np.roll(COVERED, n, axis=1)) for n in range(10)])
+    mask = masks_of(shot, recorder, people=tmp_path / "m.mp4")["people"]
+    assert all((mask.of(frame) == np.roll(COVERED, frame - 101, axis=1)).all() for frame in FRAMES)
+
+
+def test_what_a_picture_s_own_alpha_takes_away_is_not_covered(shot, recorder, tmp_path):
+    write_rgba(tmp_path / "logo.png", np.full((48, 64, 3), 255, np.uint8), np.where(COVERED, 255, 0).astype(np.uint8))
+    assert (masks_of(shot, recorder, ignore=tmp_path / "logo.png")["ignore"].of(105) == COVERED).all()
+
+
+def test_a_matte_in_the_alpha_of_black_pictures_is_one(shot, recorder, tmp_path):
+    write_rgba(tmp_path / "logo.png", np.zeros((48, 64, 3), np.uint8), np.where(COVERED, 255, 0).astype(np.uint8))
+    assert (masks_of(shot, recorder, ignore=tmp_path / "logo.png")["ignore"].of(105) == COVERED).all()
+
+
+def test_the_footage_s_alpha_ignores_what_is_transparent_and_lets_move_what_is_opaque(tmp_path, pan, recorder):
+    (tmp_path / "clip").mkdir()
+    for number, pixels in zip(FRAMES, pan(10), strict=True):
+        write_rgba(tmp_path / "clip" / f"f.{number}.png", pixels, np.where(COVERED, 255, 0).astype(np.uint8))
+    shot = Shot.create(tmp_path / "a.splannequin")
+    import_footage(shot, str(tmp_path / "clip"), FootageConfig(), recorder())
+    assert (masks_of(shot, recorder, ignore="alpha")["ignore"].of(101) == ~COVERED).all()
+    assert (masks_of(shot, recorder, people="alpha")["people"].of(101) == COVERED).all()
+
+
+def test_a_mask_is_known_by_what_it_covers_and_not_by_its_file(shot, recorder, tmp_path):
+    first = masks_of(shot, recorder, people=write_masks(tmp_path / "m", FRAMES))["people"]
+    again = masks_of(shot, recorder, people=write_masks(tmp_path / "n", FRAMES))["people"]
+    other = masks_of(shot, recorder, people=write_masks(tmp_path / "o", FRAMES, np.roll(COVERED, 1, 0)))["people"]
+    assert first.key == again.key != other.key
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda d: str(d / "none.png"), "none.png does not exist."),
+        (lambda d: write_masks(d / "m", range(101, 108)), "has no picture for frames 108-110, of 10 frames."),
+        (
+            lambda d: write_masks(d / "m", FRAMES, np.ones((48, 96), bool)),
+            "is 96x48, the footage 64x48: they have not the same shape.",
+        ),
+        (lambda d: write_masks(d / "m", FRAMES, np.zeros((48, 64), bool)), "covers nothing in any frame."),
+        (
+            lambda d: write_masks(d / "m", FRAMES, np.ones((48, 64), bool)),
+            "covers 100 % of the picture: nothing is left to solve the camera by.",
+        ),
+        (lambda _: "alpha", "f.101.png has no alpha to mask by."),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_words(shot, recorder, tmp_path, write, message):
+    with pytest.raises(JobError) as error:
+        masks_of(shot, recorder, people=write(tmp_path))
+    assert error.value.message.endswith(message) and error.value.hint
+    assert error.value.exit_code == ExitCode.FOOTAGE
+
+
+def test_a_damaged_mask_is_named(shot, recorder, tmp_path):
+    folder = write_masks(tmp_path / "m", FRAMES)
+    (tmp_path / "m" / "m.0104.png").write_bytes(b"\x89PNG")
+    with pytest.raises(JobError, match=r"m\.0104\.png cannot be read"):
+        masks_of(shot, recorder, people=folder)

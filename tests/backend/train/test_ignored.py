@@ -1,0 +1,76 @@
+"""A logo burnt into every frame, and a mask of it: what is behind it is learnt from where other frames see it."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world
+from torch_backend.contract import TrainParams, read_json
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.scene import load_images, load_scene
+from torch_backend.shot import write_json
+from torch_backend.solve.masks import IGNORE, load_mask, write_grey
+from torch_backend.train import config_from_params, train_shot
+from torch_backend.train.ignored import load_ignored
+from torch_backend.train.trainer import Trainer
+
+LOGO = np.zeros((HEIGHT, WIDTH), bool)
+LOGO[30:40, 6:22] = True
+
+
+@pytest.fixture(scope="module")
+def logo_world(tmp_path_factory):
+    """The tiny shot with a logo, solved with a mask of it."""
+    world = build_world(tmp_path_factory.mktemp("logo"))
+    record = read_json(world.shot.solve_record) if world.shot.solve_record.is_file() else {"version": 1}
+    write_json(world.shot.solve_record, {**record, "masks": {IGNORE: {"key": "logo"}}})
+    world.shot.masks(IGNORE).mkdir()
+    for n in range(FRAMES):
+        plate = world.shot.plate(FIRST + n)
+        write_png(plate, np.where(LOGO[..., None], np.uint8([255, 0, 255]), read_png(plate)))
+        write_grey(world.shot.mask(IGNORE, FIRST + n), np.where(LOGO, np.uint8(255), np.uint8(0)))
+    return world
+
+
+def masks_of(world):
+    return lambda frame: load_mask(world.shot, IGNORE, frame)
+
+
+def test_frames_with_the_same_mask_share_it_and_half_covered_pixels_count(logo_world):
+    scene = load_scene(logo_world.shot)
+    found = load_ignored(masks_of(logo_world), scene, scene.solved, WIDTH // 4, HEIGHT // 4)
+    assert set(found) == set(scene.solved) and len({id(mask) for mask in found.values()}) == 1
+    wanted = LOGO.reshape(HEIGHT // 4, 4, WIDTH // 4, 4).mean((1, 3)) > 0.1
+    assert (found[scene.solved[0]].numpy() == wanted).all()
+
+
+def shown_behind(world, quiet, ignored):
+    """[P, 3] what a run of a few steps shows where the logo is, in a frame, and what is there in truth."""
+    scene = load_scene(world.shot)
+    config = config_from_params(TrainParams(iterations=300, max_gaussians=1500, holdout=0, method="static"))
+    images = load_images(scene, scene.solved, WIDTH, HEIGHT)
+    found = load_ignored(masks_of(world), scene, scene.solved, WIDTH, HEIGHT) if ignored else {}
+    trainer = Trainer(scene, images, scene.solved, config, quiet(), ignored=found)
+    for _ in range(150):
+        trainer.schedule_events()
+        trainer.step()
+        trainer.iteration += 1
+    mask = torch.from_numpy(LOGO)
+    return trainer.render_frame(8)[mask], world.image(8, 8 / (FRAMES - 1))[mask]
+
+
+def test_a_masked_logo_is_not_learnt(logo_world, quiet):
+    errors = []
+    for ignored in (True, False):
+        shown, truth = shown_behind(logo_world, quiet, ignored)
+        errors.append(float((shown - truth).abs().mean()))
+    assert errors[0] < 0.12 and errors[1] > 2.5 * errors[0]
+
+
+def test_a_run_is_known_by_what_it_ignores(logo_world, quiet):
+    params = TrainParams(iterations=20, max_gaussians=300, method="static")
+    key = train_shot(logo_world.shot, params, quiet())["key"]
+    assert train_shot(logo_world.shot, params, quiet())["key"] == key
+    record = read_json(logo_world.shot.solve_record)
+    write_json(logo_world.shot.solve_record, {**record, "masks": {IGNORE: {"key": "another"}}})
+    assert train_shot(logo_world.shot, params, quiet())["key"] != key

@@ -1,0 +1,251 @@
+"""Masks that an artist gives: which pixels of which frame they cover, at the working frames' size.
+
+A mask is one picture for all frames, a numbered sequence, a video, or the footage's own alpha. White is covered, from
+half of it on; what a picture's own alpha takes away is not. Frames go by number; exactly as many pictures as frames are
+taken in order. What does not fit the frames is refused in a sentence.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from ..contract import MASK_ALPHA, MASK_KINDS, JobError, Reporter
+from ..shot import Shot, content_key
+from .images import error_of
+from .importing import FootageConfig, load_frames, source_places
+from .layers import find_layer
+from .sequence import PICTURES, SequenceSource, find_sequence
+from .sources import footage_error, frame_words
+from .video import VideoSource
+
+_HALF = 0.5
+_SHAPE = 0.01
+"""How much the shape of a mask may differ from the footage's: sizes are rounded."""
+_ALL = 0.98
+"""Share of the picture from which on a mask leaves nothing to solve by."""
+WORDS = {"ignore": "what is ignored", "people": "what may move"}
+"""Kind of mask -> what it says, in sentences."""
+
+
+@dataclass
+class Mask:
+    """One mask, of every frame of a shot."""
+
+    kind: str
+    """One of `MASK_KINDS`."""
+    size: tuple[int, int]
+    """Width and height of the working frames in pixels."""
+    packed: dict[int, bytes] = field(default_factory=dict[int, bytes])
+    """Frame number -> its bits, packed: a mask takes about a thousandth of its pixels."""
+    share: float = 0.0
+    """Share of all frames' pixels that it covers."""
+
+    def add(self, frame: int, covered: NDArray[np.bool_]) -> None:
+        """Keeps what it covers of a frame, bool [H, W]."""
+        self.packed[frame] = zlib.compress(np.packbits(covered).tobytes(), 1)
+
+    def of(self, frame: int) -> NDArray[np.bool_]:
+        """[H, W] bool: what it covers of a frame, over the frame as it was filmed."""
+        width, height = self.size
+        bits = np.frombuffer(zlib.decompress(self.packed[frame]), np.uint8)
+        return np.unpackbits(bits, count=width * height).reshape(height, width).astype(bool)
+
+    @property
+    def key(self) -> str:
+        """Changes with what is covered, and with nothing else."""
+        return content_key(self.kind, self.size, [[frame, zlib.crc32(bits)] for frame, bits in self.packed.items()])
+
+
+def read_masks(shot: Shot, sources: dict[str, str], report: Reporter) -> dict[str, Mask]:
+    """The masks of an imported shot, by kind; `sources` has a path or `MASK_ALPHA` for each kind that is wanted.
+
+    JobError (FOOTAGE) for what cannot be read, has another shape than the footage, lacks frames, covers nothing, or,
+    all together, leaves nothing to solve by.
+    """
+    wanted = {kind: source for kind, source in sources.items() if source}
+    if not wanted:
+        return {}
+    frames = load_frames(shot)
+    masks = {kind: _Reading(shot, frames, kind, source, report).mask() for kind, source in wanted.items()}
+    covered = 0.0
+    for number in masks[next(iter(masks))].packed:
+        covered += float(np.logical_or.reduce([mask.of(number) for mask in masks.values()]).mean())
+    covered /= max(1, len(frames["frames"]))
+    if covered > _ALL:
+        words = " and ".join(WORDS[kind] for kind in masks)
+        raise footage_error(
+            f"The mask of {words} covers {100 * covered:.0f} % of the picture: nothing is left to solve the camera by.",
+            "White is what is masked: invert it if it was made the other way round.",
+        )
+    return masks
+
+
+class _Reading:
+    """One mask while it is read."""
+
+    def __init__(self, shot: Shot, frames: dict[str, Any], kind: str, source: str, report: Reporter) -> None:
+        self.shot, self.frames, self.kind, self.source, self.report = shot, frames, kind, source, report
+        self.numbers = [int(row["frame"]) for row in frames["frames"]]
+        self.size = int(frames["width"]), int(frames["height"])
+        self.name = f"The mask {source}" if source != MASK_ALPHA else "The footage's alpha"
+
+    def mask(self) -> Mask:
+        """All of it."""
+        made = Mask(self.kind, self.size)
+        pictures = self._alpha() if self.source == MASK_ALPHA else self._pictures()
+        total = 0.0
+        for done, (number, grey) in enumerate(pictures, start=1):
+            self.report.check_cancelled()
+            covered = self._covered(grey)
+            for frame in [number] if number is not None else self.numbers:
+                made.add(frame, covered)
+                total += float(covered.mean())
+            self.report.progress("solve: masks", done, len(self.numbers), WORDS[self.kind])
+        made.share = total / max(1, len(self.numbers))
+        if total == 0.0:
+            hint = "White is what is masked, from half of it on."
+            if self.source == MASK_ALPHA:
+                hint = "Ignored is what is transparent; what is opaque may move."
+            raise footage_error(f"{self.name} covers nothing in any frame.", hint)
+        return made
+
+    def _covered(self, grey: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """[H, W] bool at the working size, of a picture [h, w] in 0..1. JobError for one of another shape."""
+        h, w = grey.shape
+        ours = self.frames.get("source_size") or self.size
+        aspect = float(self.frames.get("reading", {}).get("pixel_aspect", 1.0))
+        shape = w / h
+        # A mask of anamorphic footage may have the footage's own pixels, or square ones.
+        if all(abs(shape / (ours[0] / ours[1] / stretch) - 1.0) > _SHAPE for stretch in (1.0, aspect)):
+            raise footage_error(
+                f"{self.name} is {w}x{h}, the footage {ours[0]}x{ours[1]}: they have not the same shape.",
+                "Render the mask at the footage's size, or a fraction of it.",
+            )
+        small = cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA if w > self.size[0] else cv2.INTER_LINEAR)
+        return np.asarray(small) >= _HALF
+
+    # ------------------------------------------------------------------------------------------------- from files
+
+    def _pictures(self) -> Iterator[tuple[int | None, NDArray[np.float32]]]:
+        """(frame, [h, w] in 0..1) of each frame; a frame of None is for all of them."""
+        path = Path(self.source)
+        if not path.exists() and not any(mark in path.name for mark in ("#", "%", "@", "*")):
+            raise footage_error(f"{self.name} does not exist.", "Check the path.")
+        if path.is_file() and path.suffix.lower() not in PICTURES:
+            yield from self._video(path)
+            return
+        files = self._files(path)
+        if len(files) == 1 and None in files:
+            grey, alpha = self._picture(files[None])
+            yield None, grey if grey.max() > 0.0 or alpha is None else alpha
+            return
+        matched = self._matched(sorted(n for n in files if n is not None))
+        # Some programs write a matte into the alpha of black pictures.
+        from_alpha = all(self._picture(files[theirs])[0].max() <= 0.0 for theirs in matched.values())
+        for frame, theirs in matched.items():
+            grey, alpha = self._picture(files[theirs])
+            yield frame, alpha if from_alpha and alpha is not None else grey
+
+    def _files(self, path: Path) -> dict[int | None, Path]:
+        """Number -> file; None for a picture that is none of a sequence."""
+        try:
+            sequence = find_sequence(path)
+        except JobError:
+            if not path.is_file():
+                raise
+            return {None: path}
+        numbers = sequence.frameSet() or ()
+        files = {int(n): Path(sequence.frame(n)) for n in numbers}
+        return {n: file for n, file in files.items() if file.is_file()}
+
+    def _matched(self, theirs: list[int]) -> dict[int, int]:
+        """Frame -> number of the mask's picture. JobError names the frames that have none."""
+        missing = sorted(set(self.numbers) - set(theirs))
+        if not missing:
+            return {n: n for n in self.numbers}
+        if len(theirs) == len(self.numbers):
+            self.report.warning(
+                f"{self.name} is numbered {theirs[0]} to {theirs[-1]}, the frames {self.numbers[0]} to "
+                f"{self.numbers[-1]}: its pictures are taken in order, as there are as many."
+            )
+            return dict(zip(self.numbers, theirs, strict=True))
+        raise footage_error(
+            f"{self.name} has no picture for {frame_words(missing)}, of {len(self.numbers)} frames.",
+            "Number it as the clip's frames, or give one picture, without a number in its name, for all of them.",
+        )
+
+    def _picture(self, file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Brightness, less what its alpha takes away, and alpha, [h, w] each in 0..1."""
+        pixels, alpha = _read(file)
+        colours = [n for n in range(pixels.shape[2]) if n != alpha] or [0]
+        grey = pixels[..., colours[:3]].mean(2)
+        return grey, None if alpha is None else pixels[..., alpha]
+
+    def _video(self, path: Path) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        video = VideoSource(path)
+        count = sum(1 for _ in video.frames(None, None))
+        wanted = {theirs: frame for frame, theirs in self._matched(list(range(1, count + 1))).items()}
+        for one in video.frames(None, max(wanted)):
+            if one.number in wanted:
+                grey = one.pixels.astype(np.float32).mean(2) / np.float32(np.iinfo(one.pixels.dtype).max)
+                yield wanted[one.number], grey
+
+    # ------------------------------------------------------------------------------------------------- from alpha
+
+    def _alpha(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """(frame, what the footage's alpha covers): of what is ignored the transparent, of what may move the opaque."""
+        files, layer = self._footage()
+        for number in self.numbers:
+            file = files[number]
+            found = find_layer(file, layer)[0]
+            if found.alpha is None:
+                raise footage_error(f"{file.name} has no alpha to mask by.", "Give the mask as pictures of their own.")
+            alpha = _read(file, found.part)[0][..., found.alpha]
+            yield number, 1.0 - alpha if self.kind == MASK_KINDS[0] else alpha
+
+    def _footage(self) -> tuple[dict[int, Path], str]:
+        """The footage's files by frame, and the layer that was imported. JobError if it is no sequence any more."""
+        config = self.frames.get("config", {})
+        settings = FootageConfig(fps=float(config.get("fps", 0.0)), layer=str(config.get("layer", "")))
+        for place in source_places(self.shot, self.frames):
+            path = Path(place)
+            if path.is_file() and path.suffix.lower() not in PICTURES:
+                raise footage_error(
+                    "The alpha of a video is not read as a mask.",
+                    "Write it as a sequence of pictures, and give that.",
+                )
+            try:
+                sequence = find_sequence(path)
+                SequenceSource(sequence, settings.fps, settings.layer)
+            except (JobError, OSError):
+                continue
+            files = {number: Path(sequence.frame(number)) for number in self.numbers}
+            if all(file.is_file() for file in files.values()):
+                return files, settings.layer
+        raise footage_error(
+            f"The footage {self.shot.info().source} cannot be read any more: its alpha is not known.",
+            "Put it back where it was, or give the mask as pictures of their own.",
+        )
+
+
+def _read(file: Path, part: int = 0) -> tuple[NDArray[np.float32], int | None]:
+    """A picture over its whole frame, [h, w, C] with colour multiplied by alpha, and which channel alpha is."""
+    buffer = oiio.ImageBuf(str(file), part, 0)
+    spec = buffer.spec()
+    if buffer.has_error:
+        raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Write it again.")
+    x, y = spec.full_x, spec.full_y
+    roi = oiio.ROI(x, x + spec.full_width, y, y + spec.full_height, 0, 1, 0, spec.nchannels)
+    pixels = buffer.get_pixels(oiio.FLOAT, roi)
+    if pixels is None or buffer.has_error:
+        raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Write it again.")
+    return np.asarray(pixels, np.float32), spec.alpha_channel if spec.alpha_channel >= 0 else None

@@ -1,0 +1,204 @@
+"""Colour spaces by the names of an OpenColorIO configuration, converted by OpenImageIO's OpenColorIO.
+
+The configuration is that of $OCIO, as in Blender and every other program of a studio; without it the ACES studio
+configuration that OpenColorIO has built in, which knows the logs of cameras. Light arrives in linear Rec.709 with white
+at D65 by the role `aces_interchange`, whatever the configuration calls its spaces; one without that role has to name
+linear Rec.709 itself.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import ArrayLike, NDArray
+
+from .color import LIGHTS, PRIMARIES, Curve, InputSpace, linear_to_srgb, named_space, to_rec709
+from .images import error_of
+from .sources import footage_error
+
+BUILT_IN = "ocio://studio-config-latest"
+"""The configuration without $OCIO: ACES, with camera logs, inside of OpenColorIO."""
+INTERCHANGE = "aces_interchange"
+"""Role of ACES2065-1, by which configurations are converted into each other."""
+LINEAR = ("lin_rec709_scene", "lin_rec709", "Linear Rec.709", "Utility - Linear - sRGB", "Linear", "linear")
+"""What configurations without that role call linear Rec.709."""
+
+
+@dataclass(frozen=True)
+class OcioSpace(InputSpace):
+    """What the numbers in a picture mean, as a colour space of a configuration."""
+
+    space: str = ""
+    """Name in the configuration."""
+    config: str = ""
+    """The configuration: a file, or the ocio:// address of one that is built in."""
+
+    @property
+    def name(self) -> str:
+        """As people read it."""
+        return f"{self.space} (OCIO)"
+
+    @property
+    def is_light(self) -> bool:
+        """True: a configuration says how its numbers become light."""
+        return True
+
+    @property
+    def as_it_stands(self) -> bool:
+        """False: what is sRGB is an `InputSpace`."""
+        return False
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """The configuration."""
+        return {"ocio": self.config}
+
+    @property
+    def rows(self) -> int:
+        """Many: each call reads the configuration anew, which takes 20 ms."""
+        return 1024
+
+    def _light(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], Curve]:
+        return light_of(pixels, self.space, self.config), linear_to_srgb
+
+
+@dataclass(frozen=True)
+class Colours:
+    """How the footage's colours are to be found out."""
+
+    chosen: str = ""
+    """Colour space that a person named; empty: what the files say."""
+    config: str = ""
+    """Configuration that names are looked up in; empty, or one that is gone: the active one."""
+
+    def space(self) -> InputSpace | None:
+        """The space that a person named, None if they named none.
+
+        JobError if no colour space has that name, if it is no colour, or if the configuration cannot be read.
+        """
+        if not self.chosen:
+            return None
+        config = self._used()
+        found = known_space(self.chosen, config) or named_space(self.chosen)
+        if found is not None:
+            return found
+        names = space_names(config)
+        if any(name.lower() == self.chosen.lower() for name in names):
+            raise footage_error(f"{self.chosen!r} is no colour but data.", "Name the colour space of the footage.")
+        near = get_close_matches(self.chosen, names, 4, 0.3) or names[:4]
+        raise footage_error(
+            f"The OCIO configuration {config} has no colour space {self.chosen!r}.",
+            f"It has {len(names)}, among them: {', '.join(near)}.",
+        )
+
+    def known(self, name: str) -> InputSpace | None:
+        """The space of a name that stands in a file; None if the configuration has none of that name."""
+        return known_space(name, self._used())
+
+    def by_rules(self, file: Path) -> InputSpace | None:
+        """The space that the file rules of $OCIO give a file; None if they say nothing of it in particular."""
+        if not (self.config or os.environ.get("OCIO")):
+            return None
+        config = self._used()
+        rules: Any = _configuration(config)
+        if rules.filepathOnlyMatchesDefaultRule(str(file)):
+            return None
+        return known_space(str(rules.getColorSpaceFromFilepath(str(file))), config)
+
+    def _used(self) -> str:
+        return self.config if self.config and _is_there(self.config) else active_config()
+
+
+def active_config() -> str:
+    """$OCIO, else `BUILT_IN`."""
+    return os.environ.get("OCIO") or BUILT_IN
+
+
+def _is_there(config: str) -> bool:
+    return config.startswith("ocio://") or Path(config).is_file()
+
+
+@cache
+def _configuration(config: str) -> oiio.ColorConfig:
+    """JobError if it cannot be read: OpenImageIO would go on with one of its own."""
+    found = oiio.ColorConfig(config)
+    failed = cast(Any, found).geterror()
+    if failed:
+        raise footage_error(
+            f"The OCIO configuration {config} cannot be read: {str(failed).splitlines()[0]}.",
+            "Correct the environment variable OCIO, or unset it to use the built-in ACES configuration.",
+        )
+    return found
+
+
+def space_names(config: str) -> list[str]:
+    """Names of all colour spaces of a configuration. JobError if it cannot be read."""
+    return list(_configuration(config).getColorSpaceNames())
+
+
+def known_space(name: str, config: str) -> InputSpace | None:
+    """The colour space of this name, alias or role in a configuration; None if it has none, or none of a colour.
+
+    JobError if the configuration cannot be read, or if nothing leads from it to linear Rec.709.
+    """
+    found: Any = _configuration(config)
+    space = str(found.resolve(name) or name)
+    index = {known.lower(): known for known in found.getColorSpaceNames()}
+    if space.lower() not in index or found.isData(index[space.lower()]):
+        return None
+    space = index[space.lower()]
+    if str(found.get_color_interop_id(space) or "") in ("srgb_rec709_display", "srgb_rec709_scene"):
+        return InputSpace("srgb")  # as it stands, to the bit
+    primaries = _primaries(space, config)
+    return InputSpace("lin", primaries) if primaries else OcioSpace("lin", "", space=space, config=config)
+
+
+@cache
+def _primaries(space: str, config: str) -> str:
+    """Which of `LIGHTS` a space holds as it stands, as its conversion of a few pixels tells; empty if none."""
+    pixels = np.concatenate([np.eye(3), 30.0 * np.eye(3), -0.1 * np.ones((1, 3))]).astype(np.float32)
+    light = light_of(pixels[None], space, config)[0]
+    near = (n for n in LIGHTS if np.allclose(light, pixels @ to_rec709(PRIMARIES[n][1]).T, rtol=1e-4, atol=1e-4))
+    return next(near, "")
+
+
+@cache
+def _way_out(config: str) -> tuple[str, Callable[[ArrayLike], NDArray[np.float32]] | None]:
+    """A space to convert to, and what makes linear Rec.709 of it; None: it is that. JobError if there is neither."""
+    found: Any = _configuration(config)
+    if str(found.getColorSpaceNameByRole(INTERCHANGE) or ""):
+        matrix = to_rec709(PRIMARIES["ap0"][1]).T.astype(np.float32)
+        return INTERCHANGE, lambda light: np.asarray(light, np.float32) @ matrix
+    names = {name.lower(): name for name in found.getColorSpaceNames()}
+    for name in LINEAR:
+        resolved = str(found.resolve(name) or name).lower()
+        if resolved in names:
+            return names[resolved], None
+    raise footage_error(
+        f"The OCIO configuration {config} names neither ACES2065-1 (role {INTERCHANGE}) nor linear Rec.709.",
+        f"Give it the role {INTERCHANGE}, as configurations of OCIO 2 have it.",
+    )
+
+
+def light_of(pixels: NDArray[np.float32], space: str, config: str) -> NDArray[np.float32]:
+    """[H, W, 3] float32 in a colour space of a configuration to scene-linear Rec.709, nothing cut.
+
+    JobError if the configuration cannot convert it.
+    """
+    target, finish = _way_out(config)
+    source = oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
+    light = oiio.ImageBufAlgo.colorconvert(source, space, target, False, "", "", config)
+    values = None if light.has_error else light.get_pixels(oiio.FLOAT)
+    if values is None:
+        raise footage_error(f"{space!r} cannot be converted to light: {error_of(light)}.", "Name another colour space.")
+    values = np.asarray(values, np.float32)
+    with np.errstate(all="ignore"):  # codes that no picture has become infinite light
+        return values if finish is None else finish(values)

@@ -1,0 +1,41 @@
+"""How footage was read, in words for the one who shot it."""
+
+from __future__ import annotations
+
+from .sources import SourceInfo
+
+_MATRICES = {"ITU709": "BT.709", "ITU601": "BT.601", "BT2020": "BT.2020", "SMPTE240M": "SMPTE 240M"}
+_ASSUMED = {
+    "fps_told": "rate", "pixel_aspect_told": "pixel aspect", "colour_told": "colour space", "matrix_told": "matrix",
+    "range_told": "levels",
+}  # fmt: skip
+"""What a reading may have assumed, and what people call it."""
+
+
+def read_as(info: SourceInfo, timecode: str = "") -> list[str]:
+    """One sentence that says how the footage is read, and one that names what of it was assumed, if anything was.
+
+    `timecode` is that of the first frame that was taken.
+    """
+    reading = info.reading
+    aspect = float(reading.get("pixel_aspect", 1.0))
+    parts = [f"{info.width} x {info.height}", "square pixels" if aspect == 1 else f"pixels {aspect:.4g} times as wide"]
+    parts += [f"{info.fps:.6g} fps"] + [f"{reading['bits']} bits"] * ("bits" in reading)
+    parts += [str(reading.get("colour", ""))]
+    matrix = reading.get("matrix", "RGB")
+    if matrix != "RGB":
+        parts += [f"matrix {_MATRICES.get(matrix, matrix)}", f"{reading.get('range')} levels"]
+    if len(reading.get("layers", [])) > 1:
+        parts.append(f"layer {reading['layer'] or 'RGB'}")
+    parts.append("alpha left out" if reading.get("alpha") else "no alpha")
+    if reading.get("interlaced"):
+        parts.append("deinterlaced")
+    if reading.get("turned"):
+        parts.append(f"turned by {reading['turned']} degrees")
+    if timecode:
+        parts.append(f"timecode {timecode}")
+    assumed = [name for key, name in _ASSUMED.items() if not reading.get(key, True)]
+    if matrix == "RGB":
+        assumed = [name for name in assumed if name not in ("matrix", "levels")]
+    sentences = [f"Read as {', '.join(part for part in parts if part)}."]
+    return sentences + [f"Assumed, for the footage does not say: {', '.join(assumed)}."] * bool(assumed)
