@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..contract import MASK_ALPHA, MASK_KINDS, JobError, Reporter
 from ..shot import Shot, content_key
+from . import plate_encoding
 from .images import error_of
 from .importing import FootageConfig, load_frames, source_places
 from .layers import find_layer
@@ -196,8 +197,7 @@ class _Reading:
         wanted = {theirs: frame for frame, theirs in self._matched(list(range(1, count + 1))).items()}
         for one in video.frames(None, max(wanted)):
             if one.number in wanted:
-                grey = one.pixels.astype(np.float32).mean(2) / np.float32(np.iinfo(one.pixels.dtype).max)
-                yield wanted[one.number], grey
+                yield wanted[one.number], np.asarray(plate_encoding.display(one.pixels).mean(2), np.float32)
 
     # ------------------------------------------------------------------------------------------------- from alpha
 

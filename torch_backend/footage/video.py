@@ -1,4 +1,4 @@
-"""Frames of a video file through PyAV: real timestamps, upright, square pixels, display-referred sRGB."""
+"""Frames of a video file through PyAV: real timestamps, upright, square pixels, display-referred sRGB or light."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from ..contract import parse_timecode
 from . import plate_encoding
 from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
@@ -33,7 +34,6 @@ from .sources import (
     frame_words,
     square_size,
 )
-from .timecode import parse_timecode
 
 NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
 """FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
@@ -148,8 +148,7 @@ class VideoSource:
                 if number >= begin:
                     got += 1
                     corrupt = bool(frame.is_corrupt) or time_of(frame) in noticed.damaged
-                    pixels, clipped = self._upright(frame)
-                    yield SourceFrame(number, seconds, pixels, corrupt, clipped)
+                    yield SourceFrame(number, seconds, self._upright(frame), corrupt)
             else:
                 self._check_promise(seen, begin, last)
         if noticed.interlaced and not self._interlaced:
@@ -233,24 +232,26 @@ class VideoSource:
         except FFmpegError as error:
             raise _no_video(self.path) from error
 
-    def _upright(self, frame: av.VideoFrame) -> tuple[NDArray[Any], float]:
-        """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels."""
+    def _upright(self, frame: av.VideoFrame) -> NDArray[Any]:
+        """[H, W, 3] uint8 or uint16 sRGB, or float16 light."""
+        if self._space.is_light:
+            return self.plate_of(frame)
         if self._space.as_it_stands:
-            pixels, clipped = rgb_codes(frame, self._coding, deep=self._deep), 0.0
+            pixels = rgb_codes(frame, self._coding, deep=self._deep)
         else:
-            values, clipped = self._space.to_srgb(exact_rgb(frame, self._coding))
+            values = self._space.to_srgb(exact_rgb(frame, self._coding))
             values = np.rint(values * np.float32(65535.0 if self._deep else 255.0))
             pixels = values.astype(np.uint16 if self._deep else np.uint8)
         width, height = square_size(frame.width, frame.height, self._aspect)
         pixels = resize(pixels, width, height)
-        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns)), clipped
+        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
 
     def _warn_about(self, frame: av.VideoFrame) -> None:
         space = self._space
         if space.transfer in ("pq", "hlg"):
             self.warnings.append(
                 (
-                    f"The clip is HDR ({space.name}): light above white ({DIFFUSE_WHITE_NITS:.0f} cd/m2) is cut.",
+                    f"The clip is HDR ({space.name}): converted to light, white at {DIFFUSE_WHITE_NITS:.0f} cd/m2.",
                     "Deliver it graded for SDR, or as scene-linear EXR, if it should look otherwise.",
                 )
             )
