@@ -592,7 +592,7 @@ MESSAGES: dict[str, str] = {
     "No mask": "Keine Maske",
     "A picture for all frames, a picture of a numbered sequence, or a video": "Ein Bild für alle Einzelbilder, ein Bild einer nummerierten Sequenz, oder ein Video",
     "Alpha": "Alpha",
-    "The alpha of the clip, which is a sequence: ignored is what is transparent, people are opaque": "Das Alpha des Clips, der eine Sequenz ist: ignoriert wird, was durchsichtig ist, Personen sind deckend",
+    "The alpha of the clip, if it has one: ignored is what is transparent, people are opaque": "Das Alpha des Clips, wenn er eines hat: ignoriert wird, was durchsichtig ist, Personen sind deckend",
     "Drawn": "Gezeichnet",
     "A mask of this file, drawn over the clip in the Movie Clip editor": "Eine Maske dieser Datei, über den Clip gezeichnet im Filmclip-Editor",
     "Mask to Ignore": "Maske zum Ignorieren",

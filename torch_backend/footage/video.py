@@ -20,7 +20,7 @@ from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
 from .decoding import Noticed, decoded, stored_frames, time_of
 from .frame_rgb import BT601, MATRICES, RGB, Coding, coding_of, depth_of, exact_rgb, rgb_codes
-from .images import resize
+from .images import resize, resize_float
 from .ocio import Colours
 from .seeking import VideoReader
 from .sources import (
@@ -79,13 +79,17 @@ class VideoSource:
             self._interlaced = bool(frame.interlaced_frame)
             self._size = frame.width, frame.height
             self._promise = _promise(container, stream, rate)
+            self._alpha_decoder = _alpha_decoder_of(stream)
+            held = any(component.is_alpha for component in frame.format.components)
+            self.has_alpha = held or bool(self._alpha_decoder)
+            """True if the clip has an alpha that `alphas` can read."""
             self._warn_about(frame)
             reading = {
                 **_reading(frame, self._space, self._coding),
                 "fps_told": rate_told,
                 "pixel_aspect": float(self._aspect),
                 "pixel_aspect_told": aspect is not None,
-                "alpha": any(component.is_alpha for component in frame.format.components),
+                "alpha": self.has_alpha,
                 "interlaced": self._interlaced,
                 "timecode": _timecode(container, stream),
                 "turned": 90 * self._quarter_turns,
@@ -162,6 +166,32 @@ class VideoSource:
                     "The file is damaged there: copy or export it again.",
                 )
             )
+
+    def alphas(self, last: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """(number, alpha) of the frames up to `last`, in order: [H, W] in 0..1, upright, pixels as stored or square.
+
+        Frames that cannot be decoded are left out. JobError if the clip has no alpha, or changes its size.
+        """
+        if not self.has_alpha:
+            raise footage_error(f"{self.path.name} has no alpha.", "Give the mask as pictures of their own.")
+        with self._open() as container:
+            stream = _best_stream(container, self.path)
+            stream.thread_type = "AUTO"
+            decoder = None
+            if self._alpha_decoder:
+                decoder = av.CodecContext.create(self._alpha_decoder, "r")
+                decoder.extradata = stream.codec_context.extradata
+            for number, frame in enumerate(stored_frames(container, stream, decoder=decoder), start=1):
+                if number > last:
+                    return
+                if isinstance(frame, FFmpegError):
+                    continue
+                if (frame.width, frame.height) != self._size:
+                    raise footage_error(f"{self.path.name} changes its size at frame {number}.", "Export it in one.")
+                alpha = frame.reformat(format="rgba").to_ndarray()[..., 3].astype(np.float32) * np.float32(1 / 255)
+                if self._quarter_turns % 2:  # its pixels would be as much too high as they are too wide
+                    alpha = resize_float(alpha[..., None], *square_size(*self._size, self._aspect))[..., 0]
+                yield number, np.ascontiguousarray(np.rot90(alpha, self._quarter_turns))
 
     def plates(self, known: Known) -> PlateReader:
         """See `Source.plates`."""
@@ -259,7 +289,7 @@ class VideoSource:
             self.warnings.append((f"The clip is {space.name}: converted to Rec.709.", ""))
         if self._interlaced:
             self.warnings.append(_deinterlaced_words("The clip is interlaced: each frame"))
-        if any(component.is_alpha for component in frame.format.components):
+        if self.has_alpha:
             self.warnings.append(("The clip has alpha: its colour is taken, its alpha is not.", ""))
 
 
@@ -304,6 +334,16 @@ def _best_stream(container: Any, path: Path) -> Any:
             "Export it as H.264 or ProRes, or as an image sequence.",
         )
     return max(streams, key=lambda s: (s.codec_context.width or 0) * (s.codec_context.height or 0))
+
+
+def _alpha_decoder_of(stream: Any) -> str:
+    """The decoder that gives the alpha of a clip whose own leaves it out; empty if its own does, or there is none.
+
+    VP8 and VP9 keep alpha as a second picture beside the first, which only Google's own decoder puts to it.
+    """
+    marked = {key.lower(): str(value) for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
+    decoder = {"vp8": "libvpx", "vp9": "libvpx-vp9"}.get(stream.codec_context.name, "")
+    return decoder if marked and decoder in av.codecs_available else ""
 
 
 def _first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:
