@@ -13,9 +13,16 @@ import numpy as np
 import pytest
 
 DATA = Path(__file__).resolve().parent / "data"
-_spec = importlib.util.spec_from_file_location("_make_detail", DATA / "make_detail.py")
-made = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(made)
+
+
+def _load(name: str):
+    spec = importlib.util.spec_from_file_location(f"_{name}", DATA / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+made, shoulder = _load("make_detail"), _load("make_shoulder")
 
 FROM_AP0 = (
     "!<MatrixTransform> {matrix: [2.52168618674388, -1.13413098823972, -0.387555198504164, 0, -0.276479914229922, "
@@ -174,6 +181,23 @@ def test_light_passes_an_aces_scene_within_a_thousandth(root, shot, tmp_path):
     half = made.frozen(6).astype(np.float32).astype(np.float16)
     for name, expected in (("plate", made.plate(6)), ("frozen", half), ("warp", made.frozen(6))):
         assert off(light(tmp_path / f"{name}.exr"), expected @ TO_AP1.T) < 1e-3, name
+
+
+def test_working_frames_with_a_shoulder_give_their_light_to_an_aces_scene(root, shot, tmp_path):
+    """Their curve is of Rec.709's light, channel by channel: there and back from the scene's. Up to 60 times white."""
+    told_of = with_detail(shot, [0.78125, 0.390625, 0.1953125]) / "takes" / "detail" / "take.json"
+    facts = json.loads(told_of.read_text())
+    facts["footage"]["unlike"] = "its pixels are not square"
+    told_of.write_text(json.dumps(facts))
+    expected = shoulder.light(56, 42)
+    for frame in (5, 6):
+        shoulder.write(shot / "frames" / f"{frame:06d}.png", expected)
+    listing = shot / "frames" / "frames.json"
+    listing.write_text(json.dumps({**json.loads(listing.read_text()), "display": "shoulder"}))
+    told = blender(CG_CONFIG, root, shot, tmp_path, "in_aces")
+    assert any("shows working frames as the plate" in line for line in told["said"])
+    # A step of 16 bits is 8e-4 of light at the end of the shoulder, and Blender 4.2 is some steps off.
+    assert off(light(tmp_path / "plate.exr"), expected @ TO_AP1.T) < 5e-3
 
 
 def test_an_acescg_plate_passes_an_aces_scene_bit_for_bit(root, shot, tmp_path):

@@ -3,8 +3,6 @@
 import importlib.util
 import json
 import shutil
-import struct
-import zlib
 from pathlib import Path
 
 import bpy
@@ -21,7 +19,7 @@ def _load(name: str):
     return module
 
 
-made, levels = _load("make_detail"), _load("make_levels")
+made, levels, shoulder = _load("make_detail"), _load("make_levels"), _load("make_shoulder")
 SIZE = made.WIDTH, made.HEIGHT
 SRGB = tuple(float(((v + 0.055) / 1.055) ** 2.4) for v in (0.78125, 0.390625, 0.1953125))
 LINEAR = (0.78125, 0.390625, 0.1953125)
@@ -219,32 +217,16 @@ def test_frames_and_warps_of_acescg_footage_are_read_in_their_light(addon, scene
         bake.insert_freeze(scene, shot, "detail", warp=warp)
 
 
-def write_png16(path: Path, codes: np.ndarray) -> None:
-    """[H, W, 3] uint16 as a PNG, as the import writes frames of footage that holds light."""
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in codes)
-    parts = [(b"IHDR", struct.pack(">2I5B", codes.shape[1], codes.shape[0], 16, 2, 0, 0, 0))]
-    parts += [(b"sRGB", b"\0"), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    with path.open("wb") as file:
-        file.write(b"\x89PNG\r\n\x1a\n")
-        for kind, data in parts:
-            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
-
-
 def test_working_frames_that_stand_in_have_the_highlights_of_their_shoulder(addon, contract, scene, footage, tmp_path):
     """Light up to 60, read back through the compositor; without the record of a shoulder they are sRGB."""
     shot = footage(unlike="its pixels are not square")
-    light = np.tile(
-        np.array([0.05, 0.3, 0.6, 0.61, 1.0, 4.0, 20.0, 60.0], np.float64).repeat(7)[:, None], (SIZE[1], 1, 3)
-    )
-    light[..., 2] *= 0.5
-    srgb = np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
-    start, roll = contract.SHOULDER_FROM, contract.SHOULDER_ROLL
-    shown = np.minimum(srgb, start) + roll * np.log1p(np.maximum(srgb - start, 0.0) / roll)
+    light = shoulder.light(*SIZE)
+    assert (contract.SHOULDER_FROM, contract.SHOULDER_ROLL) == (shoulder.START, shoulder.ROLL)
     for frame in (5, 6):
-        write_png16(shot / "frames" / f"{frame:06d}.png", np.rint(shown * 65535.0))
+        shoulder.write(shot / "frames" / f"{frame:06d}.png", light)
     listing = contract.ShotFolder(shot).listing
     record = json.loads(listing.read_text())
-    cut = ((shown + 0.055) / 1.055) ** 2.4
+    cut = ((shoulder.shown(light) + 0.055) / 1.055) ** 2.4
     for display, expected in (({"display": "shoulder"}, light), ({}, cut)):
         listing.write_text(json.dumps({**record, **display}))
         addon("bake.insertion").insert_freeze(scene, shot, "detail")

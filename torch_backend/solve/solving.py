@@ -48,7 +48,7 @@ from .masks import facts_of, given_masks, more_features, write_matching, write_u
 from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
 from .poses import camera_centre, fill_poses
 from .stored import load_cameras, load_points, load_record
-from .undistort import BandUndistorter, Undistorter
+from .undistort import Undistorter, of_frames
 
 SOLVE_VERSION = 1
 LEAST_REGISTERED = 8
@@ -495,16 +495,12 @@ def _undistort(
     before, total = counts
     with np.load(file, allow_pickle=False) as data:
         where = data["where"]
-    undistort, bands = Undistorter(where), BandUndistorter(where)
-    display = display_of(load_frames(shot))
+    undistort = Undistorter(where)
+    of_frame = of_frames(undistort, where, display_of(load_frames(shot)))
 
     def one(frame: dict[str, Any]) -> int:
         pixels = read_frame(shot.frames / frame["file"])
-        if display.bends:  # highlights are not to ring, see `display`
-            pixels = bands(pixels, display.srgb_of, display.codes, np.empty(pixels.shape, np.uint16))
-        else:
-            pixels = undistort(pixels)
-        write_png(into.frames / frame_file(frame["frame"], PICTURE), pixels)
+        write_png(into.frames / frame_file(frame["frame"], PICTURE), of_frame(pixels))
         if masks:
             write_undistorted(masks, frame["frame"], undistort, into.solve)
         return frame["frame"]

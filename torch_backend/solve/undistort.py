@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..array_types import sparse_rows
+from ..footage.display import Display
 
 _TAPS = 4
 _BAND = 64
@@ -76,6 +77,17 @@ class BandUndistorter:
             band = slice(top, top + _BAND)
             out[band] = write(_band(picture, read, self._where[band]))
         return out
+
+
+def of_frames(
+    undistort: Undistorter, where: NDArray[np.float32], display: Display
+) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """What takes the lens out of working frames [H, W, 3] of a display: `undistort`, which is for `where`, or where the
+    display has a shoulder a way on which highlights do not ring (see `footage.display`). Safe for several threads."""
+    if not display.bends:
+        return undistort
+    bands = BandUndistorter(where)
+    return lambda pixels: bands(pixels, display.srgb_of, display.codes, np.empty(pixels.shape, np.uint16))
 
 
 def _band(

@@ -17,7 +17,7 @@ from torch_backend.footage.plates import Plates
 from torch_backend.footage.sources import Known
 from torch_backend.shot import Shot, write_json
 from torch_backend.solve.plate_lens import load_plate_lenses
-from torch_backend.solve.undistort import BandUndistorter, Undistorter
+from torch_backend.solve.undistort import Undistorter, of_frames
 
 
 def solved(shot, radial=0.0, **told):
@@ -32,12 +32,11 @@ def solved(shot, radial=0.0, **told):
     record_of_solve = {"version": 1, "key": f"k{radial}", "camera_model": "SIMPLE_RADIAL", "distortion": [radial]}
     write_json(shot.solve / "solve.json", {**record_of_solve, "focal_px": float(width), **told})
     if "camera_model" not in told:
-        where, display = load_plate_lenses(shot)[cameras[0].frame].where(width, height), display_of(record)
-        undistort, bands = Undistorter(where), BandUndistorter(where)
+        where = load_plate_lenses(shot)[cameras[0].frame].where(width, height)
+        undistort = of_frames(Undistorter(where), where, display_of(record))
         for row in record["frames"]:
             raw = read_png(shot.frames / row["file"])
-            done = bands(raw, display.srgb_of, display.codes, raw.copy()) if display.bends else undistort(raw)
-            write_png(shot.frames / frame_file(row["frame"], ".png"), done)
+            write_png(shot.frames / frame_file(row["frame"], ".png"), undistort(raw))
     return shot
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torch_backend.footage.display import PLAIN, ROLLED
 from torch_backend.solve import foreign
 from torch_backend.solve.plate_lens import PlateLens
-from torch_backend.solve.undistort import BandUndistorter, Undistorter
+from torch_backend.solve.undistort import BandUndistorter, Undistorter, of_frames
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -185,3 +186,17 @@ def test_there_and_back(maps, name):
     expected = scene(plain[..., 0], plain[..., 1])
     got = Undistorter(where)(seen)[..., 0]
     assert np.abs(got[2:-2, 2:-2] - expected[2:-2, 2:-2]).max() < 30
+
+
+def test_a_lamp_in_a_working_frame_with_a_shoulder_gets_no_brighter_rim():
+    light = np.full((48, 64, 3), 0.1, np.float32)
+    light[15:30, 20:40] = 20.0
+    codes = np.rint(ROLLED.from_light(light) * 65535.0).astype(np.uint16)
+    where = identity(48, 64) * np.float32(0.97) + np.float32(0.7)
+    plain = Undistorter(where)
+    got = of_frames(plain, where, ROLLED)(codes)
+    assert got.dtype == np.uint16
+    found = ROLLED.to_light(got / 65535.0)
+    assert found.max() == pytest.approx(20.0, rel=0.1) and found.min() > 0.07
+    assert ROLLED.to_light(plain(codes) / 65535.0).max() > 30.0, "as codes it would ring"
+    assert of_frames(plain, where, PLAIN) is plain
