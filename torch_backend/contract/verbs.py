@@ -133,7 +133,6 @@ class DoctorWords:
         False,
         flag="--gpu",
         switch=True,
-        side=BACKEND,
         help="test the graphics card anew: a small frame and its gradients against the processor's",
     )
     """Test the graphics card anew."""
