@@ -43,7 +43,7 @@ def new_trainer(world: Any, quiet: type, method: str, supervision: str, poses: b
     asked = TrainParams(iterations=iterations, max_gaussians=330, method=method, supervision=supervision)
     config = config_from_params(asked)
     config.poses.on, config.densify.every, config.init.seeds = poses, 5, 0
-    config.gate.start, config.field.start = 0.2, 0.2
+    config.gate.start, config.field.start, config.supervision.support_samples = 0.2, 0.2, 64
     if method in ("mlp", "control_points"):
         config.field.noise = 0.1  # published: times are blurred
     images = load_images(scene, scene.solved, 32, 24).to("cuda")
@@ -110,7 +110,7 @@ def station(folder: Path) -> dict[str, Any]:
     world, quiet = small_world(folder)
     report = quiet()
     with pretended_card():
-        params = TrainParams(run="g", iterations=10, max_gaussians=260, device="cuda", holdout=8)
+        params = TrainParams(run="g", iterations=10, max_gaussians=260, device="cuda", holdout=0)
         trained = train_shot(world.shot, params, report)
         extended = train_shot(world.shot, TrainParams(run="g", device="cuda", extend=2), report)
         asked = FreezeParams(run="g", take="t", first=101, last=101, device="cuda", develop="off")
@@ -141,7 +141,7 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
             trainer.iteration = 4
             trainer.schedule_events()
             peaks: list[tuple[int, int]] = []
-            for times in (2, 6):
+            for times in (2, 2):
                 many = len(trainer.model.gaussians) * times
                 rows = torch.arange(many, device="cuda") % len(trainer.model.gaussians)
                 fresh = torch.zeros(many, dtype=torch.bool, device="cuda")
