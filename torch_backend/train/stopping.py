@@ -32,6 +32,9 @@ _LEAST_PROBES, _MOST_PROBES = 3, 12
 _GROWN = 1.5
 """Growth is judged over measurements between which the Gaussians grew by this factor, at least `_POINTS` of them."""
 _POINTS = 4
+_SPAN = 0.1
+"""These measurements span this share of the run. In a long one the schedule doubles the Gaussians in three rounds, and
+judged on those that are as many steps old growth ended at 42,000 of 160,000."""
 
 
 @dataclass
@@ -67,14 +70,14 @@ def probe_frames(frames: int, every: int, least: int = 24) -> list[int]:
     return [int((n + 0.5) * frames / count) for n in range(count)]
 
 
-def growth_gain(measured: list[tuple[int, int, float]]) -> float | None:
+def growth_gain(measured: list[tuple[int, int, float]], steps: int = 0) -> float | None:
     """dB per 10 % more Gaussians: slope of PSNR over log count. None if they grew too little to tell.
 
-    Over the newest of the measurements (iteration, Gaussians, PSNR) that span a growth by `_GROWN`.
+    Over the newest of the measurements (iteration, Gaussians, PSNR) that span a growth by `_GROWN` and so many `steps`.
     """
     for first in range(len(measured) - _POINTS, -1, -1):
-        _, counts, values = zip(*measured[first:], strict=True)
-        if counts[-1] >= _GROWN * counts[0]:
+        iterations, counts, values = zip(*measured[first:], strict=True)
+        if counts[-1] >= _GROWN * counts[0] and iterations[-1] - iterations[0] >= steps:
             slope = np.polyfit(np.log(counts), values, 1)[0]
             return float(slope) * math.log(1.1)
     return None
@@ -319,7 +322,7 @@ class StoppingPolicy:
         self.measured.append((probe.iteration, probe.gaussian_count, value))
         # While a field is on trial probes fall and rise by it: one measured 3 steps after it had opened ended growth.
         if not self.joined and self.growing and not self.facts.on_trial:
-            gain = self.facts.growth_gain_db = growth_gain(self.measured)
+            gain = self.facts.growth_gain_db = growth_gain(self.measured, round(_SPAN * self.schedule.iterations))
             if gain is not None and gain < self.config.growth_gain:
                 self.growth_ended = probe.iteration
         s = self.schedule

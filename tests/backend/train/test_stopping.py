@@ -86,6 +86,8 @@ def test_growth_is_judged_per_tenth_and_only_when_there_was_some():
     assert growth_gain(flat) < 0.03  # what was gained before does not count any more
     assert growth_gain([(n, 1000 + n, 20.0 + n) for n in range(20)]) is None
     assert growth_gain(measured[:2]) is None
+    assert growth_gain(measured, measured[-1][0] - measured[0][0] + 1) is None  # too short a while to tell
+    assert growth_gain(measured, measured[-1][0] - measured[0][0]) == growth_gain(measured)
 
 
 def test_newest_gain_is_over_the_best_before():
@@ -197,7 +199,8 @@ def test_growth_is_not_judged_while_a_field_is_on_trial(long_world, quiet):
     for facts in (RunFacts(), RunFacts(opened=opened), RunFacts(opened=opened, hardened=60)):
         trainer.policy.facts, trainer.policy.growth_ended = facts, None
         trainer.policy.measured = [
-            (n, round(trainer.gaussian_count * 1.2 ** (n - 6)), 20.0 + 0.1 * n) for n in range(6)
+            (trainer.config.iterations * (n - 6) // 30, round(trainer.gaussian_count * 1.2 ** (n - 6)), 20.0 + 0.1 * n)
+            for n in range(6)
         ]
         trainer.policy._measure(trainer)
         ended.append(trainer.policy.growth_ended is not None)
