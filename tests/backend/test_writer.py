@@ -178,8 +178,7 @@ from torch_backend.writer import only_writer
 
 root, dead, mark, seed = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), int(sys.argv[4])
 random.seed(seed)
-while not mark.with_name("go").exists():
-    pass
+sys.stdin.read()  # all begin at once, and none spins: two that do can keep the fourth from ever being started
 held = 0
 until = time.monotonic() + 60
 while held < 60 and time.monotonic() < until:
@@ -203,11 +202,13 @@ def test_of_all_who_take_a_dead_ones_place_one_gets_it(shot, tmp_path):
     dead, mark = json.dumps(dataclasses.asdict(dead_writer())), tmp_path / "inside"
     lock_of(shot).write_text(dead)
     command = [sys.executable, "-c", CROWD, str(shot.root), dead, str(mark)]
+    gate, opens = os.pipe()
     crowd = [
-        subprocess.Popen([*command, str(n)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        subprocess.Popen([*command, str(n)], stdin=gate, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for n in range(4)
     ]
-    (tmp_path / "go").touch()
+    os.close(gate)
+    os.close(opens)
     told = [child.communicate() for child in crowd]
     assert [errors for _, errors in told] == [""] * 4 and [held for held, _ in told] == ["60\n"] * 4
 

@@ -53,13 +53,21 @@ def _check_scene(scene: Scene) -> None:
         raise ValueError(f"settings.threads must be at least 1, not {scene.settings.threads}")
 
 
-def _sh_degree(sh: Tensor | None, degree: int | None) -> int:
-    """Degree to evaluate: `degree`, or all that `sh` [N, K, 3] holds."""
+def _sh_degree(sh: Tensor | None, rest: Tensor | None, degree: int | None) -> int:
+    """Degree to evaluate: `degree`, or all that `sh` [N, K, 3], or `sh` [N, 1, 3] and `rest` [N, K - 1, 3], hold."""
     if sh is None:
+        if rest is not None:
+            raise ValueError("sh_rest is given without sh")
         return 0
-    held = _BANDS.get(sh.shape[1]) if sh.dim() == 3 else None
+    bands = sh.shape[1] if sh.dim() == 3 else 0
+    if rest is not None:
+        _shape("sh", sh, ("N", 1, 3))
+        _shape("sh_rest", rest, (sh.shape[0], "K - 1", 3))
+        bands += rest.shape[1]
+    held = _BANDS.get(bands)
     if held is None:
-        raise ValueError(f"sh must have shape [N, K, 3] with K = 1, 4, 9 or 16, not {list(sh.shape)}")
+        given = list(sh.shape) if rest is None else f"{list(sh.shape)} and {list(rest.shape)}"
+        raise ValueError(f"sh must have shape [N, K, 3] with K = 1, 4, 9 or 16, not {given}")
     if degree is None:
         return held
     if not 0 <= degree <= held:
@@ -114,6 +122,7 @@ def rasterize(
     with_contributions: bool = False,
     with_top: bool = False,
     sh_degree: int | None = None,
+    sh_rest: Tensor | None = None,
 ) -> RasterOutput:
     """Splat N Gaussians into C pinhole views.
 
@@ -121,13 +130,15 @@ def rasterize(
     opacity_logits [N]; colors [N, D] any channels, and/or sh [N, K, 3], K = (degree + 1)^2 with degree 0 to 3: colour
     = harmonics at the direction from camera to mean + 0.5, floored at 0 (a gradient passes the floor when it would
     raise the colour), no ceiling. With both, the output has the 3 channels of `sh` first, then those of `colors`.
-    `sh_degree` uses the first bands only. `with_depth`, `with_contributions` (weight_sum, weight_max) and `with_top`
-    (top_ids, top_weights: mattes) fill the outputs that cost extra. viewmats [C, 4, 4] world to camera, OpenCV axes;
+    `sh_degree` uses the first bands only. Harmonics whose degree 0 lies apart from the rest, as an optimiser with two
+    rates has them, are given as sh [N, 1, 3] and sh_rest [N, K - 1, 3]: the CPU body then copies neither.
+    `with_depth`, `with_contributions` (weight_sum, weight_max) and `with_top` (top_ids, top_weights: mattes) fill the
+    outputs that cost extra. viewmats [C, 4, 4] world to camera, OpenCV axes;
     Ks [C, 3, 3] px, pixel centres at +0.5, no skew; background [D] or None for black.
 
     Returns a RasterOutput; its attributes give shapes and units. Gradients flow from colors, alphas and depth_expected
-    to means, quats, log_scales, opacity_logits, colors, sh, viewmats and background. `constants.py` states the rules of
-    culling and blending; NaN and infinite Gaussians are culled and get zero gradients.
+    to means, quats, log_scales, opacity_logits, colors, sh, sh_rest, viewmats and background. `constants.py` states the
+    rules of culling and blending; NaN and infinite Gaussians are culled and get zero gradients.
 
     backend: 'cpu' (float32, compiled), 'cuda' (float32, compiled, NVIDIA; with CPU tensors the same kernels run on
     fibers: very slow, for tests), 'reference' (torch, the inputs' float type and device, slow), 'auto' picks by the
@@ -142,7 +153,9 @@ def rasterize(
     """
     body = _body(backend, means)
     _check_camera(viewmats, Ks, width, height, body)
-    degree = _sh_degree(sh, sh_degree)
+    degree = _sh_degree(sh, sh_rest, sh_degree)
+    if sh is not None and sh_rest is not None and (body != "cpu" or not sh_rest.shape[1]):
+        sh, sh_rest = torch.cat([sh, sh_rest[:, : (degree + 1) ** 2 - 1]], dim=1), None
     dtype = means.dtype if body == "reference" else torch.float32
 
     def ready(value: Tensor) -> Tensor:
@@ -165,6 +178,7 @@ def rasterize(
         with_depth=with_depth,
         with_contributions=with_contributions,
         with_top=with_top,
+        sh_rest=None if sh_rest is None else ready(sh_rest),
     )
     _check_scene(scene)
     return _run(body, scene)

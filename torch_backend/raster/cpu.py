@@ -79,6 +79,13 @@ def _point(block: source.Block, **tensors: Tensor | None) -> None:
         setattr(block, name, 0 if tensor is None else tensor.data_ptr())
 
 
+def _rest(sh: Tensor | None, rest: Tensor | None) -> int:
+    """Address of the harmonics above degree 0 of the first Gaussian: in a tensor of their own, or after its first."""
+    if rest is not None:
+        return rest.data_ptr()
+    return 0 if sh is None else sh.data_ptr() + 3 * sh.element_size()
+
+
 def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: int) -> None:
     """Fill the block with the sizes, flags and camera of one view."""
     block, n = workspace.block, scene.means.shape[0]
@@ -88,6 +95,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.n_colors = 0 if scene.colors is None else scene.colors.shape[1]
     block.n_sh, block.sh_degree = (0, 0) if scene.sh is None else (3, scene.sh_degree)
     block.sh_stride = 0 if scene.sh is None else 3 * scene.sh.shape[1]
+    block.rest_stride = block.sh_stride if scene.sh_rest is None else 3 * scene.sh_rest.shape[1]
     block.channels = image_channels
     block.record_stride = -(-(source.HEAD + image_channels) // 16) * 16
     block.grad_stride = -(-(source.MOMENTS + image_channels) // 16) * 16
@@ -177,6 +185,7 @@ class _Saved(NamedTuple):
     logits: Tensor
     colors: Tensor | None
     sh: Tensor | None
+    sh_rest: Tensor | None
     viewmats: Tensor
     background: Tensor | None
     image: Tensor
@@ -207,6 +216,7 @@ class _Rasterize(torch.autograd.Function):
         logits: Tensor,
         colors: Tensor | None,
         sh: Tensor | None,
+        sh_rest: Tensor | None,
         viewmats: Tensor,
         background: Tensor | None,
     ) -> _Images:
@@ -244,10 +254,11 @@ class _Rasterize(torch.autograd.Function):
                 weight_sum=weights[0, c],
                 weight_max=weights[1, c],
             )
+            lease.workspace.block.sh_rest = _rest(sh, sh_rest)
             _forward_camera(lease.workspace, scene, channels)
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(
-                means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, behind
+                means, quats, log_scales, logits, colors, sh, sh_rest, viewmats, background, image, alpha, behind
             )
             ctx.scene, ctx.norms, ctx.leases = scene, norms, leases
         ctx.mark_non_differentiable(median, radii, means2d, weights, top_ids, top_weights)
@@ -257,7 +268,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: _Context, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         saved, scene = _Saved(*ctx.saved_tensors), ctx.scene
-        means, quats, log_scales, logits, colors, sh, viewmats, background, image, alpha, behind = saved
+        means, quats, log_scales, logits, colors, sh, sh_rest, viewmats, background, image, alpha, behind = saved
         grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
         grad_alpha = torch.zeros_like(alpha) if grads[1] is None else grads[1].contiguous()
         out = {
@@ -267,6 +278,7 @@ class _Rasterize(torch.autograd.Function):
             "grad_logits": torch.zeros_like(logits),
             "grad_colors": None if colors is None else torch.zeros_like(colors),
             "grad_sh": None if sh is None else torch.zeros_like(sh),
+            "grad_sh_rest": None if sh_rest is None else torch.zeros_like(sh_rest),
         }
         grad_view = torch.zeros_like(viewmats)
         stages, blend = _compile(0), _compile(image.shape[-1])
@@ -295,12 +307,14 @@ class _Rasterize(torch.autograd.Function):
                 grad_abs=ctx.norms[1][c],
                 **out,
             )
+            block.sh_rest = _rest(sh, sh_rest)
+            block.grad_sh_rest = _rest(out["grad_sh"], out["grad_sh_rest"])
             threads = scene.settings.threads
             run_workers(blend, block, source.BLEND_BACKWARD, min(threads, block.tiles_x * block.tiles_y))
             run_workers(stages, block, source.PROJECT_BACKWARD, min(threads, block.chunks))
             grad_view[c, :3] = partial.double().sum(0).reshape(3, 4).float()
         grad_background = None
-        if background is not None and ctx.needs_input_grad[9]:
+        if background is not None and ctx.needs_input_grad[10]:
             grad_background = ((1 - alpha)[..., None] * grad_image[..., : scene.channels]).sum((0, 1, 2))
         return (None, None, *out.values(), grad_view, grad_background)
 
@@ -312,7 +326,7 @@ def rasterize(scene: Scene) -> RasterOutput:
         raise ValueError(f"{channels} channels, depth included; one call carries at most {source.MAX_CHANNELS}")
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
     norms = (torch.zeros(cameras, n), torch.zeros(cameras, n))
-    inputs = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh)
+    inputs = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh, scene.sh_rest)
     out = _Images(*applied(_Rasterize, scene, norms, *inputs, scene.viewmats, scene.background))
     colors, depth = out.image, None
     if scene.with_depth:

@@ -36,7 +36,18 @@ _F, _I, _P = ctypes.c_float, ctypes.c_int64, ctypes.c_uint64
 _FIELDS: list[tuple[str, type, str]] = [
     *[
         (n, _P, "const float*")
-        for n in ("means", "quats", "log_scales", "logits", "colors", "sh", "background", "grad_image", "grad_alpha")
+        for n in (
+            "means",
+            "quats",
+            "log_scales",
+            "logits",
+            "colors",
+            "sh",
+            "sh_rest",
+            "background",
+            "grad_image",
+            "grad_alpha",
+        )
     ],
     *[
         (n, _P, "float*")
@@ -58,6 +69,7 @@ _FIELDS: list[tuple[str, type, str]] = [
             "grad_logits",
             "grad_colors",
             "grad_sh",
+            "grad_sh_rest",
             "grad_view",
             "grad_norm",
             "grad_abs",
@@ -102,6 +114,7 @@ _FIELDS: list[tuple[str, type, str]] = [
             "n_sh",
             "sh_degree",
             "sh_stride",
+            "rest_stride",
             "channels",
             "record_stride",
             "grad_stride",

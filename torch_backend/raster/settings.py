@@ -80,6 +80,8 @@ class Scene:
     with_depth: bool
     with_contributions: bool
     with_top: bool = False
+    sh_rest: Tensor | None = None
+    """Harmonics above degree 0, [N, K - 1, 3], where `sh` is [N, 1, 3]: the CPU body reads them where they lie."""
 
     @property
     def channels(self) -> int:

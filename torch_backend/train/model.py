@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..deformation import Deformation, Deltas, apply_deltas, host
-from ..gaussians import Gaussians, sh_bases
+from ..gaussians import Gaussians
 from ..raster import RasterOutput, rasterize
 from .config import TrainConfig
 from .exposure import Exposure
@@ -95,13 +95,14 @@ def render(
 
     The background [3] (+ extra channels) is what shows where alpha < 1.
     """
-    sh = torch.cat([state["sh0"], state["shN"][:, : sh_bases(sh_degree) - 1]], dim=1) if sh_degree else state["sh0"]
     return rasterize(
         means=state["means"],
         quats=state["quats"],
         log_scales=state["log_scales"],
         opacity_logits=state["opacity_logits"],
-        sh=sh,
+        sh=state["sh0"],
+        sh_rest=state["shN"] if sh_degree else None,
+        sh_degree=sh_degree,
         viewmats=viewmat[None],
         Ks=K[None],
         width=width,

@@ -5,6 +5,8 @@ YCbCr matrix in float64, from the codes that the file holds: what was written or
 it gives back unscaled.
 """
 
+import contextlib
+import os
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
@@ -213,9 +215,17 @@ def planes_of_patches(codes, clip):
     return planes
 
 
+@contextlib.contextmanager
+def usual_scheduling():
+    """SVT-AV1 makes the thread that calls it a real-time one where it may (root), and leaves it so."""
+    yield
+    if hasattr(os, "sched_setscheduler") and os.sched_getscheduler(0) != os.SCHED_OTHER:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def written(path, clip, frame_of_planes, codes):
     """The clip of three frames; what its container or codec says is what a camera would write."""
-    with av.open(str(path), "w") as container:
+    with usual_scheduling(), av.open(str(path), "w") as container:
         stream = container.add_stream(clip.codec, rate=Fraction(clip.rate), options=clip.options)
         (stream.width, stream.height), stream.pix_fmt = clip.size, clip.kind
         context = stream.codec_context

@@ -91,6 +91,30 @@ def test_cameras_of_a_batch_are_independent_and_their_gradients_add(tools):
             assert torch.equal(getattr(out, name)[c], getattr(alone, name)[0]), name
 
 
+@pytest.mark.parametrize("body", ["cpu", "reference"])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_harmonics_held_apart_are_those_held_together(tools, body, degree):
+    scene = tools.cloud(300, 50, 41, degree=3)
+    together, expected = scene.gradients(body, sh_degree=degree)
+    sh = scene.tensors["sh"]
+    scene.tensors.update(sh=sh[:, :1].clone(), sh_rest=sh[:, 1:].clone())
+    apart, grads = scene.gradients(body, sh_degree=degree)
+    assert torch.equal(apart.colors, together.colors)
+    joined = torch.cat([grads.pop("sh"), grads.pop("sh_rest")], dim=1)
+    assert torch.equal(joined, expected.pop("sh"))
+    assert all(torch.equal(grad, expected[name]) for name, grad in grads.items())
+
+
+def test_harmonics_held_apart_are_refused_where_they_do_not_fit(tools):
+    scene = tools.cloud(6, 8, 8, degree=1)
+    sh = scene.tensors["sh"]
+    for first, rest in ((sh, sh[:, 1:]), (sh[:, :1], sh[:, 1:3]), (sh[:, :1], sh[1:, 1:]), (None, sh[:, 1:])):
+        scene.tensors.pop("sh", None)
+        scene.tensors.update({} if first is None else {"sh": first})
+        with pytest.raises(ValueError, match="sh"):
+            scene.run("cpu", sh_rest=rest)
+
+
 def test_sh_degree_uses_the_first_bands_only(tools):
     scene = tools.cloud(60, 24, 17, degree=2)
     low, grads = scene.gradients("cpu", sh_degree=1)

@@ -47,6 +47,8 @@ auto harmonics = FN(F x, F y, F z, F* Y, F (*dY)[16]) -> void {
 float shv[48][16];
 auto fetch_sh = FN(const int* id) -> void {
     for (int l = 0; l < 16; l++) {
-        const float* source = P.sh + (long long)id[l] * P.sh_stride;
-        for (int i = 0; i < bands * 3; i++) shv[i][l] = source[i];
+        const float* first = P.sh + (long long)id[l] * P.sh_stride;
+        const float* rest = P.sh_rest + (long long)id[l] * P.rest_stride;
+        for (int i = 0; i < 3; i++) shv[i][l] = first[i];
+        for (int i = 3; i < bands * 3; i++) shv[i][l] = rest[i - 3];
     } };

@@ -116,8 +116,10 @@ for (long long chunk; (chunk = take()) < P.chunks;) {
             for (int c = 0; c < 3; c++) P.grad_log_scales[3 * i + c] += flat[7 + c][l];
             P.grad_logits[i] += flat[10][l];
             P.grad_norm[i] = flat[11][l]; P.grad_abs[i] = flat[12][l];
-            float* to = P.grad_sh + i * P.sh_stride;
-            if (P.n_sh) for (int c = 0; c < bands * 3; c++) to[c] += shv[c][l];
+            float* first = P.grad_sh + i * P.sh_stride;
+            float* rest = P.grad_sh_rest + i * P.rest_stride;
+            if (P.n_sh) for (int c = 0; c < 3; c++) first[c] += shv[c][l];
+            if (P.n_sh) for (int c = 3; c < bands * 3; c++) rest[c - 3] += shv[c][l];
             for (int c = 0; c < P.n_colors; c++) P.grad_colors[i * P.n_colors + c] += g[@MOMENTS@ + P.n_sh + c][l];
         }
         I use = load(live) > 0.f;
