@@ -26,6 +26,7 @@ MORE_FEATURES = 2.0
 FAINT_PEAK = 0.0025
 """Least contrast of a feature where more are wanted; COLMAP's own is 0.0067."""
 FIRST = "first"
+NO_FOCAL = {"start_focal_px": 0.0}
 
 
 @dataclass(frozen=True)
@@ -140,14 +141,17 @@ def next_rung(best: Attempt, asked: dict[str, Any], done: set[str]) -> Rung | No
     )
     pairs = Rung("pairs", "more frames matched with each other", {"wide": True})
     mapper = Rung("global", "all cameras placed at once (global mapper)", {"mapper": "global"})
+    free: list[Rung | None] = [None]
+    if asked.get("start_focal_px") and not asked.get("focal_px"):
+        free = [Rung("focal", "no focal length to begin with (the file's may be of the whole sensor)", NO_FOCAL)]
     if "failure" in best.answer:
-        rungs = [features, pairs]
+        rungs = [*free, features, pairs]
     elif fault.kind == "bent":
-        rungs = [_other_lens(best, asked)]
+        rungs = [*free, _other_lens(best, asked)]
     elif fault.kind == "lens" or best.share >= FAIR_SHARE:
-        rungs = [_other_lens(best, asked), pairs]
+        rungs = [*free, _other_lens(best, asked), pairs]
     else:
-        rungs = [features, pairs, _other_lens(best, asked), mapper]
+        rungs = [*free, features, pairs, _other_lens(best, asked), mapper]
     return next((rung for rung in rungs if rung is not None and rung.name not in done), None)
 
 
@@ -188,6 +192,7 @@ def _told(rung: str, found: str) -> dict[str, str]:
 
 
 _HELPED = {
+    "focal": "no focal length to begin with",
     "features": "more features",
     "pairs": "more pairs",
     "lens": "another lens model",

@@ -118,6 +118,14 @@ def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
         ]
     if lens["held"]:
         off = "found one that folds the picture over" if lens["doubt"] == "bent" else f"ran off to {found:.0f} degrees"
+        if lens.get("start_px"):
+            return [
+                (
+                    f"The clip does not tell its lens (the solve {off}): the one that the file names was taken, "
+                    f"{taken:.0f} degrees wide.",
+                    "Was the clip cropped or stabilised? Then it is narrower.",
+                )
+            ]
         return [
             (
                 f"The clip does not tell its lens (the solve {off}): a usual one of {taken:.0f} degrees was taken.",

@@ -17,6 +17,8 @@ many times as large, or no more than so many pixels."""
 MASKED_INLIERS = (50, 15)
 """Matches that a first pair and a further image need where masks leave few, half of COLMAP's: what would mislead is
 masked. A room of which 70 % of 320 x 240 pixels were masked: 26 of 30 images instead of 4."""
+LONG_TRACK = 128
+"""Images of a point's track from which on not all of them are asked for the angle under which it is seen."""
 TRIANGULATE_LEAST_DEG = 1.0
 """Smallest angle under which a point is triangulated from known cameras."""
 
@@ -78,7 +80,7 @@ def build_globally(request: Request, hold_lens: bool = False) -> list[pycolmap.R
         adjustment.refine_focal_length = False
     if hold_lens:
         adjustment.refine_extra_params = False
-    if not request.focal:
+    if not request.start_focal:
         colmap.calibrate_view_graph(request.database)
     folder = request.scratch / ("models_held" if hold_lens else "models")
     folder.mkdir()
@@ -126,7 +128,9 @@ def triangulation_angle(model: pycolmap.Reconstruction) -> float:
     points = sorted(colmap.points(model).items())
     angles: list[float] = []
     for _, point in points[:: max(1, len(points) // 2000)]:
-        seen = np.array([centres[e.image_id] for e in point.track.elements])
+        track = point.track.elements
+        # Every two of them are compared: a long track is thinned out.
+        seen = np.array([centres[e.image_id] for e in track[:: 1 + len(track) // LONG_TRACK]])
         rays = seen - point.xyz
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         angles.append(float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))))

@@ -59,7 +59,7 @@ def start_params(request: Request) -> str:
 
     With it pairs are verified through the lens: the epipolar lines of a fisheye are bent.
     """
-    focal, (width, height) = request.focal, request.size
+    focal, (width, height) = request.start_focal, request.size
     if not focal and request.camera_model == FISHEYE:
         focal = FISHEYE_START * width
     if not focal:

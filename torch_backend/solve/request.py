@@ -36,6 +36,8 @@ class Request:
         """Pixels of the images, for a lens that is told beforehand."""
         self.focal: float = data.get("focal_px", 0.0)
         """Focal length that the lens is known to have, pixels; 0: not known."""
+        self.start_focal: float = self.focal or data.get("start_focal_px", 0.0)
+        """Focal length with which the solve begins, pixels: one that may be so; 0: COLMAP's guess."""
         self.hold_focal: bool = bool(self.focal) and bool(data.get("hold_focal"))
         self.masks = data.get("masks", "")
         """Folder of COLMAP's masks; empty: nothing is masked."""

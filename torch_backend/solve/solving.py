@@ -33,6 +33,7 @@ from ..contract import (
 )
 from ..footage import load_frames
 from ..footage.images import is_whole_png, read_frame, write_png
+from ..footage.lens_tags import focal_px
 from ..footage.masks import Mask, read_masks
 from ..footage.sources import frame_words
 from ..replacing import Staged, replacing_solve, settle_solve
@@ -263,6 +264,12 @@ def _matching(frames: dict[str, Any], config: SolveConfig, masks: dict[str, Mask
     return {**options, "features": round(config.features * more_features(masks)), "masks": str(folder)}
 
 
+def _focal_of_file(frames: dict[str, Any]) -> float:
+    """Focal length in pixels of the working frames that the footage's file tells; 0 if it does not."""
+    told = frames.get("reading", {}).get("focal_35mm")
+    return focal_px(told, frames["width"], frames["height"]) if told else 0.0
+
+
 def _request(
     shot: Shot, frames: dict[str, Any], config: SolveConfig, masks: dict[str, Mask], scratch: Path
 ) -> dict[str, Any]:
@@ -278,6 +285,7 @@ def _request(
         "size": [frames["width"], frames["height"]],
         "focal_px": config.focal_mm / config.sensor_mm * frames["width"],
         "hold_focal": not config.refine_focal,
+        "start_focal_px": _focal_of_file(frames),
         **_matching(frames, config, masks, scratch),
         "neighbours": config.neighbours if config.localise else 0,
         "threads": max(1, min(os.cpu_count() or 1, 16)),
@@ -325,6 +333,7 @@ def _finish(
         "camera_model": answer["camera_model"],
         "distortion": answer["distortion"],
         "focal_px": answer["focal_px"],
+        "focal_start_px": answer.get("lens", {}).get("start_px", 0.0),
         "lenses": [_lens(file) for file in maps],
         "lens_of_frame": lenses,
         "triangulation_angle_deg": answer["triangulation_angle_deg"],

@@ -98,6 +98,7 @@ def main(path: str) -> int:
                 "view_deg": angle_deg(*lens_of(camera)),
                 "impossible": impossible(*lens_of(camera)),
                 "given_px": request.focal,
+                "start_px": request.start_focal,
                 "width": camera.width,
                 "height": camera.height,
             },

@@ -72,6 +72,12 @@ def test_a_lens_that_was_chosen_gives_way_to_a_fisheye_s_alone():
     assert rungs(bent, camera_model="OPENCV_FISHEYE") == [("pairs", True)]
 
 
+def test_a_focal_length_that_the_file_names_is_the_first_thing_to_doubt_unless_one_was_given():
+    assert [name for name, *_ in rungs(attempt("few"), start_focal_px=700.0)][:2] == ["focal", "features"]
+    assert rungs(attempt("few"), start_focal_px=700.0, focal_px=650.0) == rungs(attempt("few"))
+    assert rungs(attempt("narrow"), start_focal_px=700.0) == []
+
+
 def test_the_best_is_the_one_that_can_be_used_then_the_one_with_more_frames_then_the_one_that_fits():
     order = [
         attempt("bare", 0),

@@ -105,6 +105,16 @@ def test_a_focal_length_that_is_to_be_held_is_held_to_the_pixel(tmp_path, tools)
     assert found["distortion"] == [pytest.approx(-0.06, abs=0.02)]
 
 
+def test_a_focal_length_of_the_file_is_what_a_clip_gets_that_does_not_tell_its_own(tmp_path, tools):
+    """A wall seen straight on, as in test_solving: no number was given, the file had one."""
+    poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(8)]
+    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0), -0.06) for pose in poses]
+    found, _ = solved(tmp_path, tools, pictures, start_focal_px=310.0)
+    assert found["focal_px"] == 310.0 and found["lens"]["held"] and not found["lens"]["given_px"]
+    ((said, _),) = lens_remarks(found)
+    assert said.endswith("the one that the file names was taken, 55 degrees wide.")
+
+
 def test_a_fisheye_is_solved(tmp_path, tools):
     """The room, cast ray by ray through a lens 120 degrees wide; nobody tells its focal length."""
     focal, poses = 160.0, tools.handheld(10)
