@@ -287,7 +287,7 @@ def _print_times(title: str, result: dict[str, Any]) -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "workloads", nargs="*", default=["W0", "W1", "W2"], metavar="W", help="W0 to W3 (default: W0 W1 W2)"
+        "workloads", nargs="*", default=["W0", "W1", "W2"], metavar="W", help="W0 to W4 (default: W0 W1 W2)"
     )
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")

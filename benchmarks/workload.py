@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from torch_backend.gaussians.neighbours import nearest
 
-WORKLOADS = {"W0": (400, 64, 48), "W1": (20_000, 320, 180), "W2": (50_000, 640, 360), "W3": (200_000, 640, 360)}
+WORKLOADS = {
+    "W0": (400, 64, 48),
+    "W1": (20_000, 320, 180),
+    "W2": (50_000, 640, 360),
+    "W3": (200_000, 640, 360),
+    "W4": (1_000_000, 1920, 1080),
+}
 """Gaussians, width, height."""
 
 

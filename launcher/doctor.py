@@ -49,11 +49,16 @@ class Finding:
     """What was found, and what to do about it."""
 
 
-def doctor(output: Path) -> int:
-    """Says what this machine can do and what to do about what is missing; exit code 9 if the demo cannot run."""
+def doctor(output: Path, gpu: bool = False) -> int:
+    """Says what this machine can do and what to do about what is missing; exit code 9 if the demo cannot run.
+
+    gpu: the card is tested anew, and what was found goes to gpu.json in `output`.
+    """
     backend = backend_environment()
-    facts: dict[str, Any] = backend_facts(backend) if backend.ready() else {}
+    facts: dict[str, Any] = backend_facts(backend, gpu) if backend.ready() else {}
     findings = [*machine_findings(), *gpu_findings(facts), *backend_findings(backend, facts), *blender_findings()]
+    if gpu:
+        findings.append(self_test_finding(facts, output))
     for finding in findings:
         say(f"{finding.state:<8} {finding.what:<16} {finding.text}")
     missing = [f for f in findings if f.state == "missing"]
@@ -125,6 +130,18 @@ def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
         yield Finding("torch on gpu", "note", reason)
 
 
+def self_test_finding(facts: dict[str, Any], output: Path) -> Finding:
+    """How the card's self-test ended; all that it found goes to a file that can be sent."""
+    if "gpu" not in facts:
+        reason = facts.get("error") or "the backend is not set up: `python3 splannequin.py setup` makes it"
+        return Finding("self-test", "note", f"not run: {reason}")
+    place = output / "gpu.json"
+    write_json(place, facts)
+    test = facts["gpu"]["test"]
+    ended = f"failed: {test['problem']}" if test["problem"] else f"{len(test['checks'])} checks, nothing wrong"
+    return Finding("self-test", "note" if test["problem"] else "ok", f"{ended}; {place} is what to send")
+
+
 def gpu_finding(card: Card) -> Finding:
     """One card against what Warp and torch need."""
     unfit = why_unfit(card)
@@ -133,9 +150,9 @@ def gpu_finding(card: Card) -> Finding:
     return Finding("gpu", "ok", f"{card.name}, driver {card.driver}, compute capability {card.compute or 'unknown'}")
 
 
-def backend_facts(backend: Environment) -> dict[str, Any]:
-    """What the backend says about its own environment."""
-    command = python_child(backend.python, "torch_backend", "doctor")
+def backend_facts(backend: Environment, gpu: bool = False) -> dict[str, Any]:
+    """What the backend says about its own environment; with `gpu` it tests the card."""
+    command = python_child(backend.python, "torch_backend", "doctor", *(["--gpu"] if gpu else []))
     ran = subprocess.run(**command, capture_output=True, text=True, env=child_environ())
     try:
         return json.loads(ran.stdout[ran.stdout.index("{") :])

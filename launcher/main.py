@@ -47,6 +47,10 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("clip", metavar="INPUT", help=INPUT[1])
         if name in ("test", "setup"):
             command.add_argument("--bpy", choices=sorted(BPY_WHEELS), help="the bpy wheel (default: one that fits)")
+        if name == "doctor":
+            command.add_argument(
+                "--gpu", action="store_true", help="test the graphics card, and write what was found to DIR/gpu.json"
+            )
         if name == "setup":
             command.add_argument("--tests", action="store_true", help="with what `test` needs")
             command.add_argument("--backend", action="store_true", help="the backend alone (for the add-on)")
@@ -125,4 +129,4 @@ def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
         return bench(rest, output)
     if args.command == "test":
         return run_tests(rest, args.bpy, output)
-    return doctor(output)
+    return doctor(output, args.gpu)

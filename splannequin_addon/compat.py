@@ -258,9 +258,23 @@ def new_look_up(
 
 def new_coordinates(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> tuple[Any, Any]:
     """Sockets of the first two values of a vector."""
+    s, t, _ = separated(tree, vector)
+    return s, t
+
+
+def separated(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket) -> tuple[Any, Any, Any]:
+    """Sockets of a picture's red, green and blue, nothing cut."""
     node: Any = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeSeparateXYZ")
-    tree.links.new(vector, node.inputs[0])
-    return node.outputs["X"], node.outputs["Y"]
+    tree.links.new(picture, node.inputs[0])
+    return node.outputs["X"], node.outputs["Y"], node.outputs["Z"]
+
+
+def combined(tree: bpy.types.NodeTree, channels: Sequence[bpy.types.NodeSocket]) -> Any:
+    """Socket of an opaque picture of its red, green and blue."""
+    node: Any = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeCombineXYZ")
+    for socket, channel in zip(node.inputs, channels, strict=True):
+        tree.links.new(channel, socket)
+    return node.outputs[0]
 
 
 def sized(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, size: tuple[int, int]) -> Any:

@@ -15,6 +15,7 @@ from torch_backend.contract import shot_folder
 ROOT = Path(__file__).resolve().parent.parent
 BLENDER = {"bpy", "bpy_extras", "mathutils", "gpu", "gpu_extras", "bl_ext", "addon_utils", "blf", "bmesh"}
 STATIONS = (
+    "compiler_folders",
     "native",
     "footage",
     "solve",

@@ -207,17 +207,47 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     import av
     import torch
 
-    from .train.device import choose_device, cuda_refusal
+    from .train.device import choose_device, cuda_refusal, failed_self_test
 
     facts["torch_device"] = "cuda" if torch.cuda.is_available() else "cpu"
     facts["cuda_device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    facts["trains_on"] = choose_device("auto").type
     facts["torch_cuda"] = torch.version.cuda
     facts["cuda_refusal"] = cuda_refusal()
+    if args.gpu:
+        facts["gpu"] = card_facts(facts["cuda_refusal"])
+        facts["trains_on"] = "cpu" if facts["gpu"]["test"]["problem"] else "cuda"
+    else:
+        facts["trains_on"] = choose_device("auto").type
+        if not facts["cuda_refusal"]:
+            facts["cuda_refusal"] = " ".join(failed_self_test() or ())
     facts["cores"] = os.cpu_count()
     facts["h264"] = "libx264" in av.codecs_available
     print(json.dumps(facts, indent=1), file=console.stream)
     return ExitCode.OK
+
+
+def card_facts(refusal: str) -> dict[str, Any]:
+    """The card, tested now in this process, and where its kernels are compiled; `refusal`: why it cannot be used."""
+    import platform
+
+    import torch
+
+    from .cards import nvidia_cards
+    from .train.self_test import SelfTest, keep, kernel_folder, run_self_test, self_test_key
+
+    cards, trouble = nvidia_cards()
+    key = self_test_key()
+    tested = SelfTest(key=key, problem=refusal, lasting=False) if refusal else run_self_test(torch.device("cuda"), key)
+    keep(tested, kernel_folder())
+    facts: dict[str, Any] = {
+        "test": dataclasses.asdict(tested), "system": platform.platform(),
+        "cards": [dataclasses.asdict(card) for card in cards], "driver_trouble": trouble,
+        "kernels": str(kernel_folder()),
+    }  # fmt: skip
+    if not refusal and not tested.problem:  # what a kernel broke stays broken for the rest of this process
+        free, total = torch.cuda.mem_get_info()
+        facts["memory_gb"] = {"free": round(free / 1e9, 2), "total": round(total / 1e9, 2)}
+    return facts
 
 
 def run_job(args: argparse.Namespace, console: Console) -> int:

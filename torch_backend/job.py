@@ -208,7 +208,13 @@ def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack 
         _log(reporter.folder, traceback.format_exc())
         path_problem, text = _about_a_path(error, request.shot), str(error).lower()
         state, code = "failed", path_problem.exit_code if path_problem else int(ExitCode.INTERNAL)
-        if isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
+        if type(error).__name__ == "OutOfMemoryError":  # torch's own, of a card
+            message = "The graphics card is out of memory."
+            hint = (
+                "Close other programs that use it, choose a smaller width or fewer Gaussians, or the processor as the "
+                "device."
+            )
+        elif isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
             message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."
         else:
             message = (

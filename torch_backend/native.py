@@ -22,7 +22,9 @@ from typing import Any, cast
 
 import torch
 import warp as wp
+from warp._src import build as warp_build
 
+from .compiler_folders import compiler_folders
 from .kernel_text import kernel_text
 
 Launch = Callable[[int, int, int], None]
@@ -64,10 +66,20 @@ def _without_notice() -> Generator[None]:
 
 @functools.cache
 def initialised_warp() -> Any:
-    """The module warp, initialised once without a word on the terminal."""
+    """The module warp, initialised once without a word on the terminal.
+
+    JobError where its compilers cannot read the folders that it is in (`compiler_folders`).
+    """
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    usual = os.environ.get("WARP_CACHE_PATH") or os.environ.get("LOCALAPPDATA") or Path.home()
+    folders = compiler_folders(Path(wp.__file__).parent, wp.config.version, os.environ, Path(usual))
+    if folders.kernels is not None:
+        wp.config.kernel_cache_dir = str(folders.kernels)
+    wp.config.use_precompiled_headers = wp.config.use_precompiled_headers and folders.precompiled
     with _without_notice():
         wp.init()
+    if folders.headers is not None:
+        cast(Any, warp_build).warp_home = str(folders.headers)  # Warp 1.19 has no setting for it
     return wp
 
 

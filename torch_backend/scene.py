@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from .contract import ExitCode, JobError, Reporter, frame_file
+from .footage.display import PLAIN, Display, display_of
 from .footage.images import read_frame
 from .footage.importing import load_frames
 from .shot import Shot, make_folder, need_disk
@@ -56,6 +57,8 @@ class Scene:
     """[3] float64, origin of the scene in solve units."""
     folder: Path
     """Folder of the undistorted working frames."""
+    display: Display = PLAIN
+    """What they are shown on: how their numbers mean light."""
 
     def image_path(self, index: int) -> Path:
         """Undistorted working frame of delivered frame `index`."""
@@ -117,6 +120,7 @@ def load_scene(shot: Shot) -> Scene:
         scale=scale,
         centre=centre,
         folder=shot.frames,
+        display=display_of(load_frames(shot)),
     )
 
 
@@ -170,7 +174,7 @@ def load_images(
     report: Reporter | None = None,
     beside: Path | None = None,
 ) -> Tensor:
-    """Working frames `indices` at a training size, [I, height, width, 3] float16 display-referred in [0, 1].
+    """Working frames `indices` at a training size, [I, height, width, 3] float16 in [0, 1] of the scene's display.
 
     float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `HELD_BYTES` of them are
     mapped from a nameless file in the folder `beside`, if there is one: however the process ends, nothing stays.
@@ -182,7 +186,7 @@ def load_images(
     else:
         images = _mapped(beside, shape)
     for n, index in enumerate(indices):
-        images[n] = read_image(scene.image_path(index), width, height)
+        images[n] = read_image(scene.image_path(index), width, height, scene.display)
         if report:
             report.check_cancelled()
             report.progress("loading frames", n + 1, len(indices), f"frame {scene.frames[index]}")
@@ -200,13 +204,15 @@ def _mapped(folder: Path, shape: tuple[int, ...]) -> Tensor:
         return from_numpy(np.memmap(file, dtype=np.float16, mode="r+", shape=shape))
 
 
-def read_image(path: Path, width: int, height: int) -> Tensor:
-    """One display-referred image resized to [height, width, 3] float32 in [0, 1]. Raises what `read_frame` does."""
+def read_image(path: Path, width: int, height: int, display: Display = PLAIN) -> Tensor:
+    """One image of a display resized to [height, width, 3] float32 in [0, 1]. Raises what `read_frame` does."""
     pixels = read_frame(path)
     limit = 65535.0 if pixels.dtype == np.uint16 else 255.0
-    image = from_numpy(pixels.astype(np.float32) / limit).permute(2, 0, 1)[None]
-    if image.shape[-2:] != (height, width):
-        exact = image.shape[-2] % height == 0 and image.shape[-1] % width == 0
-        mode, antialias = ("area", False) if exact else ("bicubic", True)
-        image = torch.nn.functional.interpolate(image, (height, width), mode=mode, antialias=antialias)
-    return image[0].permute(1, 2, 0).clamp(0.0, 1.0)
+    values = pixels.astype(np.float32) / limit
+    if values.shape[:2] == (height, width):
+        return from_numpy(values)
+    image = from_numpy(display.straightened(values)).permute(2, 0, 1)[None]
+    exact = image.shape[-2] % height == 0 and image.shape[-1] % width == 0
+    mode, antialias = ("area", False) if exact else ("bicubic", True)
+    image = torch.nn.functional.interpolate(image, (height, width), mode=mode, antialias=antialias)
+    return from_numpy(display.bent(image[0].permute(1, 2, 0).numpy())).clamp(0.0, 1.0)

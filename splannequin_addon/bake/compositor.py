@@ -233,9 +233,12 @@ def _show_plate(
     # The tree is ours: in a row, left to right.
     end = present(present(compat.output_socket(tree)).node)
     end.location = (node.location.x + node.width + 60.0, node.location.y)
-    image_node.location = (node.location.x - (2 if plate.map is None else 3) * GAP, node.location.y)
+    between = plate.map is not None or plate.has_shoulder
+    image_node.location = (node.location.x - (3 if between else 2) * GAP, node.location.y)
     if plate.map is not None:
         stream = original_plate.undistorted(tree, stream, plate.map, (node.location.x - 2 * GAP, node.location.y))
+    if plate.has_shoulder:
+        stream = original_plate.lit(tree, stream, (node.location.x - 2 * GAP, node.location.y))
     fit = compat.new_fit_node(tree, fitting.how_it_fits(scene, plate.size))
     fit[TAG] = True
     fit.label = "Fit Plate"

@@ -125,10 +125,24 @@ def _plate_size(state: ShotState) -> tuple[int, int]:
 
 
 def insert_freeze(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = None) -> list[str]:
-    """Puts a take into the scene's compositor, or its warp, and keeps the plate's colours if the artist consents."""
+    """Puts a take into the scene's compositor, or its warp, and keeps the plate's colours if the artist consents.
+
+    The footage's timecode goes into the metadata of what is rendered.
+    """
     with rollback.scene_of(scene):
         changes = scene_setup.keep_plate_colours(scene) if settings_of(scene).keep_colours else []
+        changes += scene_setup.note(scene, timecode_note(inventory.read(shot)))
         return insert(scene, shot, take, warp) + changes
+
+
+def timecode_note(state: ShotState) -> str:
+    """What the metadata of rendered files says of the footage's timecode; empty if it carries none.
+
+    Blender's own Time counts from frame 0, and it has no place for another start.
+    """
+    first = state.frame_range[0]
+    code = state.timecode_at(first)
+    return f"Timecode {code} at frame {first}, {state.info['fps']:g} fps." if code else ""
 
 
 def combine_cg(scene: bpy.types.Scene, shot: Path) -> list[str]:

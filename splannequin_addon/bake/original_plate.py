@@ -17,13 +17,15 @@ from .. import compat
 from ..access import present, size_of
 from ..scene import sequences
 from ..scene.ownership import TAG
-from . import warp_nodes
+from . import warp_nodes, working_light
 from .node_names import GAP
 from .take_files import Take
 
 LENS = "Splannequin Undistort"
 """Name of the group that takes the lens away."""
-_IS_LENS = "splannequin_lens"
+LIGHT = "Splannequin Working Light"
+"""Name of the group that gives working frames their highlights back."""
+_IS_OURS = "splannequin_lens"
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class Plate:
     """What it is, a sentence each."""
     size: tuple[int, int]
     """Width and height of the plate in pixels."""
+    has_shoulder: bool = False
+    """True if it is read as sRGB and has a shoulder, see `working_light`."""
 
 
 def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
@@ -88,7 +92,8 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
     if footage is None or image is None:
         said = [f"The compositor shows working frames as the plate, not the footage: {why}."] if why else []
         image = sequences.load_sequence(stand_in, working_name(stand_in), "srgb")
-        return Plate(image, None, said, sequences.shown_size(image, take.first, take.last))
+        size = sequences.shown_size(image, take.first, take.last)
+        return Plate(image, None, said, size, working_light.has_shoulder(contract.ShotFolder(shot)))
     st = None
     if footage.map is not None:
         st = sequences.load_numbers(footage.map, f"Undistort {take.folder.name}")
@@ -136,34 +141,59 @@ def undistorted(
     tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, st: bpy.types.Image, location: tuple[float, float]
 ) -> bpy.types.NodeSocket:
     """Socket of a picture seen through an ST map, by a group node of ours in a tree."""
-    group = bpy.data.node_groups.new(LENS, "CompositorNodeTree")
-    group[_IS_LENS] = True
-    compat.new_socket(group, "Image", "INPUT", "NodeSocketColor")
-    compat.new_socket(group, "Image", "OUTPUT", "NodeSocketColor")
-    enter, leave = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+    group, enter, leave = _new_group(LENS)
     reader: Any = group.nodes.new("CompositorNodeImage")
     reader.image = st
     reader.name = reader.label = "ST Map"
     shown = warp_nodes.looked_up(group, enter.outputs[0], reader.outputs["Image"], size_of(st))
     group.links.new(shown, leave.inputs[0])
-    enter.location, reader.location, leave.location = (-3 * GAP, 0.0), (-3 * GAP, -300.0), (4 * GAP, 0.0)
+    reader.location = (-3 * GAP, -300.0)
+    return _put(tree, group, "Undistort Plate", picture, location)
+
+
+def lit(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, location: tuple[float, float]) -> bpy.types.NodeSocket:
+    """Socket of the light of working frames with a shoulder, by a group node of ours in a tree."""
+    group, enter, leave = _new_group(LIGHT)
+    group.links.new(working_light.lit(group, enter.outputs[0]), leave.inputs[0])
+    return _put(tree, group, "Light of Plate", picture, location)
+
+
+def _new_group(name: str) -> tuple[bpy.types.NodeTree, bpy.types.Node, bpy.types.Node]:
+    """A group from picture to picture, its input and its output."""
+    group = bpy.data.node_groups.new(name, "CompositorNodeTree")
+    group[_IS_OURS] = True
+    compat.new_socket(group, "Image", "INPUT", "NodeSocketColor")
+    compat.new_socket(group, "Image", "OUTPUT", "NodeSocketColor")
+    enter, leave = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+    enter.location, leave.location = (-3 * GAP, 0.0), (4 * GAP, 0.0)
+    return group, enter, leave
+
+
+def _put(
+    tree: bpy.types.NodeTree,
+    group: bpy.types.NodeTree,
+    label: str,
+    picture: bpy.types.NodeSocket,
+    location: tuple[float, float],
+) -> bpy.types.NodeSocket:
+    """Socket of a picture that went through a group."""
     node: Any = tree.nodes.new("CompositorNodeGroup")
     node.node_tree = group
     node[TAG] = True
-    node.name = node.label = "Undistort Plate"
+    node.name = node.label = label
     node.location = location
     tree.links.new(picture, node.inputs[0])
     return node.outputs[0]
 
 
 def drop(node: bpy.types.Node) -> list[bpy.types.Image]:
-    """Removes a node of ours from its tree, and its group if it takes a lens away; returns the images it showed."""
+    """Removes a node of ours from its tree, and its group if it is one of these; returns the images it showed."""
     images: list[bpy.types.Image] = []
     if isinstance(node, bpy.types.CompositorNodeImage) and node.image:
         images.append(node.image)
     group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
     present(node.id_data).nodes.remove(node)  # pyright: ignore
-    if group is not None and group.get(_IS_LENS):
+    if group is not None and group.get(_IS_OURS):
         images += [n.image for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
         if group.users == 0:
             bpy.data.node_groups.remove(group)

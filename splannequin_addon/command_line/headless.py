@@ -248,7 +248,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     """`doctor`: this Blender, and what the backend's environment can do, as JSON."""
     facts: dict[str, Any] = {"blender": bpy.app.version_string, "blender_python": sys.version.split()[0]}
     facts["backend_python"] = backend.python()
-    facts["backend"] = json.loads(backend.doctor())
+    facts["backend"] = json.loads(backend.doctor(args.gpu))
     print(json.dumps(facts, indent=1))
     return ExitCode.OK
 

@@ -50,6 +50,9 @@ class Import(Step):
             f"{width} x {height}, {state.info.get('fps', 0):g} fps",
             *state.read_as,
         ]
+        timecode = state.timecode_at(scene.frame_current)
+        if timecode:
+            lines.append(f"Timecode {timecode} at frame {scene.frame_current}.")
         return View(True, True, lines, "Next: solve the camera.")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:

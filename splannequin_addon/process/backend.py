@@ -108,9 +108,9 @@ def diagnosis(question: children.Question) -> str:
     )
 
 
-def doctor() -> str:
-    """`diagnosis`, waited for."""
-    asked = begin_doctor()
+def doctor(gpu: bool = False) -> str:
+    """`diagnosis`, waited for; of a graphics card that is tested anew if `gpu`."""
+    asked = ask("doctor", "--gpu") if gpu else begin_doctor()
     asked.wait(120.0)
     return diagnosis(asked)
 

@@ -19,6 +19,7 @@ _TOGETHER = (
     {"pixel_aspect_x", "pixel_aspect_y"},
     {"fps", "fps_base"},
     {"frame_start", "frame_end"},
+    {"use_stamp_note", "stamp_note_text"},
 )
 _SHOTS = {
     "render": ("resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "fps",
@@ -126,6 +127,22 @@ def keep_plate_colours(scene: bpy.types.Scene) -> list[str]:
         _set(scene, "render", {"dither_intensity": 0.0})
         changes.append("Dither set to 0, so that pixels stay exact.")
     return changes
+
+
+def note(scene: bpy.types.Scene, text: str) -> list[str]:
+    """Has rendered files say a text in their metadata, as Blender's Note; returns what was changed, in words.
+
+    A note of the artist's own stays. Without a text one that was made here goes.
+    """
+    render = scene.render
+    ours = json.loads(scene.get(_OURS, "{}")).get("render", {}).get("stamp_note_text")
+    now = render.stamp_note_text
+    if (render.use_stamp_note or now) and now != ours:
+        return []
+    if text == now and render.use_stamp_note == bool(text):
+        return []
+    _set(scene, "render", {"use_stamp_note": bool(text), "stamp_note_text": text})
+    return [f"What is rendered says in its metadata (Note): {text}"] if text else []
 
 
 def _neutral(view: Any) -> str:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ...torch_backend import contract
+
 
 @dataclass
 class ShotState:
@@ -21,6 +23,8 @@ class ShotState:
     """How the footage was read, in sentences; empty for one of an earlier version."""
     beside: str = ""
     """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
+    timecode: str = ""
+    """SMPTE timecode of the first frame; empty if the footage carries none."""
     solve: dict[str, Any] = field(default_factory=dict[str, Any])
     """solve.json; empty before the solve."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
@@ -38,6 +42,12 @@ class ShotState:
         """Names of all runs or takes (`kind` "run" or "take"), damaged ones too, as they are shown."""
         whole = {*self.runs, *self.unfinished} if kind == "run" else {*self.takes}
         return sorted(whole | {*self.damaged[kind]})
+
+    def timecode_at(self, frame: int) -> str:
+        """Timecode of a frame of the clip; empty if the footage carries none, or cannot be counted."""
+        fps = float(self.info.get("fps", 0.0))
+        counts = bool(self.timecode) and round(fps) >= 1
+        return contract.later(self.timecode, frame - self.frame_range[0], fps) if counts else ""
 
     @property
     def size(self) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from ..properties import BoolProperty, EnumProperty, FloatProperty, PointerPrope
 MASK_SOURCES = [
     ("NONE", "None", "No mask"),
     ("FILE", "File", "A picture for all frames, a picture of a numbered sequence, or a video"),
-    ("ALPHA", "Alpha", "The alpha of the clip, which is a sequence: ignored is what is transparent, people are opaque"),
+    ("ALPHA", "Alpha", "The alpha of the clip, if it has one: ignored is what is transparent, people are opaque"),
     ("DRAWN", "Drawn", "A mask of this file, drawn over the clip in the Movie Clip editor"),
 ]
 """Where a mask may come from. In the order that .blend files keep: new ones go last."""

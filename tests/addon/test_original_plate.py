@@ -3,6 +3,8 @@
 import importlib.util
 import json
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import bpy
@@ -215,3 +217,38 @@ def test_frames_and_warps_of_acescg_footage_are_read_in_their_light(addon, scene
         found, expected = render(scene, tmp_path, 6), made.frozen(6)
         assert float((np.abs(found - expected).max(-1) / np.maximum(np.abs(expected).max(-1), 0.01)).max()) < 1e-3
         bake.insert_freeze(scene, shot, "detail", warp=warp)
+
+
+def write_png16(path: Path, codes: np.ndarray) -> None:
+    """[H, W, 3] uint16 as a PNG, as the import writes frames of footage that holds light."""
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in codes)
+    parts = [(b"IHDR", struct.pack(">2I5B", codes.shape[1], codes.shape[0], 16, 2, 0, 0, 0))]
+    parts += [(b"sRGB", b"\0"), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    with path.open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for kind, data in parts:
+            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+
+
+def test_working_frames_that_stand_in_have_the_highlights_of_their_shoulder(addon, contract, scene, footage, tmp_path):
+    """Light up to 60, read back through the compositor; without the record of a shoulder they are sRGB."""
+    shot = footage(unlike="its pixels are not square")
+    light = np.tile(
+        np.array([0.05, 0.3, 0.6, 0.61, 1.0, 4.0, 20.0, 60.0], np.float64).repeat(7)[:, None], (SIZE[1], 1, 3)
+    )
+    light[..., 2] *= 0.5
+    srgb = np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
+    start, roll = contract.SHOULDER_FROM, contract.SHOULDER_ROLL
+    shown = np.minimum(srgb, start) + roll * np.log1p(np.maximum(srgb - start, 0.0) / roll)
+    for frame in (5, 6):
+        write_png16(shot / "frames" / f"{frame:06d}.png", np.rint(shown * 65535.0))
+    listing = contract.ShotFolder(shot).listing
+    record = json.loads(listing.read_text())
+    cut = ((shown + 0.055) / 1.055) ** 2.4
+    for display, expected in (({"display": "shoulder"}, light), ({}, cut)):
+        listing.write_text(json.dumps({**record, **display}))
+        addon("bake.insertion").insert_freeze(scene, shot, "detail")
+        node_of(addon, scene).inputs["Mix"].default_value = 0.0
+        assert np.abs(render(scene, tmp_path, 6) / expected - 1.0).max() < 2e-3
+    groups = [group.name for group in bpy.data.node_groups if group.name.startswith("Splannequin Working Light")]
+    assert groups == [], "what is not shown any more is gone"

@@ -13,6 +13,7 @@ import pytest
 
 from torch_backend.contract import HOSTS, ExitCode, host_names, python_child
 from torch_backend.footage.color import linear_to_srgb
+from torch_backend.footage.display import ROLLED
 from torch_backend.footage.images import read_png, resize
 from torch_backend.freeze.exr import read_frozen_exr
 
@@ -149,7 +150,7 @@ def test_a_sequences_rate_and_layer_come_from_the_command_line(tmp_path):
     assert done.returncode == ExitCode.OK, done.stdout + done.stderr
     info = json.loads((shot / "shot.json").read_text())
     assert (info["fps"], info["last"]) == (12.0, 9)
-    assert np.abs(read_png(shot / "frames/raw/000000.png") / 65535 - linear_to_srgb(wide[:, :64])).max() < 2e-3
+    assert np.abs(read_png(shot / "frames/raw/000000.png") / 65535 - ROLLED.from_light(wide[:, :64])).max() < 2e-3
 
 
 def test_a_failed_import_leaves_no_empty_shot(tmp_path):

@@ -12,7 +12,8 @@
     writing         atomic files and folders
     camera_path     a pinhole camera over frames
     live_messages   what Blender and a live session say to each other
-    colour          a colour by which two programs know that they mean the same space
+    colour          a colour by which two programs know that they mean the same space, and the display of light
+    timecode        SMPTE timecode: the footage's start, and the code of each frame after it
     frame_layers    what the layers of a frozen frame hold
     checkpoint_header   what a checkpoint says of itself
     results         verdicts and the figures of a run
@@ -31,7 +32,12 @@ from .camera_path import (
 from .checkpoint_header import (
     checkpoint_facts,
 )
-from .colour import PROBE
+from .colour import (
+    PROBE,
+    SHOULDER,
+    SHOULDER_FROM,
+    SHOULDER_ROLL,
+)
 from .command_line import (
     as_json,
     command_line,
@@ -203,6 +209,10 @@ from .shot_folder import (
     ShotFolder,
     TakeFolder,
 )
+from .timecode import (
+    later,
+    parse_timecode,
+)
 from .typed import (
     CONTRACT_VERSION,
     check_version,
@@ -296,6 +306,9 @@ __all__ = [
     "RUNS_FOLDER",
     "SHORT_JSON",
     "SHOT_SUFFIX",
+    "SHOULDER",
+    "SHOULDER_FROM",
+    "SHOULDER_ROLL",
     "SOLVE_FILE",
     "SOLVE_FOLDER",
     "STATUS_FILE",
@@ -366,6 +379,7 @@ __all__ = [
     "is_disk_full",
     "is_link",
     "is_shot",
+    "later",
     "layers_of",
     "limits_of",
     "locked",
@@ -380,6 +394,7 @@ __all__ = [
     "options_of",
     "overscan",
     "panel",
+    "parse_timecode",
     "path_error",
     "printable",
     "process",

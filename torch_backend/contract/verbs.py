@@ -126,6 +126,19 @@ class ExportWords:
 
 
 @dataclass
+class DoctorWords:
+    """How far to look."""
+
+    gpu: bool = option(
+        False,
+        flag="--gpu",
+        switch=True,
+        help="test the graphics card anew: a small frame and its gradients against the processor's",
+    )
+    """Test the graphics card anew."""
+
+
+@dataclass
 class LiveWords:
     """A live session."""
 
@@ -177,7 +190,7 @@ VERBS: dict[str, Verb] = {
     "stmaps": Verb("ST maps of the lens, both ways, into the shot's solve folder", MapWords),
     "export": Verb("cameras and points of a solved shot for other programs", ExportWords),
     "status": Verb("jobs of a shot", ShotWords),
-    "doctor": Verb("what this environment can do, as JSON", json=False),
+    "doctor": Verb("what this environment can do, as JSON", DoctorWords, json=False),
     "run-job": Verb("the job in a folder (what Blender starts)", JobWords, sides=(BACKEND,)),
     "live": Verb(
         "frozen views as they are asked for on standard input (for Blender)", LiveWords, sides=(BACKEND,), json=False

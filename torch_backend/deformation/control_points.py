@@ -102,6 +102,10 @@ class ControlPointsConfig(HostConfig):
     rehearsal: float = 0.0
     """Share of the run for the nodes' own stage (10,000 of 80,000); 0: nodes are drawn from the moving Gaussians."""
 
+    def row_bytes(self) -> int:
+        """The nodes that a Gaussian follows: their indices, shares and what is looked up of each, and the blend."""
+        return 4 * (_FOLLOWED * (3 * (self.hyper + 2) + 4) + 40)
+
 
 def _reference(iterations: int) -> ControlPointsConfig:
     """The published host: stage one 10,000 of 80,000 steps, then its schedules; rates as published (see Host B)."""
@@ -155,6 +159,7 @@ class ControlPoints(Deformation):
         self.places: Tensor
         self.register_buffer("box", box.float().cpu())
         self.register_buffer("frames", torch.tensor(float(frames), device="cpu"))
+        self.frame_count = float(frames)  # what `frames` holds: nobody has to ask a GPU for it
         self.register_buffer("places", places.float())
         self.hyper = nn.Parameter(places.new_full((count, config.hyper), 1e-2))
         self.log_radii = nn.Parameter(_radii(places, config.published).log())
@@ -168,6 +173,11 @@ class ControlPoints(Deformation):
         # The published host adds its rotation to the raw quaternion, which is what no rule does.
         self.rules = {"log_scales": add_to_scale} if config.published else {"quats": turn}
         self.owned = {"hyper": Owned((config.hyper,), -1e-2, config.lr_hyper, 0.1 * config.lr_hyper)}
+
+    @property
+    def apart(self) -> bool:
+        """Gaussians of one time share its nodes' motions; those of many times do not."""
+        return True
 
     @property
     def rehearsal(self) -> float:
@@ -209,9 +219,14 @@ class ControlPoints(Deformation):
         return index, share / share.sum(1, keepdim=True)
 
     def _motions(self, index: Tensor, times: Tensor) -> tuple[Tensor, _Motion, Tensor]:
-        """What index [M, K] needs at times [M] or [1], each once: (places [R, 3], motions, rows [M, K])."""
+        """What index [M, K] needs at times [M] or [1]: (places [R, 3], motions, rows [M, K]); on the CPU each once."""
         if times.shape[0] == 1:
             return self.places, self.node_motion(self.places, times), index
+        if index.device.type != "cpu":
+            # How many are distinct a GPU would have to be asked: `apart` keeps these few.
+            rows = torch.arange(index.numel(), device=index.device).view_as(index)
+            places = self.places[index.flatten()]
+            return places, self.node_motion(places, times.repeat_interleave(index.shape[1])), rows
         instants, which = unique_with_inverse(times)
         pairs, at = unique_with_inverse(index * len(instants) + which[:, None])
         places = self.places[pairs // len(instants)]
@@ -235,7 +250,7 @@ class ControlPoints(Deformation):
 
     def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:
         """Blurred as in Host B."""
-        return blurred(time, float(self.frames), progress, self.config.noise, self.config.noise_until, generator)
+        return blurred(time, self.frame_count, progress, self.config.noise, self.config.noise_until, generator)
 
     # ------------------------------------------------------------------ training
 
@@ -264,8 +279,9 @@ class ControlPoints(Deformation):
             return self.places.new_zeros(())
         places = self.places
         if len(places) > 512:
-            places = places[torch.randperm(len(places), generator=generator, device="cpu")[:512].to(places.device)]
-        times = _near_times(2, _WINDOW, generator).to(places.device)
+            drawn = torch.randperm(len(places), generator=generator, device="cpu")[:512]
+            places = places[drawn.to(places.device, non_blocking=True)]
+        times = _near_times(2, _WINDOW, generator).to(places.device, non_blocking=True)
         return weight * arap_energy(*self.trajectories(places, times))
 
     def _arap_weight(self, progress: float) -> float:
@@ -303,6 +319,7 @@ class ControlPoints(Deformation):
         """Inverse of `state`, whatever the number of nodes."""
         self.place(tensors["field.places"])
         super().load_state(tensors)
+        self.frame_count = float(self.frames)
 
 
 def _with_rows(old: nn.Parameter, kept: Tensor | None, fresh: Tensor, optimizer: torch.optim.Optimizer) -> nn.Parameter:

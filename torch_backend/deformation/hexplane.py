@@ -70,6 +70,11 @@ class HexPlaneConfig(HostConfig):
     """Times fed as they are to a sampler of [-1, 1], heads that start as noise, smoothness down the planes only (so
     never along x), the box of the first points, all harmonics move, and means are pulled through the lookup (on)."""
 
+    def row_bytes(self) -> int:
+        """Six samples and their products a level, and a layer before and after it bends: the trunk's, five heads'; on
+        the way back the gradients of three layers."""
+        return 4 * (12 * self.features * len(self.levels) + self.width * (2 * (1 + len(_WIDTHS)) + 3))
+
 
 def _reference(iterations: int) -> HexPlaneConfig:
     """The published host with the sizes of its Splannequin configuration: 3000 static steps, 30,000 with the field."""

@@ -57,6 +57,12 @@ class MlpConfig(HostConfig):
     """Raw coordinates, deltas after activation, rotations added (on)."""
     six_dof: bool = False
     """Means move by a rigid motion about the origin of the encoded box instead of a shift (off)."""
+
+    def row_bytes(self) -> int:
+        """The encoding thrice, as it is made and joined, and every layer before and after it bends."""
+        inputs = 4 + 6 * self.position_frequencies + 2 * self.time_frequencies
+        return 4 * (3 * inputs + 2 * self.width * self.depth)
+
     lr: float = 1e-3
     """Start learning rate (8e-4). Synthetic scene as above: half of it left the moving pixels at 23.0 dB."""
     lr_end: float = 2e-5
@@ -150,6 +156,7 @@ class Mlp(Deformation):
         self.frames: Tensor
         self.register_buffer("box", box.float().cpu())
         self.register_buffer("frames", torch.tensor(float(frames), device="cpu"))
+        self.frame_count = float(frames)  # what `frames` holds: nobody has to ask a GPU for it
         self.trunk = Trunk(
             config.depth, config.width, (config.position_frequencies, config.time_frequencies), generator
         )
@@ -174,7 +181,12 @@ class Mlp(Deformation):
 
     def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:
         """Blurred by normal noise of `noise` frames, falling linearly to nothing at `noise_until`."""
-        return blurred(time, float(self.frames), progress, self.config.noise, self.config.noise_until, generator)
+        return blurred(time, self.frame_count, progress, self.config.noise, self.config.noise_until, generator)
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of `state`."""
+        super().load_state(tensors)
+        self.frame_count = float(self.frames)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """One group: the network."""

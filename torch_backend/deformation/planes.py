@@ -97,9 +97,8 @@ class _Product(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: _Sampling, *grads_in: Tensor) -> tuple[Tensor | None, ...]:
-        where: Tensor = ctx.saved_tensors[0]
-        samples: Tensor = ctx.saved_tensors[1]
-        planes: list[Tensor] = list(ctx.saved_tensors[2:])
+        saved: tuple[Tensor, ...] = ctx.saved_tensors  # once: where the field works in pieces they are made anew for it
+        where, samples, *planes = saved
         out = [torch.empty_like(p) for p in planes]
         grad = grads_in[0].contiguous()
         pulls = torch.empty_like(where) if ctx.needs_input_grad[0] else None

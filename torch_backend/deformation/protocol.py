@@ -94,6 +94,11 @@ class HostConfig:
     still: float = 1.0
     """Share of `support`'s price on motion (`supervision.stillness`) that the host's deltas pay."""
 
+    def row_bytes(self) -> int:
+        """Bytes that the deltas of one Gaussian hold on a GPU from the forward to the backward pass, results left out.
+        A host says its own; this is that of ours with the most."""
+        return 4800
+
 
 @dataclass
 class Start:
@@ -166,6 +171,11 @@ class Deformation(nn.Module):
     def rehearse(self, stage: Rehearsal) -> None:
         """The host's pre-stage, `rehearsal` of the run's steps long. Only hosts with `rehearsal` > 0 are asked."""
         raise NotImplementedError
+
+    @property
+    def apart(self) -> bool:
+        """On a GPU many Gaussians at one time and a few at others are cheaper in two calls than in one."""
+        return False
 
     @property
     def rehearsal(self) -> float:

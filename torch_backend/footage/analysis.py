@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .color import srgb_to_linear
+from .display import PLAIN, Display
 
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """Rec. 709 weights, for luma of encoded values and for luminance of linear ones."""
@@ -44,21 +45,26 @@ class FrameMeasures:
     """[36, 64, 3] encoded colour in [0, 1]."""
     luma: NDArray[np.float32] = field(repr=False, default_factory=lambda: np.zeros((0, 0), np.float32))
     """Every other pixel of luma in [0, 1]."""
+    brightest: float = 1.0
+    """The largest number in it, 0 to 1."""
 
 
-def measure(frame: int, pixels: NDArray[Any]) -> FrameMeasures:
-    """Measures a working frame, [H, W, 3] uint8 or uint16 sRGB."""
+def measure(frame: int, pixels: NDArray[Any], display: Display = PLAIN) -> FrameMeasures:
+    """Measures a working frame, [H, W, 3] uint8 or uint16, of a display. What is brighter than white exposes as white:
+    a lamp that comes into the picture changes nothing of the lens."""
     scale = 1.0 / (65535.0 if pixels.dtype == np.uint16 else 255.0)
     luma = (pixels @ LUMA) * np.float32(scale)
     inner = luma[1:-1, 1:-1]
     laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4.0 * inner
     thumb = thumbnail(pixels) * np.float32(scale)
-    luminance = float((srgb_to_linear(thumb) @ LUMA).mean())
+    light = srgb_to_linear(np.minimum(display.straightened(thumb), np.float32(1.0)))
+    luminance = float((light @ LUMA).mean())
     flags = ["blank"] if float(luma.std()) < BLANK_DEVIATION else []
     return FrameMeasures(
         frame=frame,
         sharpness=float(laplacian.var() * 255.0**2) if laplacian.size else 0.0,
         exposure=float(np.log2(max(luminance, 1e-6) / 0.18)),
+        brightest=float(pixels.max() * scale),
         flags=flags,
         thumb=thumb,
         luma=np.ascontiguousarray(luma[::2, ::2]),

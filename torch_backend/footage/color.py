@@ -1,11 +1,11 @@
 """The one place where display-referred sRGB and scene-linear light are converted into each other.
 
-Working frames and the trained model are display-referred (what splatting blends in); everything that leaves, EXR
-first of all, is scene-linear with the Rec.709 / sRGB primaries. Transfer function: IEC 61966-2-1, exact piecewise
-form. It is odd-extended below 0 and its power segment continues above 1, so that ringing and highlights survive the
-way there and back.
+Working frames and the trained model are display-referred (what splatting blends in; `display` bends sRGB where it has
+to hold more than white); everything that leaves, EXR first of all, is scene-linear with the Rec.709 / sRGB primaries.
+Transfer function: IEC 61966-2-1, exact piecewise form. It is odd-extended below 0 and its power segment continues above
+1, so that ringing and highlights survive the way there and back.
 
-Footage comes in other encodings too: `InputSpace` brings each of them to display-referred sRGB.
+Footage comes in other encodings too: `InputSpace` brings each of them to display-referred sRGB, or to light.
 """
 
 from __future__ import annotations
@@ -52,27 +52,18 @@ def linear_to_srgb(x: ArrayLike) -> NDArray[np.float32]:
     return np.copysign(np.where(magnitude <= LINEAR_KNEE, line, curve), x)
 
 
-def premultiplied_srgb_to_linear(rgba: ArrayLike) -> NDArray[np.float32]:
-    """[..., 4] sRGB colour premultiplied by alpha (as splats blend) to scene-linear colour premultiplied by alpha.
-
-    The transfer function acts on the unpremultiplied colour, so a half-covered white pixel becomes (0.5, 0.5, 0.5,
-    0.5), not darker. Where alpha is 0, colour (pure emission) is converted as it stands.
-    """
-    return _on_straight_colour(rgba, srgb_to_linear)
-
-
-def premultiplied_linear_to_srgb(rgba: ArrayLike) -> NDArray[np.float32]:
-    """[..., 4] scene-linear premultiplied to sRGB premultiplied; the inverse of `premultiplied_srgb_to_linear`."""
-    return _on_straight_colour(rgba, linear_to_srgb)
-
-
 def linear_to_srgb8(x: ArrayLike) -> NDArray[np.uint8]:
     """Scene-linear to 8-bit sRGB, clipped to 0..1 and rounded, any shape. NaN becomes 0."""
     encoded = np.nan_to_num(linear_to_srgb(x), nan=0.0)
     return (np.clip(encoded, 0.0, 1.0) * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
 
 
-def _on_straight_colour(rgba: ArrayLike, curve: Callable[[ArrayLike], NDArray[np.float32]]) -> NDArray[np.float32]:
+def on_straight_colour(rgba: ArrayLike, curve: Callable[[ArrayLike], NDArray[np.float32]]) -> NDArray[np.float32]:
+    """[..., 4] colour premultiplied by alpha through a curve, premultiplied again. ValueError for another shape.
+
+    The curve acts on the unpremultiplied colour, so a half-covered white pixel of sRGB becomes light (0.5, 0.5, 0.5,
+    0.5), not darker. Where alpha is 0, colour (pure emission) is converted as it stands.
+    """
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.ndim < 1 or rgba.shape[-1] != 4:
         raise ValueError(f"rgba should be [..., 4], got shape {list(rgba.shape)}")
@@ -213,7 +204,7 @@ _SCENE: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
     "pq": pq_to_linear,
     "hlg": hlg_to_linear,
 }
-"""Transfer function of pictures that hold light -> to light. They leave through sRGB's curve, cut at 1."""
+"""Transfer function of pictures that hold light -> to light."""
 TRANSFERS = {
     "srgb": "sRGB", "g18": "gamma 1.8", "g22": "gamma 2.2", "g24": "video", "g26": "gamma 2.6", "lin": "linear",
     "cineon": "Cineon log", "pq": "PQ", "hlg": "HLG",
@@ -275,20 +266,21 @@ class InputSpace:
         found = PRIMARIES[self.primaries][1] if self.primaries else self.chromaticities
         return None if found == REC709 else found
 
-    def to_srgb(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
-        """[H, W, 3] as read to display-referred sRGB in [0, 1], and the share of pixels with light above 1, cut there.
+    def to_srgb(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[H, W, 3] as read, made for a display, to display-referred sRGB in [0, 1]. NaN becomes 0.
 
-        NaN becomes 0.
+        ValueError for light, which needs `to_linear` and a `display.Display`.
         """
+        if self.is_light:
+            raise ValueError(f"{self.name} holds light: sRGB would cut it")
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=65504.0, neginf=0.0)
         if self.as_it_stands:
-            return np.clip(pixels, 0.0, 1.0), 0.0
+            return np.clip(pixels, 0.0, 1.0)
         light, encode = self._light(pixels)
-        clipped = float((light > 1.0 + 1e-6).any(axis=-1).mean()) if self.is_light else 0.0
-        return encode(np.clip(light, 0.0, 1.0)), clipped
+        return encode(np.clip(light, 0.0, 1.0))
 
     def to_linear(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[H, W, 3] as read to scene-linear Rec.709, values below 0 and above 1 kept; `to_srgb` is this, cut, encoded.
+        """[H, W, 3] as read to scene-linear Rec.709, values below 0 and above 1 kept.
 
         NaN becomes 0, what a half float cannot hold the most that it can.
         """

@@ -33,8 +33,10 @@ def time_of(item: Any) -> Fraction | None:
     return None if item.pts is None or item.time_base is None else item.pts * item.time_base
 
 
-def stored_frames(container: Any, stream: Any, noticed: Noticed | None = None) -> Iterator[Any]:
-    """As `decoded`, but interlaced frames as they are stored."""
+def stored_frames(
+    container: Any, stream: Any, noticed: Noticed | None = None, decoder: Any = None
+) -> Iterator[Any]:  # fmt: skip
+    """As `decoded`, but interlaced frames as they are stored. `decoder`: a codec context in place of the stream's."""
     for packet in _packets(container, stream):
         if isinstance(packet, FFmpegError):
             yield packet
@@ -42,7 +44,7 @@ def stored_frames(container: Any, stream: Any, noticed: Noticed | None = None) -
         if noticed is not None and packet.is_corrupt and packet.pts is not None:
             noticed.damaged.add(time_of(packet))
         try:
-            yield from packet.decode()
+            yield from packet.decode() if decoder is None else decoder.decode(packet)
         except FFmpegError as error:
             yield error
 

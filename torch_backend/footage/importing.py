@@ -22,16 +22,17 @@ from ..contract import (
     JobError,
     Reporter,
     frame_file,
+    later,
     read_json,
 )
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
+from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
 from .images import is_whole_png, resize, working_size, write_png
 from .ocio import Colours
 from .opening import open_source
 from .reading import read_as
 from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, SourceInfo, footage_error, frame_words, told_in
-from .timecode import later
 
 FRAMES_VERSION = 1
 LEAST_FRAMES = 8
@@ -64,9 +65,10 @@ class _Extracted:
 def import_footage(shot: Shot, source: str, config: FootageConfig, report: Reporter) -> dict[str, Any]:
     """Extracts every source frame of the range into `shot`, and writes frames.json and shot.json.
 
-    Frames are frames/raw/NNNNNN.png, 8-bit sRGB, or 16-bit where the source is deeper; `seconds` in frames.json count
-    from the first frame of the range. A finished import of the same source and configuration is left alone. Another
-    one takes its place once it is whole, and the solve made from it is removed; files that are not ours stay.
+    Frames are frames/raw/NNNNNN.png, 8-bit sRGB, or 16-bit where the source is deeper, with a shoulder (`display` in
+    frames.json) where it holds light; `seconds` in frames.json count from the first frame of the range. A finished
+    import of the same source and configuration is left alone, also one of before there was a shoulder. Another one
+    takes its place once it is whole, and the solve made from it is removed; files that are not ours stay.
 
     Returns {frames, solved_frames, first, last, step, width, height, fps, colour, reading,
     read_as, source}.
@@ -79,7 +81,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     restore_folder(shot.frames)
     for folder in (shot.raw, shot.solve):
         shot.own(folder)
-    done = _finished(shot, key)
+    done = _finished(shot, key) or _finished(shot, import_key(opened.info, config, PLAIN))
     if done is not None:
         report.progress("import", 1, 1, "already imported")
         return _result(shot, done)
@@ -100,11 +102,20 @@ _ALWAYS_IN_THE_KEY = ("first", "last", "step", "working_height", "fps")
 """Of what was taken; all else only where it is not its default, so that a new option leaves finished imports alone."""
 
 
-def import_key(info: SourceInfo, config: FootageConfig) -> str:
-    """What tells an import from others: of which footage it is, and what was taken of it."""
+def display_for(info: SourceInfo) -> Display:
+    """The display of working frames that are made of a source now."""
+    return ROLLED if info.colour == "linear" else PLAIN
+
+
+def import_key(info: SourceInfo, config: FootageConfig, display: Display | None = None) -> str:
+    """What tells an import from others: of which footage it is, what was taken of it, and in which display.
+
+    `display` None: the one in which it would be made now.
+    """
     plain = _recorded(type(config)())
     settings = {n: v for n, v in _recorded(config).items() if n in _ALWAYS_IN_THE_KEY or v != plain[n]}
-    return content_key(FRAMES_VERSION, info.key, settings)
+    name = (display or display_for(info)).name
+    return content_key(FRAMES_VERSION, info.key, settings, *([name] if name else []))
 
 
 def _recorded(config: FootageConfig) -> dict[str, Any]:
@@ -183,6 +194,7 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
     """Decodes, resizes, measures and writes every frame of the range."""
     info = opened.info
     width, height = working_size(info.width, info.height, config.working_height)
+    display = display_for(info)
     if config.working_height > info.height:
         report.warning(f"The clip is {info.height} pixels high: the working frames stay that high.")
     total = _expected(opened, config)
@@ -212,8 +224,9 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
             if len(seconds) % _DISK_CHECK_FRAMES == 0:
                 need_disk(shot.root, (_DISK_CHECK_FRAMES + 2) * frame_bytes, "The import of this clip")
             seconds.append(frame.seconds)
-            clipped = max(clipped, frame.clipped)
-            pending.append(pool.submit(_work, frame, width, height, into))
+            if display.bends:
+                clipped = max(clipped, clipped_share(frame.pixels))
+            pending.append(pool.submit(_work, frame, width, height, display, into))
             while len(pending) > 2 * _WRITERS:
                 collect()
         while pending:
@@ -221,10 +234,11 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
     return _Extracted(measures, seconds, clipped, width, height)
 
 
-def _work(frame: SourceFrame, width: int, height: int, into: Path) -> FrameMeasures:
-    pixels = resize(frame.pixels, width, height)
+def _work(frame: SourceFrame, width: int, height: int, display: Display, into: Path) -> FrameMeasures:
+    bends = display.bends
+    pixels = display.codes_of(frame.pixels, width, height) if bends else resize(frame.pixels, width, height)
     write_png(into / frame_file(frame.number, PICTURE), pixels)
-    measures = measure(frame.number, pixels)
+    measures = measure(frame.number, pixels, display)
     if frame.corrupt:
         measures.flags.append("corrupt")
     return measures
@@ -290,7 +304,8 @@ def _remarks(extracted: _Extracted) -> list[tuple[str, str]]:
     if extracted.clipped > CLIPPED_SHARE:
         remarks.append(
             (
-                f"Up to {100 * extracted.clipped:.0f} % of a frame is brighter than white and is clipped.",
+                f"Up to {100 * extracted.clipped:.0f} % of a frame is brighter than {MOST_LIGHT:.0f} times white: what "
+                "splats show of it is cut there.",
                 "Lower the exposure.",
             )
         )
@@ -340,12 +355,19 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "bits": 16 if info.deep else 8,
         "source_size": [info.width, info.height],
         "extended": info.extended,
+        **_displayed(info, measures),
         "start": start,
         "step": step,
         "config": _recorded(config),
         "key": key,
         "frames": frames,
     }
+
+
+def _displayed(info: SourceInfo, measures: list[FrameMeasures]) -> dict[str, Any]:
+    """What frames.json says of the working frames' display, as `display_of` reads it."""
+    display = display_for(info)
+    return {"display": display.name, "brightest": max(m.brightest for m in measures)} if display.bends else {}
 
 
 def _keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..contract import MASK_ALPHA, MASK_KINDS, JobError, Reporter
 from ..shot import Shot, content_key
+from . import plate_encoding
 from .images import error_of
 from .importing import FootageConfig, load_frames, source_places
 from .layers import find_layer
@@ -196,34 +197,50 @@ class _Reading:
         wanted = {theirs: frame for frame, theirs in self._matched(list(range(1, count + 1))).items()}
         for one in video.frames(None, max(wanted)):
             if one.number in wanted:
-                grey = one.pixels.astype(np.float32).mean(2) / np.float32(np.iinfo(one.pixels.dtype).max)
-                yield wanted[one.number], grey
+                yield wanted[one.number], np.asarray(plate_encoding.display(one.pixels).mean(2), np.float32)
 
     # ------------------------------------------------------------------------------------------------- from alpha
 
     def _alpha(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """(frame, what the footage's alpha covers): of what is ignored the transparent, of what may move the opaque."""
-        files, layer = self._footage()
+        footage = self._footage()
+        alphas = self._of_video(footage) if isinstance(footage, VideoSource) else self._of_files(*footage)
+        for number, alpha in alphas:
+            yield number, 1.0 - alpha if self.kind == MASK_KINDS[0] else alpha
+
+    def _of_files(self, files: dict[int, Path], layer: str) -> Iterator[tuple[int, NDArray[np.float32]]]:
         for number in self.numbers:
             file = files[number]
             found = find_layer(file, layer)[0]
             if found.alpha is None:
                 raise footage_error(f"{file.name} has no alpha to mask by.", "Give the mask as pictures of their own.")
-            alpha = _read(file, found.part)[0][..., found.alpha]
-            yield number, 1.0 - alpha if self.kind == MASK_KINDS[0] else alpha
+            yield number, _read(file, found.part)[0][..., found.alpha]
 
-    def _footage(self) -> tuple[dict[int, Path], str]:
-        """The footage's files by frame, and the layer that was imported. JobError if it is no sequence any more."""
+    def _of_video(self, video: VideoSource) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        if not video.has_alpha:
+            raise footage_error(
+                f"{video.path.name} has no alpha to mask by.", "Give the mask as pictures of their own, or a video."
+            )
+        missing = set(self.numbers)
+        for number, alpha in video.alphas(self.numbers[-1]):
+            if number in missing:
+                missing.remove(number)
+                yield number, alpha
+        if missing:
+            raise footage_error(
+                f"The alpha of {frame_words(sorted(missing))} of {video.path.name} cannot be read any more.",
+                "The file has changed or is damaged: import the clip again.",
+            )
+
+    def _footage(self) -> tuple[dict[int, Path], str] | VideoSource:
+        """The footage: a video, or its files by frame and the layer that was imported. JobError if it is gone."""
         config = self.frames.get("config", {})
         settings = FootageConfig(fps=float(config.get("fps", 0.0)), layer=str(config.get("layer", "")))
         for place in source_places(self.shot, self.frames):
             path = Path(place)
-            if path.is_file() and path.suffix.lower() not in PICTURES:
-                raise footage_error(
-                    "The alpha of a video is not read as a mask.",
-                    "Write it as a sequence of pictures, and give that.",
-                )
             try:
+                if path.is_file() and path.suffix.lower() not in PICTURES:
+                    return VideoSource(path)
                 sequence = find_sequence(path)
                 SequenceSource(sequence, settings.fps, settings.layer)
             except (JobError, OSError):

@@ -1,7 +1,7 @@
 """Plates: the source's frames at its own size and depth, without the lens, one by one.
 
-Working frames are small and cut at white; frozen frames take their pixels from here. Where the source holds no more
-than the working frames do, these are the plates.
+Working frames are small and hold light up to white, or 64 times that; frozen frames take their pixels from here. Where
+the source holds no more than the working frames do, these are the plates.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ..solve.stored import load_cameras, load_record
 from ..solve.undistort import BandUndistorter
 from ..torch_types import from_numpy
 from . import plate_encoding
+from .display import display_of
 from .images import read_frame, read_png, resize_float, working_size
 from .importing import FootageConfig, import_key, load_frames, source_places
 from .ocio import Colours
@@ -72,12 +73,13 @@ class Plates:
         self._files = {int(row["frame"]): str(row["file"]) for row in record["frames"]}
         self.frames = sorted(self._files)
         self._working = int(record["width"]), int(record["height"])
+        self._display = display_of(record)
         self._lenses = _lenses(shot)
         source, self.note = self._find(record)
         info = source.info if source is not None else None
         self.width, self.height = size or ((info.width, info.height) if info is not None else self._working)
         self._keep = keep or min(_KEPT, max(3, int(_KEPT_BYTES / (6.0 * self.width * self.height))))
-        self.deep = info is not None and info.extended
+        self.deep = self._display.bends or (info is not None and info.extended)
         if not self.deep and (self.width, self.height) == self._working:
             source = None  # the working frames are just that
         self._reader = source.plates(self._known(record)) if source is not None else None
@@ -87,11 +89,11 @@ class Plates:
         self.key = content_key(PLATES_VERSION, record.get("key"), solved.get("key"), footage, [self.width, self.height])
 
     def display(self, frame: int) -> Tensor:
-        """[H, W, 3] float32 on the CPU, extended display-referred: white 1, values beyond it where `deep`.
+        """[H, W, 3] float32 on the CPU, in the working frames' display: values below 0 and above 1 where `deep`.
 
         ValueError if the shot has no such frame; JobError (FOOTAGE, SOLVE) if its picture cannot be read any more.
         """
-        return from_numpy(plate_encoding.display(self._codes(frame)))
+        return from_numpy(self._display.bent(plate_encoding.display(self._codes(frame))))
 
     def linear(self, frame: int, rows: slice = slice(None)) -> Tensor:
         """The same in scene-linear Rec.709: all of it, or some rows, which at 4K spares 100 MB."""
@@ -135,6 +137,8 @@ class Plates:
     def _read(self, frame: int) -> NDArray[Any]:
         if self._reader is None:
             picture = read_frame(self._shot.plate(frame))
+            if self._display.bends:
+                picture = self._display.light_of(picture)
             return plate_encoding.resize_plate(picture, self.width, self.height)
         try:
             picture = self._reader.plate(frame)
@@ -190,7 +194,7 @@ class Plates:
     def _is_imported(self, source: Source, record: dict[str, Any], config: FootageConfig) -> bool:
         """True if the footage is by its key, or by its first, middle and last picture, what was imported."""
         info = source.info
-        if import_key(info, config) == record.get("key"):
+        if import_key(info, config, self._display) == record.get("key"):
             return True
         if working_size(info.width, info.height, config.working_height) != self._working:
             return False
@@ -215,7 +219,11 @@ class Plates:
         except (OSError, ValueError):
             return True  # nothing to hold it against
         width, height = self._working
-        if picture.dtype == np.float16:
+        if self._display.bends:  # as the import made it
+            if picture.dtype != np.float16:
+                return False
+            small = plate_encoding.display(self._display.codes_of(picture, width, height))
+        elif picture.dtype == np.float16:
             small = resize_float(np.clip(plate_encoding.display(picture), 0.0, 1.0), width, height)
         else:
             small = plate_encoding.display(plate_encoding.resize_plate(picture, width, height))

@@ -1,6 +1,6 @@
-"""Frames of a numbered image sequence through OpenImageIO: one layer, straight colour, square pixels, sRGB.
+"""Frames of a numbered image sequence through OpenImageIO: one layer, straight colour, square pixels, sRGB or light.
 
-What is not 8-bit sRGB already becomes 16-bit sRGB.
+What was made for a display and is not 8-bit sRGB already becomes 16-bit sRGB.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from fileseq.exceptions import FileSeqException
 from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
+from ..contract import parse_timecode
 from . import plate_encoding
 from .color import LIGHTS, InputSpace, named_space, space_of_chromaticities
 from .images import error_of, resize
@@ -36,7 +37,6 @@ from .sources import (
     frame_words,
     square_size,
 )
-from .timecode import parse_timecode
 
 PICTURES = {
     ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
@@ -175,11 +175,11 @@ class SequenceSource:
         findings = _Findings()
         for number in sorted(n for n in self._files if first <= n <= last):
             try:
-                pixels, clipped = self._read(self._files[number], findings)
+                pixels = self._read(self._files[number], findings)
             except (OSError, UnicodeDecodeError):  # the name of a channel may be damaged too
                 unreadable.append(number)
                 continue
-            yield SourceFrame(number, (number - self.info.first) / self.info.fps, pixels, clipped=clipped)
+            yield SourceFrame(number, (number - self.info.first) / self.info.fps, pixels)
         if unreadable:
             words = frame_words(unreadable).capitalize()
             self.warnings.append((f"{words} cannot be read: left out of the shot.", "Render or copy it again."))
@@ -231,21 +231,27 @@ class SequenceSource:
             raise footage_error(f"Frame {number} of the sequence is not there any more.", "Put it back.")
         rgb = self._stored_pixels(self._files[number], _Findings())
         if self.info.extended:
-            rgb = plate_encoding.half_of(rgb, self._space)
-        elif self.info.deep:
+            return self._light(rgb)
+        if self.info.deep:
             rgb = np.rint(np.clip(rgb, 0.0, 1.0) * np.float32(65535.0)).astype(np.uint16)
         return plate_encoding.resize_plate(np.ascontiguousarray(rgb), self.info.width, self.info.height)
+
+    def _light(self, rgb: NDArray[np.float32]) -> NDArray[Any]:
+        """[H, W, 3] float16 plate of pixels as they are stored."""
+        plate = plate_encoding.half_of(rgb, self._space)
+        return plate_encoding.resize_plate(plate, self.info.width, self.info.height)
 
     def close(self) -> None:
         """See `PlateReader.close`: files are not kept open."""
 
-    def _read(self, file: Path, findings: _Findings) -> tuple[NDArray[Any], float]:
-        """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels. OSError if unreadable."""
-        rgb, clipped = self._stored_pixels(file, findings), 0.0
+    def _read(self, file: Path, findings: _Findings) -> NDArray[Any]:
+        """[H, W, 3] uint8 or uint16 sRGB, or float16 light. OSError if unreadable."""
+        rgb = self._stored_pixels(file, findings)
+        if self._space.is_light:
+            return self._light(rgb)
         if self.info.deep:
-            rgb, clipped = self._space.to_srgb(rgb)
-            rgb = np.rint(rgb * np.float32(65535.0)).astype(np.uint16)
-        return resize(np.ascontiguousarray(rgb), self.info.width, self.info.height), clipped
+            rgb = np.rint(self._space.to_srgb(rgb) * np.float32(65535.0)).astype(np.uint16)
+        return resize(np.ascontiguousarray(rgb), self.info.width, self.info.height)
 
     def _stored_pixels(self, file: Path, findings: _Findings) -> NDArray[Any]:
         """[h, w, 3] of the layer, straight, in the file's space and pixels: uint8, or float32 if the source is deep."""

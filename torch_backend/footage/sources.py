@@ -28,11 +28,10 @@ class SourceFrame:
     seconds: float
     """Presentation time in seconds on the source's own clock."""
     pixels: NDArray[Any]
-    """[H, W, 3] uint8 or uint16 display-referred sRGB, square pixels, upright."""
+    """[H, W, 3], square pixels, upright: uint8 or uint16 display-referred sRGB, or of footage that holds light
+    (`SourceInfo.colour`) float16, scene-linear Rec.709 with nothing cut, as `plate_encoding` has it."""
     corrupt: bool = False
     """The decoder had to guess parts of it."""
-    clipped: float = 0.0
-    """Share of pixels whose linear value lay above 1 and was cut there."""
 
 
 @dataclass

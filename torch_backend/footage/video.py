@@ -1,4 +1,4 @@
-"""Frames of a video file through PyAV: real timestamps, upright, square pixels, display-referred sRGB."""
+"""Frames of a video file through PyAV: real timestamps, upright, square pixels, display-referred sRGB or light."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from ..contract import parse_timecode
 from . import plate_encoding
 from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
 from .decoding import Noticed, decoded, stored_frames, time_of
 from .frame_rgb import BT601, MATRICES, RGB, Coding, coding_of, depth_of, exact_rgb, rgb_codes
-from .images import resize
+from .images import resize, resize_float
 from .lens_tags import focal_of_video
 from .ocio import Colours
 from .seeking import VideoReader
@@ -34,7 +35,6 @@ from .sources import (
     frame_words,
     square_size,
 )
-from .timecode import parse_timecode
 
 NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
 """FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
@@ -80,13 +80,17 @@ class VideoSource:
             self._interlaced = bool(frame.interlaced_frame)
             self._size = frame.width, frame.height
             self._promise = _promise(container, stream, rate)
+            self._alpha_decoder = _alpha_decoder_of(stream)
+            held = any(component.is_alpha for component in frame.format.components)
+            self.has_alpha = held or bool(self._alpha_decoder)
+            """True if the clip has an alpha that `alphas` can read."""
             self._warn_about(frame)
             reading = {
                 **_reading(frame, self._space, self._coding),
                 "fps_told": rate_told,
                 "pixel_aspect": float(self._aspect),
                 "pixel_aspect_told": aspect is not None,
-                "alpha": any(component.is_alpha for component in frame.format.components),
+                "alpha": self.has_alpha,
                 "interlaced": self._interlaced,
                 "timecode": _timecode(container, stream),
                 "turned": 90 * self._quarter_turns,
@@ -150,8 +154,7 @@ class VideoSource:
                 if number >= begin:
                     got += 1
                     corrupt = bool(frame.is_corrupt) or time_of(frame) in noticed.damaged
-                    pixels, clipped = self._upright(frame)
-                    yield SourceFrame(number, seconds, pixels, corrupt, clipped)
+                    yield SourceFrame(number, seconds, self._upright(frame), corrupt)
             else:
                 self._check_promise(seen, begin, last)
         if noticed.interlaced and not self._interlaced:
@@ -165,6 +168,32 @@ class VideoSource:
                     "The file is damaged there: copy or export it again.",
                 )
             )
+
+    def alphas(self, last: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """(number, alpha) of the frames up to `last`, in order: [H, W] in 0..1, upright, pixels as stored or square.
+
+        Frames that cannot be decoded are left out. JobError if the clip has no alpha, or changes its size.
+        """
+        if not self.has_alpha:
+            raise footage_error(f"{self.path.name} has no alpha.", "Give the mask as pictures of their own.")
+        with self._open() as container:
+            stream = _best_stream(container, self.path)
+            stream.thread_type = "AUTO"
+            decoder = None
+            if self._alpha_decoder:
+                decoder = av.CodecContext.create(self._alpha_decoder, "r")
+                decoder.extradata = stream.codec_context.extradata
+            for number, frame in enumerate(stored_frames(container, stream, decoder=decoder), start=1):
+                if number > last:
+                    return
+                if isinstance(frame, FFmpegError):
+                    continue
+                if (frame.width, frame.height) != self._size:
+                    raise footage_error(f"{self.path.name} changes its size at frame {number}.", "Export it in one.")
+                alpha = frame.reformat(format="rgba").to_ndarray()[..., 3].astype(np.float32) * np.float32(1 / 255)
+                if self._quarter_turns % 2:  # its pixels would be as much too high as they are too wide
+                    alpha = resize_float(alpha[..., None], *square_size(*self._size, self._aspect))[..., 0]
+                yield number, np.ascontiguousarray(np.rot90(alpha, self._quarter_turns))
 
     def plates(self, known: Known) -> PlateReader:
         """See `Source.plates`."""
@@ -235,24 +264,26 @@ class VideoSource:
         except FFmpegError as error:
             raise _no_video(self.path) from error
 
-    def _upright(self, frame: av.VideoFrame) -> tuple[NDArray[Any], float]:
-        """[H, W, 3] uint8 or uint16 sRGB, and the share of clipped pixels."""
+    def _upright(self, frame: av.VideoFrame) -> NDArray[Any]:
+        """[H, W, 3] uint8 or uint16 sRGB, or float16 light."""
+        if self._space.is_light:
+            return self.plate_of(frame)
         if self._space.as_it_stands:
-            pixels, clipped = rgb_codes(frame, self._coding, deep=self._deep), 0.0
+            pixels = rgb_codes(frame, self._coding, deep=self._deep)
         else:
-            values, clipped = self._space.to_srgb(exact_rgb(frame, self._coding))
+            values = self._space.to_srgb(exact_rgb(frame, self._coding))
             values = np.rint(values * np.float32(65535.0 if self._deep else 255.0))
             pixels = values.astype(np.uint16 if self._deep else np.uint8)
         width, height = square_size(frame.width, frame.height, self._aspect)
         pixels = resize(pixels, width, height)
-        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns)), clipped
+        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
 
     def _warn_about(self, frame: av.VideoFrame) -> None:
         space = self._space
         if space.transfer in ("pq", "hlg"):
             self.warnings.append(
                 (
-                    f"The clip is HDR ({space.name}): light above white ({DIFFUSE_WHITE_NITS:.0f} cd/m2) is cut.",
+                    f"The clip is HDR ({space.name}): converted to light, white at {DIFFUSE_WHITE_NITS:.0f} cd/m2.",
                     "Deliver it graded for SDR, or as scene-linear EXR, if it should look otherwise.",
                 )
             )
@@ -260,7 +291,7 @@ class VideoSource:
             self.warnings.append((f"The clip is {space.name}: converted to Rec.709.", ""))
         if self._interlaced:
             self.warnings.append(_deinterlaced_words("The clip is interlaced: each frame"))
-        if any(component.is_alpha for component in frame.format.components):
+        if self.has_alpha:
             self.warnings.append(("The clip has alpha: its colour is taken, its alpha is not.", ""))
 
 
@@ -305,6 +336,16 @@ def _best_stream(container: Any, path: Path) -> Any:
             "Export it as H.264 or ProRes, or as an image sequence.",
         )
     return max(streams, key=lambda s: (s.codec_context.width or 0) * (s.codec_context.height or 0))
+
+
+def _alpha_decoder_of(stream: Any) -> str:
+    """The decoder that gives the alpha of a clip whose own leaves it out; empty if its own does, or there is none.
+
+    VP8 and VP9 keep alpha as a second picture beside the first, which only Google's own decoder puts to it.
+    """
+    marked = {key.lower(): str(value) for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
+    decoder = {"vp8": "libvpx", "vp9": "libvpx-vp9"}.get(stream.codec_context.name, "")
+    return decoder if marked and decoder in av.codecs_available else ""
 
 
 def _first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:

@@ -11,7 +11,8 @@ filled: what the model missed in other plates (texture, edges, light) is carried
 to where plate m shows the same point, moved from t* to m as the model moves it. Plate t* is believed even where the
 model cannot explain it, because what it shows is the truth of the frozen instant; others where nothing moves, or where
 they agree with the model. b fades to the splats alone where no plate can be believed. Residuals are carried in display
-space, in which splats blend; A mixes scene-linear light, so that the same mix of an artist's plate gives the frame.
+space, in which splats blend and highlights have a shoulder; A mixes scene-linear light, so that the same mix of an
+artist's plate gives the frame.
 
 Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023, "DynIBaR"; figures: docs/benchmarks.md.
 """
@@ -26,6 +27,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from ..footage.display import PLAIN, Display
 from ..scene import Scene
 from ..shot import Shot
 from ..solve.motion import load_motion
@@ -55,7 +57,7 @@ class DetailedFrame:
     alpha: Tensor
     """[H, W] in 0..1."""
     splat: Tensor
-    """[H, W, 3] premultiplied, display-referred: the splats alone."""
+    """[H, W, 3] premultiplied, on `display`: the splats alone."""
     splat_alpha: Tensor
     """[H, W] in 0..1: how much of the pixel they cover."""
     plate: Tensor
@@ -77,13 +79,15 @@ class DetailedFrame:
     """[H, W] in 0..1: how much of the pixel the leading plate gives."""
     fill: Tensor
     """[H, W, 3] scene-linear, premultiplied by 1 - matte: the rest of the pixel."""
+    display: Display = PLAIN
+    """What `splat` and `color` are shown on."""
 
     @property
     def color(self) -> Tensor:
-        """[H, W, 3] `linear`, extended display-referred; made anew each time, because few need it whole."""
+        """[H, W, 3] `linear` on its display, uncut; made anew each time, because few need it whole."""
         out = torch.empty_like(self.linear)
         for rows in bands(*self.alpha.shape):
-            out[rows] = to_display(self.linear[rows])
+            out[rows] = to_display(self.linear[rows], self.display)
         return out
 
 
@@ -195,7 +199,7 @@ class Detailer:
             image.alpha if ours else image.alpha.clone(), splat.color, splat.alpha,
             torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
             image.support, resized(posed.moved, columns, rows), leading, st, matte,
-            torch.zeros(rows, columns, 3, device="cpu"),
+            torch.zeros(rows, columns, 3, device="cpu"), self.scene.display,
         )  # fmt: skip
         for band in parts:
             filling = None if fillers is None else fill(self.seen, self.config, posed, fillers, matte, band)
@@ -233,7 +237,10 @@ class Detailer:
             alpha[at] += (1.0 - alpha[at]) * filling.share
             covered = torch.maximum(alpha, matte)[at].clamp_min(1e-4)[:, None]
             color = filling.color if self.plates.deep else filling.color.clamp(0.0, 1.0)
-            fill[at] = left[:, None] * covered * to_linear(color / covered)
+            color = color / covered
+            if made.display.bends:  # what is carried a little too far would be many times as bright
+                color = color.clamp_max(filling.most)
+            fill[at] = left[:, None] * covered * to_linear(color, made.display)
             share[at] += left * filling.share
             source[at] = torch.where(left > 0.5, filling.source, float(made.leading))
         torch.maximum(alpha, matte, out=alpha)

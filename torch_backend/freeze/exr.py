@@ -25,9 +25,9 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
-from ..contract import FRAME_LAYERS, channels_of, layers_of
+from ..contract import FRAME_LAYERS, channels_of, layers_of, parse_timecode
+from ..contract.timecode import smpte_bits
 from ..footage.color import LIGHTS, PRIMARIES, InputSpace, in_light, light_matrix, light_of_chromaticities
-from ..footage.timecode import parse_timecode, smpte_bits
 from ..shot import atomic_path
 
 CHANNELS = channels_of("")

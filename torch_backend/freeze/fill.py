@@ -34,6 +34,8 @@ class Fillers:
     """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
     residuals: list[Tensor]
     """[H, W, 3] float16 each, as `Sightings.residual`."""
+    most: float
+    """The largest number in any of them, or in a working frame if that is more."""
 
 
 @dataclass
@@ -50,6 +52,8 @@ class Filling:
     """[P] in 0..1: how much of it is plate."""
     source: Tensor
     """[P] number of the frame that gives most."""
+    most: float = 1.0
+    """As in `Fillers`."""
 
 
 def fillers_of(
@@ -62,7 +66,9 @@ def fillers_of(
     moved, unknown = displacements(sightings, posed, chosen)
     shown = _shown(sightings, config, posed, chosen, moved)
     agreed = _agreed(sightings, config, posed, chosen, moved)
-    return Fillers(chosen, moved, unknown, shown, agreed, [sightings.residual(frame) for frame in chosen])
+    residuals = [sightings.residual(frame) for frame in chosen]
+    most = max(sightings.scene.display.most, *(sightings.most(frame) for frame in chosen))
+    return Fillers(chosen, moved, unknown, shown, agreed, residuals, most)
 
 
 def _shown(
@@ -113,7 +119,8 @@ def fill(
     at = (matte[rows] < WHOLE).nonzero()
     y, x = at[:, 0], at[:, 1]
     count = len(at)
-    filling = Filling(y, x, posed.image.color[rows][y, x], *(torch.zeros(count, device="cpu") for _ in range(2)))
+    share, source = (torch.zeros(count, device="cpu") for _ in range(2))
+    filling = Filling(y, x, posed.image.color[rows][y, x], share, source)
     if not count:
         return filling
     pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
@@ -148,6 +155,7 @@ def fill(
     for n, residual in enumerate(fillers.residuals):
         carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
     filling.color += carried * filling.share[:, None]
+    filling.most = fillers.most
     return filling
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..footage.color import srgb_to_linear
+from ..footage.display import PLAIN, Display
 from ..footage.images import read_frame
 from ..scene import evenly_spaced
 
@@ -66,10 +67,15 @@ class Grain:
         }
 
 
-def measure_plate(files: Sequence[Path]) -> Grain:
-    """Grain of a plate from up to `SAMPLED` of its PNG frames, spread over it. JobError if one cannot be read."""
+def measure_plate(files: Sequence[Path], display: Display) -> Grain:
+    """Grain of a plate from up to `SAMPLED` of its PNG frames, spread over it. JobError if one cannot be read.
+
+    Measured on sRGB, cut at white, whatever `display` they are in: on a shoulder the same grain is next to nothing, and
+    what is guessed from darker levels would be many times too much.
+    """
     picked = evenly_spaced(len(files), SAMPLED)
-    return measure([read_frame(files[i]) for i in picked])
+    frames = [read_frame(files[i]) for i in picked]
+    return measure([PLAIN.codes(display.srgb_of(frame)) for frame in frames] if display.bends else frames)
 
 
 def measure(frames: Sequence[NDArray[Any]]) -> Grain:

@@ -190,7 +190,7 @@ class _Bench:
     def _read(self, index: int) -> View:
         scene, size = self.scene, (self.width, self.height)
         if self._plates is None:
-            picture = read_image(scene.image_path(index), *size).numpy()
+            picture = read_image(scene.image_path(index), *size, scene.display).numpy()
         else:
             picture = _resized(self._plates.display(scene.frames[index]).numpy().clip(0.0, 1.0), *size)
         return self.camera(index, np.ascontiguousarray(picture, np.float32))

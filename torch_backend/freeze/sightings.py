@@ -50,7 +50,7 @@ class PlateReader(Protocol):
     """True if values may lie beyond 0 and 1."""
 
     def display(self, frame: int) -> Tensor:
-        """[height, width, 3] float32, extended display-referred."""
+        """[height, width, 3] float32, in the scene's display, uncut."""
         ...
 
     def linear(self, frame: int, rows: slice = ...) -> Tensor:
@@ -159,6 +159,7 @@ class Sightings:
         """[F, 3] camera centres of the clip's frames, scene units."""
         self._views: OrderedDict[int, PlateView] = OrderedDict()
         self._residuals: OrderedDict[int, Tensor] = OrderedDict()
+        self._most: dict[int, float] = {}
 
     def camera(self, frame: int, width: int, height: int) -> tuple[Tensor, Tensor]:
         """(viewmat [4, 4], K [3, 3]) of a frame of the clip at a picture size."""
@@ -189,6 +190,12 @@ class Sightings:
                 self._residuals.popitem(last=False)
         self._residuals.move_to_end(frame)
         return self._residuals[frame]
+
+    def most(self, frame: int) -> float:
+        """The largest number in plate `frame`."""
+        if frame not in self._most:
+            self.residual(frame)
+        return self._most[frame]
 
     def difference(self, a: Tensor, b: Tensor, lowpass: float = 0.5) -> Tensor:
         """[h, w] greatest difference over channels of two pictures [h, w, 3] of decisions, under `lowpass` of ours."""
@@ -230,6 +237,7 @@ class Sightings:
         if shown is None:
             shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
         plate = self.plates.display(frame)
+        self._most[frame] = float(plate.max())
         out = torch.empty(height, width, 3, dtype=torch.float16, device="cpu")
         ignored = self.view(frame).ignored
         if fine == 1.0 and ignored is None:
@@ -256,7 +264,7 @@ class Sightings:
         matte = self.moving(frame)
         moving = image.motion if matte is None else resized(matte, width, height)
         # The working frame will do, and need not be decoded from 4K footage.
-        plate = read_image(self.scene.image_path(self.index[frame]), width, height)
+        plate = read_image(self.scene.image_path(self.index[frame]), width, height, self.scene.display)
         ignored = self._ignored(frame)
         if ignored is not None:  # there is nothing that the model could miss
             plate = torch.lerp(plate, image.color, ignored)

@@ -28,14 +28,16 @@ from ..contract import (
     Reporter,
     Verdict,
     frame_file,
+    later,
+    parse_timecode,
     read_json,
     verdict_of,
 )
-from ..footage.color import LIGHTS, premultiplied_srgb_to_linear
+from ..footage.color import LIGHTS, on_straight_colour
+from ..footage.display import PLAIN, Display
 from ..footage.images import read_png, write_png
 from ..footage.importing import load_frames
 from ..footage.plates import Plates
-from ..footage.timecode import later, parse_timecode
 from ..gaussians.ply import write_ply
 from ..scene import Scene, frame_table, load_scene
 from ..shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, write_json
@@ -209,7 +211,7 @@ def detail_key(shot: Shot, detail: Detailer | None) -> str:
 def plate_grain(shot: Shot, scene: Scene) -> Grain:
     """Grain of the shot's undistorted frames, which frozen ones are mixed with."""
     files = [shot.plate(n) for n in scene.frames]
-    return measure_plate([path for path in files if path.is_file()])
+    return measure_plate([path for path in files if path.is_file()], scene.display)
 
 
 def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, report: Reporter) -> int:
@@ -347,12 +349,12 @@ def _write_frame(
     def rgba(rows: slice) -> np.ndarray:
         if isinstance(image, DetailedFrame):
             return np.concatenate([image.linear[rows].numpy(), alpha[rows][..., None]], axis=2)
-        return scene_linear(image.color[rows].numpy(), alpha[rows])
+        return scene_linear(image.color[rows].numpy(), alpha[rows], scene.display)
 
     layers = None
     if isinstance(image, DetailedFrame):
         splat, covered = image.splat.numpy(), image.splat_alpha.numpy()
-        shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows]))
+        shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows], scene.display))
         layers = DetailLayers(shown, image.plate, image.source)
     write_frozen_exr(
         folder / frame_file(output.frame, ".exr"),
@@ -370,18 +372,24 @@ def _write_frame(
             light=spec.light,
         ),
         spec.beyond,
-        None if spec.grain is None else _grain(spec.grain, output.frame, image, spec),
+        None if spec.grain is None else _grain(spec.grain, output.frame, image, spec, scene.display),
         layers,
     )
 
 
-def _grain(grain: Grain, frame: int, image: FrozenImage | DetailedFrame, spec: FrameSpec) -> Made:
-    """The layer of a frame's grain, [H, W, 3] scene-linear, premultiplied."""
+def _grain(
+    grain: Grain, frame: int, image: FrozenImage | DetailedFrame, spec: FrameSpec, display: Display
+) -> Made:  # fmt: skip
+    """The layer of a frame's grain, [H, W, 3] scene-linear, premultiplied. It was measured on sRGB, whatever `display`
+    the frame's splats are shown on."""
     brush = Brush(grain, frame, image.alpha.shape, spec.whole_grain_size)
 
     def drawn(rows: slice) -> np.ndarray:
-        shown = torch.cat([_display(image, rows), image.alpha[rows][..., None]], dim=2)
-        made = brush.rows(rows, shown.numpy())
+        colour = to_display(image.linear[rows], PLAIN) if isinstance(image, DetailedFrame) else image.color[rows]
+        shown = torch.cat([colour, image.alpha[rows][..., None]], dim=2).numpy()
+        if display.bends and not isinstance(image, DetailedFrame):
+            shown = on_straight_colour(shown, lambda x: display.straightened(np.asarray(x, np.float32)))
+        made = brush.rows(rows, shown)
         if isinstance(image, DetailedFrame):  # plates have theirs
             made = made * (1.0 - image.plate[rows].numpy()[..., None])
         return made
@@ -390,8 +398,8 @@ def _grain(grain: Grain, frame: int, image: FrozenImage | DetailedFrame, spec: F
 
 
 def _display(image: FrozenImage | DetailedFrame, rows: slice) -> Tensor:
-    """[h, W, 3] some rows of a frame, premultiplied, display-referred."""
-    return to_display(image.linear[rows]) if isinstance(image, DetailedFrame) else image.color[rows]
+    """[h, W, 3] some rows of a frame, premultiplied, on the scene's display."""
+    return to_display(image.linear[rows], image.display) if isinstance(image, DetailedFrame) else image.color[rows]
 
 
 def _preview(image: FrozenImage | DetailedFrame, spec: FrameSpec) -> np.ndarray:
@@ -450,14 +458,15 @@ def detail_facts(shares: dict[int, Tensor]) -> dict[str, Any]:
     return {**means, "per_frame": rows}
 
 
-def scene_linear(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Premultiplied display-referred colour [H, W, 3] and alpha [H, W] -> premultiplied scene-linear RGBA [H, W, 4].
+def scene_linear(color: np.ndarray, alpha: np.ndarray, display: Display) -> np.ndarray:
+    """Premultiplied colour [H, W, 3] of a display and alpha [H, W] -> premultiplied scene-linear RGBA [H, W, 4].
 
     Splats blend in display space; the conversion acts on the colour that is seen, so it goes through straight alpha.
     """
-    # Beyond white there is no plate to match: the model was trained on [0, 1], overshoot is noise.
-    capped = np.clip(color, 0.0, alpha[..., None])
-    return premultiplied_srgb_to_linear(np.concatenate([capped, alpha[..., None]], axis=2))
+    # Beyond what any frame of the clip shows there was nothing to match in training: overshoot is noise, which at the
+    # end of a shoulder would be many times as bright.
+    capped = np.clip(color, 0.0, alpha[..., None] * np.float32(display.most))
+    return display.premultiplied_to_light(np.concatenate([capped, alpha[..., None]], axis=2))
 
 
 def _finish(

@@ -38,9 +38,10 @@ class WorkingPlates:
         return self._viewmats[i], self._Ks[i], self.width, self.height
 
     def picture(self, frame: int) -> Tensor:
-        """[H, W, 3] display-referred in 0..1."""
+        """[H, W, 3] in 0..1 of the scene's display."""
         if frame not in self._pictures:
-            image = read_image(self.scene.image_path(self.index[frame]), self.width, self.height)
+            path = self.scene.image_path(self.index[frame])
+            image = read_image(path, self.width, self.height, self.scene.display)
             self._pictures[frame] = (image * 255.0).round().byte()
         return self._pictures[frame].to(self.device).float() / 255.0
 

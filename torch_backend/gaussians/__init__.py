@@ -2,6 +2,6 @@
 
 from .densify import Densifier, DensifyConfig
 from .initialise import InitConfig, initialise
-from .model import PARAM_NAMES, Gaussians, sh_bases
+from .model import PARAM_NAMES, Gaussians, covering, sh_bases
 
-__all__ = ["PARAM_NAMES", "Densifier", "DensifyConfig", "Gaussians", "InitConfig", "initialise", "sh_bases"]
+__all__ = ["PARAM_NAMES", "Densifier", "DensifyConfig", "Gaussians", "InitConfig", "covering", "initialise", "sh_bases"]

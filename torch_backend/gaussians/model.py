@@ -64,25 +64,28 @@ class Gaussians:
 
     @torch.no_grad()
     def rebuild(self, parent: Tensor, fresh: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        """Makes row i a copy of row `parent[i]` [M]; rows marked `fresh` [M] start with zero optimiser moments."""
+        """Makes row i a copy of row `parent[i]` [M]; rows marked `fresh` [M] start with zero optimiser moments.
+
+        All of it or, if memory ends meanwhile, nothing.
+        """
+        made = {name: nn.Parameter(old.detach()[parent].contiguous()) for name, old in self.params.items()}
+        is_open, support, hidden = self.open[parent], self.support[parent], self.hidden[parent]
+        states: dict[str, dict[str, Tensor]] = {}
+        for name, old in self.params.items():
+            state: dict[str, Tensor] = dict(optimizer.state.get(old, {}))
+            for key, value in state.items():
+                if value.shape == old.shape:
+                    state[key] = value[parent].contiguous()
+                    state[key][fresh] = 0.0
+            states[name] = state
         replaced: dict[int, nn.Parameter] = {}
         for name, old in self.params.items():
-            new = nn.Parameter(old.detach()[parent].contiguous())
-            state = optimizer.state.pop(old, None)
-            if state is not None:
-                for key, value in state.items():
-                    if value.shape == old.shape:
-                        moved = value[parent].contiguous()
-                        moved[fresh] = 0.0
-                        state[key] = moved
-                optimizer.state[new] = state
-            replaced[id(old)] = new
-            self.params[name] = new
+            if optimizer.state.pop(old, None) is not None:
+                optimizer.state[made[name]] = states[name]
+            replaced[id(old)] = self.params[name] = made[name]
         for group in optimizer.param_groups:
             group["params"] = [replaced.get(id(p), p) for p in group["params"]]
-        self.open = self.open[parent].contiguous()
-        self.support = self.support[parent].contiguous()
-        self.hidden = self.hidden[parent].contiguous()
+        self.open, self.support, self.hidden = is_open.contiguous(), support.contiguous(), hidden.contiguous()
 
     def state(self) -> dict[str, Tensor]:
         """Tensors for a checkpoint; the bitmap packed to bytes."""
@@ -112,6 +115,15 @@ class Gaussians:
         if "gaussians.hidden" in tensors:  # earlier checkpoints did not look
             model.hidden = unpack_bits(tensors["gaussians.hidden"], bins)
         return model
+
+
+@torch.no_grad()
+def covering(model: Gaussians, count: int) -> Tensor:
+    """Rows int64 [count], ascending, of the Gaussians that cover most: by opacity times the area of their two longest
+    axes."""
+    area = model.params["log_scales"].topk(2, dim=1).values.sum(1)
+    weight = torch.nn.functional.logsigmoid(model.params["opacity_logits"]) + area
+    return weight.topk(count).indices.sort().values
 
 
 def _weights(device: torch.device) -> Tensor:

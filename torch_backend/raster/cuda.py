@@ -3,11 +3,13 @@
 Needs no CUDA toolkit: Warp brings the compiler and caches what it made. With tensors on the CPU the very same kernels
 run on Warp's CPU fibers: slow, for tests on machines without a GPU.
 
-**The list of hits** has a fixed capacity per call, so that nothing is read back. The capacity follows the calls before:
-the device keeps the most hits that a call of this device, camera count and image size ever wanted, and sends the figure
-to the host without anyone waiting for it. A call with more hits than its list holds is slower, never wrong: its tiles
-then search all Gaussians in depth order (see `cuda_source.py`), and a later call has a larger list. `RasterOutput.hits`
-says, on the device, how many hits a call had and how many its list held.
+**The list of hits** has a fixed capacity per call, so that nothing is read back. The first call of a device, camera
+count and image size waits for the number of its hits: no guess would do, from 4 tiles a Gaussian to 40. From then on
+the device keeps the most hits that such a call ever wanted, and sends the figure to the host without anyone waiting for
+it; more Gaussians than before are given as many each. A call with more hits than its list holds is slower, never wrong:
+its tiles then search all Gaussians in depth order (see `cuda_source.py`), and a later call has a larger list. A list
+takes a quarter of the card's free memory at most. `RasterOutput.hits` says, on the device, how many hits a call had and
+how many its list held.
 
 **CUDA graphs.** `rasterize` and its backward pass can be captured, for instance by `torch.cuda.graph`, after a call of
 the same shapes and its backward pass outside (they compile the kernels). The list then stays as large as it was at
@@ -34,6 +36,8 @@ MAX_CHANNELS = 64 - source.MOMENTS
 """Channels, depth included, that one call can carry."""
 _HITS_MAX = 2**27
 _HITS_STEP = 2**12
+HIT_BYTES = 40
+"""Bytes of one hit: its tile and slot, both sorted, the order that sorts them, and the sort's own scratch."""
 _lock = threading.RLock()
 _kernels: dict[tuple[str, int], Any] = {}
 _demands: dict[tuple[torch.device, int, int, int], "_Demand"] = {}
@@ -130,14 +134,20 @@ class _Demand:
             self.most = torch.zeros(1, dtype=torch.int64, device=device)
             self.echo = torch.zeros(1, dtype=torch.int64, pin_memory=device.type == "cuda")
         self.host = self.echo.numpy()
-        self.capacity = 0
+        self.capacity = self.slots = 0
 
-    def grow(self, slots: int) -> None:
-        """Room for a third more than was wanted so far; for four tiles a Gaussian before anything is known."""
-        demand = int(self.host[0])
+    def grow(self, hit_count: Tensor) -> None:
+        """Room for a third more than was wanted so far; before that is known, than the hits of this call, which are
+        waited for. hit_count: int32 [slots] on the device."""
+        slots = hit_count.shape[0]
+        demand = int(self.host[0]) if self.capacity else int(hit_count.sum(dtype=torch.int64))
+        if self.slots and slots > self.slots:
+            demand = demand * slots // self.slots
+        self.slots = max(self.slots, slots)
         if self.capacity == 0 or demand > 0.9 * self.capacity:
-            demand = demand * 4 // 3 if demand else 4 * slots
-            self.capacity = min(-(-max(demand, self.capacity, 1) // _HITS_STEP) * _HITS_STEP, _HITS_MAX)
+            wanted = max(demand * 4 // 3, self.capacity, 1)
+            most = max(min(_hits_at_most(self.most.device), _HITS_MAX), self.capacity, _HITS_STEP)
+            self.capacity = min(-(-wanted // _HITS_STEP) * _HITS_STEP, most)
 
     def report(self) -> None:
         """Send the maximum to the host, behind the work queued so far; whoever asks before it arrives sees the last."""
@@ -145,12 +155,27 @@ class _Demand:
             self.echo.copy_(self.most, non_blocking=True)
 
 
+def _hits_at_most(device: torch.device) -> int:
+    """Hits whose list fits a quarter of what is free on the device."""
+    if device.type != "cuda":
+        return _HITS_MAX
+    free, _ = torch.cuda.mem_get_info(device)
+    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return max(1, free // 4 // HIT_BYTES)
+
+
+def forget_demands() -> None:
+    """Drops the lists' sizes: each is asked for anew, by the memory that is free then."""
+    with _lock:
+        _demands.clear()
+
+
 def _capturing(device: torch.device) -> bool:
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
-def _demand(scene: Scene) -> _Demand:
-    """The demand of calls like this one, brought up to date."""
+def _demand(scene: Scene, hit_count: Tensor) -> _Demand:
+    """The demand of calls like this one, of hit_count int32 [slots], brought up to date."""
     device, cameras = scene.means.device, scene.viewmats.shape[0]
     with _lock:
         key = (device, cameras, scene.width, scene.height)
@@ -161,7 +186,7 @@ def _demand(scene: Scene) -> _Demand:
                     "size and number of cameras outside the capture"
                 )
             _demands[key] = _Demand(device)
-        _demands[key].grow(cameras * scene.means.shape[0])
+        _demands[key].grow(hit_count)
         return _demands[key]
 
 
@@ -352,7 +377,7 @@ class _Rasterize(torch.autograd.Function):
         _point(args, record=record, aux=aux, hit_count=hit_count, depth_key=depth_key)
         _point(args, radii=out.radii, means2d=out.means2d)
         launch("raster_project", args, slots)
-        binned = _bin(launch, args, _demand(scene), depth_key, hit_count)
+        binned = _bin(launch, args, _demand(scene, hit_count), depth_key, hit_count)
         _point(args, image=out.image, alpha=out.alpha, median=out.median, top_id=out.top_id, top_weight=out.top_weight)
         _point(args, weight_sum=out.weight_sum, weight_max=out.weight_max)
         launch("raster_blend", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)

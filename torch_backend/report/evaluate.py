@@ -203,7 +203,7 @@ def _of_frame(truth: TruthScene, run: LoadedRun, scene: Scene, frame: int) -> He
         background=background, with_depth=False, with_contributions=False,
     )  # fmt: skip
     image = model.exposure.apply(out.colors[0], time_of).cpu()
-    plate = read_image(truth.shot.plate(frame), *size)
+    plate = read_image(truth.shot.plate(frame), *size, scene.display)
     return HeldOut(frame, psnr_by_region(image, plate, truth.frame_regions(frame, *size)))
 
 

@@ -32,6 +32,7 @@ from ..contract import (
     open_regular,
 )
 from ..footage import load_frames
+from ..footage.display import display_of
 from ..footage.images import is_whole_png, read_frame, write_png
 from ..footage.lens_tags import focal_px
 from ..footage.masks import Mask, read_masks
@@ -47,7 +48,7 @@ from .masks import facts_of, given_masks, more_features, write_matching, write_u
 from .points import filter_points
 from .poses import camera_centre, fill_poses
 from .stored import load_cameras, load_points, load_record
-from .undistort import Undistorter
+from .undistort import BandUndistorter, Undistorter
 from .verdict import FAIR_ERROR_PX, quality_words
 
 SOLVE_VERSION = 1
@@ -426,11 +427,17 @@ def _undistort(
     """Frames of one lens; `counts` are the frames done before these, and all there are."""
     before, total = counts
     with np.load(file, allow_pickle=False) as data:
-        undistort = Undistorter(data["where"])
+        where = data["where"]
+    undistort, bands = Undistorter(where), BandUndistorter(where)
+    display = display_of(load_frames(shot))
 
     def one(frame: dict[str, Any]) -> int:
         pixels = read_frame(shot.frames / frame["file"])
-        write_png(into.frames / frame_file(frame["frame"], PICTURE), undistort(pixels))
+        if display.bends:  # highlights are not to ring, see `display`
+            pixels = bands(pixels, display.srgb_of, display.codes, np.empty(pixels.shape, np.uint16))
+        else:
+            pixels = undistort(pixels)
+        write_png(into.frames / frame_file(frame["frame"], PICTURE), pixels)
         if masks:
             write_undistorted(masks, frame["frame"], undistort, into.solve)
         return frame["frame"]

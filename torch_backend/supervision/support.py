@@ -63,7 +63,7 @@ def mark_hidden(
     height, width = depth.shape
     camera = state["means"].detach()[rows] @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = camera[:, 2]
-    pixels = camera[:, :2] / z.clamp_min(1e-6)[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
+    pixels = camera[:, :2] / z.clamp_min(1e-6)[:, None] * K.diagonal()[:2] + K[:2, 2]
     inside = (z > 1e-6) & (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     at = torch.nan_to_num(pixels).long()
     seen = depth.detach()[at[:, 1].clamp(0, height - 1), at[:, 0].clamp(0, width - 1)]

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..deformation import Deformation, Deltas, apply_deltas, host
 from ..gaussians import Gaussians
 from ..raster import RasterOutput, rasterize
+from ..torch_types import checkpoint
 from .config import TrainConfig
 from .exposure import Exposure
 
@@ -31,6 +32,8 @@ class DynamicModel:
     """SH degree in use."""
     exposure: Exposure
     """How the camera exposed each frame; the Gaussians' colours are those of no correction."""
+    pieces: int | None = None
+    """Gaussians that the field works on at a time, where memory is short; None: all."""
     _rows: tuple[Tensor, int, Tensor] | None = dataclasses.field(default=None, repr=False)
 
     @property
@@ -52,7 +55,20 @@ class DynamicModel:
         """The field at the canonical means of `rows` [M]; times [M] or [1]. None without a field or rows."""
         if self.field is None or not len(rows):
             return None
-        return self.field(self.gaussians.params["means"][rows], times, self.gaussians.own(rows))
+        return self.ask(self.field, self.gaussians.params["means"][rows], times, self.gaussians.own(rows))
+
+    def ask(self, field: Deformation, means: Tensor, times: Tensor, own: Mapping[str, Tensor]) -> Deltas:
+        """The field at means [M, 3] and times [M] or [1]; in pieces, whose work is done again on the way back."""
+        if self.pieces is None or len(means) <= self.pieces:
+            return field(means, times, own)
+        parts: list[Deltas] = []
+        for first in range(0, len(means), self.pieces):
+            rows = slice(first, first + self.pieces)
+            when = times if len(times) == 1 else times[rows]
+            held = {name: value[rows] for name, value in own.items()}
+            parts.append(checkpoint(field, means[rows], when, held))
+        joined = [None if part[0] is None else torch.cat(part) for part in zip(*parts, strict=True)]
+        return Deltas(*joined)  # type: ignore[arg-type]
 
     def moved(self, rows: Tensor, deltas: Deltas | None) -> dict[str, Tensor]:
         """All parameters where `deltas` have met those of rows [M], with gradients."""

@@ -43,6 +43,7 @@ class Poses:
         self.config, self._times = config, np.asarray(times)
         self.values = torch.nn.Parameter(torch.zeros(len(times), 6, device=device))
         """[I, 6]: turn in radians about the scene's axes through its origin, and shift in scene units."""
+        self._gauge = _Gauge(self._times, set(), device)
 
     def at(self, times: np.ndarray, held: set[int] | None = None) -> Tensor:
         """Corrections [T, 6] at normalised times [T], linear between the trained frames that are not in `held`."""
@@ -54,15 +55,57 @@ class Poses:
     @torch.no_grad()
     def fix_gauge(self, held: set[int]) -> None:
         """After a step: takes the mean correction out, and puts frames in `held` between their neighbours."""
-        keep = [n for n in range(len(self._times)) if n not in held]
-        self.values -= self.values[keep].mean(0)
-        if held:
-            rows = sorted(held)
-            self.values[rows] = self.at(self._times[rows], held)
+        if self._gauge.held != held:
+            self._gauge = _Gauge(self._times, set(held), self.values.device)
+        gauge = self._gauge
+        self.values -= self.values[gauge.keep].mean(0)
+        if not held:
+            return
+        if self.values.device.type == "cpu":
+            self.values[gauge.rows] = self.at(self._times[gauge.rows.numpy()], held)
+        else:
+            self.values[gauge.rows] = torch.lerp(self.values[gauge.left], self.values[gauge.right], gauge.share)
 
     def regularisation(self) -> Tensor:
         """No larger than needed."""
         return self.config.small * self.values.square().mean()
+
+
+class _Gauge:
+    """Indices into the frames, on the device: made where frames are held back anew, so that no step waits for them."""
+
+    def __init__(self, times: np.ndarray, held: set[int], device: torch.device) -> None:
+        keep = np.asarray([n for n in range(len(times)) if n not in held])
+        rows = np.asarray(sorted(held), dtype=np.int64)
+        right = np.searchsorted(times[keep], times[rows]).clip(0, len(keep) - 1)
+        left = np.where(times[rows] < times[keep[right]], (right - 1).clip(0), right)
+        span = np.maximum(times[keep[right]] - times[keep[left]], 1e-12)
+        share = ((times[rows] - times[keep[left]]) / span).clip(0.0, 1.0)
+        self.held = held
+        self.keep, self.rows, self.left, self.right = (
+            from_numpy(index.astype(np.int64)).to(device) for index in (keep, rows, keep[left], keep[right])
+        )
+        self.share = from_numpy(share.astype(np.float32)[:, None]).to(device)
+
+
+_HALVED = 4
+"""A twist is halved so often before its series: a turn of a radian has 1/16 of one left, and float32 needs 6 terms."""
+
+
+def _exponential(twist: Tensor) -> Tensor:
+    """exp of twists [..., 4, 4]. On a GPU by its series: torch's own has the host wait for one."""
+    return matrix_exp(twist) if twist.device.type == "cpu" else _series(twist)
+
+
+def _series(twist: Tensor) -> Tensor:
+    """exp of twists [..., 4, 4] of at most a radian or a unit."""
+    small, one = twist / 2.0**_HALVED, torch.eye(4, dtype=twist.dtype, device=twist.device)
+    total = one
+    for n in range(6, 0, -1):
+        total = one + small @ total / n
+    for _ in range(_HALVED):
+        total = total @ total
+    return total
 
 
 def corrected(viewmats: Tensor, corrections: Tensor) -> Tensor:
@@ -72,4 +115,4 @@ def corrected(viewmats: Tensor, corrections: Tensor) -> Tensor:
     twist = unflatten(torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1), -1, (3, 3))
     twist = torch.cat([twist, corrections[..., 3:, None]], dim=-1)
     twist = torch.cat([twist, torch.zeros_like(twist[..., :1, :])], dim=-2)
-    return viewmats @ matrix_exp(twist)
+    return viewmats @ _exponential(twist)

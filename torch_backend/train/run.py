@@ -30,6 +30,7 @@ from .device import choose_device, unused_card
 from .evidence import gather_evidence
 from .extend import EXTENSION_FILE, pending
 from .ignored import load_ignored
+from .memory import MemoryPlan, free_bytes, plan_memory
 from .model import DynamicModel, restore_model
 from .modelled import modelled
 from .movers import Mattes, load_movers
@@ -102,11 +103,14 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
             "The run's settings, cameras or motion mattes changed: it is trained anew.",
             "The run that is there stays until the new one is done.",
         )
-    images = place_images(load_images(scene, train + test, width, height, report, folder), device)
+    images = load_images(scene, train + test, width, height, report, folder)
+    plan = planned(config, (width, height), len(train), images, device, report)
+    images = place_images(images, device, plan)
     identity = {"key": key, "solve": solve_key(shot), "motion": motion}
     movers = load_movers(functools.partial(load_motion, shot), scene, train, width, height) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, width, height)
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored)
+    limits = () if plan is None else (plan.gaussians, plan.pieces)
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored, *limits)
     checkpoint = folder / CHECKPOINT_FILE
     resumed = _resume(trainer, checkpoint, params.resume, report)
     for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
@@ -158,13 +162,16 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     device = _prepared_device(config, params, report)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     size = training_size(scene, config.width)
-    images = place_images(load_images(scene, train + test, *size, report, folder), device)
+    images = load_images(scene, train + test, *size, report, folder)
+    plan = planned(config, size, len(train), images, device, report, int(before["gaussians"]))
+    images = place_images(images, device, plan)
     held_out = images[len(train) :]
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     identity = {"key": facts["key"], "solve": facts["solve"], "motion": motion}
     movers = load_movers(functools.partial(load_motion, shot), scene, train, *size) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, *size)
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored)
+    limits = () if plan is None else (plan.gaussians, plan.pieces)
+    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored, *limits)
     begun = pending(folder, facts) if params.resume else None
     if before["iterations"] != facts["iteration"]:  # it was killed between its last two files: only figures are missing
         trainer.restore(checkpoint)
@@ -203,13 +210,25 @@ def _prepared_device(config: TrainConfig, params: TrainParams, report: Reporter)
     return device
 
 
-def place_images(images: Tensor, device: torch.device) -> Tensor:
-    """Images [I, H, W, 3] on the device, or if they would fill half of what is free there in pinned host memory, or
-    if they are too many for that, too, where they are."""
+def planned(
+    config: TrainConfig, size: tuple[int, int], frames: int, images: Tensor, device: torch.device, report: Reporter,
+    gaussians: int = 0,
+) -> MemoryPlan | None:  # fmt: skip
+    """How a run of so many trained frames of `size` px, whose images with those held out are `images`, fits its card;
+    said if it is smaller than asked for. None on the processor. gaussians: how many a run has that only goes on."""
     if device.type == "cpu":
+        return None
+    plan = plan_memory(config, size, frames, images.nbytes, free_bytes(device), gaussians)
+    if plan.sentence:
+        report.warning(plan.sentence)
+    return plan
+
+
+def place_images(images: Tensor, device: torch.device, plan: MemoryPlan | None) -> Tensor:
+    """Images [I, H, W, 3] on the device if they are to lie there, else in host memory: pinned, unless too many."""
+    if plan is None:
         return images
-    free, _ = torch.cuda.mem_get_info(device)
-    if images.nbytes <= free // 2:
+    if plan.on_card:
         return images.to(device)
     return images.pin_memory() if images.nbytes <= HELD_BYTES else images
 

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from ..contract import Cancelled, ExitCode, JobError, Reporter
 from ..deformation import Deformation, Deltas, Rehearsal, Start, field_box, host, split_deltas
-from ..gaussians import Densifier, initialise
+from ..gaussians import Densifier, DensifyConfig, covering, initialise
 from ..raster import RasterOutput
+from ..raster.cuda import forget_demands
 from ..scene import Scene
 from ..supervision import Anchored, bin_of, bin_times, draw_anchored, mark_hidden, mark_seen, stillness, support_loss
 from ..torch_types import backward, integers, norm_of_all
+from . import memory
 from .average import ParameterMean
 from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
@@ -55,6 +57,8 @@ class Trainer:
         device: where it trains.
         movers: bool [I, H, W] what the motion mattes call moving in the training frames; None: there are no mattes.
         ignored: index of a frame of the scene -> bool [H, W] which of its pixels teach nothing, and are not measured.
+        most: Gaussians that fit the device's memory, where they are fewer than the configuration's.
+        pieces: Gaussians that the field works on at a time; None: all.
     """
 
     def __init__(
@@ -68,6 +72,8 @@ class Trainer:
         device: torch.device | str = "cpu",
         movers: Tensor | None = None,
         ignored: dict[int, Tensor] | None = None,
+        most: int | None = None,
+        pieces: int | None = None,
     ) -> None:
         self.identity, self.device = identity or {}, torch.device(device)
         self.scene, self.images, self.train_ids, self.config, self.report = scene, images, train, config, report
@@ -83,11 +89,12 @@ class Trainer:
         centres = bin_times(scene.times[train])
         self._bins = [bin_of(centres, time) for time in self.times]
         self.centres = centres.to(self.device)
-        budget = config.densify.budget
+        self.most, self.pieces = most, pieces
+        budget = self._densify_config().budget
         count = len(self.centres)
         gaussians = initialise(scene, images, train, count, config.init, self.generator, budget, self.ignored)
         gaussians = gaussians.to(self.device)
-        self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure))
+        self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure), pieces)
         self.initial = len(gaussians)
         gate, densify = config.gate, config.densify
         schedule = RunSchedule(
@@ -108,7 +115,7 @@ class Trainer:
         self._refined = False
         self.optimizer = optimizer_of(self.model, self.poses, config)
         self.mean = ParameterMean()
-        self.densifier = Densifier(config.densify, len(gaussians), self.device)
+        self.densifier = Densifier(self._densify_config(), len(gaussians), self.device)
         self._bad = torch.zeros(2, dtype=torch.int32, device=self.device)
         self._saved_at = time.perf_counter()
 
@@ -162,8 +169,10 @@ class Trainer:
         try:
             while self.iteration < self.end:
                 self.report.check_cancelled()
-                self.schedule_events()
-                loss = self.step()
+                loss = self._step_that_fits()
+                if loss is None:
+                    self._make_room(checkpoint)
+                    continue
                 self.iteration += 1
                 self._average(length)
                 self.trained_seconds = time.perf_counter() - since
@@ -181,6 +190,60 @@ class Trainer:
             raise
         self.trained_seconds = time.perf_counter() - since
         self.save(checkpoint)
+
+    def _densify_config(self) -> DensifyConfig:
+        """As configured, but for what fits; the configuration itself stays as it was asked for: it is the run's key."""
+        config = self.config.densify
+        return config if self.most is None else dataclasses.replace(config, budget=min(config.budget, self.most))
+
+    def _step_that_fits(self) -> Tensor | None:
+        """What is due and a step; None if the card's memory ended. Nothing is half done then: growth is all or nothing,
+        and the optimiser comes last."""
+        try:
+            self.schedule_events()
+            return self.step()
+        except torch.OutOfMemoryError:
+            return None  # the frames that hold the step's tensors go with the error
+
+    def _make_room(self, checkpoint: Path) -> None:
+        """After the card's memory ended: saves, and makes the run smaller. JobError if there is nothing left to take.
+
+        First the field works in pieces; then a fifth of the Gaussians goes, those that cover least. In either case no
+        more are made than there are.
+        """
+        model = self.model.gaussians
+        before = len(model)
+        self.optimizer.zero_grad(set_to_none=True)
+        self._shift = self._shift[:0]
+        if len(self.densifier.seen) != before:  # it ended between a round of growth and its end
+            self.densifier.reset(before)
+        forget_demands()
+        torch.cuda.empty_cache()
+        self.save(checkpoint)
+        moving = len(self.model.open_rows())
+        if min(self.model.pieces or moving, moving) > memory.LEAST_PIECE:
+            self.pieces = self.model.pieces = min(self.model.pieces or moving, moving) // 2
+            done = f"what moves is computed in pieces of {self.pieces}"
+        else:
+            kept = min(round(0.8 * before), self.most or before)
+            if kept < memory.LEAST:
+                raise JobError(
+                    f"The graphics card has too little memory for step {self.iteration} with {before} Gaussians.",
+                    "Close other programs that use the card, choose a smaller width, or train on the processor; what "
+                    "is trained so far is kept.",
+                    ExitCode.TRAIN,
+                )
+            rows = covering(model, kept)
+            model.rebuild(rows, torch.zeros(kept, dtype=torch.bool, device=self.device), self.optimizer)
+            self.densifier.reset(kept)
+            done = f"the {before - kept} of {before} Gaussians that cover least were dropped"
+        self.most = len(model)
+        self.densifier.config = self._densify_config()
+        self.report.warning(
+            f"The graphics card ran out of memory at step {self.iteration}: {done}, and no more are made. "
+            "Training goes on.",
+            "Other programs that use the card, closed, would leave it more; so would a smaller width.",
+        )
 
     def step(self) -> Tensor:
         """One optimisation step on one training frame; returns its photometric loss (0-dim). Not finite: left out."""
@@ -257,7 +320,11 @@ class Trainer:
         means = self.model.gaussians.params["means"]
         # Anchors teach the field; a host that moves means through it would have them pull the Gaussians along.
         where = torch.cat([means[rows], means.detach()[pairs.rows]])
-        return split_deltas(field(where, times, self.model.gaussians.own(torch.cat([rows, pairs.rows]))), len(rows))
+        if field.apart and self.device.type != "cpu":
+            anchored = field(where[len(rows) :], times[len(rows) :], self.model.gaussians.own(pairs.rows))
+            return self.model.deltas(rows, when), anchored
+        own = self.model.gaussians.own(torch.cat([rows, pairs.rows]))
+        return split_deltas(self.model.ask(field, where, times, own), len(rows))
 
     def image_of(self, frame: int) -> Tensor:
         """[H, W, 3] float32, the trained frame at position `frame`, on the device."""
@@ -270,8 +337,11 @@ class Trainer:
 
     def schedule_events(self) -> None:
         """What happens between steps: SH degree, densification, the gate."""
-        if self.extensions:
-            return
+        if not self.extensions:
+            self._schedule_events()
+        self.model.open_rows()  # asked again where they changed: the step itself shall not wait for a GPU
+
+    def _schedule_events(self) -> None:
         c = self.config
         for decision in self.policy.decide(self):
             self.model.sh_degree = decision.degree
@@ -595,7 +665,8 @@ class Trainer:
             self.poses.values.data.copy_(tensors["poses"])
         restore_optimizer(self._named(), self.optimizer, tensors)
         self.mean.restore(tensors, self.device)
-        self.densifier = Densifier(self.config.densify, len(self.model.gaussians), self.device)
+        self.model.pieces = self.pieces
+        self.densifier = Densifier(self._densify_config(), len(self.model.gaussians), self.device)
         for name in ("gradient", "seen"):
             setattr(self.densifier, name, tensors[f"densify.{name}"].to(self.device, copy=True))
         self.generator.set_state(tensors["generator"])

@@ -18,7 +18,7 @@ FOLDER = Path(__file__).with_name("grain")
 
 def main() -> None:
     """Writes grain/NNNNNN.exr beside this file."""
-    from torch_backend.footage.color import premultiplied_srgb_to_linear
+    from torch_backend.footage.display import PLAIN
     from torch_backend.freeze.exr import FrameMetadata, write_frozen_exr
     from torch_backend.freeze.grain import BINS, Grain, draw
 
@@ -32,7 +32,7 @@ def main() -> None:
         about = FrameMetadata(frame, 6.0, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32))
         noise = draw(grain, frame, rgba, (WIDTH, HEIGHT))
         path = FOLDER / f"{frame:06d}.exr"
-        write_frozen_exr(path, premultiplied_srgb_to_linear(rgba), ones, ones, ones, about, grain=noise)
+        write_frozen_exr(path, PLAIN.premultiplied_to_light(rgba), ones, ones, ones, about, grain=noise)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 from torch_backend.footage.color import (
     linear_to_srgb,
     linear_to_srgb8,
-    premultiplied_linear_to_srgb,
-    premultiplied_srgb_to_linear,
+    on_straight_colour,
     srgb_to_linear,
 )
 
@@ -68,18 +67,19 @@ def test_all_8_bit_codes_survive_the_round_trip():
 def test_premultiplied_converts_the_straight_colour():
     half_covered_grey = np.array([0.25, 0.25, 0.25, 0.5])
     expected = reference_to_linear(0.5) * 0.5
-    np.testing.assert_allclose(premultiplied_srgb_to_linear(half_covered_grey), [*[expected] * 3, 0.5], rtol=1e-6)
-    np.testing.assert_allclose(premultiplied_srgb_to_linear([0.5, 0.5, 0.5, 0.5]), [0.5] * 4, rtol=1e-6)
+    got = on_straight_colour(half_covered_grey, srgb_to_linear)
+    np.testing.assert_allclose(got, [*[expected] * 3, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(on_straight_colour([0.5] * 4, srgb_to_linear), [0.5] * 4, rtol=1e-6)
 
 
 def test_premultiplied_round_trip_including_thin_alpha():
     rng = np.random.default_rng(3)
     alpha = np.concatenate([rng.uniform(1e-6, 1.0, 500), np.zeros(4), np.ones(4)])[:, None]
     rgba = np.concatenate([rng.uniform(-0.2, 1.5, (len(alpha), 3)) * alpha, alpha], axis=1).astype(np.float32)
-    back = premultiplied_linear_to_srgb(premultiplied_srgb_to_linear(rgba))
+    back = on_straight_colour(on_straight_colour(rgba, srgb_to_linear), linear_to_srgb)
     np.testing.assert_allclose(back, rgba, rtol=1e-5, atol=1e-9)
 
 
 def test_premultiplied_refuses_a_picture_without_alpha():
     with pytest.raises(ValueError, match=r"\[\.\.\., 4\], got shape \[2, 2, 3\]"):
-        premultiplied_srgb_to_linear(np.zeros((2, 2, 3)))
+        on_straight_colour(np.zeros((2, 2, 3)), srgb_to_linear)

@@ -17,6 +17,7 @@ import pytest
 from torch_backend import contract
 from torch_backend.footage.frame_rgb import MATRIX_OVERRIDES, RANGE_OVERRIDES
 from torch_backend.footage.opening import open_source
+from torch_backend.footage.plate_encoding import display
 from torch_backend.footage.sources import Told
 
 SHARES = {
@@ -272,7 +273,7 @@ def test_decoded_clips_are_what_their_codes_say(tmp_path, frame_of_planes, clip)
     source = open_source(str(path))
     frames = list(source.frames(None, None))
     check_facts(source, frames, clip)
-    pixels = frames[0].pixels / np.iinfo(frames[0].pixels.dtype).max
+    pixels = np.clip(display(frames[0].pixels), 0.0, 1.0)  # of light, too
     pixels = np.rot90(pixels, -clip.turned // 90)
     across = max(1.0, float(Fraction(clip.aspect)))
     down = max(1.0, 1 / float(Fraction(clip.aspect)))

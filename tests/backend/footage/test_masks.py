@@ -1,5 +1,6 @@
 """Masks as artists hand them over: one picture, a sequence, a video, an alpha; and what does not fit is refused."""
 
+import av
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -101,6 +102,61 @@ def test_the_footage_s_alpha_ignores_what_is_transparent_and_lets_move_what_is_o
     import_footage(shot, str(tmp_path / "clip"), FootageConfig(), recorder())
     assert (masks_of(shot, recorder, ignore="alpha")["ignore"].of(101) == ~COVERED).all()
     assert (masks_of(shot, recorder, people="alpha")["people"].of(101) == COVERED).all()
+
+
+ALPHA_CODECS = {
+    "prores_ks.mov": ("yuva444p10le", {"profile": "4444", "alpha_bits": "16"}),
+    "png.mov": ("rgba", {}),
+    "qtrle.mov": ("argb", {}),
+    "libvpx-vp9.webm": ("yuva420p", {"lossless": "1"}),
+}
+
+
+def write_alpha_video(path, codec, pixels, rotation=0):
+    """Frames whose alpha covers `COVERED`, a pixel more to the right in each."""
+    kind, options = ALPHA_CODECS[codec]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec.partition(".")[0], rate=24, options=options)
+        stream.height, stream.width = pixels[0].shape[:2]
+        stream.pix_fmt = kind
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for n, rgb in enumerate(pixels):
+            alpha = np.where(np.roll(COVERED, n, axis=1), 255, 0).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(np.dstack([rgb, alpha]), "rgba")
+            container.mux(stream.encode(frame.reformat(format=kind)))
+        container.mux(stream.encode())
+
+
+@pytest.mark.parametrize("codec", ALPHA_CODECS)
+def test_the_alpha_of_a_video_masks_as_that_of_pictures_does(tmp_path, pan, recorder, codec):
+    clip = tmp_path / f"a.{codec.partition('.')[2]}"
+    write_alpha_video(clip, codec, pan(12))
+    shot, report = Shot.create(tmp_path / "a.splannequin"), recorder()
+    import_footage(shot, str(clip), FootageConfig(first=2, last=11), report)
+    assert "The clip has alpha: its colour is taken, its alpha is not." in report.warnings
+    ignored = masks_of(shot, recorder, ignore="alpha")["ignore"]
+    assert list(ignored.packed) == list(range(2, 12))
+    for frame in (2, 7, 11):
+        assert (ignored.of(frame) == ~np.roll(COVERED, frame - 1, axis=1)).all()
+    assert (masks_of(shot, recorder, people="alpha")["people"].of(11) == np.roll(COVERED, 10, axis=1)).all()
+
+
+def test_the_alpha_of_a_video_is_turned_as_its_picture_is(tmp_path, pan, recorder):
+    clip = tmp_path / "a.mov"
+    write_alpha_video(clip, "png.mov", pan(10), rotation=90)
+    shot = Shot.create(tmp_path / "a.splannequin")
+    import_footage(shot, str(clip), FootageConfig(), recorder())
+    found = masks_of(shot, recorder, people="alpha")["people"].of(1)
+    assert found.shape == (64, 48) and (found == np.rot90(COVERED)).all()
+
+
+def test_a_video_without_alpha_is_told_to_have_none(tmp_path, pan, recorder, write_video):
+    write_video(tmp_path / "a.mp4", pan(10))
+    shot = Shot.create(tmp_path / "a.splannequin")
+    import_footage(shot, str(tmp_path / "a.mp4"), FootageConfig(), recorder())
+    with pytest.raises(JobError, match=r"a\.mp4 has no alpha to mask by\."):
+        masks_of(shot, recorder, ignore="alpha")
 
 
 def test_a_mask_is_known_by_what_it_covers_and_not_by_its_file(shot, recorder, tmp_path):

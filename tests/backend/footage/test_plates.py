@@ -10,13 +10,14 @@ from scipy.ndimage import gaussian_filter
 
 from torch_backend.contract import CameraFrame, CameraPath, JobError, frame_file
 from torch_backend.footage import FootageConfig, import_footage, load_frames, plate_encoding
+from torch_backend.footage.display import ROLLED, display_of
 from torch_backend.footage.images import read_png, resize_float, write_png
 from torch_backend.footage.opening import open_source
 from torch_backend.footage.plates import Plates
 from torch_backend.footage.sources import Known
 from torch_backend.shot import Shot, write_json
 from torch_backend.solve.plate_lens import load_plate_lenses
-from torch_backend.solve.undistort import Undistorter
+from torch_backend.solve.undistort import BandUndistorter, Undistorter
 
 
 def solved(shot, radial=0.0, **told):
@@ -31,10 +32,12 @@ def solved(shot, radial=0.0, **told):
     record_of_solve = {"version": 1, "key": f"k{radial}", "camera_model": "SIMPLE_RADIAL", "distortion": [radial]}
     write_json(shot.solve / "solve.json", {**record_of_solve, "focal_px": float(width), **told})
     if "camera_model" not in told:
-        undistort = Undistorter(load_plate_lenses(shot)[cameras[0].frame].where(width, height))
+        where, display = load_plate_lenses(shot)[cameras[0].frame].where(width, height), display_of(record)
+        undistort, bands = Undistorter(where), BandUndistorter(where)
         for row in record["frames"]:
             raw = read_png(shot.frames / row["file"])
-            write_png(shot.frames / frame_file(row["frame"], ".png"), undistort(raw))
+            done = bands(raw, display.srgb_of, display.codes, raw.copy()) if display.bends else undistort(raw)
+            write_png(shot.frames / frame_file(row["frame"], ".png"), done)
     return shot
 
 
@@ -128,15 +131,16 @@ def test_light_beyond_white_and_below_black_passes(tmp_path, shot_of, kind):
     for picture in pictures:
         picture[10:20, 10:20], picture[30:36, 30:36] = 50.0, -0.01
         picture[0, 0] = np.nan
-    shot = shot_of(write_sequence(tmp_path / "f", pictures, "exr"))  # of the working size, which is cut
+    shot = shot_of(write_sequence(tmp_path / "f", pictures, "exr"))  # of the working size, which is rounded
     plates = Plates(shot)
     assert plates.deep and plates.note == ""
     got, want = plates.linear(1003).numpy(), np.nan_to_num(pictures[2].astype(np.float32))
     np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-7)
     assert got.max() == pytest.approx(50.0, rel=1e-3) and got.min() == pytest.approx(-0.01, rel=1e-3)
     shown = plates.display(1003).numpy()
-    assert shown.max() > 5 and shown.min() < -0.09
-    assert np.abs(np.clip(shown, 0, 1) - working_of(shot, 1003)).max() < 1 / 255
+    np.testing.assert_allclose(shown, ROLLED.from_light(got))
+    assert 0.98 < shown.max() < 1.0 and shown.min() < -0.09
+    assert np.abs(np.clip(shown, 0, 1) - working_of(shot, 1003)).max() < 1 / 65535
 
 
 def test_the_lens_is_taken_out_at_the_sources_size_as_at_the_working_size(tmp_path, shot_of):

@@ -50,7 +50,14 @@ def first_of(folder, **options):
     """The source in `folder`, after a full reading, and its first frame's pixel in the middle, as linear light."""
     source = open_source(str(folder), **options)
     frames = list(source.frames(None, None))
-    return source, srgb_to_linear(frames[0].pixels[4, 4] / (65535.0 if source.info.deep else 255.0))
+    return source, light(frames[0].pixels[4, 4])
+
+
+def light(pixels):
+    """Linear light of pixels as a source gives them."""
+    if pixels.dtype == np.float16:
+        return pixels.astype(np.float32)
+    return srgb_to_linear(pixels / np.iinfo(pixels.dtype).max)
 
 
 def said(source):
@@ -75,12 +82,12 @@ def test_folder_file_and_patterns_mean_the_same_sequence(exrs, name):
     assert (source.info.first, source.info.last, source.info.width, source.info.height) == (1001, 1010, 64, 48)
 
 
-def test_linear_pictures_become_sixteen_bit_srgb(exrs):
+def test_linear_pictures_are_read_as_the_light_that_they_hold(exrs):
     source = open_source(str(exrs))
     frame = next(iter(source.frames(None, None)))
-    assert (source.info.colour, source.info.deep, frame.pixels.dtype) == ("linear", True, np.uint16)
+    assert (source.info.colour, source.info.deep, frame.pixels.dtype) == ("linear", True, np.float16)
     expected = (np.linspace(0.0, 0.9, 64) * 0.5).astype(np.float16)
-    assert np.allclose(srgb_to_linear(frame.pixels[10, :, 0] / 65535.0), expected, atol=2e-5)
+    assert (frame.pixels[10, :, 0] == expected).all()
 
 
 def test_times_count_frames_at_the_files_rate(tmp_path):
@@ -92,7 +99,7 @@ def test_times_count_frames_at_the_files_rate(tmp_path):
     assert open_source(str(tmp_path), fps=12.0).info.fps == 12.0
 
 
-def test_bright_and_broken_values_are_clipped_and_counted(tmp_path):
+def test_bright_and_negative_values_pass_and_broken_ones_are_black(tmp_path):
     pixels = np.full((8, 8, 3), 0.25, np.float32)
     pixels[0, :4] = [4.0, 0.1, 0.1]
     pixels[1, 0] = np.nan
@@ -100,9 +107,8 @@ def test_bright_and_broken_values_are_clipped_and_counted(tmp_path):
     for i in range(1, 4):
         write(tmp_path / f"a.{i}.exr", pixels)
     frame = next(iter(open_source(str(tmp_path)).frames(None, None)))
-    assert frame.clipped == pytest.approx(4 / 64)
-    assert frame.pixels[0, 0, 0] == 65535
-    assert (frame.pixels[1, :2] == 0).all()
+    assert (frame.pixels[0, 0, 0], frame.pixels[1, 1, 0]) == (4.0, -1.0)
+    assert (frame.pixels[1, 0] == 0).all()
 
 
 def test_channels_are_found_by_name_and_layer(tmp_path):
@@ -110,7 +116,7 @@ def test_channels_are_found_by_name_and_layer(tmp_path):
     for i in range(1, 4):
         write(tmp_path / f"a.{i}.exr", pixels, names=("depth.Z", "view.B", "view.G", "view.R"))
     frame = next(iter(open_source(str(tmp_path)).frames(None, None)))
-    assert srgb_to_linear(frame.pixels[0, 0] / 65535.0) == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
+    assert frame.pixels[0, 0] == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
 
 
 def test_a_data_window_is_placed_in_its_picture(tmp_path):
@@ -120,7 +126,7 @@ def test_a_data_window_is_placed_in_its_picture(tmp_path):
     expected = np.zeros((8, 10), bool)
     expected[3:7, 2:6] = True
     assert frame.pixels.shape == (8, 10, 3)
-    assert ((frame.pixels[..., 0] == 65535) == expected).all()
+    assert ((frame.pixels[..., 0] == 1.0) == expected).all()
 
 
 def test_eight_bit_pictures_stay_as_they_are(tmp_path):
@@ -239,7 +245,7 @@ def test_transparent_pictures_keep_their_colour_and_say_that_alpha_is_not_taken(
     source, pixel = first_of(tmp_path)
     assert pixel == pytest.approx([0.3, 0.2, 0.1], abs=1e-4)
     glow = next(iter(source.frames(None, None))).pixels[5, 0]
-    assert srgb_to_linear(glow / 65535.0) == pytest.approx([0.2, 0.1, 0.0], abs=1e-4)
+    assert glow == pytest.approx([0.2, 0.1, 0.0], abs=1e-4)
     assert said(source)[0] == "The pictures are transparent in places: their colour is taken, their alpha is not."
 
 
@@ -280,7 +286,7 @@ def test_a_crop_window_is_told(tmp_path):
     source, _ = first_of(tmp_path)
     assert said(source) == ["Pictures fill only a part of their frame: the rest of it is black."]
     row = next(iter(source.frames(None, None))).pixels[5, :, 0]
-    assert (row == np.where(np.arange(20) < 6, 65535, 0)).all()
+    assert (row == np.where(np.arange(20) < 6, 1.0, 0.0)).all()
 
 
 # ------------------------------------------------------------------------------------------------- colour
@@ -319,7 +325,7 @@ def test_chromaticities_are_converted_and_named(tmp_path, name):
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", flat(*colour), chromaticities=values)
     source, pixel = first_of(tmp_path)
-    assert pixel == pytest.approx(to_rec709(name) @ colour, abs=5e-5)
+    assert pixel == pytest.approx(to_rec709(name) @ colour, rel=3e-4)
     assert said(source) == [f"The pictures are linear, {name}: converted to Rec.709."]
     assert source.info.reading["colour"] == f"linear, {name}"
     assert source.info.reading["colour_told"]
@@ -329,7 +335,7 @@ def test_a_named_colour_space_is_converted(tmp_path):
     colour = np.array([0.30, 0.25, 0.20])
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", flat(*colour), oiio__ColorSpace="ACEScg")
-    assert first_of(tmp_path)[1] == pytest.approx(to_rec709("ACEScg (AP1)") @ colour, abs=5e-5)
+    assert first_of(tmp_path)[1] == pytest.approx(to_rec709("ACEScg (AP1)") @ colour, rel=3e-4)
 
 
 def test_rec709_light_needs_no_words_and_what_was_assumed_is_recorded(tmp_path):

@@ -7,9 +7,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from torch_backend.contract.timecode import later, parse_timecode, smpte_bits
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.opening import open_source
-from torch_backend.footage.timecode import later, parse_timecode, smpte_bits
 from torch_backend.shot import Shot
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from torch_backend.footage.color import linear_to_srgb, srgb_to_linear
+from torch_backend.footage.display import PLAIN, ROLLED
 from torch_backend.footage.images import write_png
 from torch_backend.freeze.grain import BINS, Brush, Grain, draw, measure, measure_plate
 
@@ -65,11 +66,13 @@ def test_a_clip_in_which_nothing_is_flat_has_no_grain_of_the_size_of_its_texture
     assert measure([]).deviation.max() == 0.0 == measure([np.zeros((8, 8, 3), np.uint8)]).deviation.max()
 
 
-def test_a_plate_is_measured_from_its_files(tmp_path):
+@pytest.mark.parametrize("display", [PLAIN, ROLLED])
+def test_a_plate_is_measured_from_its_files_on_whatever_display_they_are(tmp_path, display):
     files = [tmp_path / f"{k:06d}.png" for k in range(3)]
     for k, path in enumerate(files):
-        write_png(path, stored(scene() + noise(k, 0.6) * 3.0 / 255, 8))
-    np.testing.assert_allclose(measure_plate(files).deviation[:, 1:-1] * 255, 3.0, rtol=0.1)
+        picture = scene() + noise(k, 0.6) * 3.0 / 255
+        write_png(path, display.codes(picture) if display.bends else stored(picture, 8))
+    np.testing.assert_allclose(measure_plate(files, display).deviation[:, 1:-1] * 255, 3.0, rtol=0.1)
 
 
 GRAIN = Grain(np.tile(np.linspace(2, 6, BINS, dtype=np.float32) / 255, (3, 1)), 0.7, AGREEMENT)

@@ -1,5 +1,6 @@
 """Takes made of plates, as files: what stands beside the frames, killed and gone on with, light beyond white."""
 
+import dataclasses
 import hashlib
 import json
 import signal
@@ -11,15 +12,18 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, binary_erosion
 
-from torch_backend.contract import FreezeParams, TrainParams
+from torch_backend.contract import CameraPath, FreezeParams, TrainParams
 from torch_backend.footage import FootageConfig, import_footage
-from torch_backend.footage.color import InputSpace
+from torch_backend.footage.color import InputSpace, linear_to_srgb
+from torch_backend.footage.display import ROLLED
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr, read_key
 from torch_backend.freeze.warp import apply_warp, read_warp
+from torch_backend.raster import rasterize
 from torch_backend.shot import Shot
 from torch_backend.solve.motion import PAINTED, STILL, write_matte
 from torch_backend.train import train_shot
@@ -213,10 +217,10 @@ def test_light_beyond_white_and_below_black_is_the_plates(bright, quiet):
     for n in (103, 104):
         source = oiio.ImageBuf(str(bright.root.parent / "source" / f"a.{n}.exr")).get_pixels(oiio.FLOAT)
         frame = read_frozen_exr(bright.take("freeze") / f"{n:06d}.exr")
-        still = frame.detail.plate == 1.0
-        assert still.mean() > 0.95 and source[still].max() == 50.0 and source[still].min() < -0.1
-        np.testing.assert_allclose(frame.rgba[..., :3][still], source[still], rtol=1e-3, atol=1e-6)
         warp = read_warp(bright.take("freeze") / "warp" / f"{n:06d}.exr")
+        still = warp.matte.numpy() == 1.0
+        assert still.mean() > 0.95 and source[still].max() == 50.0 and source[still].min() < -0.05
+        np.testing.assert_allclose(frame.rgba[..., :3][still], source[still], rtol=1e-3, atol=1e-6)
         graded = torch.from_numpy(source) * torch.tensor([2.0, 0.5, 1.0])
         again = apply_warp(graded, warp).numpy()
         np.testing.assert_allclose(again[still], graded.numpy()[still], rtol=1e-3, atol=1e-6)
@@ -243,3 +247,74 @@ def test_acescg_footage_is_frozen_in_acescg(bright, quiet):
     again = read_frozen_exr(folder / "000103.exr")
     np.testing.assert_allclose(again.rgba, plain.rgba, atol=0.05)
     assert again.metadata.light == "ap1" and again.metadata.key != plain.metadata.key
+
+
+LAMP = 20.0
+
+
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory, world, quiet):
+    """The wall filmed as scene-linear EXR, its patch a lamp that hangs still: imported, trained on."""
+    folder = tmp_path_factory.mktemp("lit")
+    (folder / "source").mkdir()
+    state = world.at(0.0)
+    lamp = {name: value[world.moving] for name, value in state.items()}
+    for n in range(16):
+        view = dict(viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
+        covered = rasterize(**lamp, **view).alphas[0].numpy() > 0.5
+        picture = (0.8 * world.image(n, 0.0).numpy()) ** 2.2
+        picture[covered] = LAMP
+        path = str(folder / "source" / f"a.{101 + n}.exr")
+        out = oiio.ImageOutput.create(path)
+        assert out.open(path, oiio.ImageSpec(64, 48, 3, "half"))
+        assert out.write_image(picture.astype(np.float16)) and out.close()
+    shot = Shot.create(folder / "lit.splannequin")
+    import_footage(shot, str(folder / "source"), FootageConfig(), quiet())
+    shot.solve.mkdir(exist_ok=True)
+    for name in ("cameras.json", "points.npz"):
+        (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
+    for n in range(101, 117):
+        (shot.frames / f"{n:06d}.png").write_bytes((shot.raw / f"{n:06d}.png").read_bytes())
+        path = shot.root / PAINTED / f"{n:06d}.png"
+        path.parent.mkdir(exist_ok=True)
+        write_matte(path, np.full((48, 64), STILL, np.uint8))
+    train_shot(shot, TrainParams(iterations=300, max_gaussians=1500, method="static"), quiet())
+    return shot
+
+
+def test_a_lamp_is_a_lamp_in_splats_alone(lit, quiet):
+    """Cut at white, it could be no brighter than 1; and what is no lamp is as it was."""
+    facts = freeze_shot(lit, FreezeParams(t_star=108, first=106, last=106, detail="off", develop="off"), quiet())
+    frame = read_frozen_exr(lit.take("freeze") / "000106.exr")
+    source = oiio.ImageBuf(str(lit.root.parent / "source" / "a.106.exr")).get_pixels(oiio.FLOAT)
+    inside = binary_erosion(source[..., 1] > 10.0)
+    away = ~binary_dilation(source[..., 1] > 10.0, iterations=4)
+    assert inside.sum() > 20 and away.sum() > 1000
+    assert np.median(frame.rgba[..., :3][inside]) == pytest.approx(LAMP, rel=0.3)
+    off = linear_to_srgb(frame.rgba[..., :3][away]) - linear_to_srgb(source[away])
+    assert np.abs(off).mean() < 0.03 and frame.rgba[..., :3][away].max() < 2.0
+    assert frame.rgba.max() < 1.01 * LAMP
+    assert np.abs(frame.grain[inside]).max() < 0.1, "grain is not what a lamp flickers by"
+    preview = read_png(lit.take("freeze") / "preview" / "000106.png") / 255.0
+    shown = ROLLED.from_light(frame.rgba[..., :3])
+    assert facts["grain"] is not None and np.abs(preview - shown)[away].max() < 1.5 / 255
+    assert 0.9 < np.median(preview[inside]) < 1.0
+
+
+def test_a_lamp_that_plates_fill_stays_a_lamp(lit, quiet):
+    """Seen from between the clip's frames, from which no plate is looked at as it stands."""
+    path = CameraPath.from_json(json.loads((lit.solve / "cameras.json").read_text()))
+    before, after = (np.array(path.frames[n].viewmat) for n in (5, 6))
+    between = dataclasses.replace(path.frames[5], viewmat=(0.5 * (before + after)).tolist())
+    camera = lit.root / "between.json"
+    camera.write_text(json.dumps(dataclasses.replace(path, frames=[between]).to_json()))
+    ask = FreezeParams(take="between", t_star=108, camera_path=str(camera), width=64, develop="off", grain=False)
+    freeze_shot(lit, ask, quiet())
+    frame = read_frozen_exr(lit.take("between") / "000106.exr").rgba[..., :3]
+    assert frame.max() == pytest.approx(LAMP, rel=0.01)
+    assert 0.5 < (frame > 10.0).sum() / (_lamp_of(lit, 106) + _lamp_of(lit, 107)) / 0.5 < 1.5
+
+
+def _lamp_of(shot, frame):
+    source = oiio.ImageBuf(str(shot.root.parent / "source" / f"a.{frame}.exr")).get_pixels(oiio.FLOAT)
+    return (source > 10.0).sum()

@@ -7,10 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.contract import NO_DEPTH, CameraFrame, CameraPath, Cancelled, FreezeParams, JobError, TrainParams
+from torch_backend.contract import (
+    NO_DEPTH,
+    CameraFrame,
+    CameraPath,
+    Cancelled,
+    FreezeParams,
+    JobError,
+    TrainParams,
+    later,
+)
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
-from torch_backend.footage.timecode import later
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take_cameras import plan

@@ -252,9 +252,11 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
     monkeypatch.setattr(cuda, "_HITS_STEP", 1)
     monkeypatch.setattr(cuda, "_demands", {})
     scene = covering(tools)
-    small, small_grads = gradients(scene, device)
+    with monkeypatch.context() as short:
+        short.setattr(cuda, "_HITS_MAX", 96)
+        small, small_grads = gradients(scene, device)
     wanted, held = small.hits.tolist()
-    assert held == 4 * 24 < wanted, "the first call's list should have been too short"
+    assert held == 96 < wanted, "the list should have been too short"
     if GPU:
         torch.cuda.synchronize()  # what the device wanted arrives whenever it arrives
     large, large_grads = gradients(scene, device)
@@ -268,6 +270,17 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
     # Once known, the demand stays covered when a quieter view comes in between.
     run(tools.cloud(5, 130, 90), device)
     assert run(scene, device).hits[1] >= wanted
+
+
+def test_the_first_call_of_a_size_lists_all_its_hits(tools, device, monkeypatch):
+    monkeypatch.setattr(cuda, "_HITS_STEP", 1)
+    monkeypatch.setattr(cuda, "_demands", {})
+    with torch.no_grad():
+        wanted, held = run(covering(tools), device).hits.tolist()
+        assert wanted > 4 * 24 and wanted <= held <= wanted * 4 // 3 + 1
+        # Twice the Gaussians of a round of growth: nobody has to find out by a slow call.
+        wanted, held = run(covering(tools, n=48), device).hits.tolist()
+    assert wanted <= held
 
 
 def test_kernels_of_a_module_are_made_together(monkeypatch):

@@ -78,6 +78,9 @@ def test_cuda_without_a_gpu_is_refused_in_words(world, quiet):
 def test_a_card_that_is_not_used_is_said_at_the_start_of_training(world, quiet, nvidia_smi):
     nvidia_smi("NVIDIA GeForce RTX 3090, 535.183.01, 8.6")
     assert unused_card() is not None and cuda_refusal() == unused_card()[0]
+    with pytest.raises(JobError, match="R580 or newer is needed") as refused:
+        choose_device("cuda")
+    assert refused.value.hint.startswith("Update the NVIDIA driver")
     report = quiet()
     train_shot(world.shot, TrainParams(run="unused-card", iterations=20, max_gaussians=1500), report)
     said = [event for event in report.events if event[0] == "warning" and "RTX 3090" in event[1]]

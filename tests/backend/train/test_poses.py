@@ -7,7 +7,7 @@ import torch
 from torch_backend.contract import TrainParams
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
-from torch_backend.train.poses import Poses, PosesConfig, corrected
+from torch_backend.train.poses import Poses, PosesConfig, _Gauge, _series, corrected
 from torch_backend.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -101,3 +101,21 @@ def test_wrong_cameras_are_found_and_frozen(world, quiet, tmp_path):
     again = Trainer(scene, trainer.images, scene.solved, trainer.config, quiet())
     again.restore(tmp_path / "checkpoint.safetensors")
     assert torch.equal(again.viewmats, cameras)
+
+
+def test_what_a_gpu_computes_of_a_correction_is_the_same():
+    g = torch.Generator().manual_seed(4)
+    twists = torch.zeros(6, 4, 4)
+    turn = 0.3 * torch.randn(6, 3, generator=g)
+    twists[:, [2, 0, 1], [1, 2, 0]], twists[:, [1, 2, 0], [2, 0, 1]] = turn, -turn
+    twists[:, :3, 3] = 0.3 * torch.randn(6, 3, generator=g)
+    assert torch.allclose(_series(twists), torch.matrix_exp(twists), atol=1e-6)
+    times = np.array([0.0, 0.2, 0.4, 0.8, 1.0])
+    for held in ({1}, {0, 3}, {2, 4}, {0, 1}):
+        poses = Poses(times.tolist(), PosesConfig(), CPU)
+        with torch.no_grad():
+            poses.values[:] = torch.randn(5, 6, generator=g)
+        gauge = _Gauge(times, held, CPU)
+        between = torch.lerp(poses.values[gauge.left], poses.values[gauge.right], gauge.share)
+        assert gauge.rows.tolist() == sorted(held)
+        assert torch.allclose(between, poses.at(times[sorted(held)], held), atol=1e-6)

@@ -1,0 +1,512 @@
+"""What there is to ask a card that is at hand for half an hour: `python -m benchmarks.gpu STAGE --results DIR`.
+
+Stages, of at most 8 minutes each; docs/gpu.md says what each answers:
+  environment  the self-test, kernels compiled cold and warm, the tests that need a card
+  sanitizer    compute-sanitizer's four tools over the rasteriser's tests
+  raster       W2, W3 and W4 against gsplat in one run, where a step's time goes, what a list that is too short costs
+  training     a solved shot (--shot) on both devices, two seeds: PSNR, ms a step, how often the host waits
+  limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, views a second, a CUDA graph
+
+Each writes DIR/gpu-STAGE.json. A part that fails is a sentence there, and the others go on; so is a part for which no
+time was left. `--dry-run` carries the same code out on the processor, at tiny sizes: its figures mean nothing.
+"""
+
+import argparse
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import torch
+
+from benchmarks import raster as raster_bench
+from benchmarks.workload import WORKLOADS, room
+from torch_backend.cli import card_facts
+from torch_backend.contract import METRICS_FILE, CameraPath, FreezeParams, JobError, LiveView, TrainParams, program
+from torch_backend.freeze import freeze_shot
+from torch_backend.live import LiveSession
+from torch_backend.native import default_threads
+from torch_backend.raster import cuda
+from torch_backend.scene import load_images, load_scene
+from torch_backend.shot import Shot, write_json
+from torch_backend.train import config_from_params, train_shot
+from torch_backend.train.device import cuda_refusal
+from torch_backend.train.memory import plan_memory
+from torch_backend.train.run import training_size
+from torch_backend.train.trainer import Trainer
+
+ROOT = Path(__file__).resolve().parents[1]
+SECONDS = 480.0
+"""Of a stage."""
+TESTS = (
+    "tests/backend/raster/test_cuda.py",
+    "tests/backend/raster/test_ssim_cuda.py",
+    "tests/backend/train/test_device.py",
+)
+"""Files with tests that need a card."""
+TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
+PEER = "benchmarks.peers.gsplat"
+
+
+class Silent:
+    """A reporter that keeps the warnings."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None: ...
+
+    def metric(self, stage: str, values: Any) -> None: ...
+
+    def image(self, label: str, path: Any) -> None: ...
+
+    def warning(self, message: str, hint: str = "") -> None:
+        self.warnings.append(f"{message} {hint}".strip())
+
+    def check_cancelled(self) -> None: ...
+
+
+class Stage:
+    """A stage that runs: its parts, its clock, what it found."""
+
+    def __init__(self, dry: bool, shot: Path | None, results: Path) -> None:
+        self.dry, self.shot, self.results = dry, shot, results
+        self.device = torch.device("cpu" if dry else "cuda")
+        self.found: dict[str, Any] = {}
+        self.until = time.monotonic() + SECONDS
+
+    @property
+    def left(self) -> float:
+        """Seconds."""
+        return self.until - time.monotonic()
+
+    def part(self, name: str, call: Callable[[], Any], needs: float = 0.0) -> None:
+        """Notes what a part found, or why it found nothing; needs: seconds without which it is not begun."""
+        if self.left < needs and not self.dry:
+            self.found[name] = {"left_out": f"{self.left:.0f} s were left, {needs:.0f} are needed"}
+            return
+        since = time.monotonic()
+        try:
+            told = call()
+        except Exception as error:  # the stage goes on: the card is not at hand for long
+            told = {"failed": f"{type(error).__name__}: {error}".splitlines()[0]}
+        self.found[name] = {"seconds": round(time.monotonic() - since, 2), **told}
+        print(f"{name}: {json.dumps(self.found[name])[:400]}", flush=True)
+
+    def child(self, command: list[str], most: float, **environ: str) -> dict[str, Any]:
+        """A process of its own: its exit code, seconds, and the end of what it said."""
+        since = time.monotonic()
+        whole = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1", **environ}
+        limit = max(10.0, min(most, self.left))
+        try:
+            ran = subprocess.run(command, cwd=ROOT, env=whole, capture_output=True, text=True, timeout=limit)
+        except subprocess.TimeoutExpired:
+            return {"exit_code": None, "seconds": round(limit, 1), "said": "it was ended: no time was left"}
+        said = (ran.stdout + ran.stderr).strip().splitlines()
+        return {"exit_code": ran.returncode, "seconds": round(time.monotonic() - since, 2), "said": said[-25:]}
+
+    def scratch_shot(self) -> Shot:
+        """A copy of the shot, to write runs into. JobError without one."""
+        if self.shot is None:
+            raise JobError("This part needs a solved shot.", "Name one with --shot.", 2)
+        copy = self.results / "gpu-scratch.splannequin"
+        if not copy.exists():
+            shutil.copytree(self.shot, copy, ignore=shutil.ignore_patterns("runs", "takes", "jobs"))
+        return Shot.open(copy)
+
+    def wait(self) -> None:
+        """Until the card has done what it was told."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+
+
+# ------------------------------------------------------------------------------------------------------ environment
+
+COMPILE = """
+import sys, time, torch
+from torch_backend.raster import cuda, ssim_cuda
+since = time.perf_counter()
+device = torch.device(sys.argv[1])
+cuda.warm_up(int(sys.argv[2]), device)
+image = torch.rand(16, 16, 3, device=device)
+ssim_cuda.ssim(image, image)
+if device.type == "cuda":
+    torch.cuda.synchronize()
+print(round(time.perf_counter() - since, 2))
+"""
+
+
+def environment(stage: Stage) -> None:
+    refusal = "" if stage.dry else cuda_refusal()
+    stage.part("card", lambda: card_facts("a dry run" if stage.dry else refusal))
+    with tempfile.TemporaryDirectory() as cache:
+        for name in ("compile_cold", "compile_warm"):
+            command = [sys.executable, "-P", "-c", COMPILE, stage.device.type, "4"]
+            stage.part(name, lambda command=command: stage.child(command, 240.0, WARP_CACHE_PATH=cache))
+    picked = ["-k", "first_call"] if stage.dry else []
+    command = [sys.executable, "-P", "-m", "pytest", "-q", "-ra", *(TESTS[:1] if stage.dry else TESTS), *picked]
+    stage.part("tests", lambda: stage.child(command, 300.0), needs=30.0)
+
+
+# -------------------------------------------------------------------------------------------------------- sanitizer
+
+
+def sanitizer(stage: Stage) -> None:
+    tool = program("compute-sanitizer")
+    if tool is None and not stage.dry:
+        stage.found["sanitizer"] = {"failed": "compute-sanitizer (of the CUDA toolkit) is not on the PATH"}
+        return
+    tests = [sys.executable, "-P", "-m", "pytest", "-q", TESTS[0], "-k", "first_call" if stage.dry else "cuda"]
+    for name in TOOLS:
+        before = [] if tool is None else [tool, "--tool", name, "--error-exitcode", "99", "--target-processes", "all"]
+        stage.part(name, lambda before=before: stage.child([*before, *tests], SECONDS / len(TOOLS)), needs=20.0)
+
+
+# ----------------------------------------------------------------------------------------------------------- raster
+
+
+def raster(stage: Stage) -> None:
+    torch.set_num_threads(default_threads())
+    bodies = {"ours": raster_bench.Body("cpu" if stage.dry else "cuda", stage.device.type)}
+    missing = raster_bench._peer(PEER).missing(stage.device.type)
+    if missing is None:
+        bodies["gsplat"] = raster_bench.Body("peer", stage.device.type, peer=PEER)
+    rivals = [name for name in bodies if name != "ours"]
+    stage.found["peer"] = missing or "measured beside ours, round by round"
+    for name in ("W0",) if stage.dry else ("W2", "W3", "W4"):
+        rounds = 2 if stage.dry else 30
+        stage.part(name, lambda n=name, r=rounds: raster_bench.measure(WORKLOADS[n], bodies, rivals, r), needs=60.0)
+    largest = "W0" if stage.dry else "W4"
+    stage.part("profile", lambda: _profile(stage, largest), needs=30.0)
+    stage.part("short_list", lambda: _short_list(stage, largest), needs=30.0)
+
+
+def _profile(stage: Stage, name: str) -> dict[str, Any]:
+    """The kernels that a frame and its gradient spend most on."""
+    case = raster_bench._Case(
+        room(*WORKLOADS[name]), raster_bench.Body("cpu" if stage.dry else "cuda", stage.device.type)
+    )
+    case.image()
+    kinds = [torch.profiler.ProfilerActivity.CPU]
+    kinds += [torch.profiler.ProfilerActivity.CUDA] if stage.device.type == "cuda" else []
+    with torch.profiler.profile(activities=kinds) as seen:
+        for _ in range(2 if stage.dry else 10):
+            case.image()
+        stage.wait()
+
+    def spent(event: Any) -> float:
+        return float(getattr(event, "self_device_time_total", 0.0) or event.self_cpu_time_total)
+
+    rows = sorted(seen.key_averages(), key=spent, reverse=True)[:20]
+    return {"us": [{"what": row.key[:80], "self_us": round(spent(row), 1), "calls": row.count} for row in rows]}
+
+
+def _short_list(stage: Stage, name: str) -> dict[str, Any]:
+    """A frame whose list holds all its hits, and one whose list holds a tenth of them."""
+    size = (60, 24, 17) if stage.dry else WORKLOADS[name]  # on fibers in a dry run
+    case = raster_bench._Case(room(*size), raster_bench.Body("cuda", stage.device.type))
+    times: dict[str, Any] = {}
+    most, step = cuda._HITS_MAX, cuda._HITS_STEP
+    try:
+        for what, share in (("whole_ms", 1.0), ("tenth_ms", 0.1)):
+            cuda.forget_demands()
+            if share < 1.0:
+                held = max(1, int(share * times["hits"]))
+                cuda._HITS_MAX, cuda._HITS_STEP = held, min(step, held)
+            case.image()
+            times["hits"] = max(int(demand.most) for demand in cuda._demands.values())
+            times[what] = round(min(case.run()[1] for _ in range(2 if stage.dry else 5)), 3)
+    finally:
+        cuda._HITS_MAX, cuda._HITS_STEP = most, step
+        cuda.forget_demands()
+    return times
+
+
+# --------------------------------------------------------------------------------------------------------- training
+
+
+def training(stage: Stage) -> None:
+    torch.set_num_threads(default_threads())
+    devices = ("cpu",) if stage.dry else ("cuda", "cpu")
+    for device in devices:  # the card first: the processor may take longer than the stage has
+        for preset in ("preview", "final"):
+            for seed in (0,) if stage.dry else (0, 1):
+                name = f"{preset}-{device}-{seed}"
+                needs = 20.0 if device == "cuda" else 150.0
+                stage.part(name, lambda p=preset, d=device, s=seed: _trained(stage, p, d, s), needs=needs)
+    stage.part("waits", lambda: _waits(stage), needs=20.0)
+
+
+def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any]:
+    """A run: PSNR on frames held out, and ms a step between its measurements."""
+    steps = 20 if stage.dry else {"preview": 0, "final": 3000}[preset]
+    report, name = Silent(), f"gpu-{preset}-{device}-{seed}"
+    few = 400 if stage.dry else 0
+    width = 64 if stage.dry else 0
+    asked = TrainParams(
+        run=name, preset=preset, iterations=steps, seed=seed, device=device, holdout=8, max_gaussians=few, width=width,
+        resume=False,
+    )  # fmt: skip
+    shot = stage.scratch_shot()
+    summary = train_shot(shot, asked, report)
+    lines = (shot.run(name) / METRICS_FILE).read_text(encoding="utf-8").splitlines()
+    rows = [{"iteration": 0, "seconds": 0.0}, *map(json.loads, lines)]
+    pace = [
+        {"to": b["iteration"], "ms": round(1e3 * (b["seconds"] - a["seconds"]) / (b["iteration"] - a["iteration"]), 2)}
+        for a, b in itertools.pairwise(rows)
+        if b["iteration"] > a["iteration"]
+    ]
+    kept = ("heldout_psnr_db", "gaussians", "moving_gaussians", "train_seconds", "iterations", "device", "width_px")
+    return {**{key: summary[key] for key in kept}, "ms_per_step": pace, "warnings": report.warnings}
+
+
+def _trainer(stage: Stage, iterations: int, most: int, width: int = 0, method: str = "auto") -> Trainer:
+    """A run of `final` that nothing is saved of."""
+    scene = load_scene(stage.scratch_shot())
+    config = config_from_params(
+        TrainParams(preset="final", iterations=iterations, max_gaussians=most, method=method, width=width)
+    )
+    size = training_size(scene, config.width)
+    images = load_images(scene, scene.solved, *size).to(stage.device)
+    return Trainer(scene, images, scene.solved, config, Silent(), {}, stage.device)
+
+
+def _step(trainer: Trainer) -> None:
+    trainer.schedule_events()
+    trainer.step()
+    trainer.iteration += 1
+
+
+def _waits(stage: Stage) -> dict[str, Any]:
+    """Places where the host waited for the card, by torch's own count, in steps that are no tenth."""
+    trainer = _trainer(stage, 400, 600 if stage.dry else 100_000, 64 if stage.dry else 640, "hexplane")
+    places: dict[str, int] = {}
+    steps = 0
+    while trainer.iteration < (140 if stage.dry else 300):
+        trainer.schedule_events()
+        look = trainer.iteration >= 135 and trainer.iteration % 10 != 0  # the field is there from a third on
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            if look and stage.device.type == "cuda":
+                torch.cuda.set_sync_debug_mode("warn")
+            trainer.step()
+            if stage.device.type == "cuda":
+                torch.cuda.set_sync_debug_mode("default")
+        trainer.iteration += 1
+        steps += look
+        for warning in heard if look else ():
+            where = f"{Path(warning.filename).name}:{warning.lineno}"
+            places[where] = places.get(where, 0) + 1
+    return {"steps": steps, "waits": places}
+
+
+# ----------------------------------------------------------------------------------------------------------- limits
+
+
+def limits(stage: Stage) -> None:
+    torch.set_num_threads(default_threads())
+    for gb in (6,) if stage.dry else (8, 6, 4):
+        stage.part(f"memory_{gb}", lambda gb=gb: _memory(stage, gb), needs=40.0)
+    stage.part("resume", lambda: _resumed(stage), needs=30.0)
+    stage.part("freeze", lambda: _frozen(stage), needs=60.0)
+    stage.part("live", lambda: _live(stage), needs=20.0)
+    stage.part("graph", lambda: _graph(stage), needs=20.0)
+
+
+def _memory(stage: Stage, gb: int) -> dict[str, Any]:
+    """A step of a run as large as the plan for such a card allows: what it took, beside what was reckoned with."""
+    scene = load_scene(stage.scratch_shot())
+    config = config_from_params(TrainParams(preset="final", method="hexplane", max_gaussians=1_000_000))
+    size = training_size(scene, config.width)
+    plan = plan_memory(config, size, len(scene.solved), 0, gb * 10**9 - 900_000_000)
+    trainer = _trainer(stage, 60, 2000, 64 if stage.dry else 0, "hexplane")
+    trainer.iteration = 21  # a third: the field is made
+    trainer.schedule_events()
+    trainer.model.pieces = 500 if stage.dry else plan.pieces
+    gaussians, many = trainer.model.gaussians, 2000 if stage.dry else plan.gaussians
+    rows = torch.arange(many, device=stage.device) % len(gaussians)
+    gaussians.rebuild(rows, torch.zeros(many, dtype=torch.bool, device=stage.device), trainer.optimizer)
+    gaussians.open[:] = True
+    trainer.densifier.reset(many)
+    told: dict[str, Any] = {"planned": {"gaussians": plan.gaussians, "pieces": plan.pieces}, "sentence": plan.sentence}
+    if stage.device.type == "cuda":
+        whole = torch.cuda.get_device_properties(stage.device).total_memory
+        torch.cuda.set_per_process_memory_fraction(min(1.0, (gb * 1e9 - 9e8) / whole))
+        torch.cuda.reset_peak_memory_stats()
+    try:
+        for _ in range(3):
+            trainer.step()
+            trainer.iteration += 1
+        stage.wait()
+        told["fits"] = True
+    except torch.OutOfMemoryError as error:
+        told |= {"fits": False, "said": str(error).splitlines()[0]}
+    finally:
+        if stage.device.type == "cuda":
+            told["peak_gb"] = round(torch.cuda.max_memory_allocated() / 1e9, 3)
+            told["reserved_gb"] = round(torch.cuda.max_memory_reserved() / 1e9, 3)
+            torch.cuda.set_per_process_memory_fraction(1.0)
+            del trainer, gaussians
+            torch.cuda.empty_cache()
+    return told
+
+
+def _resumed(stage: Stage) -> dict[str, Any]:
+    """A run saved before a round of growth, and gone on with on each device."""
+    most, width = (1200, 64) if stage.dry else (60_000, 640)
+    trainer = _trainer(stage, 600, most, width)
+    every = trainer.config.densify.every
+    for _ in range(every):
+        _step(trainer)
+    path = stage.results / "gpu-scratch.safetensors"
+    trainer.save(path)
+    told: dict[str, Any] = {"at": trainer.iteration}
+    for device in dict.fromkeys((stage.device.type, "cpu")):
+        other = Trainer(
+            trainer.scene, trainer.images.to(device), trainer.train_ids, trainer.config, Silent(), {}, device
+        )
+        other.restore(path)
+        before = len(other.model.gaussians)
+        for _ in range(3):
+            _step(other)
+        loss = float(other.step())
+        told[device] = {"gaussians": [before, len(other.model.gaussians)], "loss": loss}
+    path.unlink()
+    return told
+
+
+def _run_of(stage: Stage) -> str:
+    """A run of the scratch shot, trained if there is none: the stage `training` leaves some."""
+    shot = stage.scratch_shot()
+    name = f"gpu-preview-{stage.device.type}-0"
+    if not (shot.run(name) / METRICS_FILE).is_file():
+        _trained(stage, "preview", stage.device.type, 0)
+    return name
+
+
+def _frozen(stage: Stage) -> dict[str, Any]:
+    """Frames of a take a second, as they are delivered."""
+    shot, name = stage.scratch_shot(), _run_of(stage)
+    first = load_scene(shot).frames[0]
+    last = first + (0 if stage.dry else 9)
+    since = time.perf_counter()
+    asked = FreezeParams(run=name, take="gpu", first=first, last=last, device=stage.device.type)
+    asked.develop = "off" if stage.dry else asked.develop
+    facts = freeze_shot(shot, asked, Silent())
+    return {"frames": facts["frames"], "seconds_per_frame": round((time.perf_counter() - since) / facts["frames"], 3)}
+
+
+def _live(stage: Stage) -> dict[str, Any]:
+    """Views a second that a session draws, 320 x 180, without the pipe to Blender."""
+    shot = stage.scratch_shot()
+    session = LiveSession(shot, _run_of(stage), stage.device.type)
+    cameras = CameraPath.load(shot.cameras).frames
+    scene, count = session.scene, 3 if stage.dry else 200
+    width, height = (64, 36) if stage.dry else (320, 180)
+    focal = float(scene.Ks[0, 0, 0]) * width / scene.width
+    trained = session.run.train_frames
+    spent: list[float] = []
+    for n in range(count):
+        view = LiveView(
+            view=0, seq=n, t_star=trained[3 * n % len(trained)], viewmat=cameras[n % len(cameras)].viewmat,
+            K=[focal, focal, width / 2, height / 2], width=width, height=height, show="color", detail=False,
+        )  # fmt: skip
+        since = time.perf_counter()
+        session.draw(view)
+        spent.append(time.perf_counter() - since)
+    return {"views_per_second": round(count / sum(spent), 1), "median_ms": round(1e3 * sorted(spent)[count // 2], 2)}
+
+
+def _graph(stage: Stage) -> dict[str, Any]:
+    """A frame and its gradient captured as a CUDA graph, against the same launched one by one."""
+    size = (60, 24, 17) if stage.dry else WORKLOADS["W2"]
+    case = raster_bench._Case(room(*size), raster_bench.Body("cuda", stage.device.type))
+
+    def once() -> torch.Tensor:
+        for leaf in case.prepared.leaves.values():
+            leaf.grad = None
+        image = case.prepared.forward()
+        torch.autograd.backward(image, case.g)
+        return image.detach()
+
+    plain = once().clone()
+    gradient = case.prepared.leaves["means"].grad
+    assert gradient is not None
+    truth = gradient.clone()
+    if stage.device.type != "cuda":
+        return {"same": bool(torch.equal(plain, once())), "captured": False}
+    side = torch.cuda.Stream()
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            once()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        image = once()
+    graph.replay()
+    torch.cuda.synchronize()
+    captured = case.prepared.leaves["means"].grad
+    assert captured is not None
+    since = time.perf_counter()
+    for _ in range(50):
+        graph.replay()
+    torch.cuda.synchronize()
+    replayed = (time.perf_counter() - since) / 50
+    since = time.perf_counter()
+    for _ in range(50):
+        once()
+    torch.cuda.synchronize()
+    return {
+        "same": bool(torch.equal(plain, image)), "gradient_relative": float((captured - truth).norm() / truth.norm()),
+        "captured": True, "replay_ms": round(1e3 * replayed, 3),
+        "launched_ms": round(1e3 * (time.perf_counter() - since) / 50, 3),
+    }  # fmt: skip
+
+
+STAGES: dict[str, Callable[[Stage], None]] = {
+    "environment": environment,
+    "sanitizer": sanitizer,
+    "raster": raster,
+    "training": training,
+    "limits": limits,
+}
+
+
+def main(words: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("stage", choices=tuple(STAGES))
+    parser.add_argument("--results", type=Path, default=Path("output/gpu"), metavar="DIR")
+    parser.add_argument("--shot", type=Path, help="a solved shot folder, copied: for training and limits")
+    parser.add_argument("--dry-run", action="store_true", help="on the processor, at tiny sizes: figures mean nothing")
+    args = parser.parse_args(words)
+    if not args.dry_run and (refusal := cuda_refusal()):
+        print(f"{refusal} --dry-run goes through the stage on the processor.", file=sys.stderr)
+        return 9
+    args.results.mkdir(parents=True, exist_ok=True)
+    stage = Stage(args.dry_run, args.shot, args.results.absolute())
+    since = time.monotonic()
+    STAGES[args.stage](stage)
+    report = {
+        "stage": args.stage, "dry_run": args.dry_run, "machine": raster_bench.machine(stage.device.type),
+        "seconds": round(time.monotonic() - since, 1), "found": stage.found,
+    }  # fmt: skip
+    place = args.results / f"gpu-{args.stage}.json"
+    write_json(place, report)
+    failed = [name for name, told in stage.found.items() if isinstance(told, dict) and "failed" in told]
+    print(f"{place}: {len(stage.found)} parts, {len(failed)} failed {failed or ''}".rstrip())
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""The light of working frames that have a shoulder, as nodes: Blender reads them as sRGB, which up to a value they are.
+
+Above it they hold light up to 64 times white, as `torch_backend/contract/colour.py` says; one of Blender's curves of
+its own would end at 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from mathutils import Color
+
+from ...torch_backend import contract
+from .. import compat
+from ..access import set_value
+
+if TYPE_CHECKING:
+    import bpy
+
+_KNEE = ((contract.SHOULDER_FROM + 0.055) / 1.055) ** 2.4
+"""Light at which the shoulder begins."""
+_WIDE = 180.0
+
+
+def has_shoulder(shot_folder: contract.ShotFolder) -> bool:
+    """True if the working frames of a shot have one; False too where its record cannot be read."""
+    try:
+        return contract.read_json(shot_folder.listing).get("display") == contract.SHOULDER
+    except (OSError, ValueError, contract.JobError):
+        return False
+
+
+def lit(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Socket of a picture's light, scene-linear; the picture was read as sRGB and has a shoulder. It is opaque."""
+    there = {node.name for node in tree.nodes}
+    # The curve is of Rec.709's light; where Blender works in another, there and back.
+    channels = _through(tree, list(compat.separated(tree, picture)), Color.from_scene_linear_to_rec709_linear)
+    channels = _through(tree, [_bent_back(tree, c) for c in channels], Color.from_rec709_linear_to_scene_linear)
+    whole = compat.combined(tree, channels)
+    for column, node in enumerate(n for n in tree.nodes if n.name not in there):
+        node.location = (_WIDE * (column % 8), -300.0 - _WIDE * (column // 8))
+    return whole
+
+
+def _bent_back(tree: bpy.types.NodeTree, channel: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Light of a channel that was read as sRGB: max(c, knee) through the curve, less the knee, plus min(c, knee)."""
+    start, roll = contract.SHOULDER_FROM, contract.SHOULDER_ROLL
+    srgb = _on(tree, _on(tree, channel, "MAXIMUM", _KNEE), "POWER", 1.0 / 2.4)
+    grown = _on(tree, _on(tree, srgb, "MULTIPLY_ADD", 1.055 / roll, -(0.055 + start) / roll), "EXPONENT")
+    # 0.8 + roll (e - 1), and of that sRGB's light
+    base = _on(tree, grown, "MULTIPLY_ADD", roll / 1.055, (start - roll + 0.055) / 1.055)
+    above = _on(tree, _on(tree, base, "POWER", 2.4), "SUBTRACT", _KNEE)
+    node = compat.new_math_node(tree, "ADD")
+    tree.links.new(above, node.inputs[0])
+    tree.links.new(_on(tree, channel, "MINIMUM", _KNEE), node.inputs[1])
+    return node.outputs[0]
+
+
+def _through(
+    tree: bpy.types.NodeTree, channels: list[bpy.types.NodeSocket], convert: Callable[[Color], Color]
+) -> list[bpy.types.NodeSocket]:
+    """Channels in another linear space; themselves if it is the same."""
+    units = [convert(Color([float(n == k) for n in range(3)])) for k in range(3)]
+    columns: list[tuple[float, float, float]] = [(unit.r, unit.g, unit.b) for unit in units]
+    same = all(abs(columns[k][n] - float(n == k)) < 1e-4 for n in range(3) for k in range(3))
+    if same:
+        return channels
+    out: list[bpy.types.NodeSocket] = []
+    for n in range(3):
+        total = _on(tree, channels[0], "MULTIPLY", columns[0][n])
+        for k in (1, 2):
+            node = compat.new_math_node(tree, "MULTIPLY_ADD")
+            tree.links.new(channels[k], node.inputs[0])
+            set_value(node.inputs[1], columns[k][n])
+            tree.links.new(total, node.inputs[2])
+            total = node.outputs[0]
+        out.append(total)
+    return out
+
+
+def _on(tree: bpy.types.NodeTree, source: bpy.types.NodeSocket, operation: str, *values: float) -> bpy.types.NodeSocket:
+    node = compat.new_math_node(tree, operation)
+    tree.links.new(source, node.inputs[0])
+    for socket, value in zip(node.inputs[1:], values, strict=False):
+        set_value(socket, value)
+    return node.outputs[0]

@@ -1,0 +1,66 @@
+"""A pretended card for this folder's tests: a shim that needs a C++ compiler, and processes that begin with it."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[2]
+
+
+@pytest.fixture(scope="session")
+def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The compiled shim. Skips, with the reason, where it cannot be made or would meet a real CUDA."""
+    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if sys.platform != "linux":
+        pytest.skip("the pretended card is a shared library for Linux")
+    if compiler is None:
+        pytest.skip("the pretended card needs a C++ compiler (c++, g++ or clang++), and there is none")
+    if torch.version.cuda is not None or torch.version.hip is not None:
+        pytest.skip("the pretended card needs a PyTorch without CUDA: this one would ask a driver")
+    folder, home = tmp_path_factory.mktemp("card"), Path(torch.__path__[0])
+    command = [compiler, "-shared", "-fPIC", "-O0", "-w", "-std=c++20", str(HERE / "guard.cpp"), "-o", "guard.so"]
+    command += [f"-D_GLIBCXX_USE_CXX11_ABI={int(torch.compiled_with_cxx11_abi())}", f"-I{home / 'include'}"]
+    command += [f"-L{home / 'lib'}", "-ltorch_cpu", "-lc10", f"-Wl,-rpath,{home / 'lib'}"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        said = [line for line in done.stderr.splitlines() if "error" in line] or ["it gave no reason"]
+        pytest.skip(f"the pretended card does not compile here ({compiler}): {said[0]}")
+    return folder / "guard.so"
+
+
+WALKS = (
+    "steps auto/support/poses hexplane/paper mlp/support control_points/support",
+    "resume static",
+    "step_bytes static hexplane control_points",
+    "memory_ends hexplane 0.6",
+    "memory_ends static 0.85",
+    "self_test",
+    "station",
+)
+"""All in one process: half of what one takes is the import of torch."""
+
+
+@pytest.fixture(scope="session")
+def walk(card: Path) -> Callable[[str], Any]:
+    """walk(name and arguments): what `walks.py` says of one of `WALKS`."""
+    environ = {**os.environ, "PRETEND_CARD": str(card), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-P", str(HERE / "walks.py"), *WALKS]
+    done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    told = json.loads(done.stdout.splitlines()[-1])
+
+    def of(words: str) -> Any:
+        (found,) = (told[name] for name in WALKS if f"{name} ".startswith(f"{words} "))
+        assert "broke" not in found, found["broke"]
+        return found
+
+    return of

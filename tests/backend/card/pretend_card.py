@@ -1,0 +1,299 @@
+"""A CUDA card that is not there, for machines without one: real CPU tensors that say they lie on `cuda:0`.
+
+They keep torch's rules on mixing devices, and are counted: what would make the host wait for the card, and the bytes
+that live on it, up to a limit. The rasteriser's kernels run on Warp's fibers, the others on Warp's cpu device. Import
+this file before torch, in a process of its own (`guard.cpp`, compiled, has to be found first; it stays for good).
+What it does not know: the bytes of a kernel's own scratch (a sort's), other streams, how long anything takes.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import ctypes
+import os
+import sys
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any
+
+ctypes.CDLL(os.environ["PRETEND_CARD"])
+
+import torch  # noqa: E402
+from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
+from torch.utils._pytree import tree_flatten, tree_map  # noqa: E402
+
+CUDA = torch.device("cuda:0")
+_BLOCK = 512
+"""Bytes that torch's allocator hands out at a time."""
+_ASKED = {
+    "_local_scalar_dense", "nonzero", "masked_select", "unique_dim", "_unique2", "unique_consecutive", "equal",
+    "repeat_interleave",
+}  # fmt: skip
+"""Operators whose answer, or its size, the host has to wait for."""
+_INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index"}
+_COPIES = {"copy_", "_to_copy", "copy", "_copy_from"}
+_LENIENT = {
+    "where", "lerp", "lerp_", "fill_", "masked_fill", "masked_fill_", "index_fill", "clamp", "clamp_min", "clamp_max",
+}  # fmt: skip
+"""Take a number of the host's as a 0-dim tensor, as pointwise operators do."""
+
+
+class Mismatch(RuntimeError):
+    """Tensors of two devices in one operator."""
+
+
+class Card:
+    """What is counted."""
+
+    def __init__(self) -> None:
+        self.waits: collections.Counter[str] = collections.Counter()
+        """Operator and place in the backend -> how often the host waited for the card."""
+        self.launched: collections.Counter[str] = collections.Counter()
+        """Kernel of ours -> launches."""
+        self.limit = 8 << 30
+        """Bytes there are."""
+        self.live = self.peak = 0
+        """Bytes in use now, and at most."""
+        self._held: dict[int, list[int]] = {}
+        self.before_launch: Callable[[str], None] = lambda name: None
+        """Called with the name of each kernel of the rasteriser; may raise."""
+
+    def waited(self, what: str) -> None:
+        self.waits[f"{what} at {_place()}"] += 1
+
+    def take(self, storage: torch.UntypedStorage) -> int:
+        """Counts a tensor of this storage. torch.OutOfMemoryError if it is new, and too large for what is free."""
+        key = storage.data_ptr()
+        if not key:
+            return 0
+        if key not in self._held:
+            size = -(-storage.nbytes() // _BLOCK) * _BLOCK
+            if self.live + size > self.limit:
+                raise torch.OutOfMemoryError(f"CUDA out of memory. Tried to allocate {size} bytes at {_place()}.")
+            self._held[key] = [0, size]
+            self.live += size
+            self.peak = max(self.peak, self.live)
+        self._held[key][0] += 1
+        return key
+
+    def drop(self, key: int) -> None:
+        held = self._held.get(key)
+        if held is None:
+            return
+        held[0] -= 1
+        if not held[0]:
+            self.live -= self._held.pop(key)[1]
+
+
+CARD = Card()
+
+
+def _place() -> str:
+    """The two innermost lines of the backend."""
+    frame, found = sys._getframe(2), []
+    while frame and len(found) < 2:
+        name = frame.f_code.co_filename.replace("\\", "/")
+        if "/torch_backend/" in name:
+            found.append(f"{name.split('/torch_backend/')[-1]}:{frame.f_code.co_name}")
+        frame = frame.f_back
+    return " < ".join(found)
+
+
+def _given_back(held: list[int]) -> None:
+    CARD.drop(held[0])
+
+
+class Pretended(torch.Tensor):
+    """A tensor that says it lies on the card."""
+
+    _real: torch.Tensor
+    _held: list[int]
+    """What `CARD.take` said of the storage."""
+
+    @staticmethod
+    def __new__(cls, real: torch.Tensor) -> Pretended:
+        made = torch.Tensor._make_wrapper_subclass(
+            cls, real.shape, strides=real.stride(), storage_offset=real.storage_offset(), dtype=real.dtype,
+            layout=real.layout, device=CUDA, requires_grad=False,
+        )  # fmt: skip
+        made._real, made._held = real, [CARD.take(real.untyped_storage())]
+        weakref.finalize(made, _given_back, made._held)
+        return made
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(func, args, kwargs or {})
+
+    def data_ptr(self) -> int:
+        return self._real.data_ptr()
+
+    def tolist(self) -> Any:
+        CARD.waited("tolist")
+        return self._real.tolist()
+
+    def __repr__(self, **_: Any) -> str:
+        return f"Pretended({self._real!r})"
+
+    @property
+    def data(self) -> Any:
+        return self.detach()
+
+    @data.setter
+    def data(self, other: Any) -> None:
+        if not isinstance(other, Pretended) or other.shape != self.shape:
+            raise Mismatch("data of another device or shape")
+        key = CARD.take(other._real.untyped_storage())
+        CARD.drop(self._held[0])
+        self._real, self._held[0] = other._real, key
+
+
+def _real(value: Any) -> Any:
+    return value._real if isinstance(value, Pretended) else value
+
+
+def _on_card(value: Any) -> Any:
+    return Pretended(value) if isinstance(value, torch.Tensor) and not isinstance(value, Pretended) else value
+
+
+def _check(func: Any, name: str, tensors: list[Any]) -> None:
+    """Mismatch where torch would refuse tensors of two devices."""
+    ours = [t for t in tensors if isinstance(t, Pretended)]
+    others = [t for t in tensors if not isinstance(t, Pretended)]
+    if not ours or not others or name in _COPIES or name in _INDEXED:
+        return
+    lenient = torch.Tag.pointwise in func.tags or name in _LENIENT
+    written = name.endswith("_") and not isinstance(tensors[0], Pretended)
+    if written or not lenient or any(t.dim() > 0 for t in others):
+        shapes = [(tuple(t.shape), "cuda" if isinstance(t, Pretended) else "cpu") for t in tensors]
+        raise Mismatch(f"{func} of {shapes} at {_place()}")
+
+
+def _check_index(func: Any, name: str, args: Any) -> None:
+    """The same of indices, which may lie on the host; waits where they do, or where they are flags."""
+    values, indices = args[0], [i for i in args[1] if isinstance(i, torch.Tensor)]
+    if not isinstance(values, Pretended) and any(isinstance(i, Pretended) for i in indices):
+        raise Mismatch(f"{func}: cpu indexed by cuda at {_place()}")
+    for index in indices:
+        if isinstance(values, Pretended) and not isinstance(index, Pretended):
+            CARD.waited("index from the host")
+        if index.dtype in (torch.bool, torch.uint8):
+            CARD.waited("flags as an index")
+    apart = "put" in name and isinstance(values, Pretended) != isinstance(args[2], Pretended)
+    if apart and (not isinstance(values, Pretended) or args[2].dim() > 0):
+        raise Mismatch(f"{func}: values of another device at {_place()}")
+
+
+def _count_waits(name: str, args: Any, kwargs: dict[str, Any], to_card: bool, touches: bool) -> None:
+    if name == "copy_":
+        waits = not kwargs.get("non_blocking", args[2] if len(args) > 2 else False)
+        if waits and isinstance(args[0], Pretended) != isinstance(args[1], Pretended):
+            CARD.waited("copy_")
+    elif name == "_to_copy":
+        from_card = isinstance(args[0], Pretended)
+        leaves = from_card and kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "cpu"
+        if leaves or (not from_card and to_card and not kwargs.get("non_blocking", False)):
+            CARD.waited("to cpu" if leaves else "to cuda")
+    elif name in _ASKED and touches:
+        CARD.waited(name)
+
+
+def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """Carries an operator out on the real tensors."""
+    name = func._schema.name.split("::")[-1]
+    tensors = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, torch.Tensor)]
+    touches = any(isinstance(t, Pretended) for t in tensors)
+    device = kwargs.get("device")
+    to_card = device is not None and torch.device(device).type == "cuda"
+    to_host = device is not None and torch.device(device).type == "cpu"
+    _check(func, name, tensors)
+    if name in _INDEXED and touches:
+        _check_index(func, name, args)
+    _count_waits(name, args, kwargs, to_card, touches)
+    held = {**kwargs, "device": torch.device("cpu")} if to_card else dict(kwargs)
+    held.pop("pin_memory", None)
+    if name == "_to_copy":
+        held.pop("device", None)  # between two tensors of the host it is always a copy
+    out = func(*tree_map(_real, args), **tree_map(_real, held))
+    stays = isinstance(args[0], Pretended) if name == "copy_" else to_card or (touches and not to_host)
+    if name == "_local_scalar_dense" or not stays:
+        return out
+    if func._schema.is_mutable and name.endswith("_"):
+        return args[0]
+    if func._schema.is_mutable and "out" in kwargs:
+        return kwargs["out"]
+    if func._schema.is_mutable and not func._schema.returns:
+        return None
+    return tree_map(_on_card, out)
+
+
+class _Mode(TorchDispatchMode):
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(func, args, kwargs or {})
+
+
+@contextlib.contextmanager
+def pretended_card() -> Iterator[Card]:
+    """All below has one NVIDIA card, with `CARD.limit` bytes."""
+    import torch_backend.native as native
+    import torch_backend.raster.cuda as cuda
+    import torch_backend.raster.ssim_cuda as ssim_cuda
+    import torch_backend.train.adam as adam
+    import torch_backend.train.device as chosen
+
+    saved: list[tuple[Any, str, Any]] = []
+
+    def patch(where: Any, name: str, value: Any) -> None:
+        saved.append((where, name, getattr(where, name)))
+        setattr(where, name, value)
+
+    def launch_on(kernel: Any, dim: Any, inputs: list[Any], device: torch.device) -> None:
+        CARD.launched[kernel.key] += device.type == "cuda"
+        native.initialised_warp().launch(kernel, dim=dim, inputs=inputs, device="cpu")
+
+    def launcher(self: Any, device: torch.device) -> None:
+        self.wp, self.device, self.where = native.initialised_warp(), device, {"device": "cpu"}
+
+    def launch(self: Any, name: str, args: Any, threads: int, channels: int = 0) -> None:
+        if threads:
+            CARD.before_launch(name)
+            CARD.launched[name] += 1
+            dim = -(-threads // cuda.source.BLOCK) * cuda.source.BLOCK
+            with cuda._Fibers(self.wp):
+                self.wp.launch(
+                    cuda.build(name, channels), dim=dim, inputs=[args], block_dim=cuda.source.BLOCK, record_tape=False,
+                    **self.where,
+                )  # fmt: skip
+
+    plain = torch.tensor
+    patch(torch, "tensor", lambda *values, pin_memory=False, **options: plain(*values, **options))
+    patch(torch.Tensor, "pin_memory", lambda self, *_: self)
+    patch(torch.cuda, "_lazy_init", lambda: None)
+    patch(torch.cuda, "is_available", lambda: True)
+    patch(torch.cuda, "is_current_stream_capturing", lambda: False)
+    patch(torch.cuda, "device", lambda device: contextlib.nullcontext())
+    patch(torch.cuda, "mem_get_info", lambda device=None: (CARD.limit - CARD.live, CARD.limit))
+    patch(torch.cuda, "empty_cache", lambda: None)
+    patch(torch.cuda, "memory_reserved", lambda device=None: CARD.live)
+    patch(torch.cuda, "memory_allocated", lambda device=None: CARD.live)
+    patch(torch.cuda, "synchronize", lambda device=None: None)
+    patch(chosen, "cuda_refusal", lambda: "")
+    patch(chosen, "card_problem", lambda: "")  # it would ask a process of its own, which has no such card
+    for module in (native, ssim_cuda, adam):
+        patch(module, "launch_on", launch_on)
+    patch(cuda._Launcher, "__init__", launcher)
+    patch(cuda._Launcher, "__call__", launch)
+    patch(cuda, "_refusal", lambda device: None)
+    overwritten = torch.__future__.get_overwrite_module_params_on_conversion()
+    torch.__future__.set_overwrite_module_params_on_conversion(True)
+    torch._C._set_only_lift_cpu_tensors(True)
+    try:
+        with _Mode():
+            yield CARD
+    finally:
+        torch._C._set_only_lift_cpu_tensors(False)
+        torch.__future__.set_overwrite_module_params_on_conversion(overwritten)
+        for where, name, value in reversed(saved):
+            setattr(where, name, value)

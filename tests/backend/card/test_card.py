@@ -1,0 +1,55 @@
+"""Training on a card, walked on one that is pretended: tensors of one device, a host that does not wait, a memory that
+ends."""
+
+import pytest
+
+RUNS = ("auto/support/poses", "hexplane/paper", "mlp/support", "control_points/support")
+"""Every host and every supervision."""
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_a_step_on_a_card_waits_for_nothing_but_at_the_tenth(walk, run):
+    told = walk("steps")[run]
+    assert told["finite"] and told["moving"] > 0
+    assert told["waits"] == {}
+
+
+def test_a_run_is_resumed_on_a_card_at_a_round_of_growth(walk):
+    told = walk("resume")
+    assert told["iteration"] == 6 and told["after"] > told["before"]
+    assert told["devices"] == ["cuda"]
+
+
+def test_a_shot_goes_the_whole_way_on_a_card(walk):
+    told = walk("station")
+    assert told["device"] == "cuda" and told["iterations"] == [10, 12]
+    assert told["frames"] == 1 and told["drawn"] > 0
+    assert {"raster_blend", "raster_blend_backward", "ssim_pass", "adam"} <= set(told["launched"])
+
+
+@pytest.mark.parametrize("method", ["static", "hexplane", "control_points"])
+def test_a_step_takes_the_memory_that_is_reckoned_with(walk, method):
+    told = walk("step_bytes")[method]
+    assert 0.7 * told["said"] < told["measured"] < 1.1 * told["said"]  # of which the plan asks 1.15
+
+
+def test_where_memory_ends_the_field_works_in_pieces_first(walk):
+    told = walk("memory_ends hexplane")
+    assert told["iteration"] == 14 and told["finite"] and told["saved"]
+    assert told["after"] == told["before"]
+    assert len(told["warnings"]) == 1 and "in pieces of" in told["warnings"][0]
+
+
+def test_where_memory_ends_without_a_field_the_least_go(walk):
+    told = walk("memory_ends static")
+    assert told["iteration"] == 14 and told["finite"] and told["saved"]
+    assert told["after"] < told["before"] and "that cover least were dropped" in told["warnings"][0]
+    assert told["budget"] == 330, "what was asked for is the run's key"
+
+
+def test_a_card_is_tested_before_its_first_use(walk):
+    told = walk("self_test")
+    assert told["sound"] == "" and told["checks"] > 8
+    assert {"raster_project_backward", "ssim_pass", "adam"} <= set(told["launched"])
+    assert "an illegal memory access" in told["broken"] and "see the log" not in told["broken"]
+    assert told["full"] == ["its memory is taken by other programs", False]

@@ -1,0 +1,223 @@
+"""Walks over the pretended card, in a process of their own: `python walks.py "WALK ARGUMENT ..." ...`, JSON out.
+
+The tiny shot of `conftest.py`, at a quarter of its size: the rasteriser's kernels run on fibers here.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parents[2])]
+
+from pretend_card import CARD, pretended_card  # noqa: E402  (before torch)
+
+
+def small_world(folder: Path) -> tuple[Any, type]:
+    """(the tiny shot at 32 x 24, the class of its silent reporter)."""
+    spec = importlib.util.spec_from_file_location("tiny", HERE.parent / "conftest.py")
+    assert spec is not None and spec.loader is not None
+    tiny = importlib.util.module_from_spec(spec)
+    sys.modules["tiny"] = tiny
+    spec.loader.exec_module(tiny)
+    tiny.WIDTH, tiny.HEIGHT = 32, 24
+    return tiny.build_world(folder), tiny.Quiet
+
+
+def new_trainer(world: Any, quiet: type, method: str, supervision: str, poses: bool, iterations: int = 20) -> Any:
+    """A run of few steps whose every event happens: growth, the gate, the poses, the paper's and our anchors."""
+    from torch_backend.contract import TrainParams
+    from torch_backend.scene import load_images, load_scene
+    from torch_backend.train import config_from_params
+    from torch_backend.train.trainer import Trainer
+
+    scene = load_scene(world.shot)
+    asked = TrainParams(iterations=iterations, max_gaussians=330, method=method, supervision=supervision)
+    config = config_from_params(asked)
+    config.poses.on, config.densify.every, config.init.seeds = poses, 5, 0
+    config.gate.start, config.field.start = 0.2, 0.2
+    if method in ("mlp", "control_points"):
+        config.field.noise = 0.1  # published: times are blurred
+    images = load_images(scene, scene.solved, 32, 24).to("cuda")
+    return Trainer(scene, images, scene.solved, config, quiet(), {}, "cuda")
+
+
+def _steps(trainer: Any, count: int) -> dict[str, int]:
+    """Takes steps; what the host waited for in those that are no tenth, by operator and place."""
+    waits: dict[str, int] = {}
+    for _ in range(count):
+        trainer.schedule_events()
+        CARD.waits.clear()
+        tenth = trainer.iteration % 10 == 0
+        trainer.step()
+        trainer.iteration += 1
+        for what, times in () if tenth else CARD.waits.items():
+            waits[what] = waits.get(what, 0) + times
+        if trainer.iteration % 10 == 0:
+            trainer.inspect_nonfinite()
+    return waits
+
+
+def steps(folder: Path, *runs: str) -> dict[str, Any]:
+    """`METHOD/SUPERVISION[/poses]` ...: per run its waits in steps, and how it stands at the end."""
+    world, quiet = small_world(folder)
+    told: dict[str, Any] = {}
+    for run in runs:
+        method, supervision, *poses = run.split("/")
+        with pretended_card():
+            trainer = new_trainer(world, quiet, method, supervision, bool(poses))
+            waits = _steps(trainer, 5)
+            moving = len(trainer.model.open_rows())
+            waits |= _steps(trainer, 8)
+            means = trainer.model.gaussians.params["means"]
+            told[run] = {"waits": waits, "moving": moving, "finite": bool(means.isfinite().all())}
+    return told
+
+
+def resume(folder: Path, method: str) -> dict[str, Any]:
+    """A run that is resumed just before a round of growth: moments are cloned before the optimiser's next step."""
+    world, quiet = small_world(folder)
+    with pretended_card():
+        trainer = new_trainer(world, quiet, method, "support", False)
+        _steps(trainer, 5)
+        trainer.save(folder / "x.safetensors")
+        other = new_trainer(world, quiet, method, "support", False)
+        other.restore(folder / "x.safetensors")
+        before = len(other.model.gaussians)
+        _steps(other, 1)
+        moments = other.optimizer.state[other.model.gaussians.params["means"]]
+        return {
+            "iteration": other.iteration, "before": before, "after": len(other.model.gaussians),
+            "devices": sorted({value.device.type for value in moments.values()}),
+        }  # fmt: skip
+
+
+def station(folder: Path) -> dict[str, Any]:
+    """Train, extend, freeze, live: the whole way of a shot."""
+    from torch_backend.contract import FreezeParams, LiveView, TrainParams
+    from torch_backend.freeze import freeze_shot
+    from torch_backend.live import LiveSession
+    from torch_backend.train import train_shot
+
+    world, quiet = small_world(folder)
+    report = quiet()
+    with pretended_card():
+        params = TrainParams(run="g", iterations=10, max_gaussians=260, device="cuda", holdout=8)
+        trained = train_shot(world.shot, params, report)
+        extended = train_shot(world.shot, TrainParams(run="g", device="cuda", extend=2), report)
+        asked = FreezeParams(run="g", take="t", first=101, last=101, device="cuda", develop="off")
+        frozen = freeze_shot(world.shot, asked, report)
+        live = LiveSession(world.shot, "g", "cuda")
+        view = LiveView(
+            view=0, seq=1, t_star=105, viewmat=world.viewmats[3].flatten().tolist(), K=[60.0, 60.0, 32.0, 24.0],
+            width=32, height=24, show="color",
+        )  # fmt: skip
+        drawn = live.draw(view)
+    return {
+        "device": trained["device"], "iterations": [trained["iterations"], extended["iterations"]],
+        "frames": frozen["frames"], "drawn": len(drawn[1]), "launched": sorted(CARD.launched),
+    }  # fmt: skip
+
+
+def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
+    """Bytes that a step takes per Gaussian, all of them moving but with `static`, beside what the model says."""
+    import torch
+
+    from torch_backend.train import memory
+
+    world, quiet = small_world(folder)
+    told: dict[str, Any] = {}
+    for method in methods:
+        with pretended_card():
+            trainer = new_trainer(world, quiet, method, "support", False)
+            trainer.iteration = 4
+            trainer.schedule_events()
+            peaks: list[tuple[int, int]] = []
+            for times in (2, 6):
+                many = len(trainer.model.gaussians) * times
+                rows = torch.arange(many, device="cuda") % len(trainer.model.gaussians)
+                fresh = torch.zeros(many, dtype=torch.bool, device="cuda")
+                trainer.model.gaussians.rebuild(rows, fresh, trainer.optimizer)
+                trainer.densifier.reset(many)
+                trainer.step()  # makes the moments
+                CARD.peak = CARD.live
+                trainer.step()
+                peaks.append((many, CARD.peak))
+            (few, low), (many, high) = peaks
+            whole = memory.moving_bytes(trainer.config, True) if method != "static" else 0
+            harmonics = 3 * (trainer.config.sh_degree + 1) ** 2
+            # Of so few steps on so small a picture: no mean of the last steps, one list of hits, no harmonics yet.
+            absent = 4 * (11 + harmonics) + 16 * memory.HIT_BYTES + 8 * harmonics
+            said = memory.gaussian_bytes(trainer.config, len(trainer.centres)) + whole - absent
+            told[method] = {"measured": (high - low) / (many - few), "said": said}
+    return told
+
+
+def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
+    """A run whose card has this share of the memory that a step with anchors takes, from the ninth step on."""
+    from torch_backend.train import memory
+
+    world, quiet = small_world(folder)
+    memory.LEAST, memory.LEAST_PIECE = 40, 100
+    with pretended_card():
+        trainer = new_trainer(world, quiet, method, "support", False, iterations=14)
+        _steps(trainer, 8)
+        CARD.peak = CARD.live
+        _steps(trainer, 1)  # the first with anchors, which take most
+        CARD.limit = CARD.live + int(float(share) * (CARD.peak - CARD.live))
+        before = len(trainer.model.gaussians)
+        trainer.run(folder / "c.safetensors", lambda _: None)
+        saved = (folder / "c.safetensors").is_file()
+    warnings = [event[1] for event in trainer.report.events if event[0] == "warning"]
+    means = trainer.model.gaussians.params["means"]
+    return {
+        "iteration": trainer.iteration, "before": before, "after": len(trainer.model.gaussians), "saved": saved,
+        "warnings": warnings, "finite": bool(means.isfinite().all()), "budget": trainer.config.densify.budget,
+    }  # fmt: skip
+
+
+def self_test(folder: Path) -> dict[str, Any]:
+    """The self-test of the card as it is, of one whose kernels fail to launch, and of one that is full."""
+    import torch
+
+    from torch_backend.train.self_test import run_self_test
+
+    def fails(name: str) -> None:
+        raise RuntimeError(f"CUDA error: an illegal memory access in {name}\nsee the log")
+
+    with pretended_card():
+        sound = run_self_test(torch.device("cuda"))
+        CARD.before_launch = fails
+        broken = run_self_test(torch.device("cuda"))
+        CARD.before_launch = lambda name: None
+        CARD.limit = CARD.live + 1000
+        full = run_self_test(torch.device("cuda"))
+    return {
+        "sound": sound.problem, "checks": len(sound.checks), "broken": broken.problem,
+        "full": [full.problem, full.lasting], "launched": sorted(CARD.launched),
+    }  # fmt: skip
+
+
+WALKS = {
+    "steps": steps, "resume": resume, "station": station, "step_bytes": step_bytes, "memory_ends": memory_ends,
+    "self_test": self_test,
+}  # fmt: skip
+
+if __name__ == "__main__":
+    told = {}
+    for walk in sys.argv[1:]:
+        with tempfile.TemporaryDirectory() as made:
+            CARD.limit = 8 << 30
+            try:
+                told[walk] = WALKS[walk.split()[0]](Path(made), *walk.split()[1:])
+            except Exception:
+                told[walk] = {"broke": traceback.format_exc()}
+    print(json.dumps(told))

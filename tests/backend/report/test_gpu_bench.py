@@ -1,0 +1,36 @@
+"""The script for a card that is at hand for half an hour goes through its stages without one."""
+
+import json
+
+import pytest
+
+from benchmarks import gpu
+from torch_backend.train.device import cuda_refusal
+
+
+def test_a_dry_run_goes_through_all_parts_of_a_stage(world, tmp_path):
+    assert gpu.main(["limits", "--dry-run", "--shot", str(world.shot.root), "--results", str(tmp_path)]) == 0
+    told = json.loads((tmp_path / "gpu-limits.json").read_text())
+    assert told["dry_run"] and set(told["found"]) == {"memory_6", "resume", "freeze", "live", "graph"}
+    assert not [name for name, part in told["found"].items() if "failed" in part]
+    before, after = told["found"]["resume"]["cpu"]["gaussians"]
+    assert after > before, "it was resumed at a round of growth"
+    assert told["found"]["graph"]["same"] and told["found"]["memory_6"]["fits"]
+    assert not (world.shot.root / "runs").is_dir(), "the shot itself is left alone"
+
+
+def test_a_part_that_fails_is_a_sentence_and_the_others_go_on(tmp_path):
+    stage = gpu.Stage(True, None, tmp_path)
+    stage.part("without a shot", lambda: {"frames": stage.scratch_shot()})
+    stage.part("after it", lambda: {"ms": 1.0})
+    assert stage.found["without a shot"]["failed"] == "JobError: This part needs a solved shot."
+    assert stage.found["after it"]["ms"] == 1.0
+    stage.dry, stage.until = False, 0.0
+    stage.part("too late", lambda: {"ms": 1.0}, needs=30.0)
+    assert "30 are needed" in stage.found["too late"]["left_out"]
+
+
+@pytest.mark.skipif(not cuda_refusal(), reason="there is a card")
+def test_without_a_card_it_says_how_to_go_on(tmp_path, capsys):
+    assert gpu.main(["raster", "--results", str(tmp_path)]) == 9
+    assert "--dry-run" in capsys.readouterr().err and not list(tmp_path.iterdir())

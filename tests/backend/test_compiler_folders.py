@@ -1,0 +1,105 @@
+"""Folders that a compiler can open whatever the profile is called, and that Warp really compiles from them."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from torch_backend.compiler_folders import CompilerFolders, compiler_folders
+from torch_backend.contract import JobError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def warp_of(tmp_path: Path):
+    """warp_of(name): a package of that name with a header."""
+
+    def make(name: str) -> Path:
+        package = tmp_path / name / "warp"
+        (package / "native").mkdir(parents=True)
+        (package / "native" / "builtin.h").write_text("// here")
+        return package
+
+    return make
+
+
+def environ(tmp_path: Path) -> dict[str, str]:
+    return {"PROGRAMDATA": str(tmp_path / "all users"), "USERPROFILE": "C:\\Users\\Jörg"}
+
+
+def test_plain_names_and_other_systems_stay_as_they_are(warp_of, tmp_path: Path):
+    plain, odd = warp_of("plain"), warp_of("Jörg")
+    assert compiler_folders(plain, "1.0", environ(tmp_path), tmp_path, windows=True).headers is None
+    assert compiler_folders(plain, "1.0", environ(tmp_path), tmp_path, windows=True).kernels is None
+    assert compiler_folders(odd, "1.0", environ(tmp_path), odd, windows=False) == CompilerFolders()
+
+
+def test_an_umlaut_moves_headers_and_kernels_once(warp_of, tmp_path: Path):
+    odd = warp_of("Jörg")
+    found = compiler_folders(odd, "1.0", environ(tmp_path), odd.parent / "cache", windows=True)
+    for folder in (found.headers, found.kernels):
+        assert folder is not None and str(folder).isascii() and tmp_path / "all users" in folder.parents
+    assert (found.headers / "native" / "builtin.h").read_text() == "// here"
+    (found.headers / "native" / "builtin.h").write_text("// the copy")
+    again = compiler_folders(odd, "1.0", environ(tmp_path), odd.parent / "cache", windows=True)
+    assert again == found and (found.headers / "native" / "builtin.h").read_text() == "// the copy"
+    newer = compiler_folders(odd, "1.1", environ(tmp_path), odd.parent / "cache", windows=True)
+    assert newer.headers != found.headers, "headers are of one version"
+    only_cache = compiler_folders(warp_of("plain"), "1.0", environ(tmp_path), odd, windows=True)
+    assert only_cache.headers is None and only_cache.kernels == found.kernels
+
+
+def test_a_copy_that_was_interrupted_is_made_anew(warp_of, tmp_path: Path):
+    odd = warp_of("Jörg")
+    first = compiler_folders(odd, "1.0", environ(tmp_path), odd, windows=True).headers
+    os.rename(first / "native", first / "native.part")
+    (first / "native.part" / "half a file").write_text("")
+    again = compiler_folders(odd, "1.0", environ(tmp_path), odd, windows=True).headers
+    assert [path.name for path in (again / "native").iterdir()] == ["builtin.h"]
+
+
+def test_nowhere_to_go_is_one_sentence(warp_of, tmp_path: Path):
+    odd = warp_of("Jörg")
+    for places in ({}, {"PROGRAMDATA": str(tmp_path / "Jörg")}, {"PUBLIC": "not absolute"}):
+        with pytest.raises(JobError, match="the compiler cannot open .*Jörg") as refused:
+            compiler_folders(odd, "1.0", places, odd, windows=True)
+        assert "PROGRAMDATA" in refused.value.hint
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+import warp
+import torch_backend.native as native
+from torch_backend.compiler_folders import CompilerFolders
+moved = CompilerFolders(Path(sys.argv[1]), Path(sys.argv[2]), False)
+native.compiler_folders = lambda *told: moved
+seen = native.build("moved", "*(int*)block = PROBE;")
+import ctypes
+number = ctypes.c_int(0)
+seen(ctypes.addressof(number), 0, 0)
+print(number.value, native.initialised_warp().config.kernel_cache_dir)
+"""
+
+
+def test_warp_compiles_from_moved_headers_into_a_moved_cache(tmp_path: Path):
+    home = tmp_path / "headers"
+    folders = compiler_folders(Path(wp.__file__).parent, "x", {}, tmp_path, windows=False)
+    assert folders.headers is None
+    home.mkdir()
+    native = home / "native"
+    shutil.copytree(Path(wp.__file__).parent / "native", native)
+    with open(native / "builtin.h", "a", encoding="utf-8") as header:
+        header.write("\n#define PROBE 77\n")
+    command = [sys.executable, "-P", "-c", SCRIPT, str(tmp_path / "kernels"), str(home)]
+    done = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    number, cache = done.stdout.split(maxsplit=1)
+    assert number == "77" and Path(cache.strip()).parent == tmp_path / "kernels"

@@ -1,0 +1,108 @@
+"""The card's self-test, here on Warp's cpu device (fibers): what it finds, and that it is asked once.
+
+On a pretended card, and with kernels that do not launch: tests/backend/card/test_card.py.
+"""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torch_backend.contract import JobError
+from torch_backend.train import adam, choose_device, device, self_test
+from torch_backend.train.self_test import SelfTest, card_problem, run_self_test
+
+
+@pytest.fixture
+def cards(nvidia_smi):
+    if sys.platform == "win32":
+        pytest.skip("the stand-in of nvidia-smi is a shell script")
+    return nvidia_smi
+
+
+@pytest.fixture
+def other_adam(monkeypatch):
+    """other_adam(old, new): Adam's kernel with another text."""
+
+    def change(old: str, new: str) -> None:
+        source = adam._source
+        assert old in source("adam.cu")
+        monkeypatch.setattr(
+            adam, "_source", lambda name: source(name).replace(old, new) if name == "adam.cu" else source(name)
+        )
+        adam._kernel.cache_clear()
+
+    yield change
+    monkeypatch.undo()
+    adam._kernel.cache_clear()
+
+
+def test_kernels_that_compute_something_else_are_found(other_adam, monkeypatch):
+    monkeypatch.setattr(self_test, "_frame", lambda device: [])  # walked on a pretended card
+    other_adam("r[1] * (g[i] - m[i])", "1.02f * r[1] * (g[i] - m[i])")
+    found = run_self_test(torch.device("cpu"))
+    assert len(found.checks) == 3 and found.lasting
+    assert [c.what for c in found.checks if not c.error <= c.bound] == ["a step of Adam"]
+    assert found.problem.startswith("a step of Adam comes out wrong on it")
+
+
+def test_a_kernel_that_does_not_build_is_a_sentence(other_adam, monkeypatch, capfd):
+    monkeypatch.setattr(self_test, "_frame", lambda device: [])
+    other_adam("float odd", "flaot odd")
+    found = run_self_test(torch.device("cpu"))
+    assert found.problem.startswith("a kernel does not build or run on it (") and "\n" not in found.problem
+    capfd.readouterr()
+
+
+def test_a_card_is_tested_once_and_again_after_an_update(tmp_path: Path, cards):
+    asked = []
+
+    def test(key: str) -> SelfTest:
+        asked.append(key)
+        return SelfTest(key=key, problem="it is broken", checks=[self_test.Check("a frame", 0.5, 0.01)])
+
+    cards("NVIDIA GeForce RTX 4070, 580.65.06, 8.9")
+    assert [card_problem(tmp_path, test) for _ in range(3)] == ["it is broken"] * 3
+    assert len(asked) == 1
+    kept = json.loads((tmp_path / "splannequin-card.json").read_text())
+    assert kept["checks"] == [{"what": "a frame", "error": 0.5, "bound": 0.01}]
+    cards("NVIDIA GeForce RTX 4070, 590.10.01, 8.9")
+    card_problem(tmp_path, test)
+    assert len(asked) == 2 and asked[0] != asked[1]
+    (tmp_path / "splannequin-card.json").write_text("[]")  # damaged: as if it were not there
+    assert card_problem(tmp_path, test) == "it is broken" and len(asked) == 3
+
+
+def test_what_may_be_otherwise_the_next_time_is_not_kept(tmp_path: Path):
+    def full(key: str) -> SelfTest:
+        return SelfTest(key=key, problem="its memory is taken by other programs", lasting=False)
+
+    assert card_problem(tmp_path, full) and not list(tmp_path.iterdir())
+    assert card_problem(tmp_path, lambda key: SelfTest(key=key)) == ""
+    assert card_problem(tmp_path, full) == "", "it was sound, and is not asked again"
+
+
+def test_a_card_that_fails_is_not_used_and_said(monkeypatch):
+    monkeypatch.setattr(device, "cuda_refusal", lambda: "")
+    monkeypatch.setattr(device, "card_problem", lambda: "a frame comes out wrong on it (2e-01 off, 1e-02 is allowed)")
+    assert choose_device("auto").type == "cpu"
+    sentence, advice = device.unused_card()
+    assert sentence.startswith("The graphics card failed its self-test: a frame comes out wrong")
+    assert "doctor --gpu" in advice
+    with pytest.raises(JobError, match="failed its self-test") as refused:
+        choose_device("cuda")
+    assert "--device cpu" in refused.value.hint
+    monkeypatch.setattr(device, "card_problem", lambda: "")
+    assert choose_device("auto").type == choose_device("cuda").type == "cuda" and device.unused_card() is None
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
+def test_a_test_in_another_process_comes_back(tmp_path: Path):
+    found = self_test.tested_apart("of this key")
+    assert found.key == "of this key" and not found.lasting
+    assert found.problem == device.cuda_refusal()
+    self_test.keep(dataclasses.replace(found, lasting=True), tmp_path)
+    assert self_test._kept(tmp_path / "splannequin-card.json") == dataclasses.replace(found, lasting=True)

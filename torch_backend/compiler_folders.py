@@ -1,0 +1,104 @@
+"""Folders that Warp's compilers can open: on Windows those whose names are ASCII.
+
+Warp hands its compilers paths as UTF-8, and Clang and NVRTC open them as Windows' own code page: from a profile such as
+`C:\\Users\\Jörg` neither the headers in `warp/native` nor the folder of compiled kernels can be read, and nothing
+compiles, for the processor no more than for a card. Short (8.3) names do not help: Warp makes the long ones of them.
+So both move to a folder that everybody may write and whose name is ASCII. Standard library only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from .contract import ExitCode, JobError
+from .shot import locked
+
+_FOLDER = "Splannequin"
+
+
+@dataclass(frozen=True)
+class CompilerFolders:
+    """Where Warp compiles; None leaves a folder as Warp has it."""
+
+    kernels: Path | None = None
+    """Compiled kernels."""
+    headers: Path | None = None
+    """Holds `native`, Warp's headers."""
+    precompiled: bool = True
+    """May headers be compiled ahead? That goes to the temporary folder."""
+
+
+def compiler_folders(
+    package: Path, version: str, environ: Mapping[str, str], kernels: Path, windows: bool = os.name == "nt"
+) -> CompilerFolders:
+    """Folders for a Warp of this version that is installed as `package`; copies its headers where they have to move.
+
+    Args:
+        package: folder of the package warp.
+        version: its version.
+        environ: environment variables.
+        kernels: where Warp would keep compiled kernels.
+        windows: whether paths have to be ASCII.
+
+    JobError if they have to move and there is nowhere to.
+    """
+    if not windows:
+        return CompilerFolders()
+    moved = [not str(path).isascii() for path in (kernels, package)]
+    precompiled = tempfile.gettempdir().isascii()
+    if not any(moved):
+        return CompilerFolders(precompiled=precompiled)
+    root = _writable(environ)
+    if root is None:
+        where = kernels if moved[0] else package
+        raise JobError(
+            f"Kernels cannot be compiled: the compiler cannot open {where}, whose name is not plain ASCII.",
+            "Set the environment variable PROGRAMDATA, or PUBLIC, to a folder with a plain name that can be written.",
+            ExitCode.ENVIRONMENT,
+        )
+    return CompilerFolders(
+        root / "kernels" if moved[0] else None,
+        _copied(package / "native", root / f"warp-{version}") if moved[1] else None,
+        precompiled,
+    )
+
+
+def _writable(environ: Mapping[str, str]) -> Path | None:
+    """A folder of this user's with an ASCII name that can be written; None if there is none."""
+    user = hashlib.sha256(environ.get("USERPROFILE", environ.get("USERNAME", "")).encode()).hexdigest()[:8]
+    for base in _bases(environ):
+        folder = base / _FOLDER / user
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+            return folder
+        except OSError:
+            continue
+    return None
+
+
+def _bases(environ: Mapping[str, str]) -> Iterator[Path]:
+    """Where all users may write, with ASCII names; the first is the usual one."""
+    drive = environ.get("SYSTEMDRIVE", "")
+    for named in (environ.get("PROGRAMDATA", ""), environ.get("PUBLIC", ""), f"{drive}{os.sep}" if drive else ""):
+        if named and named.isascii() and os.path.isabs(named):
+            yield Path(named)
+
+
+def _copied(native: Path, home: Path) -> Path:
+    """`home` with a whole copy of the folder `native` in it: made beside its name and renamed."""
+    if not (home / "native").is_dir():
+        home.mkdir(parents=True, exist_ok=True)
+        with locked(home / "copying.lock"):
+            if not (home / "native").is_dir():
+                beside = home / "native.part"
+                shutil.rmtree(beside, ignore_errors=True)
+                shutil.copytree(native, beside)
+                os.replace(beside, home / "native")
+    return home

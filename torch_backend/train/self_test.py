@@ -1,0 +1,254 @@
+"""The self-test of a card: a small frame and its gradients, a loss and a step of Adam, against the processor's bodies.
+
+It runs in a process of its own (`python -m torch_backend doctor --gpu`), because what a kernel breaks on a card stays
+broken for the process that launched it, and because a driver may hang. What it found is kept beside Warp's compiled
+kernels, for one driver, card and version of ours, Warp's and torch's: so it runs once, and again after an update.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from .. import __version__
+from ..cards import nvidia_cards
+from ..contract import ExitCode, check_version, content_key, from_dict, python_child, read_json
+from ..native import initialised_warp
+from ..raster import RasterOutput, RasterSettings, rasterize, ssim, ssim_cuda
+from ..shot import write_json
+from ..torch_types import backward, norm_of_all
+from .adam import FusedAdam
+
+SELF_TEST_VERSION = 1
+_SECONDS = 240.0
+"""A card that has not answered by then hangs; cold, the kernels take tens of seconds to compile."""
+_GAUSSIANS, _WIDTH, _HEIGHT = 300, 64, 48
+_FLIPPED = 0.01
+"""Share of pixels that may differ by more than `_PIXEL`: at the alpha cut one may fall on either side."""
+_PIXEL = 3e-4
+_GRADIENT = 2e-2
+"""Relative L2 that a gradient may be off by: what flips at the cut is in it (1e-4 to 4e-3 on fibers)."""
+_NO_NUMBER = 1e9
+_EXACT = 1e-4
+"""Relative L2 of what has no cut."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was compared."""
+
+    what: str
+    """In words."""
+    error: float
+    """By how much the card differs."""
+    bound: float
+    """By how much it may."""
+
+
+@dataclass
+class SelfTest:
+    """What a self-test found."""
+
+    version: int = SELF_TEST_VERSION
+    """Of this record."""
+    key: str = ""
+    """Driver, card and versions that it speaks of."""
+    problem: str = ""
+    """What is wrong, in a sentence; empty if nothing is."""
+    lasting: bool = True
+    """Will it be so the next time, too? Not if the card was full, or did not answer."""
+    seconds: float = 0.0
+    """How long it took, compiling included."""
+    checks: list[Check] = field(default_factory=list[Check])
+    """What was compared."""
+
+
+def self_test_key() -> str:
+    """Identifies driver, card and versions."""
+    cards = [dataclasses.astuple(card) for card in nvidia_cards()[0]]
+    name = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
+    return content_key(SELF_TEST_VERSION, cards, name, __version__, torch.__version__, wp.config.version)
+
+
+def run_self_test(device: torch.device, key: str = "") -> SelfTest:
+    """Tests the kernels on `device`; on 'cpu' the CUDA kernels run on fibers, for tests. Never raises for a failure."""
+    found, since = SelfTest(key=key), time.perf_counter()
+    try:
+        found.checks = [*_frame(device), *_loss(device), *_adam(device)]
+    except torch.OutOfMemoryError:
+        found.problem, found.lasting = "its memory is taken by other programs", False
+    except Exception as error:  # whatever a driver, a compiler or a kernel comes up with is what this test is for
+        words = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        found.problem = f"a kernel does not build or run on it ({words})"
+    for check in found.checks:
+        if not check.error <= check.bound and not found.problem:
+            found.problem = f"{check.what} comes out wrong on it ({check.error:.1e} off, {check.bound:.0e} is allowed)"
+    found.seconds = round(time.perf_counter() - since, 2)
+    return found
+
+
+def card_problem(folder: Path | None = None, test: Callable[[str], SelfTest] | None = None) -> str:
+    """What a self-test has against this machine's card; empty if nothing. Tests it if it was not yet.
+
+    Args:
+        folder: where the verdict is kept (default: beside Warp's kernels).
+        test: makes a self-test for a key (default: in a child process).
+    """
+    place, key = (folder or kernel_folder()) / "splannequin-card.json", self_test_key()
+    found = _kept(place)
+    if found is None or found.key != key:
+        found = (test or tested_apart)(key)
+        keep(found, place.parent)
+    return found.problem
+
+
+def keep(found: SelfTest, folder: Path) -> None:
+    """Notes a verdict; one that may be another the next time is forgotten, and the one before with it."""
+    place = folder / "splannequin-card.json"
+    try:
+        if found.lasting:
+            write_json(place, dataclasses.asdict(found))
+        else:
+            place.unlink(missing_ok=True)
+    except OSError:
+        pass  # a folder that cannot be written: it is tested again the next time
+
+
+def kernel_folder() -> Path:
+    """Where Warp keeps compiled kernels."""
+    return Path(str(initialised_warp().config.kernel_cache_dir))
+
+
+def _kept(place: Path) -> SelfTest | None:
+    try:
+        data = read_json(place)
+        check_version(data, str(place), SELF_TEST_VERSION)
+        return from_dict(SelfTest, {**data, "checks": [from_dict(Check, row) for row in data["checks"]]})
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def tested_apart(key: str) -> SelfTest:
+    """The self-test in a process of its own."""
+    command = python_child(sys.executable, "torch_backend", "doctor", "--gpu")
+    root = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join(part for part in (root, os.environ.get("PYTHONPATH", "")) if part)
+    try:
+        ran = subprocess.run(
+            **command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, encoding="utf-8",
+            errors="replace", stdin=subprocess.DEVNULL, timeout=_SECONDS,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return SelfTest(key=key, problem=f"it did not answer within {_SECONDS:.0f} s", lasting=False)
+    except OSError as error:
+        return SelfTest(key=key, problem=f"it could not be tested ({error})", lasting=False)
+    try:
+        told = cast(dict[str, Any], json.loads(ran.stdout[ran.stdout.index("{") :])["gpu"]["test"])
+        checks = [from_dict(Check, row) for row in told["checks"]]
+        return from_dict(SelfTest, {**told, "key": key, "checks": checks})
+    except (ValueError, KeyError, TypeError):
+        if ran.returncode == ExitCode.ENVIRONMENT:
+            return SelfTest(key=key, problem="it could not be tested", lasting=False)
+        last = (ran.stderr.strip().splitlines() or ["without a word"])[-1]
+        return SelfTest(key=key, problem=f"the process that tested it ended with code {ran.returncode} ({last})")
+
+
+# ------------------------------------------------------------------------------------------------------- the checks
+
+
+def _relative(value: Tensor, truth: Tensor) -> float:
+    """L2 of the difference over that of the truth; `_NO_NUMBER` if something is not finite."""
+    value, truth = value.detach().cpu().double(), truth.detach().cpu().double()
+    error = float(norm_of_all(value - truth) / norm_of_all(truth).clamp_min(1e-12))
+    return min(error, _NO_NUMBER) if error == error else _NO_NUMBER
+
+
+def _scene() -> dict[str, Tensor]:
+    """Gaussians before the camera: some large, some faint, with harmonics of the first degree."""
+    g, n = torch.Generator(device="cpu").manual_seed(11), _GAUSSIANS
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, device="cpu")
+
+    means = normal(n, 3) * torch.tensor([1.3, 1.0, 0.7], device="cpu") + torch.tensor([0.0, 0.0, 4.0], device="cpu")
+    return {
+        "means": means, "quats": normal(n, 4), "log_scales": 0.5 * normal(n, 3) - 2.3,
+        "opacity_logits": 2.0 * normal(n), "sh": 0.4 * normal(n, 4, 3),
+    }  # fmt: skip
+
+
+def _rendered(device: torch.device, backend: str) -> tuple[RasterOutput, dict[str, Tensor]]:
+    """The scene's frame, and the gradients of a weighted sum of its colours and depths by every input."""
+    leaves: dict[str, Any] = {name: value.to(device).requires_grad_() for name, value in _scene().items()}
+    K = torch.tensor([[[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]], device="cpu")
+    out = rasterize(
+        **leaves, viewmats=torch.eye(4, device=device)[None], Ks=K.to(device), width=_WIDTH, height=_HEIGHT,
+        background=torch.full((3,), 0.5, device=device), backend=backend, with_depth=True, with_contributions=True,
+        settings=RasterSettings(threads=1),
+    )  # fmt: skip
+    weights = torch.randn(out.colors.shape, generator=torch.Generator(device="cpu").manual_seed(3), device="cpu")
+    if out.depth_expected is None:
+        raise RuntimeError("the frame was rendered without depth")
+    total = (out.colors * weights.to(device)).sum() + out.depth_expected.clamp_max(10.0).sum() / 64.0
+    backward(total)
+    return out, {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+def _frame(device: torch.device) -> list[Check]:
+    """Projection, tiles and blending, forward and back."""
+    truth, true_gradients = _rendered(torch.device("cpu"), "cpu")
+    seen, gradients = _rendered(device, "cuda")
+    off = (seen.colors.detach().cpu() - truth.colors.detach()).abs().amax(-1)
+    flipped = float((~(off <= _PIXEL)).float().mean())  # NaN counts
+    checks = [Check("a frame", flipped, _FLIPPED)]
+    checks += [
+        Check(f"the gradient of {name}", _relative(gradients[name], value), _GRADIENT)
+        for name, value in true_gradients.items()
+    ]
+    return checks
+
+
+def _loss(device: torch.device) -> list[Check]:
+    """SSIM and its gradient."""
+    g = torch.Generator(device="cpu").manual_seed(4)
+    image, target = torch.rand(2, 40, 56, 3, generator=g, device="cpu")
+    found: list[tuple[Tensor, Tensor]] = []
+    for where, body in ((torch.device("cpu"), ssim.ssim), (device, ssim_cuda.ssim)):
+        leaf = image.to(where, copy=True).requires_grad_()
+        value = body(leaf, target.to(where))
+        backward(value)
+        if leaf.grad is None:
+            raise RuntimeError("SSIM has no gradient")
+        found.append((value, leaf.grad))
+    (value, gradient), (here, gradient_here) = found
+    return [
+        Check("SSIM", _relative(here, value), _EXACT),
+        Check("the gradient of SSIM", _relative(gradient_here, gradient), _EXACT),
+    ]
+
+
+def _adam(device: torch.device) -> list[Check]:
+    """Two steps of Adam."""
+    g = torch.Generator(device="cpu").manual_seed(5)
+    start, *gradients = torch.randn(3, 5000, generator=g, device="cpu")
+    found: list[Tensor] = []
+    for where, kernel in ((torch.device("cpu"), False), (device, True)):
+        parameter = torch.nn.Parameter(start.to(where, copy=True))
+        optimizer = FusedAdam([parameter], lr=0.1, kernel=kernel)
+        for gradient in gradients:
+            parameter.grad = gradient.to(where)
+            optimizer.step()
+        found.append(parameter.detach().cpu() - start)
+    return [Check("a step of Adam", _relative(found[1], found[0]), _EXACT)]
