@@ -163,7 +163,7 @@ def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(14)[:5]]
     rng = np.random.default_rng(3)
     pictures += [rng.integers(0, 256, (240, 320, 3), np.uint8) for _ in range(6)]
-    request, frames = tools.asked(tmp_path, pictures, features=400)
+    request, frames = tools.asked(tmp_path, pictures, features=250)
     report = tools.recorder()
     with pytest.raises(JobError) as error:
         climb(request, frames, True, tmp_path, tmp_path / "log.txt", report)
