@@ -16,21 +16,23 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from torch_backend.solve import worker
+from torch_backend.solve.answers import write_points
+from torch_backend.solve.mapping import triangulate
+from torch_backend.solve.request import SEED, Request
 
 
 def main(path: str) -> int:
     """Runs the request; 1 if nothing could be triangulated."""
     threading.Thread(target=_die_with_parent, daemon=True).start()
-    request = worker.Request(Path(path))
+    request = Request(Path(path))
     data = json.loads(Path(path).read_text(encoding="utf-8"))
-    pycolmap.set_random_seed(worker.SEED)
+    pycolmap.set_random_seed(SEED)
     camera = pycolmap.Camera(model="PINHOLE", width=data["width"], height=data["height"], params=data["K"])
     poses = {name: (0, np.array(matrix)[:3]) for name, matrix in data["cameras"].items()}
-    model = worker.triangulate(request, [camera], poses)
+    model = triangulate(request, [camera], poses)
     if not model.num_points3D():
         return 1
-    worker.write_points(request, model)
+    write_points(request, model)
     return 0
 
 

@@ -27,7 +27,7 @@ def params(scene: bpy.types.Scene, shot: Path | None) -> contract.SolveParams:
     JobError names what is missing. OSError if the shot cannot be written.
     """
     props = settings_of(scene)
-    asked = contract.SolveParams(camera_model=props.camera_model)
+    asked = contract.SolveParams(camera_model=props.camera_model, retry=props.retry)
     asked.focal_mm = _said(props.focal_mm)
     if asked.focal_mm:
         asked.sensor_mm, asked.refine_focal = _said(props.sensor_mm), props.refine_focal

@@ -55,7 +55,9 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
             for name in ("sensor_mm", "refine_focal"):
                 layout.prop(props, name)
         layout.prop(props, "cameras_from")
-        if props.cameras_from == "FILE":
+        if props.cameras_from == "SOLVE":
+            layout.prop(props, "retry")
+        elif props.cameras_from == "FILE":
             layout.prop(props, "cameras_path", text="")
         elif props.cameras_from == "TRACKING":
             layout.prop(props, "tracking_clip", text="")

@@ -41,6 +41,10 @@ class SolveSettings:
         **contract.panel(contract.SolveParams, "refine_focal"),
         options=set(),
     )
+    retry = BoolProperty(
+        **contract.panel(contract.SolveParams, "retry"),
+        options=set(),
+    )
     cameras_from = EnumProperty(
         name="Cameras From",
         description="Solve the camera here, or take cameras that another program found for the same clip",

@@ -55,6 +55,8 @@ def test_a_focal_length_is_asked_for_as_it_was_typed(addon, contract, scene):
     assert step.params(scene) == contract.SolveParams(), "without a focal length they say nothing"
     props.focal_mm = 24.3
     assert step.params(scene) == contract.SolveParams(focal_mm=24.3, sensor_mm=23.6, refine_focal=False)
+    props.retry = False
+    assert step.params(scene).retry is False
 
 
 def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file(addon, contract, scene, shot, drawn):

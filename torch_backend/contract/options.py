@@ -226,6 +226,17 @@ class SolveParams:
         tip="Let the solve correct the focal length. Off: it is held as it is given",
     )
     """Refine `focal_mm`; else it is held."""
+    retry: bool = option(
+        True,
+        flag="--no-retry",
+        switch=True,
+        help="stop at the first solve, even where it is poor; else more features, more pairs, another lens model and "
+        "a global mapper are tried, each where it can help",
+        label="Try Again",
+        tip="Where a solve fails or is poor, try again: with more features, more pairs of frames, another lens model, "
+        "a global mapper. Each is said, and none is tried where it cannot help",
+    )
+    """Try again in other ways where the solve fails or is poor."""
     ignore_mask: str = option(
         "",
         flag="--ignore-mask",

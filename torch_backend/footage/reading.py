@@ -32,6 +32,8 @@ def read_as(info: SourceInfo, timecode: str = "") -> list[str]:
         parts.append("deinterlaced")
     if reading.get("turned"):
         parts.append(f"turned by {reading['turned']} degrees")
+    if reading.get("focal_35mm"):
+        parts.append(f"a lens of {reading['focal_35mm']:.4g} mm (on 35 mm film)")
     if timecode:
         parts.append(f"timecode {timecode}")
     assumed = [name for key, name in _ASSUMED.items() if not reading.get(key, True)]

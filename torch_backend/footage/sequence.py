@@ -22,6 +22,7 @@ from . import plate_encoding
 from .color import LIGHTS, InputSpace, named_space, space_of_chromaticities
 from .images import error_of, resize
 from .layers import Layer, find_layer, shown
+from .lens_tags import focal_of_picture
 from .ocio import Colours
 from .oiio_types import attribute, bits_of, channel_names
 from .sources import (
@@ -149,6 +150,7 @@ class SequenceSource:
                 "fps_told": bool(fps or rate),
                 "timecode": parse_timecode(str(spec.get_string_attribute("smpte:TimeCode"))),
                 "bits": bits_of(spec),
+                **({"focal_35mm": lens} if (lens := focal_of_picture(spec)) else {}),
             },
             file=str(first),
             probe=space.probe,

@@ -21,6 +21,7 @@ from .color import PRIMARIES as PRIMARIES_READ
 from .decoding import Noticed, decoded, stored_frames, time_of
 from .frame_rgb import BT601, MATRICES, RGB, Coding, coding_of, depth_of, exact_rgb, rgb_codes
 from .images import resize, resize_float
+from .lens_tags import focal_of_video
 from .ocio import Colours
 from .seeking import VideoReader
 from .sources import (
@@ -93,6 +94,7 @@ class VideoSource:
                 "interlaced": self._interlaced,
                 "timecode": _timecode(container, stream),
                 "turned": 90 * self._quarter_turns,
+                **({"focal_35mm": lens} if (lens := focal_of_video(container, stream)) else {}),
             }
         stat = path.stat()
         self.info = SourceInfo(

@@ -23,11 +23,12 @@ _COUNT = re.compile(rb"Process(?:ed|ing) \w+ \[(\d+)/(\d+)\]")
 SQLite in one process breaks the first one's locks.)"""
 
 
-def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
+def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = False) -> dict[str, Any]:
     """Runs `worker.py` on a request file; returns its last message ({"result"} or {"failure"}).
 
     The worker is killed on cancellation and on any other exception here. JobError (SOLVE, or DISK if
-    that is full) if it dies by itself, with the end of COLMAP's log, which is kept in `log`.
+    that is full) if it dies by itself, with the end of COLMAP's log, which is kept in `log`: with `keep_log` after what
+    stands there.
     """
     package_root = Path(__file__).resolve().parents[2]
     environment = {**os.environ, "PYTHONSAFEPATH": "1"}
@@ -38,7 +39,8 @@ def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
     # Threads that spin while they wait take the core from whoever shares it.
     environment.setdefault("OMP_WAIT_POLICY", "passive")
     command = python_child(sys.executable, "torch_backend.solve.worker", str(request.absolute()))
-    with open(log, "wb") as errors:
+    with open(log, "ab" if keep_log else "wb") as errors:
+        start = errors.tell()
         process = subprocess.Popen(
             command["args"],
             cwd=command["cwd"],
@@ -48,7 +50,7 @@ def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
             env=environment,
         )
         try:
-            answer = _listen(process, log, report)
+            answer = _listen(process, log, start, report)
             code = process.wait()
         finally:
             if process.poll() is None:
@@ -60,14 +62,14 @@ def run_worker(request: Path, log: Path, report: Reporter) -> dict[str, Any]:
     if answer is None or code != 0:
         need_disk(log.parent, _FULL_BYTES, "The camera solve")
         raise JobError(
-            f"The camera solve broke off (COLMAP ended with code {code}): {_tail(log)}",
+            f"The camera solve broke off (COLMAP ended with code {code}): {_tail(log, start)}",
             f"Try again with a shorter range or a smaller working height; if it stays, please report it with {log}.",
             ExitCode.SOLVE,
         )
     return answer
 
 
-def _listen(process: subprocess.Popen[bytes], log: Path, report: Reporter) -> dict[str, Any] | None:
+def _listen(process: subprocess.Popen[bytes], log: Path, start: int, report: Reporter) -> dict[str, Any] | None:
     lines: queue.Queue[bytes | None] = queue.Queue()
 
     def read() -> None:
@@ -79,6 +81,7 @@ def _listen(process: subprocess.Popen[bytes], log: Path, report: Reporter) -> di
     threading.Thread(target=read, name="solve output", daemon=True).start()
     answer, stage = None, "start"
     with open(log, "rb") as tail:
+        tail.seek(start)
         while True:
             report.check_cancelled()
             try:
@@ -104,7 +107,8 @@ def _tell(report: Reporter, stage: str, done: int, total: int) -> None:
     report.progress(f"solve: {stage}", done, total, f"{done} of {total}" if done else "")
 
 
-def _tail(log: Path) -> str:
-    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+def _tail(log: Path, start: int) -> str:
+    text = log.read_bytes()[start:].decode("utf-8", errors="replace")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     wanted = [line for line in lines if line.startswith(("F2", "E2")) or "Error" in line] or lines
     return " ".join(wanted[-_LAST_LINES:]) or "it left no message."

@@ -102,6 +102,18 @@ def incremental_mapping(
     return _colmap.incremental_mapping(database, folder, into, options, next_image_callback=next_image)
 
 
+def global_mapping(
+    database: Path, folder: Path, into: Path, options: pycolmap.GlobalPipelineOptions
+) -> dict[int, pycolmap.Reconstruction]:
+    """Models by number."""
+    return _colmap.global_mapping(database, folder, into, options)
+
+
+def calibrate_view_graph(database: Path) -> None:
+    """Focal lengths from what pairs share, into the database."""
+    _colmap.calibrate_view_graph(database)
+
+
 def triangulate_points(
     known: pycolmap.Reconstruction,
     database: Path,

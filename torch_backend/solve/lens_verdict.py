@@ -19,6 +19,8 @@ MOST_BEND = 1.0
 """First radial coefficient from which on a lens is none."""
 RUN_OFF = 1.3
 """Times by which a solve may change a focal length that it was given, before the given one is believed instead."""
+WIDE_DEG = 100.0
+"""Angle of view from which on a lens that is no fisheye's may be one."""
 _SAMPLES = 2048
 _BEYOND = 2.0
 """How far out of the picture a radial curve is looked at, in corners."""
@@ -39,7 +41,7 @@ def doubt_of(model: str, width: int, height: int, params: Sequence[float], given
     focal = _focal(model, params)
     if given and not given / RUN_OFF <= focal <= given * RUN_OFF:
         return "off"
-    bends = _bends(model, params)
+    bends = bends_of(model, params)
     if model == FISHEYE:
         angle = angle_deg(model, width, height, params)
         found = "narrow" if not angle >= NARROWEST_DEG else "wide" if angle > MOST_DEG else ""
@@ -52,7 +54,7 @@ def doubt_of(model: str, width: int, height: int, params: Sequence[float], given
 
 def impossible(model: str, width: int, height: int, params: Sequence[float]) -> str:
     """What of a lens's bend no camera has: "folded", "strong", or "" if it can be."""
-    bends = [*_bends(model, params), 0.0]
+    bends = [*bends_of(model, params), 0.0]
     if not abs(bends[0]) <= MOST_BEND:
         return "strong"
     fx, fy = _focals(model, params)
@@ -85,11 +87,20 @@ def refuse_lens(answer: dict[str, Any]) -> None:
         message = f"The solve found a lens that no camera has: it bends the picture out of all measure ({numbers})."
     else:
         return
-    raise JobError(
-        message,
-        "Choose a longer range, in which the camera travels more; mask what moves by itself, or give the focal length.",
-        ExitCode.SOLVE,
+    hint = (
+        "Choose a longer range, in which the camera travels more; mask what moves by itself, or give the focal length."
     )
+    if answer.get("camera_model") != FISHEYE and like_a_fisheye(answer):
+        hint = f"Choose Fisheye as the lens (--camera-model {FISHEYE}) if it is one. Else: {hint[0].lower()}{hint[1:]}"
+    raise JobError(message, hint, ExitCode.SOLVE)
+
+
+def like_a_fisheye(answer: dict[str, Any]) -> bool:
+    """True if a worker's answer found an ordinary lens as a fisheye would be taken for one: very wide, or bent inwards
+    until it folds over."""
+    lens = answer["lens"]
+    wide = max(lens.get("found_deg", 0.0), lens.get("view_deg", 0.0)) >= WIDE_DEG
+    return wide or (lens.get("doubt") == "bent" and lens.get("found_bend", 0.0) < 0)
 
 
 def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
@@ -107,6 +118,14 @@ def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
         ]
     if lens["held"]:
         off = "found one that folds the picture over" if lens["doubt"] == "bent" else f"ran off to {found:.0f} degrees"
+        if lens.get("start_px"):
+            return [
+                (
+                    f"The clip does not tell its lens (the solve {off}): the one that the file names was taken, "
+                    f"{taken:.0f} degrees wide.",
+                    "Was the clip cropped or stabilised? Then it is narrower.",
+                )
+            ]
         return [
             (
                 f"The clip does not tell its lens (the solve {off}): a usual one of {taken:.0f} degrees was taken.",
@@ -152,7 +171,7 @@ def _focal(model: str, params: Sequence[float]) -> float:
     return 0.5 * sum(_focals(model, params))
 
 
-def _bends(model: str, params: Sequence[float]) -> list[float]:
+def bends_of(model: str, params: Sequence[float]) -> list[float]:
     """Radial coefficients: those of a fisheye all four, of others k1 and, if the model has it, k2."""
     counts = {"SIMPLE_RADIAL": (3, 1), "RADIAL": (3, 2), "OPENCV": (4, 2), FISHEYE: (4, 4)}
     first, count = counts.get(model, (0, 0))

@@ -8,6 +8,7 @@ SHOT/motion_paint/NNNNNN.png, which no solve touches.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 from pathlib import Path
 from typing import Any, TypedDict, cast
@@ -106,9 +107,17 @@ def _solve_key(shot: Shot, config: FlowConfig) -> str:
     """Identifies the cameras, frames and masks that a matte is made from; of a shot without them, what it has."""
     digests: list[str] = []
     for file in (shot.cameras, shot.listing):
-        with contextlib.suppress(OSError, ValueError), open_regular(file) as handle:
-            digests.append(hashlib.sha256(handle.read()).hexdigest())
+        with contextlib.suppress(OSError, ValueError):
+            stat = file.stat()
+            digests.append(_digest(file, stat.st_ino, stat.st_size, stat.st_mtime_ns))
     return content_key(MOTION_VERSION, config, digests, *masks_key(shot))
+
+
+@functools.lru_cache(maxsize=16)
+def _digest(file: Path, *_state: int) -> str:
+    """SHA-256 of a file in the state that it is in: asked for with each matte, and the files grow with the clip."""
+    with open_regular(file) as handle:
+        return hashlib.sha256(handle.read()).hexdigest()
 
 
 def _record(path: Path) -> dict[str, Any]:

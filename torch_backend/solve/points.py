@@ -32,10 +32,12 @@ def filter_points(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> dic
     return {name: points[name][keep] for name in ("xyz", "rgb", "error", "track")}
 
 
+def narrow_words(angle_deg: float) -> str:
+    """That points are seen under too small an angle for depth, degrees in the middle of them."""
+    return f"The camera moves too little for depth: half of the points are seen under {angle_deg:.1f} degrees or less."
+
+
 def refuse_narrow(angle_deg: float) -> None:
     """JobError if the points are seen under too small an angle (median, degrees) for depth."""
     if angle_deg < LEAST_ANGLE_DEG:
-        message = (
-            f"The camera moves too little for depth: half of the points are seen under {angle_deg:.1f} degrees or less."
-        )
-        raise JobError(message, STILL_HINT, ExitCode.SOLVE)
+        raise JobError(narrow_words(angle_deg), STILL_HINT, ExitCode.SOLVE)

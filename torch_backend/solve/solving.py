@@ -21,7 +21,6 @@ from ..contract import (
     MASK_KINDS,
     PICTURE,
     POINTS_FILE,
-    REQUEST_FILE,
     SOLVE_FILE,
     CameraFrame,
     CameraPath,
@@ -35,25 +34,24 @@ from ..contract import (
 from ..footage import load_frames
 from ..footage.display import display_of
 from ..footage.images import is_whole_png, read_frame, write_png
+from ..footage.lens_tags import focal_px
 from ..footage.masks import Mask, read_masks
 from ..footage.sources import frame_words
 from ..replacing import Staged, replacing_solve, settle_solve
 from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, write_json
 from . import foreign
-from .child import run_worker
 from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
-from .lens_verdict import lens_remarks, refuse_lens
+from .ladder import climb
+from .lens_verdict import lens_remarks
 from .masks import facts_of, given_masks, more_features, write_matching, write_undistorted
-from .points import LEAST_POINTS, STILL_HINT, filter_points, refuse_narrow
+from .points import filter_points
 from .poses import camera_centre, fill_poses
 from .stored import load_cameras, load_points, load_record
 from .undistort import Undistorter, of_frames
+from .verdict import FAIR_ERROR_PX, quality_words
 
 SOLVE_VERSION = 1
-LEAST_REGISTERED = 8
-REFUSED_SHARE = 0.5
-GOOD_SHARE, GOOD_ERROR_PX = 0.95, 1.2
 _WRITERS = 2
 _LOG_END_BYTES = 16_384
 
@@ -83,6 +81,8 @@ class SolveConfig:
     """Width in mm of the part of the sensor that the picture shows."""
     refine_focal: bool = True
     """Refine `focal_mm`; else it is held."""
+    retry: bool = True
+    """Try again in other ways where the solve is refused or poor, as `ladder.climb` does."""
 
 
 class SolveResult(TypedDict):
@@ -153,12 +153,15 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     make_folder(scratch)
     try:
         if taken is None:
-            answer = _ask_worker(shot, frames, config, masks, scratch, report)
+            request = _request(shot, frames, config, masks, scratch)
+            climbed = climb(request, frames, config.retry, scratch, shot.colmap_log, report)
+            answer = {**climbed.best.answer["result"], "rung": climbed.best.rung, "tries": climbed.tries}
+            left = climbed.best.folder
         else:
             options = _matching(frames, config, masks, scratch)
-            answer = take_over(shot, frames, taken, options, scratch, report)
+            answer, left = take_over(shot, frames, taken, options, scratch, report), scratch
         with replacing_solve(shot) as staged:
-            result = _finish(shot, frames, answer, masks, config, scratch, staged, key, report)
+            result = _finish(shot, frames, answer, masks, config, left, staged, key, report)
     except JobError as error:
         error.add_note(_log_end(shot.colmap_log))
         raise
@@ -179,6 +182,7 @@ def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: 
     settings = asdict(config)
     new = ["ignore_mask", "people_mask"]  # solves of before had none of these
     new += [] if config.focal_mm else ["focal_mm", "sensor_mm", "refine_focal"]
+    new += ["retry"] if config.retry else []  # who switches it on again wants what it may find
     for name in new:
         settings.pop(name)
     return content_key(SOLVE_VERSION, settings, frames.get("key"), *source, *(mask.key for mask in masks.values()))
@@ -261,18 +265,20 @@ def _matching(frames: dict[str, Any], config: SolveConfig, masks: dict[str, Mask
     return {**options, "features": round(config.features * more_features(masks)), "masks": str(folder)}
 
 
-def _ask_worker(
-    shot: Shot,
-    frames: dict[str, Any],
-    config: SolveConfig,
-    masks: dict[str, Mask],
-    scratch: Path,
-    report: Reporter,
+def _focal_of_file(frames: dict[str, Any]) -> float:
+    """Focal length in pixels of the working frames that the footage's file tells; 0 if it does not."""
+    told = frames.get("reading", {}).get("focal_35mm")
+    return focal_px(told, frames["width"], frames["height"]) if told else 0.0
+
+
+def _request(
+    shot: Shot, frames: dict[str, Any], config: SolveConfig, masks: dict[str, Mask], scratch: Path
 ) -> dict[str, Any]:
+    """What the worker is asked for at first."""
     names: dict[bool, list[str]] = {True: [], False: []}
     for frame in frames["frames"]:
         names[bool(frame["solve"])].append(Path(frame["file"]).name)
-    request = {
+    return {
         "images": str(shot.raw),
         "solved": names[True],
         "others": names[False],
@@ -280,85 +286,11 @@ def _ask_worker(
         "size": [frames["width"], frames["height"]],
         "focal_px": config.focal_mm / config.sensor_mm * frames["width"],
         "hold_focal": not config.refine_focal,
+        "start_focal_px": _focal_of_file(frames),
         **_matching(frames, config, masks, scratch),
         "neighbours": config.neighbours if config.localise else 0,
         "threads": max(1, min(os.cpu_count() or 1, 16)),
     }
-    write_json(scratch / REQUEST_FILE, request)
-    answer = run_worker(scratch / REQUEST_FILE, shot.colmap_log, report)
-    if "failure" in answer:
-        raise _failure(answer)
-    return answer["result"]
-
-
-_TURNING = "The camera only turns on the spot: there is nothing to tell depth by."
-
-
-def _failure(answer: dict[str, Any]) -> JobError:
-    flow = answer["flow_px"]
-    if answer["failure"] == "still":
-        message = f"The camera does not move: features shift by at most {flow:.1f} px over the clip."
-        return JobError(message, STILL_HINT, ExitCode.SOLVE)
-    if answer["failure"] == "turning":
-        return JobError(_TURNING, STILL_HINT, ExitCode.SOLVE)
-    return JobError(
-        "No two frames show enough of the same scene from different places to start a camera solve.",
-        f"{STILL_HINT} Blur and bare walls give nothing to match.",
-        ExitCode.SOLVE,
-    )
-
-
-def refuse_poor(answer: dict[str, Any], frames: dict[str, Any]) -> None:
-    """JobError for a model that nothing could be trained on; `frames` is frames.json, whose solved frames it is of."""
-    solved = [f["frame"] for f in frames["frames"] if f["solve"]]
-    registered, angle = answer["registered"], answer["triangulation_angle_deg"]
-    if registered < min(LEAST_REGISTERED, len(solved)) or registered < REFUSED_SHARE * len(solved):
-        if answer.get("turning"):  # a tripod's head: what was placed was placed by chance
-            raise JobError(_TURNING, STILL_HINT, ExitCode.SOLVE)
-        parts = [_spans(solved, part) for part in answer["parts"] if len(part) >= LEAST_REGISTERED]
-        apart = f"; {len(parts)} parts of the clip do not connect" if len(parts) > 1 else ""
-        worked = f": {_span_words(parts[0])}" if parts else ""
-        raise JobError(
-            f"Cameras were found for only {registered} of {len(solved)} frames{worked}{apart}.",
-            _range_hint(parts, solved, frames["step"]),
-            ExitCode.SOLVE,
-        )
-    refuse_lens(answer)
-    refuse_narrow(angle)
-    if answer["points"] < LEAST_POINTS:
-        raise JobError(
-            f"Only {answer['points']} points of the scene could be placed: the clip is too blurred or too bare.",
-            "Choose a sharper range, or film with more light and texture in view.",
-            ExitCode.SOLVE,
-        )
-
-
-def _spans(solved: list[int], names: list[str]) -> list[tuple[int, int, int]]:
-    """(first, last, how many) of each unbroken row of `solved` frames whose pictures are among `names`."""
-    placed = {int(Path(name).stem) for name in names}
-    spans: list[tuple[int, int, int]] = []
-    before = False
-    for frame in solved:
-        if frame in placed:
-            first, count = (spans[-1][0], spans[-1][2]) if before else (frame, 0)
-            spans[-1 if before else len(spans) :] = [(first, frame, count + 1)]
-        before = frame in placed
-    return spans
-
-
-def _span_words(spans: list[tuple[int, int, int]]) -> str:
-    """'12 to 41, 60 to 74', the longest four of them, in the clip's order."""
-    longest = sorted(sorted(spans, key=lambda span: span[2], reverse=True)[:4])
-    return ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last, _ in longest)
-
-
-def _range_hint(parts: list[list[tuple[int, int, int]]], solved: list[int], step: int) -> str:
-    """What can help: a range that worked, and a smaller step only where there is one."""
-    best = max((span for part in parts for span in part), key=lambda span: span[2], default=(0, 0, 0))
-    smaller = " A smaller step shows more of each to the next." if step > 1 else ""
-    if best[2] < LEAST_REGISTERED or best[2] == len(solved):
-        return f"Choose a range without fast pans or blur.{smaller}"
-    return f"Frames {best[0]} to {best[1]} worked: import that range, or one without fast pans or blur.{smaller}"
 
 
 def _finish(
@@ -372,10 +304,8 @@ def _finish(
     key: str,
     report: Reporter,
 ) -> SolveResult:
-    """Checks the worker's answer and writes the solve's files to where they wait until they are whole."""
+    """Writes the solve's files, from what the worker left in `scratch`, to where they wait until they are whole."""
     solved = sum(f["solve"] for f in frames["frames"])
-    if "given" not in answer:
-        refuse_poor(answer, frames)
     poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
     maps = [scratch / f"undistort_{n}.npz" for n in range(1 + max(p.get("lens", 0) for p in poses.values()))]
     path, lenses = _camera_path(frames, poses, [_pinhole(file) for file in maps])
@@ -404,11 +334,14 @@ def _finish(
         "camera_model": answer["camera_model"],
         "distortion": answer["distortion"],
         "focal_px": answer["focal_px"],
+        "focal_start_px": answer.get("lens", {}).get("start_px", 0.0),
         "lenses": [_lens(file) for file in maps],
         "lens_of_frame": lenses,
         "triangulation_angle_deg": answer["triangulation_angle_deg"],
         "quality": result["quality"],
         "cameras_from": answer.get("given", "solve"),
+        "rung": answer.get("rung"),
+        "tries": answer.get("tries", []),
         "agreement": answer.get("agreement"),
         "floor": floor_of(path, points["xyz"]),
         "masks": facts_of(masks, _mask_sources(config)),
@@ -533,18 +466,6 @@ def _result(answer: dict[str, Any], path: CameraPath, solved: int, points: int, 
     )
 
 
-def quality_words(registered: int, solved: int, error_px: float, given: bool = False) -> str:
-    """One sentence: Good, Fair or Poor, and the figures; cameras that were `given` are said to be."""
-    share = registered / max(1, solved)
-    if share >= GOOD_SHARE and error_px <= GOOD_ERROR_PX:
-        word = "Good"
-    else:
-        word = "Fair" if share >= 0.8 and error_px <= 1.5 * GOOD_ERROR_PX else "Poor"
-    if given:
-        return f"{word}: cameras given for {registered} of {solved} frames, {error_px:.2f} px."
-    return f"{word}: {registered} of {solved} frames registered, {error_px:.2f} px."
-
-
 def _warnings(
     frames: dict[str, Any], path: CameraPath, result: SolveResult, given: bool = False
 ) -> list[tuple[str, str]]:
@@ -571,7 +492,7 @@ def _warnings(
                 "Cut them off.",
             )
         )
-    if result["reprojection_error_px"] > 1.5 * GOOD_ERROR_PX:
+    if result["reprojection_error_px"] > FAIR_ERROR_PX:
         hint = "Are they of this clip and its lens?" if given else "Try the OPENCV camera model."
         warnings.append(("The reprojection error is high: the picture will be soft.", hint))
     return warnings

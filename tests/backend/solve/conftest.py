@@ -123,12 +123,12 @@ def handheld(count=COUNT):
     return poses
 
 
-def write_clip(folder, poses, noise=1.0, blurred=()):
+def write_clip(folder, poses, noise=1.0, blurred=(), contrast=1.0):
     """Renders PNG frames 101, 102, ... into `folder`, with sensor noise; `blurred` frames show next to nothing."""
     room, rng = the_room(), np.random.default_rng(1)
     K = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     for i, viewmat in enumerate(poses):
-        clean = room.render(viewmat, K, RADIAL)
+        clean = 128 + contrast * (room.render(viewmat, K, RADIAL).astype(float) - 128)
         if 101 + i in blurred:
             clean = gaussian_filter(clean, (8, 8, 0))
         noisy = np.clip(np.rint(clean + rng.normal(0.0, noise, clean.shape)), 0, 255).astype(np.uint8)
@@ -172,6 +172,26 @@ def again(solved, tmp_path):
 def tools():
     """What the tests of this folder build with."""
 
+    def asked(folder, pictures, **changes):
+        """A worker's request and frames.json for `pictures`, written into a folder; no frames besides them."""
+        (folder / "pictures").mkdir()
+        names = [f"{n:06d}.png" for n in range(1, len(pictures) + 1)]
+        for name, pixels in zip(names, pictures, strict=True):
+            write_png(folder / "pictures" / name, pixels)
+        request = {"images": str(folder / "pictures"), "solved": names, "others": [], "camera_model": "SIMPLE_RADIAL"}
+        request |= {"overlap": 15, "features": 800, "neighbours": 0, "threads": 1, "size": [WIDTH, HEIGHT], **changes}
+        rows = [{"frame": n, "solve": True, "seconds": n / 12, "sharpness": 100.0} for n in range(1, len(pictures) + 1)]
+        return request, {"step": 1, "frames": rows}
+
+    def fisheye_rays(focal, k1, size=(WIDTH, HEIGHT)):
+        """[H, W, 3] directions in which a fisheye of `size` looks."""
+        x, y = np.meshgrid(np.arange(size[0]) + 0.5 - size[0] / 2, np.arange(size[1]) + 0.5 - size[1] / 2)
+        away = np.hypot(x, y)
+        angle = away / focal
+        for _ in range(30):
+            angle -= (angle * (1.0 + k1 * angle**2) - away / focal) / (1.0 + 3.0 * k1 * angle**2)
+        return np.stack([x * np.sin(angle) / away, y * np.sin(angle) / away, np.cos(angle)], axis=-1)
+
     class Tools:
         recorder = Recorder
         cancelled = Cancelled
@@ -180,4 +200,5 @@ def tools():
         look = staticmethod(look)
         write_clip = staticmethod(write_clip)
 
+    Tools.asked, Tools.fisheye_rays = staticmethod(asked), staticmethod(fisheye_rays)
     return Tools

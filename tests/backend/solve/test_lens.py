@@ -40,7 +40,7 @@ def colmap(tmp_path_factory):
     """By lens: pinhole and map of the worker, the model's parameters, points of the original and their rays."""
     code = (
         "import json, sys, numpy as np, pycolmap\n"
-        "from torch_backend.solve.worker import undistortion\n"
+        "from torch_backend.solve.answers import undistortion\n"
         "points = np.random.default_rng(3).uniform([0, 0], [160, 120], (500, 2))\n"
         "for name, (model, params) in json.loads(sys.argv[2]).items():\n"
         "    camera = pycolmap.Camera.create_from_model_name(1, model, 100.0, 160, 120)\n"

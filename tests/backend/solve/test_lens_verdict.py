@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from torch_backend.contract import ExitCode, JobError
-from torch_backend.footage.images import write_png
 from torch_backend.solve.child import run_worker
 from torch_backend.solve.lens_verdict import angle_deg, doubt_of, impossible, lens_remarks, refuse_lens
 
@@ -91,12 +90,8 @@ def test_a_given_focal_length_that_was_held_or_left_is_said():
 
 def solved(folder, tools, pictures, **request):
     """(answer, poses by picture) of COLMAP alone: no frames are undistorted, no mattes found."""
-    (folder / "pictures").mkdir()
-    names = [f"{n:06d}.png" for n in range(1, len(pictures) + 1)]
-    for name, pixels in zip(names, pictures, strict=True):
-        write_png(folder / "pictures" / name, pixels)
-    told = {"images": str(folder / "pictures"), "solved": names, "others": [], "camera_model": "SIMPLE_RADIAL"}
-    told |= {"overlap": 15, "features": 800, "neighbours": 0, "threads": 1, "size": [320, 240], **request}
+    told, _ = tools.asked(folder, pictures, **request)
+    names = told["solved"]
     (folder / "request.json").write_text(json.dumps(told))
     found = run_worker(folder / "request.json", folder / "log.txt", tools.recorder())["result"]
     poses = json.loads((folder / "poses.json").read_text())
@@ -110,20 +105,20 @@ def test_a_focal_length_that_is_to_be_held_is_held_to_the_pixel(tmp_path, tools)
     assert found["distortion"] == [pytest.approx(-0.06, abs=0.02)]
 
 
-def fisheye_rays(focal, k1, size):
-    """[H, W, 3] directions in which a fisheye of `size` looks."""
-    x, y = np.meshgrid(np.arange(size[0]) + 0.5 - size[0] / 2, np.arange(size[1]) + 0.5 - size[1] / 2)
-    away = np.hypot(x, y)
-    angle = away / focal
-    for _ in range(30):
-        angle -= (angle * (1.0 + k1 * angle**2) - away / focal) / (1.0 + 3.0 * k1 * angle**2)
-    return np.stack([x * np.sin(angle) / away, y * np.sin(angle) / away, np.cos(angle)], axis=-1)
+def test_a_focal_length_of_the_file_is_what_a_clip_gets_that_does_not_tell_its_own(tmp_path, tools):
+    """A wall seen straight on, as in test_solving: no number was given, the file had one."""
+    poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(8)]
+    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0), -0.06) for pose in poses]
+    found, _ = solved(tmp_path, tools, pictures, start_focal_px=310.0)
+    assert found["focal_px"] == 310.0 and found["lens"]["held"] and not found["lens"]["given_px"]
+    ((said, _),) = lens_remarks(found)
+    assert said.endswith("the one that the file names was taken, 55 degrees wide.")
 
 
 def test_a_fisheye_is_solved(tmp_path, tools):
     """The room, cast ray by ray through a lens 120 degrees wide; nobody tells its focal length."""
     focal, poses = 160.0, tools.handheld(10)
-    rays = fisheye_rays(focal, 0.02, (320, 240))
+    rays = tools.fisheye_rays(focal, 0.02)
     pictures = [tools.room().cast(pose, rays) for pose in poses]
     found, solved_poses = solved(tmp_path, tools, pictures, camera_model=FISHEYE)
     assert len(solved_poses) == 10 and found["focal_px"] == pytest.approx(focal, rel=0.02)

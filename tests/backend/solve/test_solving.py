@@ -20,7 +20,7 @@ from torch_backend.solve.floor import floor_of
 from torch_backend.solve.lens_verdict import lens_remarks
 from torch_backend.solve.motion import load_motion
 from torch_backend.solve.poses import camera_centre
-from torch_backend.solve.solving import quality_words, refuse_poor
+from torch_backend.solve.verdict import fault_of, quality_words
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -170,7 +170,7 @@ def test_the_same_frames_give_the_same_cameras(solved, tools, tmp_path):
 
 def test_pairs_are_matched_by_one_thread():
     """Two get wrong products of OpenBLAS now and then: too seldom for a test to meet."""
-    code = "from torch_backend.solve.worker import _matching\nassert _matching()[0].num_threads == 1"
+    code = "from torch_backend.solve.matching import _matching\nassert _matching()[0].num_threads == 1"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -203,7 +203,10 @@ def test_frames_that_cannot_be_placed_are_filled_in_and_said(tmp_path, tools):
 
 def listed(count, step=1):
     """frames.json of frames 1 to `count`, every `step`-th solved."""
-    return {"step": step, "frames": [{"frame": n, "solve": (n - 1) % step == 0} for n in range(1, count + 1)]}
+    rows = [
+        {"frame": n, "solve": (n - 1) % step == 0, "seconds": n / 24, "sharpness": 100.0} for n in range(1, count + 1)
+    ]
+    return {"step": step, "frames": rows}
 
 
 def names(*frames):
@@ -226,11 +229,10 @@ def names(*frames):
 )
 def test_models_that_nothing_could_be_trained_on_are_refused(changes, message):
     good = {"registered": 74, "parts": [names(*range(1, 75))], "triangulation_angle_deg": 12.0, "points": 5000}
-    good |= {"focal_px": 500.0, "lens": {"width": 640, "height": 480}}
-    refuse_poor(good, listed(74))
-    with pytest.raises(JobError) as error:
-        refuse_poor({**good, **changes}, listed(74))
-    assert (error.value.message, error.value.exit_code) == (message, ExitCode.SOLVE)
+    good |= {"reprojection_error_px": 0.8, "focal_px": 500.0, "lens": {"width": 640, "height": 480}}
+    assert fault_of({"result": good}, listed(74)) is None
+    error = fault_of({"result": {**good, **changes}}, listed(74)).error
+    assert (error.message, error.exit_code) == (message, ExitCode.SOLVE)
 
 
 @pytest.mark.parametrize(
@@ -265,9 +267,8 @@ def test_models_that_nothing_could_be_trained_on_are_refused(changes, message):
 )
 def test_a_poor_solve_says_which_frames_worked_and_only_what_can_help(step, parts, message, hint):
     answer = {"registered": len(parts[0]), "parts": parts, "triangulation_angle_deg": 12.0, "points": 5000}
-    with pytest.raises(JobError) as error:
-        refuse_poor(answer, listed(74, step))
-    assert (error.value.message, error.value.hint, error.value.exit_code) == (message, hint, ExitCode.SOLVE)
+    error = fault_of({"result": answer}, listed(74, step)).error
+    assert (error.message, error.hint, error.exit_code) == (message, hint, ExitCode.SOLVE)
 
 
 def test_a_failed_solve_leaves_colmaps_last_words_in_the_job_s_log(tmp_path, tools):
@@ -275,7 +276,7 @@ def test_a_failed_solve_leaves_colmaps_last_words_in_the_job_s_log(tmp_path, too
     for n in range(109, 118):  # a whole clip of it would not have been imported
         noise = np.random.default_rng(n).integers(0, 256, (240, 320, 3), np.uint8)
         write_png(shot.frames / f"raw/{n:06d}.png", noise)
-    folder = new_job(shot, "solve", SolveParams())
+    folder = new_job(shot, "solve", SolveParams(retry=False))
     assert run_job(folder)[0] == ExitCode.SOLVE
     status, log = read_json(folder / "status.json"), (folder / "log.txt").read_text()
     assert status["message"].startswith("Cameras were found for only 8 of 17 frames: 101 to 108")
@@ -293,9 +294,8 @@ def test_a_failed_solve_leaves_colmaps_last_words_in_the_job_s_log(tmp_path, too
 )
 def test_a_lens_that_no_camera_has_is_refused(focal, message):
     answer = {"registered": 74, "parts": [], "triangulation_angle_deg": 12.0, "points": 5000, "focal_px": focal}
-    with pytest.raises(JobError) as error:
-        refuse_poor({**answer, "lens": {"width": 640, "height": 480}}, listed(74))
-    assert (error.value.message, error.value.exit_code) == (message, ExitCode.SOLVE)
+    fault = fault_of({"result": {**answer, "lens": {"width": 640, "height": 480}}}, listed(74))
+    assert (fault.kind, fault.error.message, fault.error.exit_code) == ("lens", message, ExitCode.SOLVE)
 
 
 def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
@@ -326,10 +326,12 @@ def test_a_doubtful_lens_is_said(lens, words):
 
 
 def refused(shot, tools):
+    """The sentence of a refusal; nothing was tried after the first solve."""
+    report = tools.recorder()
     with pytest.raises(JobError) as error:
-        solve_shot(shot, SolveConfig(features=1000), tools.recorder())
+        solve_shot(shot, SolveConfig(features=1000), report)
     assert error.value.exit_code == ExitCode.SOLVE
-    assert error.value.hint
+    assert error.value.hint and report.warnings == []
     assert not (shot.solve / "cameras.json").exists()
     assert not (shot.solve / "scratch").exists()
     return error.value.message
@@ -337,7 +339,7 @@ def refused(shot, tools):
 
 def test_a_still_camera_is_refused(tmp_path, tools):
     shot = imported(tmp_path, tools, [tools.look([0, 0, 0])] * 9, noise=4.0)
-    assert refused(shot, tools).startswith("The camera does not move: features shift by at most")
+    assert refused(shot, tools).startswith("The range of 9 frames (0.3 s) is too short: features shift by at most 0.")
 
 
 def test_a_camera_that_only_turns_is_refused(tmp_path, tools):

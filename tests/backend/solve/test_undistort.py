@@ -78,7 +78,7 @@ def maps(tmp_path_factory):
     """The worker's maps for 160x120 lenses; from a process of its own: pycolmap cannot share one with OpenImageIO."""
     code = (
         "import json, sys, numpy as np, pycolmap\n"
-        "from torch_backend.solve.worker import undistortion\n"
+        "from torch_backend.solve.answers import undistortion\n"
         "for name, (model, params) in json.loads(sys.argv[2]).items():\n"
         "    camera = pycolmap.Camera.create_from_model_name(1, model, 100.0, 160, 120)\n"
         "    camera.params = params\n"
