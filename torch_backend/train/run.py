@@ -26,7 +26,7 @@ from . import adam
 from .anew import SUMMARY_FILE, drop_begun, finish_replacing, folder_for, replace_run
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
-from .device import choose_device, unused_card
+from .device import choose_device
 from .evidence import gather_evidence
 from .extend import EXTENSION_FILE, pending
 from .ignored import load_ignored
@@ -197,10 +197,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
 
 
 def _prepared_device(config: TrainConfig, params: TrainParams, report: Reporter) -> torch.device:
-    device = choose_device(params.device)
-    unused = unused_card() if params.device == "auto" and device.type == "cpu" else None
-    if unused is not None:
-        report.warning(f"Training uses the processor, not the graphics card: {unused[0]}", unused[1])
+    device = choose_device(params.device, report, "Training")
     torch.set_num_threads(default_threads())
     if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
         for module in (raster_cpu, ssim, adam):
