@@ -82,6 +82,7 @@ from .hosts import (
 from .jobs import (
     CANCEL_FILE,
     EVENTS_FILE,
+    FORECAST,
     HEARTBEAT_SECONDS,
     JOB_COMMAND,
     LOG_FILE,
@@ -262,6 +263,7 @@ __all__ = [
     "DEVICES",
     "EVENTS_FILE",
     "EXTENSION_FILE",
+    "FORECAST",
     "FRAMES_FILE",
     "FRAMES_FOLDER",
     "FRAME_LAYERS",
