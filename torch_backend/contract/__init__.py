@@ -126,6 +126,8 @@ from .option_table import (
 )
 from .options import (
     CAMERA_MODELS,
+    CARD_GAUSSIANS,
+    CARD_WIDTH,
     DETECTORS,
     DEVICES,
     HOST_CONFIGS,
@@ -251,6 +253,8 @@ __all__ = [
     "CAMERAS_FILE",
     "CAMERA_MODELS",
     "CANCEL_FILE",
+    "CARD_GAUSSIANS",
+    "CARD_WIDTH",
     "CHECKPOINT_FILE",
     "COLMAP_FOLDER",
     "COLMAP_LOG",
