@@ -82,6 +82,7 @@ from .hosts import (
 from .jobs import (
     CANCEL_FILE,
     EVENTS_FILE,
+    FORECAST,
     HEARTBEAT_SECONDS,
     JOB_COMMAND,
     LOG_FILE,
@@ -125,6 +126,8 @@ from .option_table import (
 )
 from .options import (
     CAMERA_MODELS,
+    CARD_GAUSSIANS,
+    CARD_WIDTH,
     DETECTORS,
     DEVICES,
     HOST_CONFIGS,
@@ -250,6 +253,8 @@ __all__ = [
     "CAMERAS_FILE",
     "CAMERA_MODELS",
     "CANCEL_FILE",
+    "CARD_GAUSSIANS",
+    "CARD_WIDTH",
     "CHECKPOINT_FILE",
     "COLMAP_FOLDER",
     "COLMAP_LOG",
@@ -262,6 +267,7 @@ __all__ = [
     "DEVICES",
     "EVENTS_FILE",
     "EXTENSION_FILE",
+    "FORECAST",
     "FRAMES_FILE",
     "FRAMES_FOLDER",
     "FRAME_LAYERS",

@@ -16,6 +16,8 @@ PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
 PRESET_WIDTHS = {"preview": 320, "standard": 960, "final": 0}
 """Width in pixels of each preset's training images, never above the working frames'; 0: theirs."""
+CARD_WIDTH, CARD_GAUSSIANS = 1920, 1_000_000
+"""Of `final` on a graphics card: width in pixels of its images, never above the source's, and most Gaussians."""
 CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
 """What `SolveParams.camera_model` may be."""
 HOSTS = host_names()
@@ -303,7 +305,11 @@ class TrainParams:
         items={
             "preview": ("Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
             "standard": ("Standard", "960 pixels wide, 9000 steps: for most shots"),
-            "final": ("Final", "As wide as the working frames, 30000 steps, most Gaussians: takes longest"),
+            "final": (
+                "Final",
+                "As wide as the working frames, 30000 steps, most Gaussians: takes longest. On a graphics card as "
+                "wide as the source, up to 1920 pixels, with up to a million Gaussians",
+            ),
         },
     )
     """preview, standard or final."""

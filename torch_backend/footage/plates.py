@@ -29,6 +29,8 @@ from .opening import open_source
 from .sources import Known, Source, SourceInfo, told_in
 
 PLATES_VERSION = 1
+STAYS = "Frozen frames stay at the size and depth of the working frames."
+"""End of every note."""
 _KEPT, _KEPT_BYTES = 11, 150e6
 _NO_LARGER = 720
 """Import leaves clips of fewer lines than this at their size unless it is told otherwise."""
@@ -168,17 +170,16 @@ class Plates:
         """The footage, or None for the working frames and, where those hold less, a sentence that says why."""
         if _holds_no_more(record, self._working):
             return None, ""
-        stays = "Frozen frames stay at the size and depth of the working frames."
         if isinstance(self._lenses, str):
-            return None, f"{self._lenses} {stays}"
+            return None, f"{self._lenses} {STAYS}"
         config = _config(record)
         for place, source in self._opened(record, config):
             if not source.info.extended and (source.info.width, source.info.height) == self._working:
                 return None, ""
             if self._is_imported(source, record, config):
                 return source, ""
-            return None, f"The footage {place} is not what was imported any more. {stays}"
-        return None, f"The footage {self._shot.info().source or 'of this shot'} cannot be read. {stays}"
+            return None, f"The footage {place} is not what was imported any more. {STAYS}"
+        return None, f"The footage {self._shot.info().source or 'of this shot'} cannot be read. {STAYS}"
 
     def _opened(self, record: dict[str, Any], config: FootageConfig) -> Iterator[tuple[str, Source]]:
         """Where footage lies that can be opened, and itself, read as it was imported."""
