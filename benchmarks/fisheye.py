@@ -1,3 +1,6 @@
+# pyright: reportMissingModuleSource=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+# pyright: reportArgumentType=false
+# As in synthetic/render_bpy.py: nodes, lights and meshes are more to Blender than their types say.
 """A rendered fisheye, solved: a lens of another formula than the solve's, against the cameras it was rendered from.
 
     BPY_PYTHON benchmarks/fisheye.py render OUT             # Cycles: OUT/clip/NNNN.png and OUT/truth.json
@@ -151,7 +154,9 @@ def solve(out: Path, model: str) -> dict[str, Any]:
     scale, rotation, shift = align(centres, wanted)
     off = np.linalg.norm(scale * centres @ rotation.T + shift - wanted, axis=1)
     length = float(np.linalg.norm(np.diff(wanted, axis=0), axis=1).sum())
-    turned = [p[:3, :3] @ rotation.T for p in poses]
+    # Places on a line say nothing of how the path is turned about it: rotations are aligned by themselves.
+    u, _, vt = np.linalg.svd(sum(p[:3, :3].T @ q[:3, :3] for p, q in zip(poses, given, strict=True)))
+    turned = [p[:3, :3] @ u @ vt for p in poses]
     degrees = [rotation_degrees(a, b[:3, :3]) for a, b in zip(turned, given, strict=True)]
     return {
         "camera_model": record["camera_model"],

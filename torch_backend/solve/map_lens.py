@@ -16,6 +16,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from ..array_types import linear_solution, meshgrid
 from ..contract import ExitCode, JobError
 
 ST_MAP = "ST_MAP"
@@ -75,7 +76,8 @@ class Polynomial:
             return np.zeros_like(self._tables), np.zeros_like(self._tables)
         found = [chebyshev.chebder(self._tables, axis=axis) for axis in (2, 1)]
         along, down = np.pad(found[0], ((0, 0), (0, 0), (0, 1))), np.pad(found[1], ((0, 0), (0, 1), (0, 0)))
-        return along * 2.0 / (self.box[2] - self.box[0]), down * 2.0 / (self.box[3] - self.box[1])
+        width, height = self.box[2] - self.box[0], self.box[3] - self.box[1]
+        return np.asarray(along * 2.0 / width, np.float64), np.asarray(down * 2.0 / height, np.float64)
 
     def _values(self, points: NDArray[np.float64], tables: NDArray[np.float64]) -> NDArray[np.float64]:
         left, above = self._vanders(points[:, 0], points[:, 1])
@@ -84,7 +86,8 @@ class Polynomial:
     def _vanders(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         u = (x - self.box[0]) * (2.0 / (self.box[2] - self.box[0])) - 1.0
         v = (y - self.box[1]) * (2.0 / (self.box[3] - self.box[1])) - 1.0
-        return chebyshev.chebvander(u, self.degree), chebyshev.chebvander(v, self.degree)
+        one, two = (chebyshev.chebvander(axis, self.degree) for axis in (u, v))
+        return np.asarray(one, np.float64), np.asarray(two, np.float64)
 
 
 def exponents(degree: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -189,14 +192,14 @@ class MapLens:
                 side = self.map_of_plate(np.stack([np.zeros_like(rows), rows], 1))
                 at = self.bend.of_grid(corner[:, 0], side[:, 1]) * (self.width, self.height)
             else:
-                at = self.to_original(np.stack(np.meshgrid(x, rows), -1).reshape(-1, 2)).reshape(len(rows), width, 2)
+                at = self.to_original(np.stack(meshgrid(x, rows), -1).reshape(-1, 2)).reshape(len(rows), width, 2)
             out[top : top + _ROWS] = at * ratio
         return out
 
     def check(self) -> None:
         """JobError (SOLVE) if the lens folds over within the original frame or within the undistorted one."""
         x, y = np.linspace(0.0, self.width, _GRID), np.linspace(0.0, self.height, _GRID)
-        original = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        original = np.stack(meshgrid(x, y), -1).reshape(-1, 2)
         if self.forward:
             seen = self.map_of_plate(np.concatenate([original, self.to_plate(original)]))
         else:
@@ -233,7 +236,7 @@ class MapLens:
     def _start(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
         """A first guess for `_back`: as if the map bent nothing."""
         middle = np.array([[0.5, 0.5]])
-        return 0.5 + (wanted - self.bend(middle)) @ np.linalg.inv(self.bend.slopes(middle)[0]).T
+        return 0.5 + linear_solution(self.bend.slopes(middle)[0], (wanted - self.bend(middle)).T).T
 
 
 def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) -> MapLens:
@@ -286,8 +289,9 @@ def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) ->
 def _around(width: int, height: int) -> NDArray[np.float64]:
     """[N, 2]: pixel centres of a picture's border, and of its middle row and column."""
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
-    rows = [np.stack([x, np.full_like(x, at)], 1) for at in (y[0], y[len(y) // 2], y[-1])]
-    return np.concatenate(rows + [np.stack([np.full_like(y, at), y], 1) for at in (x[0], x[len(x) // 2], x[-1])])
+    lines = [np.stack([x, np.full_like(x, at)], 1) for at in (y[0], y[len(y) // 2], y[-1])]
+    lines += [np.stack([np.full_like(y, at), y], 1) for at in (x[0], x[len(x) // 2], x[-1])]
+    return np.concatenate(lines).astype(np.float64, copy=False)
 
 
 def _folded() -> JobError:

@@ -14,6 +14,7 @@ Values that are 0 in both channels, transparent, or cut off at 0 and 1 say nothi
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -336,15 +337,15 @@ def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect:
     slope = lens.slopes_in_the_middle
     width, height = read.size
     ours = source[0] / source[1]
-    fits = {}
+    fits: dict[float, float] = {}
     for stretch in {1.0, aspect}:  # of anamorphic footage a map may have the footage's own pixels, or square ones
         own = stretch * width / height
         if way == UNDISTORT:
             fits[own] = slope[0] / slope[1] * ours / own
         elif abs(own / ours - 1.0) < 0.01:
             fits[ours] = slope[0] / slope[1]
-    best = min(fits, key=lambda own: abs(np.log(fits[own])), default=None)
-    if best is None or abs(np.log(fits[best])) > SHAPE:
+    best = min(fits, key=lambda own: abs(math.log(fits[own])), default=None)
+    if best is None or abs(math.log(fits[best])) > SHAPE:
         raise _refused(
             f"{name} is {width} x {height}, the footage {source[0]} x {source[1]}: it is of a picture of another "
             "shape.",

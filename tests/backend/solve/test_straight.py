@@ -43,7 +43,10 @@ def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
     quarter of a pixel, at the corners too. A mask goes through the map as the frames do."""
     shot, poses, folder = clip
     config = SolveConfig(
-        features=1200, st_map=str(folder / "redistort.exr"), st_map_way="redistort", ignore_mask=str(folder / "logo.png")
+        features=1200,
+        st_map=str(folder / "redistort.exr"),
+        st_map_way="redistort",
+        ignore_mask=str(folder / "logo.png"),
     )
     report = tools.recorder()
     result = solve_shot(shot, config, report)
