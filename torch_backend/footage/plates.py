@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..contract import ExitCode, JobError
 from ..shot import Shot, content_key
+from ..solve.map_lens import MapLens
 from ..solve.plate_lens import PlateLens, load_plate_lenses
 from ..solve.stored import load_cameras, load_record
 from ..solve.undistort import BandUndistorter
@@ -85,7 +86,7 @@ class Plates:
         if not self.deep and (self.width, self.height) == self._working:
             source = None  # the working frames are just that
         self._reader = source.plates(self._known(record)) if source is not None else None
-        self._warp: tuple[PlateLens, BandUndistorter] | None = None
+        self._warp: tuple[PlateLens | MapLens, BandUndistorter] | None = None
         self._held: OrderedDict[int, NDArray[Any]] = OrderedDict()
         footage = source.info.key if source is not None else "working frames"
         self.key = content_key(PLATES_VERSION, record.get("key"), solved.get("key"), footage, [self.width, self.height])
@@ -114,9 +115,9 @@ class Plates:
             return source.info if self._is_imported(source, record, config) else None
         return None
 
-    def lens(self) -> PlateLens | None:
+    def lens(self) -> PlateLens | MapLens | None:
         """The lens of all frames; None where frames have lenses of their own, or it is not told."""
-        lenses = set(self._lenses.values()) if isinstance(self._lenses, dict) else set[PlateLens]()
+        lenses = set(self._lenses.values()) if isinstance(self._lenses, dict) else set[PlateLens | MapLens]()
         return next(iter(lenses)) if len(lenses) == 1 else None
 
     def close(self) -> None:
@@ -249,7 +250,7 @@ def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
     return tuple(size) == working and not record.get("extended", True)
 
 
-def _lenses(shot: Shot) -> dict[int, PlateLens] | str:
+def _lenses(shot: Shot) -> dict[int, PlateLens | MapLens] | str:
     """The lens of each frame, or a sentence that says why there is none. JobError (SOLVE) if there is no solve."""
     load_cameras(shot)
     try:

@@ -68,7 +68,7 @@ def _kernel() -> Any:
 
 
 def all_finite(tensors: Sequence[Tensor], threads: int | None = None) -> bool:
-    """Whether every value of dense float32 `tensors` on the CPU is finite; on `threads` workers (default: all cores)."""
+    """Whether every value of dense float32 CPU `tensors` is finite; on `threads` workers (default: all cores)."""
     whole: list[int] = []
     chunks = 0
     for values in tensors:
