@@ -6,6 +6,7 @@
     jobs            a job's folder: request, status, events
     processes       children, and which process lives
     lock            one writer per shot
+    path_rules      where files of another computer lie on this one
     shot_folder     where everything of a shot lies
     unborn          what a failed import leaves behind
     files, typed    reading what may come from anywhere, and plain JSON into dataclasses
@@ -142,6 +143,10 @@ from .options import (
     SolveParams,
     TrainParams,
     check_params,
+)
+from .path_rules import (
+    RULES_VARIABLE,
+    mapped,
 )
 from .processes import (
     GRACE_SECONDS,
@@ -303,6 +308,7 @@ __all__ = [
     "QUERIES",
     "RAW_FOLDER",
     "REQUEST_FILE",
+    "RULES_VARIABLE",
     "RUNS_FOLDER",
     "SHORT_JSON",
     "SHOT_SUFFIX",
@@ -384,6 +390,7 @@ __all__ = [
     "limits_of",
     "locked",
     "make_folder",
+    "mapped",
     "measured",
     "need_disk",
     "new_job",

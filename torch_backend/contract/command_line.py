@@ -85,6 +85,8 @@ def _add_options(parser: argparse.ArgumentParser, name: str, verb: Verb, side: s
             words.update(metavar=spec.metavar, choices=spec.choices or None)
             if one.name in verb.shown:
                 words["metavar"], words["help"] = verb.shown[one.name]
+            if spec.many:
+                words["nargs"] = "+"
             if spec.flag.startswith("--"):
                 own = unset.get(one.name)
                 words["required"] = spec.required

@@ -14,8 +14,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..contract import TAKE_FILE, TAKE_PREVIEW_FOLDER, TAKE_STATE_FILE, ExitCode, FreezeParams, JobError, Reporter
-from ..contract import frame_file, read_json
+from ..contract import (
+    TAKE_FILE,
+    TAKE_PREVIEW_FOLDER,
+    TAKE_STATE_FILE,
+    ExitCode,
+    FreezeParams,
+    JobError,
+    Reporter,
+    frame_file,
+    read_json,
+)
 from ..shot import Shot, content_key, write_json
 from .exr import read_key
 from .take import PlannedTake, finish, frames_in, is_whole, make_folders, planned, render_frames
