@@ -324,9 +324,7 @@ def farm(args: argparse.Namespace, console: Console) -> int:
         return ExitCode.OK
     asked = export.Asked(
         args.shots, output, args.t_star or "", args.t_star_list, args.frames, args.bake, args.shots_folder,
-        args.shots_per_job, args.request, args.rates, args.device == "cuda", hasattr(args, "said") and bool(
-            set(args.said) & export.trainings()
-        ),
+        args.shots_per_job, args.request, args.rates, contract.trains_anew(args),
     )  # fmt: skip
     args.t_star = None  # instants are takes of their own; see `FarmWords`
     told, files = export.export(asked, contract.requested_params(args))

@@ -25,7 +25,7 @@ import bpy
 from ...torch_backend import contract
 from ...torch_backend.contract import ExitCode
 from ..access import scene_in, settings_of
-from ..bake import insertion, rendering
+from ..bake import farm, insertion, rendering
 from ..freeze import takes
 from ..process import backend, begin, jobs, steps
 from ..scene import paths, scene_setup, sequences
@@ -138,6 +138,28 @@ def export(args: argparse.Namespace, console: Console) -> int:
     output = Path(args.output).absolute()
     asked = exchange.begin_export(Path(args.shot).absolute(), args.format, output, args.text)
     console.say(exchange.exported(asked, output))
+    return ExitCode.OK
+
+
+def export_for_farm(args: argparse.Namespace, console: Console) -> int:
+    """`farm export SHOT... --output DIR`: a job for a render farm; `farm measure`: rates of what its tasks took."""
+    output = _output(args)
+    shots = [shot if "://" in shot else str(Path(shot).absolute()) for shot in args.shots]
+    files = [str(Path(file).absolute()) if file else "" for file in (args.t_star_list, args.shots_folder, args.rates)]
+    words = farm.Words(
+        args.action, args.t_star or "", files[0], args.frames, args.bake, files[1], args.shots_per_job, files[2]
+    )
+    args.t_star = None  # instants are takes of their own
+    requests: dict[str, Any] = {kind: dataclasses.asdict(params) for kind, params in asked(args).items()}
+    if not contract.trains_anew(args):
+        del requests["train"]
+    if args.request:
+        for kind, values in contract.read_json(args.request).items():
+            requests[kind] = {**requests.get(kind, {}), **values}
+    question = farm.begin(shots, output, words, requests)
+    question.wait()
+    for line in farm.written(question):
+        print(line, flush=True)
     return ExitCode.OK
 
 
@@ -423,6 +445,7 @@ _DOES = {
     "bake": bake_take,
     "stmaps": write_stmaps,
     "export": export,
+    "farm": export_for_farm,
     "status": status,
     "doctor": doctor,
 }

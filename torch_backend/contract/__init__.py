@@ -47,6 +47,7 @@ from .command_line import (
     notes,
     options_for,
     requested_params,
+    trains_anew,
 )
 from .errors import (
     Cancelled,
@@ -421,6 +422,7 @@ __all__ = [
     "runs_job",
     "runs_still",
     "summarise",
+    "trains_anew",
     "try_lock",
     "verdict_lines",
     "verdict_of",

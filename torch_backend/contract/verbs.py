@@ -196,7 +196,7 @@ class FarmWords:
         "", flag="--shots-folder", metavar="DIR", help="where shots of clips are made", words="beside each clip"
     )
     """Folder for shots of clips; empty: beside each."""
-    shots_per_job: int = option(25, flag="--shots-per-job", metavar="N", help="shots of one template, at most")
+    shots_per_job: int = option(15, flag="--shots-per-job", metavar="N", help="shots of one template, at most")
     """Shots of one template: farms limit how long it may be."""
     request: str = option(
         "",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..contract import ExitCode, JobError, TrainParams, options_for
+from ..contract import ExitCode, JobError
 from . import cost, rates, shots, template, work
 
 RATES_FILE = "rates.json"
@@ -32,21 +32,14 @@ class Asked:
     """Takes go through Blender, too."""
     shots_folder: str = ""
     """Where shots of clips are made; empty: beside each."""
-    shots_per_job: int = 25
+    shots_per_job: int = 15
     """Shots of one template, at most."""
     request: str = ""
     """JSON file of parameters; empty: none."""
     rates: str = ""
     """rates.json; empty: `rates.MEASURED`."""
-    card: bool = False
-    """Training and freezing ask for a graphics card."""
     trains: bool = False
     """An option of the training was given: finished runs are trained again, if it changes them."""
-
-
-def trainings() -> set[str]:
-    """Names, among parsed arguments, of the training's options; but for those that freezing has as well."""
-    return {spec.dest for _, spec in options_for("train", TrainParams)} - {"run", "device"}
 
 
 def export(asked: Asked, requests: dict[str, Any]) -> tuple[cost.Estimate, list[Path]]:
@@ -67,17 +60,19 @@ def export(asked: Asked, requests: dict[str, Any]) -> tuple[cost.Estimate, list[
     instants = shots.parse_instants(asked.t_star)
     if requests["freeze"].t_star is not None and not instants:
         instants = [requests["freeze"].t_star]
+    requests["train"].run = requests["freeze"].run
+    card = requests["freeze"].device == "cuda"
     trains = asked.trains or bool(asked.request and "train" in shots.read_json(asked.request))
     found = shots.gather(asked.shots, requests, instants, table, asked.shots_folder, not trains)
     known = rates.read_rates(asked.rates) if asked.rates else rates.MEASURED
     every = [step for shot in found for step in work.steps_of(shot, asked.frames, asked.bake)]
-    told = cost.estimate(every, known, asked.card, asked.bake)
+    told = cost.estimate(every, known, card, asked.bake)
     groups = [found[n : n + asked.shots_per_job] for n in range(0, len(found), asked.shots_per_job)]
     files: list[Path] = []
     for number, group in enumerate(groups, 1):
         names = {shot.name for shot in group}
         steps = [step for step in every if step.shot.name in names]
-        job = template.job_template(_name(group), steps, cost.needs(known, asked.card), asked.bake)
+        job = template.job_template(_name(group), steps, cost.needs(known, card), asked.bake)
         values = template.job_values(SOFTWARE, group, asked.output / "baked", asked.bake)
         folder = asked.output if len(groups) == 1 else asked.output / f"job-{number:03d}"
         files += template.write_job(folder, job, values)
