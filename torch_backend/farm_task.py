@@ -104,8 +104,8 @@ def run_task(args: argparse.Namespace) -> int:
     with _cancelling(reporter):
         try:
             request = read_request(args.request)
-            take = f" {request['takes'][args.t_star]}" if args.step not in contract.PARAMS else ""
-            reporter.what = f"{request['name']}, {args.step}{take or ''}"
+            take = f" {request['takes'][args.t_star]}" if "takes" in request else ""
+            reporter.what = f"{request['name']}, {args.step}{take}"
             if args.path_rules:
                 os.environ[contract.RULES_VARIABLE] = str(Path(args.path_rules).absolute())
             code = _STEPS[args.step](args, request, reporter)

@@ -113,8 +113,8 @@ def _bury(root: Path, dead: Writer) -> None:
     except OSError:
         return  # another one was faster
     try:
-        if beside.read_bytes() != _text(dead):
-            with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError):
+            if contract.from_dict(Writer, json.loads(beside.read_bytes())) != dead:
                 os.link(beside, path)
     finally:
         beside.unlink(missing_ok=True)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,76 +11,11 @@ import bpy
 from ...torch_backend import contract
 from ..access import Outcome, scene_in, settings_of
 from ..freeze import own_camera, takes
-from ..process import backend, children, job_timer, steps
+from ..process import children, job_timer, steps
 from ..properties import BoolProperty, IntProperty, StringProperty
 from ..shot import inventory, selection
 from ..translations import tr
-
-REQUEST = "request.json"
-"""Parameters of the steps, in the job's folder."""
-
-
-@dataclass(frozen=True)
-class Words:
-    """What a job for a farm is asked for, besides the parameters of its steps; as `contract.verbs.FarmWords`."""
-
-    action: str = "export"
-    """export or measure."""
-    t_star: str = ""
-    """Instants with commas; empty: the scene's."""
-    t_star_list: str = ""
-    """File with instants of each shot; empty: none."""
-    frames: int = 10
-    """Frames of a task."""
-    bake: bool = False
-    """Takes go through Blender, too."""
-    shots_folder: str = ""
-    """Where shots of clips are made; empty: beside each."""
-    shots_per_job: int = 0
-    """Shots of one template; 0: the backend's own number."""
-    rates: str = ""
-    """Rates to estimate with; empty: the backend's own."""
-
-
-def begin(shots: Sequence[str], output: Path, words: Words, requests: dict[str, Any]) -> children.Question:
-    """Has the backend write a job, without waiting.
-
-    Args:
-        shots: shot folders and clips.
-        output: folder for the job.
-        words: what it is asked for.
-        requests: step -> its parameters, those of `contract.PARAMS` or dicts of some of them; written into `output`.
-
-    Raises:
-        contract.JobError: there is no backend, or it cannot be started; OSError: the folder cannot be written.
-    """
-    backend.python()  # before anything is written
-    said = ["farm", words.action, *shots, "--output", str(output)]
-    if words.action == "export":
-        told = {
-            kind: params if isinstance(params, dict) else dataclasses.asdict(params)
-            for kind, params in requests.items()
-        }
-        contract.write_json(output / REQUEST, told)
-        said += ["--request", str(output / REQUEST), "--frames", str(words.frames)]
-        if told.get("freeze", {}).get("device"):
-            said += ["--device", told["freeze"]["device"]]
-        if words.shots_per_job:
-            said += ["--shots-per-job", str(words.shots_per_job)]
-        for flag, value in (
-            ("--t-star", words.t_star),
-            ("--t-star-list", words.t_star_list),
-            ("--shots-folder", words.shots_folder),
-            ("--rates", words.rates),
-        ):
-            said += [f"{flag}={value}"] if value else []
-        said += ["--bake"] if words.bake else []
-    return backend.ask(*said)
-
-
-def written(asked: children.Question) -> list[str]:
-    """What the backend says of the job that it wrote, line by line. JobError with its own sentence if it failed."""
-    return [line.rstrip() for line in asked.answer("{}").splitlines() if line.strip()]
+from . import farm_job
 
 
 def requests_of(scene: bpy.types.Scene, shot: Path) -> dict[str, Any]:
@@ -148,11 +80,11 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
             self.report({"ERROR"}, "No folder was given")
             return {"CANCELLED"}
         folder = Path(os.path.abspath(bpy.path.abspath(self.directory)))
-        words = Words(t_star=self.instants, frames=self.frames, bake=self.bake)
+        words = farm_job.Words(t_star=self.instants, frames=self.frames, bake=self.bake)
         try:
-            asked = begin([str(shot)], folder, words, requests_of(scene, shot))
+            asked = farm_job.begin([str(shot)], folder, words, requests_of(scene, shot))
             if bpy.app.background:
-                for line in written(asked):
+                for line in farm_job.written(asked):
                     self.report({"INFO"}, line)
                 return {"FINISHED"}
         except (contract.JobError, OSError, ValueError) as error:
@@ -168,7 +100,7 @@ def _tell(shot: Path, asked: children.Question) -> None:
     """Puts what came of an export onto the panel."""
     watch = job_timer.watch_of(shot)
     try:
-        watch.notes["bake"] = written(asked)
+        watch.notes["bake"] = farm_job.written(asked)
     except contract.JobError as error:
         watch.failures["bake"] = (error.message, error.hint)
 

@@ -25,7 +25,7 @@ import bpy
 from ...torch_backend import contract
 from ...torch_backend.contract import ExitCode
 from ..access import scene_in, settings_of
-from ..bake import farm, insertion, rendering
+from ..bake import farm_job, insertion, rendering
 from ..freeze import takes
 from ..process import backend, begin, jobs, steps
 from ..scene import paths, scene_setup, sequences
@@ -146,7 +146,7 @@ def export_for_farm(args: argparse.Namespace, console: Console) -> int:
     output = _output(args)
     shots = [shot if "://" in shot else str(Path(shot).absolute()) for shot in args.shots]
     files = [str(Path(file).absolute()) if file else "" for file in (args.t_star_list, args.shots_folder, args.rates)]
-    words = farm.Words(
+    words = farm_job.Words(
         args.action, args.t_star or "", files[0], args.frames, args.bake, files[1], args.shots_per_job, files[2]
     )
     args.t_star = None  # instants are takes of their own
@@ -156,9 +156,9 @@ def export_for_farm(args: argparse.Namespace, console: Console) -> int:
     if args.request:
         for kind, values in contract.read_json(args.request).items():
             requests[kind] = {**requests.get(kind, {}), **values}
-    question = farm.begin(shots, output, words, requests)
+    question = farm_job.begin(shots, output, words, requests)
     question.wait()
-    for line in farm.written(question):
+    for line in farm_job.written(question):
         print(line, flush=True)
     return ExitCode.OK
 

@@ -15,6 +15,9 @@ ON_A_CARD = ("train", "open", "freeze")
 """Steps that a graphics card does, where one is asked for."""
 SPARE = 1.5
 """Memory that is asked for, over what was seen."""
+MIB_PER_MEGAPIXEL = 160
+"""Memory that a take's frames want by their size: docs/benchmarks.md, "What a frame costs", 640 x 360 against 4K."""
+_OF_FRAMES = ("open", "freeze", "finish", "bake")
 
 
 @dataclass(frozen=True)
@@ -75,12 +78,13 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
     )
 
 
-def needs(rates: dict[str, Rate], card: bool) -> dict[str, Needs]:
-    """What hosts are asked for, by what was measured."""
-    return {
-        kind: Needs(int(-(-rate.memory_mib * SPARE // 512) * 512), card and kind in ON_A_CARD)
-        for kind, rate in rates.items()
-    }
+def needs(rates: dict[str, Rate], card: bool, megapixels: float) -> dict[str, Needs]:
+    """What hosts are asked for, by what was measured; `megapixels` of the largest take's frames."""
+    found: dict[str, Needs] = {}
+    for kind, rate in rates.items():
+        memory = SPARE * rate.memory_mib + (MIB_PER_MEGAPIXEL * megapixels if kind in _OF_FRAMES else 0.0)
+        found[kind] = Needs(int(-(-memory // 512) * 512), card and kind in ON_A_CARD)
+    return found
 
 
 def sentences(told: Estimate, rates_from: str) -> list[str]:

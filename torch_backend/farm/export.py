@@ -72,7 +72,8 @@ def export(asked: Asked, requests: dict[str, Any]) -> tuple[cost.Estimate, list[
     for number, group in enumerate(groups, 1):
         names = {shot.name for shot in group}
         steps = [step for step in every if step.shot.name in names]
-        job = template.job_template(_name(group), steps, cost.needs(known, card), asked.bake)
+        largest = max(wide * high / 1e6 for wide, high in map(work.take_size, group))
+        job = template.job_template(_name(group), steps, cost.needs(known, card, largest), asked.bake)
         values = template.job_values(SOFTWARE, group, asked.output / "baked", asked.bake)
         folder = asked.output if len(groups) == 1 else asked.output / f"job-{number:03d}"
         files += template.write_job(folder, job, values)

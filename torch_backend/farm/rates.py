@@ -22,7 +22,7 @@ class Rate:
     fixed: float
     """Seconds that a task takes whatever it has to do: starting, loading."""
     per_unit: float
-    """Seconds per unit of `work.Step.amounts`: a megapixel, or a megapixel of a training step."""
+    """Seconds per unit of `work.Step.amounts`."""
     cores: float
     """Processor cores that it keeps busy, in the mean."""
     memory_mib: int
@@ -34,16 +34,16 @@ class Rate:
 
 
 MEASURED: dict[str, Rate] = {
-    "import": Rate(2.0, 0.02, 1.0, 400),
-    "solve": Rate(10.0, 1.0, 1.0, 900),
-    "train": Rate(15.0, 1.0, 1.0, 1500),
-    "open": Rate(6.0, 1.0, 1.0, 1500),
-    "freeze": Rate(6.0, 1.0, 1.0, 1500),
-    "finish": Rate(6.0, 0.1, 1.0, 1000),
-    "bake": Rate(5.0, 0.3, 1.0, 1000),
-    "deliver": Rate(4.0, 0.0, 1.0, 600),
+    "import": Rate(3.0, 0.03, 1.0, 400),
+    "solve": Rate(5.0, 3.4, 1.0, 1000),
+    "train": Rate(4.0, 0.228, 1.0, 1500),
+    "open": Rate(3.5, 0.153, 1.0, 1000),
+    "freeze": Rate(3.8, 0.43, 1.0, 1250),
+    "finish": Rate(3.2, 0.03, 1.0, 700),
+    "bake": Rate(4.2, 0.11, 1.0, 600),
+    "deliver": Rate(4.1, 0.0, 1.0, 500),
 }
-"""Step -> rate on the processor of docs/farm.md, which says how they were measured."""
+"""Step -> rate on one core of the processor of docs/farm.md, which says how they were measured."""
 SESSION_SECONDS = 2.0
 """Seconds that entering the job's environment takes once it is set up, per session of a host."""
 

@@ -16,6 +16,10 @@ MOST_VALUES = 1024
 """Values of a task parameter, at most, as Open Job Description has it."""
 
 
+PER_STEP, PER_FRAME = 0.16, 0.9
+"""Megapixels that a training step, and a frozen frame, cost whatever their size; measured, see docs/farm.md."""
+
+
 @dataclass(frozen=True)
 class Step:
     """One step of one shot."""
@@ -30,7 +34,8 @@ class Step:
     part: int
     """Frames of a part."""
     amounts: dict[int, float]
-    """First frame of a part, 0 where there are none -> megapixels, or megapixels times training steps, of a task."""
+    """First frame of a part, 0 where there are none -> how much a task has to do: megapixels of pictures that are read;
+    of training steps and frozen frames with what each costs whatever its size."""
 
     @property
     def name(self) -> str:
@@ -51,9 +56,10 @@ def steps_of(shot: FarmShot, part: int, bake: bool) -> list[Step]:
     part = max(1, part, -(-shot.frames // MOST_VALUES))
     starts = list(range(shot.first, shot.last + 1, part))
     wide, high = take_size(shot)
-    sizes = {start: min(part, shot.last + 1 - start) * wide * high / 1e6 for start in starts}
+    each = wide * high / 1e6 + PER_FRAME
+    sizes = {start: min(part, shot.last + 1 - start) * each for start in starts}
     working = shot.working[0] * shot.working[1] / 1e6
-    whole = {0: shot.frames * wide * high / 1e6}
+    whole = {0: shot.frames * each}
     every = list(shot.takes)
     plain: list[tuple[str, float]] = []
     if shot.clip:
@@ -79,21 +85,25 @@ def take_size(shot: FarmShot) -> tuple[int, int]:
 
 
 def _training(shot: FarmShot) -> float:
-    """Megapixels times steps of a training."""
     asked: dict[str, Any] = shot.requests["train"]
-    width = asked["width"] or PRESET_WIDTHS[asked["preset"]] or shot.working[0]
-    width = min(width, shot.working[0])
-    return (asked["iterations"] or PRESET_STEPS[asked["preset"]]) * width**2 * _shape(shot) / 1e6
+    steps = asked["iterations"] or PRESET_STEPS[asked["preset"]]
+    return steps * (_trained_width(shot) ** 2 * _shape(shot) / 1e6 + PER_STEP)
+
+
+def _trained_width(shot: FarmShot) -> int:
+    """Pixels of the training's pictures."""
+    asked: dict[str, Any] = shot.requests["train"]
+    return min(asked["width"] or PRESET_WIDTHS[asked["preset"]] or shot.working[0], shot.working[0])
 
 
 def _developing(shot: FarmShot) -> float:
-    """Megapixels times steps of developing an instant; 0 where it is not."""
+    """Of an instant; 0 where it is not developed."""
     if shot.requests["freeze"]["develop"] != "on":
         return 0.0
-    asked, usual = shot.requests["train"], DevelopConfig()
-    trained = min(asked["width"] or PRESET_WIDTHS[asked["preset"]] or shot.working[0], shot.working[0])
+    usual, trained = DevelopConfig(), _trained_width(shot)
     width = min(max(usual.width, trained), shot.working[0])
-    return usual.steps * max(1.0, trained / usual.width) * width**2 * _shape(shot) / 1e6
+    steps = round(usual.steps * max(1.0, trained / usual.width))
+    return steps * (width**2 * _shape(shot) / 1e6 + PER_STEP)
 
 
 def _shape(shot: FarmShot) -> float:
