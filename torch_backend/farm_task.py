@@ -26,6 +26,7 @@ from typing import Any
 
 from . import contract
 from .contract import Cancelled, Event, ExitCode, FreezeParams, JobError, ShotFolder
+from .contract.files import is_json_object
 from .farm import records
 from .farm.template import read_request, shot_name
 from .job import new_job, run_job
@@ -256,9 +257,9 @@ def _event(line: str) -> Event | None:
     if not line.startswith("{"):
         return None
     try:
-        data = json.loads(line)
+        data: Any = json.loads(line)
         known = {one.name for one in dataclasses.fields(Event)}
-        return Event(**data) if isinstance(data, dict) and set(data) <= known and "seq" in data else None
+        return Event(**data) if is_json_object(data) and set(data) <= known and "seq" in data else None
     except (ValueError, TypeError):
         return None
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...torch_backend import contract
+from ...torch_backend.contract.files import is_json_object
 from ..process import backend, children
 
 REQUEST = "request.json"
@@ -52,9 +53,8 @@ def begin(shots: Sequence[str], output: Path, words: Words, requests: dict[str, 
     backend.python()  # before anything is written
     said = ["farm", words.action, *shots, "--output", str(output)]
     if words.action == "export":
-        told = {
-            kind: params if isinstance(params, dict) else dataclasses.asdict(params)
-            for kind, params in requests.items()
+        told: dict[str, dict[str, Any]] = {
+            kind: params if is_json_object(params) else dataclasses.asdict(params) for kind, params in requests.items()
         }
         contract.write_json(output / REQUEST, told)
         said += ["--request", str(output / REQUEST), "--frames", str(words.frames)]

@@ -10,9 +10,9 @@ import ntpath
 import os
 import posixpath
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from .files import LONGEST_JSON, read_json
+from .files import LONGEST_JSON, is_json_object, read_json
 
 RULES_VARIABLE = "SPLANNEQUIN_PATH_RULES"
 """Environment variable that names the file of rules."""
@@ -58,8 +58,10 @@ def _told() -> list[dict[str, Any]]:
     if not file or not Path(file).is_file():
         return []
     data = read_json(Path(file), LONGEST_JSON)
-    rules = data.get("path_mapping_rules") or []
+    rules: Any = data.get("path_mapping_rules") or []
     wanted = {"source_path_format", "source_path", "destination_path"}
-    if not isinstance(rules, list) or not all(isinstance(r, dict) and wanted <= set(r) for r in rules):
+    told = cast("list[Any]", rules) if isinstance(rules, list) else [None]
+    found = [rule for rule in told if is_json_object(rule) and wanted <= set(rule)]
+    if len(found) != len(told):
         raise ValueError(f"{file} holds no path mapping rules as Open Job Description writes them")
-    return rules
+    return found

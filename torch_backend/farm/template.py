@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..contract import PARAMS, SHOT_SUFFIX, ExitCode, JobError, write_json
+from ..contract.files import is_json_object
 from ..contract.option_table import MASK_ALPHA, mask_path, options_of
 from .shots import FarmShot
 from .work import STEPS, Step
@@ -159,7 +160,7 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
     shot, kind = step.shot, step.kind
     words = [_LAUNCHER, "farm-task", kind, "--shot", "{{Task.Param.Shot}}", "--request", "{{Task.File.Request}}"]
     words += ["--path-rules", "{{Session.PathMappingRulesFile}}"]
-    space = [{"name": "Shot", "type": "PATH", "range": [_refused(str(shot.root))]}]
+    space: list[dict[str, Any]] = [{"name": "Shot", "type": "PATH", "range": [_refused(str(shot.root))]}]
     said: list[str] = []
     if kind == "import":
         space.append({"name": "Clip", "type": "PATH", "range": [_refused(shot.clip)]})
@@ -224,8 +225,8 @@ def _refused(text: str) -> str:
 def read_request(path: str | Path) -> dict[str, Any]:
     """What `_request` wrote. JobError if it is none, or from a newer version."""
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-        if not isinstance(data, dict) or data.get("version") != 1:
+        data: Any = json.loads(Path(path).read_text(encoding="utf-8"))
+        if not is_json_object(data) or data.get("version") != 1:
             raise ValueError("it is not of this version")
     except (OSError, ValueError) as error:
         raise JobError(f"{path} is no request of a farm's template: {error}.", "", ExitCode.USAGE) from error
