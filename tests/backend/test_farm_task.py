@@ -61,7 +61,7 @@ def test_a_template_of_one_layout_runs_on_another(submitted, tmp_path):
     assert sorted(p.relative_to(submitted) for p in submitted.rglob("*")) == before, "nothing where it was submitted"
     assert "openjd_progress: 100.0" in said and "tiny, freeze freeze_0110: freezing" in said
     took = json.loads((there / "shots" / "tiny.splannequin" / "farm" / "freeze-110-109.json").read_text())
-    assert took["amount"] == pytest.approx(8 * (64 * 48 / 1e6 + PER_FRAME)) and took["cpu_seconds"] > 0
+    assert took["amount"] == pytest.approx(8 * (64 * 48 / 1e6 + PER_FRAME), abs=1e-3) and took["cpu_seconds"] > 0
 
 
 @pytest.fixture
