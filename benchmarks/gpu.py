@@ -40,7 +40,7 @@ from torch_backend.native import default_threads
 from torch_backend.raster import cuda
 from torch_backend.scene import load_images, load_scene
 from torch_backend.shot import Shot, write_json
-from torch_backend.train import config_from_params, train_shot
+from torch_backend.train import PRESETS, config_from_params, train_shot
 from torch_backend.train.device import cuda_refusal
 from torch_backend.train.memory import plan_memory
 from torch_backend.train.run import training_size
@@ -252,13 +252,14 @@ def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any
     """A run: PSNR on frames held out, and ms a step between its measurements."""
     steps = 20 if stage.dry else {"preview": 0, "final": 3000}[preset]
     report, name = Silent(), f"gpu-{preset}-{device}-{seed}"
-    few = 400 if stage.dry else 0
-    width = 64 if stage.dry else 0
+    shot, known = stage.scratch_shot(), PRESETS[preset]()
+    # The processor's numbers on either device: a card's own are others.
+    few = 400 if stage.dry else known.densify.budget
+    width = 64 if stage.dry else known.width or load_scene(shot).width
     asked = TrainParams(
         run=name, preset=preset, iterations=steps, seed=seed, device=device, holdout=8, max_gaussians=few, width=width,
         resume=False,
     )  # fmt: skip
-    shot = stage.scratch_shot()
     summary = train_shot(shot, asked, report)
     lines = (shot.run(name) / METRICS_FILE).read_text(encoding="utf-8").splitlines()
     rows = [{"iteration": 0, "seconds": 0.0}, *map(json.loads, lines)]

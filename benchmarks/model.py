@@ -47,10 +47,12 @@ from torch_backend.raster import ssim
 from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot, write_json
+from torch_backend.solve.masks import IGNORE, load_mask
 from torch_backend.solve.motion import load_motion
 from torch_backend.train import LoadedRun, adam, config_from_params
 from torch_backend.train.checkpoint import CHECKPOINT_FILE, read_meta
 from torch_backend.train.config import TrainConfig, config_from_json, config_to_json
+from torch_backend.train.ignored import Masks, load_ignored
 from torch_backend.train.movers import load_movers
 from torch_backend.train.run import training_size
 from torch_backend.train.trainer import Trainer
@@ -87,6 +89,11 @@ class Judge:
         images = load_images(self.scene, test, self.width, self.height)
         self.images = dict(zip(test, images.float(), strict=True))
         self.Ks = self.scene.camera_at(self.width, self.height)
+        self.ignored = load_ignored(masks_of(shot), self.scene, test, self.width, self.height)
+
+    def judged(self, index: int, where: Tensor) -> Tensor:
+        """Of the pixels `where`, bool [H, W], those that the shot's mask does not say are no part of the scene."""
+        return where if index not in self.ignored else where & ~self.ignored[index]
 
     def matte(self, index: int) -> Tensor:
         """[H, W] in 0..1. ValueError without one."""
@@ -107,9 +114,9 @@ class Judge:
             shown, matte = self.trainer.render_frame(index), self.matte(index)
             rows.append({
                 "frame": self.scene.frames[index],
-                "still": _psnr(shown, plate, self.still(matte)),
-                "moving": _psnr(shown, plate, matte > 0.75),
-                "whole": _psnr(shown, plate, torch.ones_like(matte) > 0),
+                "still": _psnr(shown, plate, self.judged(index, self.still(matte))),
+                "moving": _psnr(shown, plate, self.judged(index, matte > 0.75)),
+                "whole": _psnr(shown, plate, self.judged(index, torch.ones_like(matte) > 0)),
                 "gradient": gradient_magnitude(shown) / max(1e-9, gradient_magnitude(plate)),
             })  # fmt: skip
         return rows
@@ -134,7 +141,7 @@ class Judge:
             shown = over_grey(image)
             rows.append({
                 "frame": self.scene.frames[index],
-                "frozen": _psnr(shown, plate, self.still(self.matte(index), mover)),
+                "frozen": _psnr(shown, plate, self.judged(index, self.still(self.matte(index), mover))),
                 "best_90": best_share_psnr(shown, plate),
                 "gradient": gradient_magnitude(shown) / max(1e-9, gradient_magnitude(plate)),
             })  # fmt: skip
@@ -142,7 +149,13 @@ class Judge:
 
     def moving_at(self, frozen: FrozenGaussians, index: int) -> float | None:
         """PSNR of what moves in a held-out frame, of the scene frozen at it, from its own pose."""
-        return _psnr(over_grey(self.seen(frozen, index)), self.images[index], self.matte(index) > 0.75)
+        moving = self.judged(index, self.matte(index) > 0.75)
+        return _psnr(over_grey(self.seen(frozen, index)), self.images[index], moving)
+
+
+def masks_of(shot: Shot) -> Masks:
+    """What is ignored of a shot's frames."""
+    return functools.partial(load_mask, shot, IGNORE)
 
 
 def over_grey(image: FrozenImage) -> Tensor:
@@ -196,7 +209,8 @@ def trained(args: argparse.Namespace, shot: Shot, config: TrainConfig) -> tuple[
     for module in (raster_cpu, ssim, adam, planes):
         module.warm_up()
     since, left = time.process_time(), args.results / f"{args.name}.safetensors"
-    trainer = Trainer(scene, images, train, config, _Silent(), movers=movers)  # type: ignore[arg-type]
+    ignored = load_ignored(masks_of(shot), scene, train, width, height)
+    trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)  # type: ignore[arg-type]
     if args.run or args.again:
         trainer.restore(shot.run(args.run) / CHECKPOINT_FILE if args.run else left)
     else:

@@ -6,7 +6,7 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import interpolate, sparse
 
 
 class SparseMatrix(Protocol):
@@ -38,6 +38,18 @@ def sparse_entries(
 def meshgrid(x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """`np.meshgrid` of two axes [W] and [H]: x and y at each place, [H, W] each."""
     return cast(tuple[NDArray[Any], NDArray[Any]], np.meshgrid(x, y))
+
+
+def between_nodes(
+    nodes: tuple[NDArray[np.float64], NDArray[np.float64]],
+    values: NDArray[np.float64],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Values [len(y), len(x)] between those of a grid, by a cubic spline: `nodes` are the grid's x and y, ascending,
+    four at least, `values` [y, x]."""
+    spline = cast(Any, interpolate).RectBivariateSpline(nodes[1], nodes[0], values)
+    return np.asarray(spline(y, x), np.float64)
 
 
 def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:

@@ -47,6 +47,7 @@ class JobReporter:
         self._missed = 0
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
+        self._foretold = ("", 0.0)
         now = time.time()
         pid, host = os.getpid(), contract.computer_name()
         self.status = Status(kind, "running", pid, now, contract.process_start(pid), now, host=host)
@@ -74,6 +75,9 @@ class JobReporter:
         self._emit("progress", stage=stage, done=done, total=total, message=message, eta_seconds=eta)
 
     def metric(self, stage: str, values: Mapping[str, Any]) -> None:
+        if stage == contract.FORECAST:
+            with self._lock:
+                self._foretold = (str(values["of"]), time.time() + float(values["seconds_left"]))
         self._emit("metric", stage=stage, values=dict(values))
 
     def image(self, label: str, path: str | Path) -> None:
@@ -129,7 +133,10 @@ class JobReporter:
     # -- inside
 
     def _eta(self, now: float, fraction: float) -> float | None:
-        _, since, at_fraction = self._stage_started
+        stage, since, at_fraction = self._stage_started
+        of, until = self._foretold
+        if of == stage and now < until and fraction < 1.0:  # by whoever knows what grows; longer than that nobody does
+            return round(until - now, 1)
         gained = fraction - at_fraction
         if gained <= 0.02 or now - since < 1.0:
             return None

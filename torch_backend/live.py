@@ -5,7 +5,7 @@ when that process ends, so does this one. Messages are those of `contract.write_
 
 | header | from | means |
 |---|---|---|
-| `ready` | backend | the run is loaded: its frames, what they are good for as instants, size |
+| `ready` | backend | the run is loaded: its frames, frames good as instants, size; `note`: a warning or empty |
 | a `LiveView` | Blender | draw this; a newer one for the same view replaces one that waits or is being made of plates |
 | `frame` | backend | a view: float32 premultiplied display-referred RGBA, then float32 depth in solve units |
 | `error` | backend | message and hint; after one without `seq` the session ends |
@@ -45,7 +45,8 @@ from .freeze.frozen import (
 from .freeze.sightings import SightingConfig, motion_mattes
 from .scene import Scene, frame_table, load_scene
 from .shot import Shot
-from .train import LoadedRun, choose_device, load_run
+from .train import LoadedRun, load_run
+from .train.device import decide_device, unused_words
 
 _INSTANTS_KEPT = 8
 """Frozen scenes that are kept: going back and forth between keys costs no evaluation of the field."""
@@ -125,7 +126,9 @@ class LiveSession:
     """A loaded run. JobError if the shot has no such run."""
 
     def __init__(self, shot: Shot, run: str, device: str = "auto") -> None:
-        self._shot, self.run = shot, load_run(shot, run, choose_device(device))
+        chosen, unused = decide_device(device)
+        self._note = " ".join(unused_words(unused, "Scrubbing")).strip() if unused is not None else ""
+        self._shot, self.run = shot, load_run(shot, run, chosen)
         self.scene = load_scene(shot)
         self._span = span_of(self.scene, self.run)
         self._frozen: OrderedDict[tuple[int, tuple[int, int] | None], FrozenGaussians] = OrderedDict()
@@ -147,6 +150,7 @@ class LiveSession:
             "height": self.run.height,
             "gaussians": len(self.run.model.gaussians),
             "moving": len(self.run.model.open_rows()),
+            "note": self._note,
             "suggestions": [
                 {"frame": trained[i.index], "seen": round(i.seen, 3), "sharpness": round(i.sharpness, 3)}
                 for i in best_instants(ranking)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 import os
 import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from .contract import ExitCode, JobError, Reporter, frame_file
 from .footage.display import PLAIN, Display, display_of
 from .footage.images import read_frame
 from .footage.importing import load_frames
+from .native import default_threads
 from .shot import Shot, make_folder, need_disk
 from .solve.stored import damaged, load_cameras, load_points
 from .torch_types import from_numpy
@@ -162,6 +165,8 @@ def split_frames(solved: list[int], holdout: int, phase: int = 0) -> tuple[list[
     return [i for i in solved if i not in held], test
 
 
+_DECODERS = 8
+"""Frames that are decoded at a time, at most: each holds some tens of megabytes meanwhile."""
 HELD_BYTES = 1 << 30
 """Bytes of training images that are held in memory; more lie in a file, of which the system holds what is in use."""
 
@@ -173,23 +178,40 @@ def load_images(
     height: int,
     report: Reporter | None = None,
     beside: Path | None = None,
+    read: Callable[[int], Tensor] | None = None,
 ) -> Tensor:
     """Working frames `indices` at a training size, [I, height, width, 3] float16 in [0, 1] of the scene's display.
 
     float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `HELD_BYTES` of them are
     mapped from a nameless file in the folder `beside`, if there is one: however the process ends, nothing stays.
     JobError if the disk has no room for that.
+
+    Several are decoded at a time, unless `read` makes them, one after the other and in the clip's order: index of a
+    frame of the scene -> [height, width, 3] in [0, 1].
     """
     shape = len(indices), height, width, 3
     if beside is None or 2 * math.prod(shape) <= HELD_BYTES:
         images = torch.empty(*shape, dtype=torch.float16)
     else:
         images = _mapped(beside, shape)
-    for n, index in enumerate(indices):
-        images[n] = read_image(scene.image_path(index), width, height, scene.display)
-        if report:
-            report.check_cancelled()
-            report.progress("loading frames", n + 1, len(indices), f"frame {scene.frames[index]}")
+
+    def load(n: int) -> None:
+        index = indices[n]
+        if read is not None:
+            images[n] = read(index)
+        else:
+            images[n] = read_image(scene.image_path(index), width, height, scene.display)
+
+    order = range(len(indices)) if read is None else sorted(range(len(indices)), key=lambda n: indices[n])
+    pool = ThreadPoolExecutor(1 if read is not None else min(default_threads(), _DECODERS), "frames in")
+    try:
+        for done, (n, loaded) in enumerate([(n, pool.submit(load, n)) for n in order], start=1):
+            loaded.result()
+            if report:
+                report.check_cancelled()
+                report.progress("loading frames", done, len(indices), f"frame {scene.frames[indices[n]]}")
+    finally:
+        pool.shutdown(cancel_futures=True)
     return images
 
 

@@ -89,6 +89,8 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
         row.operator("splannequin.suggested_instant", text="", icon="TRIA_RIGHT").step = 1
         layout.row().prop(settings_of(scene_in(context)), "live_show", expand=True)
         wrap(layout, context, viewport.reason(scene_in(context)), "INFO")
+        if viewport.note():
+            wrap(layout, context, viewport.note(), "ERROR")
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The take's name, what it is made of, its size, and where it is seen from."""

@@ -118,6 +118,11 @@ def suggestions() -> list[dict[str, Any]]:
     return list(_session.facts.get("suggestions", [])) if _session is not None else []
 
 
+def note() -> str:
+    """What the backend warned of when the session began, in its words; empty if of nothing."""
+    return str(_session.facts.get("note", "")) if _session is not None else ""
+
+
 def reason(scene: bpy.types.Scene) -> str:
     """One sentence about the instant in the view: why it is a good one, or where better ones are."""
     if _session is None or not _session.facts:

@@ -31,6 +31,9 @@ def params(scene: bpy.types.Scene, shot: Path | None) -> contract.SolveParams:
     asked.focal_mm = _said(props.focal_mm)
     if asked.focal_mm:
         asked.sensor_mm, asked.refine_focal = _said(props.sensor_mm), props.refine_focal
+    if props.st_map and props.cameras_from == "SOLVE":  # others bring their own lens
+        asked.st_map = os.path.abspath(bpy.path.abspath(props.st_map))
+        asked.st_map_way, asked.st_map_layer = props.st_map_way, props.st_map_layer.strip()
     if props.cameras_from == "FILE":
         if not props.cameras_path:
             raise contract.JobError(

@@ -49,13 +49,19 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The lens, where cameras come from, and where they go."""
         props = settings_of(scene_in(context))
-        layout.prop(props, "camera_model")
+        row = layout.row()
+        row.enabled = not (props.st_map and props.cameras_from == "SOLVE")  # the map is the lens
+        row.prop(props, "camera_model")
         layout.prop(props, "focal_mm")
         if props.focal_mm > 0.0:
             for name in ("sensor_mm", "refine_focal"):
                 layout.prop(props, name)
         layout.prop(props, "cameras_from")
         if props.cameras_from == "SOLVE":
+            layout.prop(props, "st_map")
+            if props.st_map:
+                for name in ("st_map_way", "st_map_layer"):
+                    layout.prop(props, name)
             layout.prop(props, "retry")
         elif props.cameras_from == "FILE":
             layout.prop(props, "cameras_path", text="")

@@ -41,6 +41,19 @@ class SolveSettings:
         **contract.panel(contract.SolveParams, "refine_focal"),
         options=set(),
     )
+    st_map = StringProperty(
+        **contract.panel(contract.SolveParams, "st_map"),
+        subtype="FILE_PATH",
+        options=compat.PATH_OPTIONS,
+    )
+    st_map_way = EnumProperty(
+        **contract.panel(contract.SolveParams, "st_map_way"),
+        options=set(),
+    )
+    st_map_layer = StringProperty(
+        **contract.panel(contract.SolveParams, "st_map_layer"),
+        options=set(),
+    )
     retry = BoolProperty(
         **contract.panel(contract.SolveParams, "retry"),
         options=set(),

@@ -35,7 +35,10 @@ def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
     for preset, steps in contract.PRESET_STEPS.items():
         width = contract.PRESET_WIDTHS[preset] or across
         width = min(width, across) if across else width
-        own = [run for run in timed if run.get("preset") == preset and run.get("width_px") == width]
+        same = [run for run in timed if run.get("preset") == preset]
+        if preset == "final" and same and same[-1].get("device") == "cuda":
+            width = same[-1]["width_px"]  # a card's may be finer than the working frames
+        own = [run for run in same if run.get("width_px") == width]
         nearest = own[-1:] or timed[-1:]
         seconds = None
         for run in nearest:

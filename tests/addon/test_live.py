@@ -120,6 +120,16 @@ def test_a_view_that_came_to_rest_is_drawn_once_more_however_late_the_timer_is(a
     assert drawn.count(("WINDOW",)) == 2, "the switch is followed"
 
 
+def test_what_the_backend_warned_of_is_shown_while_it_draws(addon, shot, monkeypatch):
+    viewport = addon("freeze.viewport")
+    assert viewport.note() == ""
+    session = addon("freeze.live").Session(shot, "main")
+    monkeypatch.setattr(viewport, "_session", session)
+    assert viewport.note() == "", "of an older backend, or one that loads"
+    session._take_in({"kind": "ready", "note": "Scrubbing uses the processor."}, b"")
+    assert viewport.note() == "Scrubbing uses the processor."
+
+
 def test_an_orthographic_view_is_not_asked_for(addon, shot, scene):
     scene.splannequin.shot_path = str(shot)
     assert addon("freeze.viewport").view_of(scene, shot, (64, 48), (Matrix(), Matrix()), 6.0, 10**9) is None

@@ -138,6 +138,17 @@ def test_missing_cameras_are_said(addon, contract, scene, clip, shot):
     assert steps["solve"].params(scene) == contract.SolveParams()
 
 
+def test_an_st_map_is_handed_on_with_its_way_and_only_where_the_lens_is_ours_to_find(addon, contract, scene, shot):
+    solve, props = addon("process.steps").STEPS["solve"], scene.splannequin
+    props.shot_path, props.st_map_way, props.st_map_layer = str(shot), "redistort", " back "
+    assert solve.params(scene) == contract.SolveParams(), "without a file the rest says nothing"
+    props.st_map = str(shot / "x" / ".." / "lens.exr")
+    asked = solve.params(scene)
+    assert (asked.st_map, asked.st_map_way, asked.st_map_layer) == (str(shot / "lens.exr"), "redistort", "back")
+    props.cameras_from, props.cameras_path = "FILE", str(shot / "model")
+    assert solve.params(scene).st_map == "", "cameras from elsewhere bring their own lens"
+
+
 @pytest.mark.parametrize("kind", ["colmap", "colmap_text", "nerfstudio"])
 def test_the_export_button_writes_every_camera(scene, shot, tmp_path, contract, kind):
     scene.splannequin.shot_path = str(shot)

@@ -47,6 +47,15 @@ def test_a_static_run_does_not_tell_how_long_one_with_motion_takes(costs):
     assert told["run"] == "still" and rows["preview"].seconds == 40.0, "better than nothing"
 
 
+def test_a_final_run_of_a_card_tells_of_the_sources_pixels(costs):
+    runs = {"main": run(preset="final", width_px=1920, iterations=30_000, train_seconds=600.0, device="cuda")}
+    rows, told = costs(runs)
+    assert (rows["final"].width, rows["final"].seconds, rows["final"].measured) == (1920, 600.0, True)
+    assert rows["preview"].width == 320 and not rows["preview"].measured and told["device"] == "cuda"
+    runs["main"] |= dict(device="cpu")
+    assert costs(runs)[0]["final"].width == 1280
+
+
 def test_a_small_clip_is_not_enlarged(costs):
     rows, _ = costs({"main": run(width_px=320)}, width=640)
     assert (rows["standard"].width, rows["final"].width) == (640, 640)

@@ -50,6 +50,25 @@ def test_done_is_last_and_status_is_true(shot, monkeypatch):
     assert status_of(folder).state == "done"
 
 
+def test_what_a_station_foretells_is_what_is_left(shot, monkeypatch):
+    told = []
+
+    def station(shot, params, report):
+        for stage, done in (("one", 0), ("one", 1), ("other", 1)):
+            report.progress(stage, done, 1000, "")
+            told.append(report.status.eta_seconds)
+            report.metric(contract.FORECAST, {"of": "one", "seconds_left": 5000.0})
+        report.progress("one", 2, 1000, "")
+        report.metric(contract.FORECAST, {"of": "one", "seconds_left": 0.0})
+        told.append(report.status.eta_seconds)
+        report.progress("one", 3, 1000, "")
+        told.append(report.status.eta_seconds)
+
+    run_with(shot, monkeypatch, station)
+    before, one, other, again, overdue = told
+    assert before is other is overdue is None and 4000 < one <= 5000 and 4000 < again <= 5000
+
+
 @pytest.mark.parametrize(
     ("error", "code", "word"),
     [

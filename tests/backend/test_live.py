@@ -27,6 +27,7 @@ from torch_backend.footage.color import linear_to_srgb
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.live import _TINT, _TINTED, LiveSession, Superseded, _Waiting
+from torch_backend.train import device
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -84,6 +85,14 @@ def test_ready_tells_what_there_is_to_freeze(session, trained):
     assert len(frames) == len(set(frames))
     assert set(frames) <= set(header["trained"])
     assert all(0 <= s["seen"] <= 1 and 0 <= s["sharpness"] <= 1 for s in header["suggestions"])
+
+
+def test_ready_says_why_the_card_is_not_used(session, trained, monkeypatch):
+    assert session[1]["note"] == "", "on the processor by wish"
+    monkeypatch.setattr(device, "cuda_refusal", lambda: "")
+    monkeypatch.setattr(device, "card_problem", lambda: "a frame comes out wrong on it")
+    note = LiveSession(trained[0].shot, "main", "auto").facts()["note"]
+    assert note.startswith("Scrubbing uses the processor, not the graphics card: ") and "doctor --gpu" in note
 
 
 def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):

@@ -16,8 +16,12 @@ PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
 PRESET_WIDTHS = {"preview": 320, "standard": 960, "final": 0}
 """Width in pixels of each preset's training images, never above the working frames'; 0: theirs."""
+CARD_WIDTH, CARD_GAUSSIANS = 1920, 1_000_000
+"""Of `final` on a graphics card: width in pixels of its images, never above the source's, and most Gaussians."""
 CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
 """What `SolveParams.camera_model` may be."""
+ST_MAP_WAYS = ("undistort", "redistort")
+"""What `SolveParams.st_map_way` may be."""
 HOSTS = host_names()
 """Hosts of the deformation, as their files in deformation/ name themselves."""
 METHODS = ("auto", *HOSTS, "static")
@@ -227,6 +231,42 @@ class SolveParams:
         tip="Let the solve correct the focal length. Off: it is held as it is given",
     )
     """Refine `focal_mm`; else it is held."""
+    st_map: str = option(
+        "",
+        flag="--st-map",
+        metavar="FILE",
+        is_path=True,
+        help="ST map of the lens (EXR, red s, green t): the lens is taken from it, whatever `--camera-model` says",
+        words="none",
+        label="ST Map",
+        tip="ST map of the lens, as a lens department hands it over: the footage is undistorted through it before the "
+        "solve, and put back through it at the end. EXR of 32 bits, red s, green t; empty: the solve finds the lens",
+    )
+    """ST map that holds the lens; empty: the solve finds it."""
+    st_map_way: str = option(
+        "undistort",
+        flag="--st-map-way",
+        choices=ST_MAP_WAYS,
+        help="what `--st-map` does: `undistort` (a map of the undistorted picture: it takes the lens out of a plate), "
+        "`redistort` (a map of the original: it puts the lens back into a render)",
+        label="Map",
+        tip="Which way the ST map goes: a map does not say it",
+        items={
+            "undistort": ("Undistorts", "It takes the lens out of a plate: each of its pixels looks into the original"),
+            "redistort": ("Redistorts", "It puts the lens back into a render: its pixels look into undistorted ones"),
+        },
+    )
+    """One of `ST_MAP_WAYS`."""
+    st_map_layer: str = option(
+        "",
+        flag="--st-map-layer",
+        metavar="NAME",
+        help="layer of `--st-map` that holds it",
+        words="its red and green",
+        label="Map Layer",
+        tip="Layer of the ST map's file that holds it, by its name or the end of it; empty: its red and green",
+    )
+    """Layer of the map's file; empty: red and green."""
     retry: bool = option(
         True,
         flag="--no-retry",
@@ -304,7 +344,11 @@ class TrainParams:
         items={
             "preview": ("Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
             "standard": ("Standard", "960 pixels wide, 9000 steps: for most shots"),
-            "final": ("Final", "As wide as the working frames, 30000 steps, most Gaussians: takes longest"),
+            "final": (
+                "Final",
+                "As wide as the working frames, 30000 steps, most Gaussians: takes longest. On a graphics card as "
+                "wide as the source, up to 1920 pixels, with up to a million Gaussians",
+            ),
         },
     )
     """preview, standard or final."""

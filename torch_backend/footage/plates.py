@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..contract import ExitCode, JobError
 from ..shot import Shot, content_key
+from ..solve.map_lens import MapLens
 from ..solve.plate_lens import PlateLens, load_plate_lenses
 from ..solve.stored import load_cameras, load_record
 from ..solve.undistort import BandUndistorter
@@ -29,6 +30,8 @@ from .opening import open_source
 from .sources import Known, Source, SourceInfo, told_in
 
 PLATES_VERSION = 1
+STAYS = "Frozen frames stay at the size and depth of the working frames."
+"""End of every note."""
 _KEPT, _KEPT_BYTES = 11, 150e6
 _NO_LARGER = 720
 """Import leaves clips of fewer lines than this at their size unless it is told otherwise."""
@@ -83,7 +86,7 @@ class Plates:
         if not self.deep and (self.width, self.height) == self._working:
             source = None  # the working frames are just that
         self._reader = source.plates(self._known(record)) if source is not None else None
-        self._warp: tuple[PlateLens, BandUndistorter] | None = None
+        self._warp: tuple[PlateLens | MapLens, BandUndistorter] | None = None
         self._held: OrderedDict[int, NDArray[Any]] = OrderedDict()
         footage = source.info.key if source is not None else "working frames"
         self.key = content_key(PLATES_VERSION, record.get("key"), solved.get("key"), footage, [self.width, self.height])
@@ -112,9 +115,9 @@ class Plates:
             return source.info if self._is_imported(source, record, config) else None
         return None
 
-    def lens(self) -> PlateLens | None:
+    def lens(self) -> PlateLens | MapLens | None:
         """The lens of all frames; None where frames have lenses of their own, or it is not told."""
-        lenses = set(self._lenses.values()) if isinstance(self._lenses, dict) else set[PlateLens]()
+        lenses = set(self._lenses.values()) if isinstance(self._lenses, dict) else set[PlateLens | MapLens]()
         return next(iter(lenses)) if len(lenses) == 1 else None
 
     def close(self) -> None:
@@ -168,17 +171,16 @@ class Plates:
         """The footage, or None for the working frames and, where those hold less, a sentence that says why."""
         if _holds_no_more(record, self._working):
             return None, ""
-        stays = "Frozen frames stay at the size and depth of the working frames."
         if isinstance(self._lenses, str):
-            return None, f"{self._lenses} {stays}"
+            return None, f"{self._lenses} {STAYS}"
         config = _config(record)
         for place, source in self._opened(record, config):
             if not source.info.extended and (source.info.width, source.info.height) == self._working:
                 return None, ""
             if self._is_imported(source, record, config):
                 return source, ""
-            return None, f"The footage {place} is not what was imported any more. {stays}"
-        return None, f"The footage {self._shot.info().source or 'of this shot'} cannot be read. {stays}"
+            return None, f"The footage {place} is not what was imported any more. {STAYS}"
+        return None, f"The footage {self._shot.info().source or 'of this shot'} cannot be read. {STAYS}"
 
     def _opened(self, record: dict[str, Any], config: FootageConfig) -> Iterator[tuple[str, Source]]:
         """Where footage lies that can be opened, and itself, read as it was imported."""
@@ -248,7 +250,7 @@ def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
     return tuple(size) == working and not record.get("extended", True)
 
 
-def _lenses(shot: Shot) -> dict[int, PlateLens] | str:
+def _lenses(shot: Shot) -> dict[int, PlateLens | MapLens] | str:
     """The lens of each frame, or a sentence that says why there is none. JobError (SOLVE) if there is no solve."""
     load_cameras(shot)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
@@ -61,6 +62,7 @@ from .verdict import judge_take, unsure
 from .video import write_video
 from .warp import FOLDER as WARPS
 from .warp import WarpMetadata, write_warp
+from .write_beside import WriteBeside
 
 TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
@@ -176,7 +178,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     `t_star`: the instant, where it is settled already; None: as `params` say, or suggested. JobError in words if it
     cannot be done.
     """
-    run = load_run(shot, params.run, choose_device(params.device))
+    run = load_run(shot, params.run, choose_device(params.device, report, "Freezing"))
     scene = load_scene(shot)
     if t_star is None:
         t_star = choose_t_star(shot, scene, run, params, report)
@@ -356,29 +358,41 @@ def render_frames(
 
 def _render_all(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> dict[int, Tensor]:
     folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
-    run = spec.run
     shares: dict[int, Tensor] = {}
     spec.instants.prepare((f.t_star for f in frames if f.frame not in done), report)
-    for n, output in enumerate(frames):
-        report.check_cancelled()
-        report.progress("freezing", n, len(frames), f"frame {output.frame}")
-        if output.frame in done:
-            continue
-        frozen = spec.instants.at(output.t_star, report)
-        exposed_at = scene.time_of_frame(output.exposed_like)
-        K = output.K.clone()
-        K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
-        image = render_frozen(frozen, output.viewmat, K, *spec.whole, run.model.exposure, exposed_at)
-        if spec.detail is None:
-            _write_frame(folder, output, image, scene, spec, keys[output.frame])
-            continue
-        made = spec.detail.frame(output, frozen, image, *spec.size)
-        _write_warp(folder, output, made, spec, keys[output.frame])
-        _write_frame(folder, output, made, scene, spec, keys[output.frame])
-        shares[output.frame] = small_share(made.plate)
-        del made, image  # at 4K the next frame needs their gigabyte
+    with WriteBeside() as out:
+        for n, output in enumerate(frames):
+            report.check_cancelled()
+            report.progress("freezing", n, len(frames), f"frame {output.frame}")
+            if output.frame in done:
+                continue
+            image = _render(output, scene, spec, report)
+            if isinstance(image, DetailedFrame):
+                shares[output.frame] = small_share(image.plate)
+            write = functools.partial(_write, folder, output, image, scene, spec, keys[output.frame])
+            out.write(write, sum(value.nbytes for value in vars(image).values() if isinstance(value, Tensor)))
+            del image, write  # at 4K the next frame needs their gigabyte
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
     return shares
+
+
+def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter) -> FrozenImage | DetailedFrame:
+    """A frame of the take, of splats or of plates."""
+    frozen = spec.instants.at(output.t_star, report)
+    exposed_at = scene.time_of_frame(output.exposed_like)
+    K = output.K.clone()
+    K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
+    image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at)
+    return image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+
+
+def _write(
+    folder: Path, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
+) -> None:
+    """All files of a frame, the EXR last: a frame that has one has the others."""
+    if isinstance(image, DetailedFrame):
+        _write_warp(folder, output, image, spec, key)
+    _write_frame(folder, output, image, scene, spec, key)
 
 
 def _write_frame(

@@ -123,6 +123,7 @@ _FIELDS: list[tuple[str, type, str]] = [
             "want_weights",
             "want_top",
             "want_abs",
+            "clear",
             "counter",
         )
     ],

@@ -125,6 +125,11 @@ def triangulate_points(
     return _colmap.triangulate_points(known, database, folder, into, True, options)
 
 
+def adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
+    """Bundle adjustment of a whole model, in place."""
+    _colmap.bundle_adjustment(model, options)
+
+
 def absolute_pose(
     xy: NDArray[np.float64],
     xyz: NDArray[np.float64],

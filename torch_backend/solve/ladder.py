@@ -158,7 +158,7 @@ def next_rung(best: Attempt, asked: dict[str, Any], done: set[str]) -> Rung | No
 def _other_lens(best: Attempt, asked: dict[str, Any]) -> Rung | None:
     """Another model of the lens: a fisheye's only where the solve looks like one."""
     model = asked["camera_model"]
-    if model == FISHEYE or "failure" in best.answer:
+    if model == FISHEYE or asked.get("hold_bend") or "failure" in best.answer:
         return None
     if like_a_fisheye(best.answer["result"]):
         return Rung("lens", "the lens of a fisheye (OPENCV_FISHEYE)", {"camera_model": FISHEYE}, stays=False)

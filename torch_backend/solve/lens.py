@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from ..contract import ExitCode, JobError
 from ..shot import Shot
-from .stored import load_cameras, load_record
+from .map_lens import ST_MAP, MapLens
+from .stored import damaged, load_cameras, load_record
 
 _EXTRA = {
     "SIMPLE_PINHOLE": (),
@@ -97,6 +98,11 @@ class Lens:
     """COLMAP's name, for sentences."""
 
     @property
+    def is_none(self) -> bool:
+        """True if the original frames are straight already."""
+        return not any((self.k1, self.k2, self.p1, self.p2))
+
+    @property
     def intrinsics(self) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy of the undistorted frames, pixels."""
         return (*self.plate_focal, *self.centre)
@@ -176,9 +182,14 @@ class Lens:
         )
 
 
-def load_lens(shot: Shot) -> Lens:
+def load_lens(shot: Shot) -> Lens | MapLens:
     """The lens of a solved shot, from solve.json and cameras.json. JobError (SOLVE) if they do not tell it."""
     record, path = load_record(shot), load_cameras(shot)
+    if record.get("camera_model") == ST_MAP:
+        try:
+            return MapLens.from_params(path.width, path.height, record["lenses"][0]["params"], path.frames[0].K)
+        except (ValueError, TypeError, KeyError, IndexError) as error:
+            raise damaged(shot.solve_record, error) from error
     model, extra, focal = record.get("camera_model"), record.get("distortion"), record.get("focal_px")
     if model is None or extra is None or not focal:
         raise JobError(

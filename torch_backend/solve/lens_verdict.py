@@ -21,6 +21,8 @@ RUN_OFF = 1.3
 """Times by which a solve may change a focal length that it was given, before the given one is believed instead."""
 WIDE_DEG = 100.0
 """Angle of view from which on a lens that is no fisheye's may be one."""
+LEFT_SHARE = 0.003
+"""How far pictures without its lens may still be bent at the corners, as a share of the diagonal: 2.4 px at 640x480."""
 _SAMPLES = 2048
 _BEYOND = 2.0
 """How far out of the picture a radial curve is looked at, in corners."""
@@ -105,6 +107,26 @@ def like_a_fisheye(answer: dict[str, Any]) -> bool:
 
 def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
     """(sentence, hint) for a lens that is doubtful, or was put in the place of one that is."""
+    left = left_px(answer)
+    if left > LEFT_SHARE * np.hypot(answer["lens"]["width"], answer["lens"]["height"]):
+        return [
+            (
+                f"Through the ST map the frames are still bent, by {left:.1f} pixels at their corners.",
+                "Is the map of this clip's lens, and the right way round (--st-map-way)?",
+            ),
+            *_remarks(answer),
+        ]
+    return _remarks(answer)
+
+
+def left_px(answer: dict[str, Any]) -> float:
+    """How far the corners of frames whose lens was out before the solve are from where the solve would have them."""
+    lens, focal = answer["lens"], float(answer["focal_px"])
+    corner = float(np.hypot(0.5 * lens["width"], 0.5 * lens["height"])) / focal
+    return abs(float(lens.get("left_bend", 0.0))) * corner**3 * focal
+
+
+def _remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
     lens = answer["lens"]
     found, taken = (_shown_deg(lens, *it) for it in (("found_deg", lens["found_px"]), ("view_deg", answer["focal_px"])))
     given = lens.get("given_px")

@@ -47,7 +47,7 @@ def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruc
         options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = MASKED_INLIERS
     if hold_lens or request.hold_focal:
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
-    if hold_lens:
+    if hold_lens or request.hold_bend:
         options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
     folder = request.scratch / ("models_held" if hold_lens else "models")
     folder.mkdir()
@@ -78,7 +78,7 @@ def build_globally(request: Request, hold_lens: bool = False) -> list[pycolmap.R
     options.mapper.global_positioning.use_gpu = adjustment.ceres.use_gpu = False
     if hold_lens or request.hold_focal:
         adjustment.refine_focal_length = False
-    if hold_lens:
+    if hold_lens or request.hold_bend:
         adjustment.refine_extra_params = False
     if not request.start_focal:
         colmap.calibrate_view_graph(request.database)
@@ -97,6 +97,17 @@ def _largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.R
 def first_camera(model: pycolmap.Reconstruction) -> pycolmap.Camera:
     """The lens of a solve of our own: all its images share one."""
     return next(iter(colmap.cameras(model).values()))
+
+
+def left_bend(model: pycolmap.Reconstruction) -> float:
+    """First radial coefficient that the model of a straightened clip would rather have: 0 if its lens is all out."""
+    freed = pycolmap.Reconstruction(model)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = True
+    options.print_summary = False
+    colmap.adjust(freed, options)
+    camera = first_camera(freed)
+    return float(camera.params[camera.extra_params_idxs()[0]])
 
 
 def posed(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

@@ -30,11 +30,19 @@ _MOST_FEATURES = 3.0
 """Of a picture that is mostly masked so many times more features are asked for: masked ones count before they go."""
 
 
-def write_matching(masks: dict[str, Mask], names: dict[int, str], folder: Path) -> None:
-    """Writes COLMAP's masks: NAME.png of each picture, black where it finds no features; `names` by frame."""
+def write_matching(
+    masks: dict[str, Mask], names: dict[int, str], folder: Path, undistort: Undistorter | None = None
+) -> None:
+    """Writes COLMAP's masks: NAME.png of each picture, black where it finds no features; `names` by frame.
+
+    `undistort`: what took the lens out of the pictures that are matched; None: they are as they were filmed.
+    """
     make_folder(folder)
     for frame, name in names.items():
         covered = np.logical_or.reduce([mask.of(frame) for mask in masks.values()])
+        if undistort is not None:
+            white = np.where(covered, np.uint8(255), np.uint8(0))
+            covered = undistort(np.repeat(white[..., None], 3, axis=2))[..., 0] > 127
         free = _wider(covered, MARGIN) == 0
         write_grey(folder / f"{name}.png", np.where(free, np.uint8(255), np.uint8(0)))
 

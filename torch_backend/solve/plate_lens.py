@@ -15,6 +15,7 @@ from ..array_types import meshgrid
 from ..shot import Shot
 from . import foreign
 from .lens import load_lens
+from .map_lens import ST_MAP, MapLens
 from .stored import damaged, load_cameras, load_record
 
 _ROWS = 64
@@ -72,7 +73,7 @@ class PlateLens:
         return np.stack([fx * u + cx, fy * v + cy], axis=-1)
 
 
-def load_plate_lenses(shot: Shot) -> dict[int, PlateLens]:
+def load_plate_lenses(shot: Shot) -> dict[int, PlateLens | MapLens]:
     """The lens of every solved frame, by its number; frames that share one share the object.
 
     JobError (SOLVE) if the shot is not solved, its files are damaged, or its solve, of an earlier version, did not
@@ -80,8 +81,10 @@ def load_plate_lenses(shot: Shot) -> dict[int, PlateLens]:
     """
     record, path = load_record(shot), load_cameras(shot)
     recorded = record.get("lenses")
-    if recorded is None:
+    if recorded is None or record.get("camera_model") == ST_MAP:
         one = load_lens(shot)
+        if isinstance(one, MapLens):
+            return dict.fromkeys((frame.frame for frame in path.frames), one)
         lens = foreign.Lens("OPENCV", one.width, one.height, (*one.focal, *one.centre, one.k1, one.k2, one.p1, one.p2))
         return dict.fromkeys((frame.frame for frame in path.frames), PlateLens(lens, one.intrinsics))
     try:
@@ -91,7 +94,7 @@ def load_plate_lenses(shot: Shot) -> dict[int, PlateLens]:
         ]
         index = [int(n) for n in record["lens_of_frame"]]
         shared: dict[tuple[int, tuple[float, ...]], PlateLens] = {}
-        lenses: dict[int, PlateLens] = {}
+        lenses: dict[int, PlateLens | MapLens] = {}
         for frame, n in zip(path.frames, index, strict=True):
             fx, fy, cx, cy = frame.K
             lenses[frame.frame] = shared.setdefault((n, tuple(frame.K)), PlateLens(known[n], (fx, fy, cx, cy)))

@@ -39,6 +39,8 @@ class Request:
         self.start_focal: float = self.focal or data.get("start_focal_px", 0.0)
         """Focal length with which the solve begins, pixels: one that may be so; 0: COLMAP's guess."""
         self.hold_focal: bool = bool(self.focal) and bool(data.get("hold_focal"))
+        self.hold_bend: bool = data.get("hold_bend", False)
+        """The pictures have no lens any more: the model's bend stays at nothing."""
         self.masks = data.get("masks", "")
         """Folder of COLMAP's masks; empty: nothing is masked."""
         self.known: dict[str, Any] | None = data.get("known")

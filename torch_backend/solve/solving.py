@@ -22,6 +22,7 @@ from ..contract import (
     PICTURE,
     POINTS_FILE,
     SOLVE_FILE,
+    ST_MAP_WAYS,
     CameraFrame,
     CameraPath,
     Cancelled,
@@ -39,15 +40,17 @@ from ..footage.masks import Mask, read_masks
 from ..footage.sources import frame_words
 from ..replacing import Staged, replacing_solve, settle_solve
 from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, write_json
-from . import foreign
+from . import foreign, map_reading
 from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
 from .ladder import climb
 from .lens_verdict import lens_remarks
+from .map_lens import MapLens
 from .masks import facts_of, given_masks, more_features, write_matching, write_undistorted
 from .points import filter_points
 from .poses import camera_centre, fill_poses
 from .stored import load_cameras, load_points, load_record
+from .straight import Straight
 from .undistort import Undistorter, of_frames
 from .verdict import FAIR_ERROR_PX, quality_words
 
@@ -81,6 +84,12 @@ class SolveConfig:
     """Width in mm of the part of the sensor that the picture shows."""
     refine_focal: bool = True
     """Refine `focal_mm`; else it is held."""
+    st_map: str = ""
+    """File of an ST map that holds the lens; empty: the solve finds it."""
+    st_map_way: str = "undistort"
+    """One of `contract.ST_MAP_WAYS`."""
+    st_map_layer: str = ""
+    """Layer of the file; empty: red and green."""
     retry: bool = True
     """Try again in other ways where the solve is refused or poor, as `ladder.climb` does."""
 
@@ -120,6 +129,8 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     frames. They take the place of a solve of before when all of them are written; until then, and if this one fails,
     that one stays. A shot already solved from the same frames with the same configuration is left alone.
 
+    With an ST map in `config` the frames are undistorted through it first, and the solve finds the focal length alone.
+
     With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
     its world, frames without one interpolated.
 
@@ -127,7 +138,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
-    _check(config)
+    _check(config, cameras)
     for folder in (
         shot.frames,
         shot.colmap,
@@ -137,6 +148,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     settle_solve(shot)
     frames = load_frames(shot)
     source = [foreign.fingerprint(cameras)] if cameras else []
+    source += [map_reading.fingerprint(config.st_map)] if config.st_map else []
     masks = read_masks(shot, _mask_sources(config), report)
     key = _key(config, frames, source, masks)
     done = _finished(shot, frames, key)
@@ -144,19 +156,23 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
         report.progress("solve", 1, 1, "already solved")
         return _with_motion(shot, done["result"], report)
     taken = prepare(frames, cameras, report) if cameras else None
+    lens = _lens_of_map(config, frames, report)
     _refuse_damaged(shot, frames)
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
-    size = sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
-    need_disk(shot.root, 1.2 * size + (len(frames["frames"]) << 20), "The camera solve")
+    size = (1.2 if lens is None else 2.4) * sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
+    need_disk(shot.root, size + (len(frames["frames"]) << 20), "The camera solve")
     scratch = shot.solve / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
     make_folder(scratch)
     try:
         if taken is None:
-            request = _request(shot, frames, config, masks, scratch)
+            straight = None if lens is None else Straight(shot, frames, lens, scratch / "straight", report)
+            request = _request(shot, frames, config, masks, scratch, straight)
             climbed = climb(request, frames, config.retry, scratch, shot.colmap_log, report)
             answer = {**climbed.best.answer["result"], "rung": climbed.best.rung, "tries": climbed.tries}
             left = climbed.best.folder
+            if straight is not None:
+                answer |= straight.told(left)
         else:
             options = _matching(frames, config, masks, scratch)
             answer, left = take_over(shot, frames, taken, options, scratch, report), scratch
@@ -172,6 +188,13 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     return result
 
 
+def _lens_of_map(config: SolveConfig, frames: dict[str, Any], report: Reporter) -> MapLens | None:
+    """The lens that the ST map holds; None without one."""
+    if not config.st_map:
+        return None
+    return map_reading.read_lens(config.st_map, config.st_map_way, config.st_map_layer, frames, report)
+
+
 def _mask_sources(config: SolveConfig) -> dict[str, str]:
     """Kind of mask -> where it comes from."""
     return dict(zip(MASK_KINDS, (config.ignore_mask, config.people_mask), strict=True))
@@ -181,6 +204,7 @@ def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: 
     """Tells a solve from others. Masks count by what they cover, wherever they lie."""
     settings = asdict(config)
     new = ["ignore_mask", "people_mask"]  # solves of before had none of these
+    new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # the file counts by what is in it
     new += [] if config.focal_mm else ["focal_mm", "sensor_mm", "refine_focal"]
     new += ["retry"] if config.retry else []  # who switches it on again wants what it may find
     for name in new:
@@ -216,7 +240,15 @@ def _log_end(log: Path) -> str:
     return f"The end of {log}:\n{end}"
 
 
-def _check(config: SolveConfig) -> None:
+def _check(config: SolveConfig, cameras: str) -> None:
+    if config.st_map and cameras:
+        raise JobError(
+            "Cameras from elsewhere bring their own lens: an ST map beside them would be a second one.",
+            "Give one of the two.",
+            ExitCode.USAGE,
+        )
+    if config.st_map_way not in ST_MAP_WAYS:
+        raise ValueError(f"st_map_way should be one of {', '.join(ST_MAP_WAYS)}, got {config.st_map_way!r}")
     if config.camera_model not in CAMERA_MODELS:
         raise ValueError(f"camera_model should be one of {', '.join(CAMERA_MODELS)}, got {config.camera_model!r}")
     if config.focal_mm < 0 or config.sensor_mm <= 0:
@@ -255,13 +287,19 @@ def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
         )
 
 
-def _matching(frames: dict[str, Any], config: SolveConfig, masks: dict[str, Mask], scratch: Path) -> dict[str, Any]:
-    """What the worker is told of features and matches; writes its masks."""
+def _matching(
+    frames: dict[str, Any],
+    config: SolveConfig,
+    masks: dict[str, Mask],
+    scratch: Path,
+    undistort: Undistorter | None = None,
+) -> dict[str, Any]:
+    """What the worker is told of features and matches; writes its masks, of frames that went through `undistort`."""
     options = {"overlap": config.overlap, "features": config.features}
     if not masks:
         return options
     folder = scratch / "not_matched"
-    write_matching(masks, {f["frame"]: Path(f["file"]).name for f in frames["frames"]}, folder)
+    write_matching(masks, {f["frame"]: Path(f["file"]).name for f in frames["frames"]}, folder, undistort)
     return {**options, "features": round(config.features * more_features(masks)), "masks": str(folder)}
 
 
@@ -272,22 +310,29 @@ def _focal_of_file(frames: dict[str, Any]) -> float:
 
 
 def _request(
-    shot: Shot, frames: dict[str, Any], config: SolveConfig, masks: dict[str, Mask], scratch: Path
+    shot: Shot,
+    frames: dict[str, Any],
+    config: SolveConfig,
+    masks: dict[str, Mask],
+    scratch: Path,
+    straight: Straight | None,
 ) -> dict[str, Any]:
-    """What the worker is asked for at first."""
+    """What the worker is asked for at first: of frames whose lens was taken out before, no bend."""
+    scale = 1.0 if straight is None else straight.focal_scale
     names: dict[bool, list[str]] = {True: [], False: []}
     for frame in frames["frames"]:
         names[bool(frame["solve"])].append(Path(frame["file"]).name)
     return {
-        "images": str(shot.raw),
+        "images": str(shot.raw if straight is None else straight.folder),
         "solved": names[True],
         "others": names[False],
-        "camera_model": config.camera_model,
+        "camera_model": config.camera_model if straight is None else "SIMPLE_RADIAL",
+        "hold_bend": straight is not None,
         "size": [frames["width"], frames["height"]],
-        "focal_px": config.focal_mm / config.sensor_mm * frames["width"],
+        "focal_px": config.focal_mm / config.sensor_mm * frames["width"] * scale,
         "hold_focal": not config.refine_focal,
-        "start_focal_px": _focal_of_file(frames),
-        **_matching(frames, config, masks, scratch),
+        "start_focal_px": _focal_of_file(frames) * scale,
+        **_matching(frames, config, masks, scratch, None if straight is None else straight.undistort),
         "neighbours": config.neighbours if config.localise else 0,
         "threads": max(1, min(os.cpu_count() or 1, 16)),
     }
@@ -345,6 +390,7 @@ def _finish(
         "agreement": answer.get("agreement"),
         "floor": floor_of(path, points["xyz"]),
         "masks": facts_of(masks, _mask_sources(config)),
+        "st_map": [config.st_map, config.st_map_way, config.st_map_layer] if config.st_map else None,
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,
     }

@@ -20,6 +20,7 @@ from ..contract import STMAP_FILES, TAKE_REDISTORT, ExitCode, FreezeParams, JobE
 from ..footage.oiio_types import open_output
 from ..shot import Shot, atomic_path, disk_error, is_disk_full, need_disk
 from .lens import Lens, load_lens
+from .map_lens import MapLens
 from .plate_lens import PlateLens
 
 UNDISTORT, REDISTORT = STMAP_FILES
@@ -33,7 +34,7 @@ _TOUCHING_PX = 1e-3
 _MOST_PERCENT = 100.0
 
 
-def undistort_map(lens: Lens, width: int, height: int) -> NDArray[np.float32]:
+def undistort_map(lens: Lens | MapLens, width: int, height: int) -> NDArray[np.float32]:
     """[height, width, 3]: for each pixel of the undistorted frame, where to look in the original one."""
     out = np.ones((height, width, 3), np.float32)
     for top in range(0, height, _ROWS):
@@ -42,7 +43,9 @@ def undistort_map(lens: Lens, width: int, height: int) -> NDArray[np.float32]:
     return out
 
 
-def redistort_map(lens: Lens, width: int, height: int, beyond: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float32]:
+def redistort_map(
+    lens: Lens | MapLens, width: int, height: int, beyond: tuple[float, float] = (0.0, 0.0)
+) -> NDArray[np.float32]:
     """[height, width, 3]: for each pixel of the original frame, where to look in the undistorted one.
 
     `beyond`: the undistorted frame goes on past the plate by this share of the plate's width on the left and right, and
@@ -57,13 +60,13 @@ def redistort_map(lens: Lens, width: int, height: int, beyond: tuple[float, floa
     return out
 
 
-def needed_margin(lens: Lens, width: int, height: int) -> tuple[int, int]:
+def needed_margin(lens: Lens | MapLens, width: int, height: int) -> tuple[int, int]:
     """Pixels that a frozen frame of `width` x `height` needs beyond each side, and beyond top and bottom.
 
     With them every pixel of the original frame finds its neighbours for a bilinear or cubic filter. The same on
     opposite sides, so that the plate stays in the middle.
     """
-    if not any((lens.k1, lens.k2, lens.p1, lens.p2)):
+    if lens.is_none:
         return 0, 0  # also for a smaller frame, whose outer pixel centres lie farther in than the original's
     x, y = np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5
     border = np.concatenate(
@@ -114,7 +117,7 @@ def margin(shot: Shot, params: FreezeParams, width: int, height: int, Ks: NDArra
     return math.ceil(overscan / 100.0 * width), math.ceil(overscan / 100.0 * height)
 
 
-def same_camera(lens: Lens, width: int, height: int, Ks: NDArray[np.float64]) -> bool:
+def same_camera(lens: Lens | MapLens, width: int, height: int, Ks: NDArray[np.float64]) -> bool:
     """True if frames with intrinsics `Ks` [F, 4], of `width` x `height`, show what the plate shows, lens for lens."""
     ratio = np.array([width / lens.width, height / lens.height] * 2)
     side = max(width, height)
@@ -162,7 +165,7 @@ def write_take_map(
     return write_map(path, pixels)
 
 
-def write_plate_map(path: Path, lens: PlateLens, width: int, height: int, key: str) -> Path:
+def write_plate_map(path: Path, lens: PlateLens | MapLens, width: int, height: int, key: str) -> Path:
     """The map from footage of `width` x `height` to the plate of that size without its lens, unless it is there.
 
     `key` tells whether a file that is there is this map. JobError (DISK), OSError.
@@ -205,13 +208,13 @@ def write_map(path: Path, pixels: NDArray[np.float32], key: str = "") -> Path:
     return path
 
 
-def _centres(lens: Lens, width: int, height: int, top: int) -> NDArray[np.float64]:
+def _centres(lens: Lens | MapLens, width: int, height: int, top: int) -> NDArray[np.float64]:
     """[P, 2]: pixel centres of rows from `top` of a map of that size, in pixels of the working frames."""
     x = (np.arange(width) + 0.5) / width * lens.width
     y = (np.arange(top, min(top + _ROWS, height)) + 0.5) / height * lens.height
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def _st(pixels: NDArray[np.float64], lens: Lens) -> NDArray[np.float64]:
+def _st(pixels: NDArray[np.float64], lens: Lens | MapLens) -> NDArray[np.float64]:
     """Pixels [P, 2] of a working frame, y down, as s and t, t up."""
     return np.stack([pixels[:, 0] / lens.width, 1.0 - pixels[:, 1] / lens.height], axis=1)

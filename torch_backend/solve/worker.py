@@ -34,6 +34,7 @@ from .mapping import (
     as_good,
     build,
     first_camera,
+    left_bend,
     lens_doubt,
     lens_of,
     posed,
@@ -101,6 +102,7 @@ def main(path: str) -> int:
                 "start_px": request.start_focal,
                 "width": camera.width,
                 "height": camera.height,
+                **({"left_bend": left_bend(model)} if request.hold_bend else {}),
             },
         }
     )

@@ -67,6 +67,22 @@ def _kernel() -> Any:
     return wp.Kernel(entry, key="adam", module=module, options={"enable_backward": False})
 
 
+def all_finite(tensors: Sequence[Tensor], threads: int | None = None) -> bool:
+    """Whether every value of dense float32 CPU `tensors` is finite; on `threads` workers (default: all cores)."""
+    whole: list[int] = []
+    chunks = 0
+    for values in tensors:
+        whole += (0, values.data_ptr(), 0, 0, values.numel(), 0, chunks, 0)
+        chunks += -(-values.numel() // _CHUNK)
+    table = torch.tensor(whole, dtype=torch.int64, device="cpu")
+    bad = torch.zeros(1, dtype=torch.int32, device="cpu")
+    _snippet().run(
+        threads, 0, whole=table.data_ptr(), real=table.data_ptr(), bad=bad.data_ptr(), visible=0,
+        segments=len(tensors), chunks=chunks,
+    )  # fmt: skip
+    return not int(bad)
+
+
 class FusedAdam(torch.optim.Optimizer):
     """Adam as `torch.optim.Adam(params, lr, betas, eps)`, for float32 parameters on one device.
 

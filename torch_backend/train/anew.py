@@ -19,13 +19,19 @@ from .extend import EXTENSION_FILE
 
 def folder_for(run: Path, key: str, resume: bool) -> Path:
     """The folder in which settings of a key are trained: the run's own if it holds nothing else, or has begun them."""
-    beside = run / NEXT_FOLDER / key
-    if resume:
-        for place in (run, beside):
-            checkpoint = place / CHECKPOINT_FILE
-            if checkpoint.is_file() and read_meta(checkpoint).get("key") == key:
-                return place
-    return beside if (run / CHECKPOINT_FILE).is_file() else run
+    there = begun(run, key) if resume else None
+    if there is not None:
+        return there
+    return run / NEXT_FOLDER / key if (run / CHECKPOINT_FILE).is_file() else run
+
+
+def begun(run: Path, key: str) -> Path | None:
+    """The folder in which settings of a key were begun, or finished; None if nowhere."""
+    for place in (run, run / NEXT_FOLDER / key):
+        checkpoint = place / CHECKPOINT_FILE
+        if checkpoint.is_file() and read_meta(checkpoint).get("key") == key:
+            return place
+    return None
 
 
 def replace_run(run: Path, done: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from ..contract import DETECTORS, METHODS, SUPERVISIONS, TrainParams
+from ..contract import CARD_GAUSSIANS, CARD_WIDTH, DETECTORS, METHODS, SUPERVISIONS, TrainParams
 from ..deformation import GateConfig, HexPlaneConfig, HostConfig, host, host_config, hosts
 from ..gaussians import DensifyConfig, InitConfig
 from ..supervision import SupervisionConfig
@@ -30,7 +30,8 @@ class TrainConfig:
     iterations: int = 2000
     """Training steps of one image each."""
     width: int = 320
-    """Width in pixels of the training images, never above the working frames'; 0: theirs."""
+    """Width in pixels of the training images, never above the working frames', or the source's with `plates`; 0:
+    theirs."""
     holdout: int = 8
     """Every how many solved frames one is held out, never the first or last; 0: none."""
     holdout_phase: int = 0
@@ -93,6 +94,8 @@ class TrainConfig:
     """When `auto` has enough: SH degree, Gaussians, time nodes, steps."""
     poses: PosesConfig = dataclasses.field(default_factory=PosesConfig)
     """Small corrections of the solve's cameras."""
+    plates: bool = False
+    """Images wider than the working frames are made of the source's own; else they stay at the working frames'."""
 
     @property
     def decides(self) -> bool:
@@ -133,8 +136,15 @@ PRESETS = {"preview": _preview, "standard": _standard, "final": _final}
 """Name -> a fresh configuration."""
 
 
-def config_from_params(params: TrainParams) -> TrainConfig:
-    """The preset with the artist's changes. ValueError names a choice that does not exist."""
+def _for_card(config: TrainConfig) -> None:
+    """What a preset has on a card; the others have the same there."""
+    if config.preset == "final":
+        config.width, config.plates, config.densify.budget = CARD_WIDTH, True, CARD_GAUSSIANS
+
+
+def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfig:
+    """The preset, that of a card or of the processor, with the artist's changes. ValueError names a choice that does
+    not exist."""
     for name, value, allowed in (
         ("preset", params.preset, tuple(PRESETS)),
         ("method", params.method, METHODS),
@@ -144,6 +154,8 @@ def config_from_params(params: TrainParams) -> TrainConfig:
         if value not in allowed:
             raise ValueError(f"{name} is {value!r}: it should be one of {', '.join(allowed)}")
     config = PRESETS[params.preset]()
+    if on_card:
+        _for_card(config)
     config.method, config.seed = params.method, params.seed
     config.iterations = params.iterations or config.iterations
     config.width = params.width or config.width
@@ -176,7 +188,10 @@ def _rates_for(config: TrainConfig) -> None:
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:
     """Plain types for config.json."""
-    return dataclasses.asdict(config)
+    plain = dataclasses.asdict(config)
+    if not config.plates:  # runs are known by this: those of before there was a choice are the same as without
+        del plain["plates"]
+    return plain
 
 
 def _as_tuple(value: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..cards import why_unused
-from ..contract import DEVICES, ExitCode, JobError
+from ..contract import DEVICES, ExitCode, JobError, Reporter
 from ..native import initialised_warp
 from .self_test import card_problem
 
@@ -16,23 +16,43 @@ _REPORT = (
 )
 
 
-def choose_device(requested: str) -> torch.device:
+def choose_device(requested: str, report: Reporter | None = None, doing: str = "") -> torch.device:
     """The device for `auto`, `cpu` or `cuda`. ValueError for another word, JobError if `cuda` cannot be had.
 
     The first use of a card on a machine tests it, in seconds, or tens of them where nothing is compiled yet.
+
+    Args:
+        report: told once, as a warning, why `auto` leaves this machine's card unused; None: nobody.
+        doing: what is done there, with which that sentence begins: "Training", "Freezing".
+    """
+    device, unused = decide_device(requested)
+    if report is not None and unused is not None:
+        report.warning(*unused_words(unused, doing))
+    return device
+
+
+def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]:
+    """`choose_device`, and why `auto` leaves this machine's card unused with what to do about it, as `unused_card`.
+
+    Both of one look at the card: one that does not answer is waited for once.
     """
     if requested not in DEVICES:
         raise ValueError(f"device is {requested!r}: it should be one of {', '.join(DEVICES)}")
     if requested == "cpu":
-        return torch.device("cpu")
-    refusal, advice = cuda_refusal(), ""
-    if refusal and torch.version.hip is None and not torch.cuda.is_available():
-        advice = (why_unused(torch.version.cuda) or ("", ""))[1]
-    if not refusal:
-        refusal, advice = failed_self_test() or ("", "")
-    if requested == "cuda" and refusal:
-        raise JobError(refusal, f"{advice} {_HINT}".strip(), ExitCode.TRAIN)
-    return torch.device("cpu" if refusal else "cuda")
+        return torch.device("cpu"), None
+    refusal = cuda_refusal()
+    unused = _unused(refusal)
+    if not refusal and unused is None:
+        return torch.device("cuda"), None
+    if requested == "cuda":
+        sentence, advice = unused or (refusal, "")
+        raise JobError(sentence, f"{advice} {_HINT}".strip(), ExitCode.TRAIN)
+    return torch.device("cpu"), unused
+
+
+def unused_words(unused: tuple[str, str], doing: str) -> tuple[str, str]:
+    """(sentence, hint) for whoever waits for `doing`, of what `unused_card` says."""
+    return f"{doing} uses the processor, not the graphics card: {unused[0]}", unused[1]
 
 
 def cuda_refusal() -> str:
@@ -57,7 +77,11 @@ def failed_self_test() -> tuple[str, str] | None:
 
 def unused_card() -> tuple[str, str] | None:
     """Why the NVIDIA card of this machine is not used, and what to do about it; None if it is, or there is none."""
-    refusal = cuda_refusal()
+    return _unused(cuda_refusal())
+
+
+def _unused(refusal: str) -> tuple[str, str] | None:
+    """`unused_card`, of what `cuda_refusal` said."""
     if torch.version.hip is not None:
         return None
     if not refusal:

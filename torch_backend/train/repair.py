@@ -30,6 +30,7 @@ from ..deformation import Deformation
 from ..deformation.protocol import Owned
 from ..gaussians import PARAM_NAMES, Densifier
 from ..raster.constants import QUAT_MIN
+from .adam import all_finite
 from .model import DynamicModel
 
 _FEW = 0.01
@@ -143,10 +144,12 @@ def drop_offenders(model: DynamicModel, optimizer: torch.optim.Optimizer, densif
 def _sound(model: DynamicModel, optimizer: torch.optim.Optimizer) -> bool:
     params = [p for group in optimizer.param_groups for p in group["params"]]
     moments = [value for p in params for key, value in optimizer.state.get(p, {}).items() if key in _MOMENTS]
-    # The norm of the largest number: NaN and infinity stay what they are, in one pass and without copies.
-    largest = torch.nn.utils.get_total_norm([t for t in [*params, *moments] if t.numel()], math.inf)
+    values = [t for t in [*params, *moments] if t.numel()]
     turned = (model.gaussians.params["quats"].abs().amax(1) > QUAT_MIN).all()
-    return bool(torch.isfinite(largest) & turned)
+    if all(t.device.type == "cpu" for t in values):
+        return bool(turned) and all_finite(values)
+    # The norm of the largest number: NaN and infinity stay what they are, in one pass and without copies.
+    return bool(torch.isfinite(torch.nn.utils.get_total_norm(values, math.inf)) & turned)
 
 
 def _repair_gaussians(

@@ -18,15 +18,15 @@ from ..footage.images import write_png
 from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
-from ..scene import HELD_BYTES, Scene, load_images, load_scene, split_frames
+from ..scene import HELD_BYTES, Scene, load_scene, split_frames
 from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
 from ..solve.masks import IGNORE, load_mask, masks_key
 from ..solve.motion import load_motion, motion_key
 from . import adam
-from .anew import SUMMARY_FILE, drop_begun, finish_replacing, folder_for, replace_run
+from .anew import SUMMARY_FILE, begun, drop_begun, finish_replacing, folder_for, replace_run
 from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
-from .device import choose_device, unused_card
+from .device import choose_device
 from .evidence import gather_evidence
 from .extend import EXTENSION_FILE, pending
 from .ignored import load_ignored
@@ -34,6 +34,8 @@ from .memory import MemoryPlan, free_bytes, plan_memory
 from .model import DynamicModel, restore_model
 from .modelled import modelled
 from .movers import Mattes, load_movers
+from .pictures import pictures_of
+from .pictures import training_size as training_size
 from .trainer import Trainer
 from .verdict import figures_of, verdict_fields, warn_if_poor
 
@@ -76,20 +78,14 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     """
     if params.extend:
         return extend_run(shot, params, report)
-    config = config_from_params(params)
-    device = _prepared_device(config, params, report)
+    config_from_params(params)  # refuses what does not exist before anything is looked for
+    device = choose_device(params.device, report, "Training")
     run = shot.own(shot.run(params.run))
     shot.own(run / PREVIEWS_FOLDER)
     finish_replacing(run)
     scene = load_scene(shot)
-    width, height = training_size(scene, config.width)
+    config, key, motion = _asked(shot, scene, run, params, device, report)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
-    motion = motion_of(shot, config)
-    key = content_key(config_to_json(config), solve_key(shot), train, test, *masks_key(shot, IGNORE))
-    if motion and not trained_without(shot, run, key):
-        key = content_key(key, motion)
-    else:
-        motion = None
     done = finished(run, key)
     if done is not None and params.resume:
         drop_begun(run, key)
@@ -103,7 +99,10 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
             "The run's settings, cameras or motion mattes changed: it is trained anew.",
             "The run that is there stays until the new one is done.",
         )
-    images = load_images(scene, train + test, width, height, report, folder)
+    _warm_up(config, device)
+    pictures = pictures_of(shot, scene, config, report)
+    width, height = pictures.size
+    images = pictures.load(train + test, report, folder)
     plan = planned(config, (width, height), len(train), images, device, report)
     images = place_images(images, device, plan)
     identity = {"key": key, "solve": solve_key(shot), "motion": motion}
@@ -159,10 +158,12 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         message = f"The run {params.run!r} was trained with other motion mattes than the shot has now."
         raise JobError(message, "Train it again: it cannot be extended.", ExitCode.TRAIN)
     config, scene = config_from_json(facts["config"]), load_scene(shot)
-    device = _prepared_device(config, params, report)
+    device = choose_device(params.device, report, "Training")
+    _warm_up(config, device)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
-    size = training_size(scene, config.width)
-    images = load_images(scene, train + test, *size, report, folder)
+    pictures = pictures_of(shot, scene, config, report)
+    size = pictures.size
+    images = pictures.load(train + test, report, folder)
     plan = planned(config, size, len(train), images, device, report, int(before["gaussians"]))
     images = place_images(images, device, plan)
     held_out = images[len(train) :]
@@ -196,18 +197,48 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     return summary
 
 
-def _prepared_device(config: TrainConfig, params: TrainParams, report: Reporter) -> torch.device:
-    device = choose_device(params.device)
-    unused = unused_card() if params.device == "auto" and device.type == "cpu" else None
-    if unused is not None:
-        report.warning(f"Training uses the processor, not the graphics card: {unused[0]}", unused[1])
+def _asked(
+    shot: Shot, scene: Scene, run: Path, params: TrainParams, device: torch.device, report: Reporter
+) -> tuple[TrainConfig, str, str | None]:
+    """(numbers, key, motion) of the run that is asked for; motion is the key of its mattes, None without.
+
+    A preset has other numbers on a card. What was begun or finished with those of the other device stays that run, and
+    goes on: a driver that fails for a day makes no training begin anew.
+    """
+    on_card = device.type == "cuda"
+    config, elsewhere = config_from_params(params, on_card), config_from_params(params, not on_card)
+    key, motion = _identity(shot, scene, run, config)
+    if elsewhere == config or not params.resume or begun(run, key) is not None:
+        return config, key, motion
+    its_key, its_motion = _identity(shot, scene, run, elsewhere)
+    if begun(run, its_key) is None:
+        return config, key, motion
+    if finished(run, its_key) is None:
+        where = "the processor" if on_card else "a graphics card"
+        report.warning(
+            f"The run was begun with the preset's numbers for {where}: it goes on with them.",
+            "Train it with --restart, or another run, for those of this device.",
+        )
+    return elsewhere, its_key, its_motion
+
+
+def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig) -> tuple[str, str | None]:
+    """(key, motion) of a run of these numbers, see `_asked`."""
+    train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
+    motion = motion_of(shot, config)
+    key = content_key(config_to_json(config), solve_key(shot), train, test, *masks_key(shot, IGNORE))
+    if motion and not trained_without(shot, run, key):
+        return content_key(key, motion), motion
+    return key, None
+
+
+def _warm_up(config: TrainConfig, device: torch.device) -> None:
     torch.set_num_threads(default_threads())
     if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
         for module in (raster_cpu, ssim, adam):
             module.warm_up()
         if config.method != "static":
             host(config.host).warm_up(config.field)
-    return device
 
 
 def planned(
@@ -231,12 +262,6 @@ def place_images(images: Tensor, device: torch.device, plan: MemoryPlan | None) 
     if plan.on_card:
         return images.to(device)
     return images.pin_memory() if images.nbytes <= HELD_BYTES else images
-
-
-def training_size(scene: Scene, requested_width: int) -> tuple[int, int]:
-    """(width, height) of the training images: the working frames' shape, never larger; as large if 0 is asked for."""
-    width = min(requested_width or scene.width, scene.width)
-    return width, max(16, round(scene.height * width / scene.width))
 
 
 def checkpoint_bytes(config: TrainConfig) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..contract import Cancelled, ExitCode, JobError, Reporter
+from ..contract import FORECAST, Cancelled, ExitCode, JobError, Reporter
 from ..deformation import Deformation, Deltas, Rehearsal, Start, field_box, host, split_deltas
 from ..gaussians import Densifier, DensifyConfig, covering, initialise
 from ..raster import RasterOutput
@@ -27,6 +27,7 @@ from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, sav
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
 from .extend import Extension
+from .forecast import Outlook, Stopwatch, smaller_presets, step_work, warning_of
 from .losses import photometric, psnr
 from .model import DynamicModel, render, restore_model
 from .movers import harden, on_trial
@@ -116,6 +117,7 @@ class Trainer:
         self.optimizer = optimizer_of(self.model, self.poses, config)
         self.mean = ParameterMean()
         self.densifier = Densifier(self._densify_config(), len(gaussians), self.device)
+        self._foretold = False
         self._bad = torch.zeros(2, dtype=torch.int32, device=self.device)
         self._saved_at = time.perf_counter()
 
@@ -166,6 +168,7 @@ class Trainer:
         every = max(1, round(self.config.evaluate_every * length))
         since = time.perf_counter() - self.trained_seconds
         started = self.iteration
+        watch = Stopwatch() if self.device.type == "cpu" else None
         try:
             while self.iteration < self.end:
                 self.report.check_cancelled()
@@ -176,8 +179,12 @@ class Trainer:
                 self.iteration += 1
                 self._average(length)
                 self.trained_seconds = time.perf_counter() - since
+                if watch is not None:
+                    self._foretell(watch, resumed=started > 0)
                 if (self.iteration - begin) % every == 0:
                     evaluate(self)
+                    if watch is not None:
+                        watch.begin()
                 if self.iteration % _INSPECT_EVERY == 0 or self.iteration == self.end:
                     self.inspect_nonfinite()
                     text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {float(loss):.4f}"
@@ -190,6 +197,28 @@ class Trainer:
             raise
         self.trained_seconds = time.perf_counter() - since
         self.save(checkpoint)
+
+    def _foretell(self, watch: Stopwatch, resumed: bool) -> None:
+        """After a step on the processor: how long the run will still take, once some were timed; the first time a
+        long one says so in words."""
+        pixels, now = self.width * self.height, len(self.model.gaussians)
+        each = watch.step(step_work(pixels, now))
+        if each is None:
+            return
+        grows = self.policy.growing and not self.extensions
+
+        def count(step: int) -> float:
+            return max(now, self.densifier.target(self.initial, step / self.config.iterations)) if grows else now
+
+        left = each * Outlook(pixels, self.iteration, self.end, count).work()
+        self.report.metric(FORECAST, {"of": "training", "seconds_left": round(left, 1)})
+        if not self._foretold:
+            self._foretold = True
+            size = self.scene.width, self.scene.height
+            smaller = smaller_presets(self.config.preset, size, self.initial, each)
+            told = warning_of(left, resumed, [row for row in smaller if row[1] < left])
+            if told is not None:
+                self.report.warning(*told)
 
     def _densify_config(self) -> DensifyConfig:
         """As configured, but for what fits; the configuration itself stays as it was asked for: it is the run's key."""

@@ -4,6 +4,7 @@ import json
 import shutil
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 
@@ -19,13 +20,13 @@ from torch_backend.contract import (
 )
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
-from torch_backend.freeze import freeze_at, freeze_shot
+from torch_backend.freeze import freeze_at, freeze_shot, write_beside
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take_cameras import plan
 from torch_backend.gaussians.ply import read_ply
 from torch_backend.scene import load_scene
 from torch_backend.shot import Shot, write_json
-from torch_backend.train import load_run, train_shot
+from torch_backend.train import device, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 from torch_backend.train.run import solve_key
 
@@ -100,6 +101,18 @@ def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(tra
     assert told == [True, False]
 
 
+def test_a_freeze_says_why_it_does_not_use_the_card(trained, quiet, monkeypatch):
+    world, _ = trained
+    monkeypatch.setattr(device, "cuda_refusal", lambda: "")
+    monkeypatch.setattr(device, "card_problem", lambda: "a frame comes out wrong on it")
+    small = dict(take="no card", t_star=105, first=105, last=105, detail="off", develop="off")
+    for asked, times in (("auto", 1), ("cpu", 0)):
+        report = quiet()
+        freeze_shot(world.shot, FreezeParams(**small, device=asked), report)
+        said = [event[1] for event in report.events if event[0] == "warning" and "graphics card" in event[1]]
+        assert len(said) == times and all(s.startswith("Freezing uses the processor") for s in said)
+
+
 def test_depth_is_in_solve_units_and_empty_is_1e10(trained, takes):
     world, _ = trained
     image = frozen(world, 105, 105)
@@ -153,6 +166,44 @@ def test_only_missing_frames_are_rendered_again(trained, quiet):
     assert {n for n in after if after[n] != before.get(n)} == {"000103.exr"}
     freeze_shot(world.shot, FreezeParams(take="again", develop="off", t_star=110, only_missing=True), quiet())
     assert all(p.stat().st_mtime_ns != after[p.name] for p in folder.glob("*.exr"))
+
+
+@pytest.mark.parametrize("detail", ["on", "off"])
+def test_frames_written_beside_the_next_are_those_written_at_once(trained, quiet, monkeypatch, detail):
+    world, _ = trained
+    asked = dict(t_star=108, first=103, last=106, detail=detail, develop="off")
+    for take, held in (("beside", 1 << 40), ("at once", -1)):
+        monkeypatch.setattr(write_beside, "HELD_BYTES", held)
+        freeze_shot(world.shot, FreezeParams(take=take, **asked), quiet())
+    beside, at_once = world.shot.take("beside"), world.shot.take("at once")
+    pictures = sorted(p.relative_to(beside) for p in beside.rglob("*.exr"))
+    assert len(pictures) == (8 if detail == "on" else 4)
+    for picture in pictures:
+        one, other = (oiio.ImageBuf(str(folder / picture)).get_pixels(oiio.FLOAT) for folder in (beside, at_once))
+        assert np.array_equal(one, other, equal_nan=True), picture
+    for n in range(103, 107):
+        one, other = (folder / "preview" / f"{n:06d}.png" for folder in (beside, at_once))
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_a_frame_that_cannot_be_written_ends_the_take_and_leaves_whole_frames(trained, quiet):
+    world, _ = trained
+    folder = world.shot.take("refused")
+
+    class InTheWay(quiet):
+        def progress(self, stage, done, total, message=""):
+            if (stage, done) == ("freezing", 0):
+                (folder / "preview" / "000105.png").mkdir()
+
+    asked = dict(take="refused", t_star=108, first=103, last=106, detail="off", develop="off")
+    with pytest.raises(OSError, match="000105"):
+        freeze_shot(world.shot, FreezeParams(**asked), InTheWay())
+    assert [p.name for p in sorted(folder.glob("*.exr"))] == ["000103.exr", "000104.exr"]
+    assert read_frozen_exr(folder / "000104.exr").rgba.any() and not list(folder.rglob(".*"))
+    (folder / "preview" / "000105.png").rmdir()
+    before = (folder / "000104.exr").stat().st_mtime_ns
+    assert freeze_shot(world.shot, FreezeParams(**asked, only_missing=True), quiet())["frames"] == 4
+    assert (folder / "000104.exr").stat().st_mtime_ns == before
 
 
 def test_cancelled_take_goes_on(trained, quiet):

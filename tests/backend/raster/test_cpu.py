@@ -105,6 +105,25 @@ def test_harmonics_held_apart_are_those_held_together(tools, body, degree):
     assert all(torch.equal(grad, expected[name]) for name, grad in grads.items())
 
 
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_gradients_of_what_no_camera_sees_are_zero_whatever_memory_held(tools, cameras, apart):
+    scene = tools.cloud(700, 50, 41, degree=2)
+    scene.tensors["means"][::3, 2] = -5.0  # behind the camera
+    tensors = scene.tensors | {"viewmats": scene.tensors["viewmats"].repeat(cameras, 1, 1)}
+    if apart:
+        tensors |= {"sh": tensors["sh"][:, :1].clone(), "sh_rest": tensors["sh"][:, 1:].clone()}
+    scene = tools.Scene(tensors, scene.Ks.repeat(cameras, 1, 1), 50, 41, scene.options)
+    _, expected = scene.gradients("reference", sh_degree=1)
+    torch.use_deterministic_algorithms(True)  # torch then fills memory that nobody has written with NaN
+    try:
+        _, grads = scene.gradients("cpu", sh_degree=1)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert_gradients(grads, expected, tools.relative, 1e-3)
+    assert all((grad[::3] == 0).all() for name, grad in grads.items() if len(grad) == 700)
+
+
 def test_harmonics_held_apart_are_refused_where_they_do_not_fit(tools):
     scene = tools.cloud(6, 8, 8, degree=1)
     sh = scene.tensors["sh"]

@@ -1,8 +1,14 @@
 """The bench of the model behind the picture: what it judges, and on which frames."""
 
 import json
+import shutil
+
+import numpy as np
 
 from benchmarks.model import OF_FROZEN, main
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.shot import Shot, write_json
+from torch_backend.solve.masks import write_grey
 
 
 def test_a_trained_run_is_judged_frozen_and_developed_on_frames_that_it_has_not_seen(trained, tmp_path):
@@ -23,3 +29,26 @@ def test_a_number_that_the_configuration_does_not_have_is_named(trained, tmp_pat
     world, _ = trained
     command = [str(world.shot.root), "--results", str(tmp_path), "--set", "gate.strat=0.4"]
     assert main(command) == 1 and "gate.strat" in capsys.readouterr().err
+
+
+def test_what_the_mask_ignores_is_not_judged(trained, tmp_path):
+    world, _ = trained
+    shot = Shot(shutil.copytree(world.shot.root, tmp_path / "logo.splannequin"))
+    plate = shot.frames / "000109.png"
+    pixels = read_png(plate)
+    pixels[: len(pixels) // 2] = 255 - pixels[: len(pixels) // 2]  # half the plate shows something else
+
+    def whole(name: str) -> float:
+        assert main([str(shot.root), "--run", "main", "--results", str(tmp_path / name), "--t-star", "103"]) == 0
+        return json.loads((tmp_path / name / "model.json").read_text())["figures"]["whole"]
+
+    before = whole("before")
+    write_png(plate, pixels)
+    assert whole("spoilt") < before - 5.0
+    write_json(shot.solve_record, {"masks": {"ignore": {"key": "logo"}}})
+    shot.masks("ignore").mkdir()
+    for path in shot.frames.glob("*.png"):
+        mask = np.zeros(pixels.shape[:2], np.uint8)
+        mask[: len(pixels) // 2] = 255
+        write_grey(shot.mask("ignore", int(path.stem)), mask)
+    assert abs(whole("masked") - before) < 2.0

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_backend.gaussians import Gaussians
-from torch_backend.train.adam import FusedAdam
+from torch_backend.train.adam import FusedAdam, all_finite
 from torch_backend.train.checkpoint import optimizer_state, restore_optimizer
 
 BODIES = [pytest.param(False, id="snippet"), pytest.param(True, id="kernel")]
@@ -107,6 +107,19 @@ def test_a_step_that_is_not_finite_changes_nothing(kernel, bad, where):
     optimizer.step(guard=[torch.tensor(1.0)])
     assert bool(optimizer.applied)
     assert float(optimizer.state[params[0]]["step"]) == 2
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_one_value_that_is_not_finite_is_found_wherever_it_lies(bad):
+    tensors = [torch.full((5,), 3e38), torch.full((3001, 3), -3e38), torch.zeros(1, 16, 9, 11)]
+    assert all_finite(tensors, threads=2)
+    for values in tensors:
+        for place in (0, values.numel() // 2, values.numel() - 1):
+            kept = float(values.view(-1)[place])
+            values.view(-1)[place] = bad
+            assert not all_finite(tensors, threads=2)
+            values.view(-1)[place] = kept
+    assert all_finite([])
 
 
 @pytest.mark.parametrize("kernel", BODIES)

@@ -85,6 +85,18 @@ def test_what_may_be_otherwise_the_next_time_is_not_kept(tmp_path: Path):
     assert card_problem(tmp_path, full) == "", "it was sound, and is not asked again"
 
 
+def test_a_card_that_does_not_answer_is_waited_for_once(monkeypatch, quiet):
+    asked = []
+    monkeypatch.setattr(device, "cuda_refusal", lambda: "")
+    monkeypatch.setattr(device, "card_problem", lambda: asked.append(1) or "it did not answer within 240 s")
+    report = quiet()
+    assert choose_device("auto", report, "Freezing").type == "cpu" and len(asked) == 1
+    ((_, sentence, advice),) = report.events
+    assert sentence.startswith("Freezing uses the processor, not the graphics card: ") and "240 s" in sentence
+    assert "doctor --gpu" in advice
+    assert choose_device("cpu", report, "Freezing").type == "cpu" and len(report.events) == len(asked) == 1
+
+
 def test_a_card_that_fails_is_not_used_and_said(monkeypatch):
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
     monkeypatch.setattr(device, "card_problem", lambda: "a frame comes out wrong on it (2e-01 off, 1e-02 is allowed)")

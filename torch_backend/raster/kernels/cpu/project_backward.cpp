@@ -1,10 +1,20 @@
-// Stage 6: gradients of the projection from the summed gradients of the hits. Parallel over chunks.
+// Stage 6: gradients of the projection from the summed gradients of the hits. Parallel over chunks. The first camera
+// clears the rows of its chunk before it adds to them: they come uninitialised, and are still in the cache afterwards.
 #include "gather.cpp"
 
 const long long GS = P.grad_stride;
 const int D = (int)P.channels;
+auto clear = FN(float* rows, long long first, long long count, long long width) -> void {
+    if (rows) for (long long i = first * width; i < (first + count) * width; i++) rows[i] = 0.f; };
 for (long long chunk; (chunk = take()) < P.chunks;) {
     long long base = chunk * @CHUNK@; int count = P.chunk_count[chunk];
+    if (P.clear) {
+        long long own = P.n - base < @CHUNK@ ? P.n - base : @CHUNK@;
+        clear(P.grad_means, base, own, 3); clear(P.grad_quats, base, own, 4);
+        clear(P.grad_log_scales, base, own, 3); clear(P.grad_logits, base, own, 1);
+        clear(P.grad_colors, base, own, P.n_colors); clear(P.grad_sh, base, own, P.sh_stride);
+        if (P.clear > 1) clear(P.grad_sh_rest, base, own, P.rest_stride);
+    }
     F gV[12]; for (int c = 0; c < 12; c++) gV[c] = (F)0.f;
     for (int b = 0; b < count; b += 16) {
         int id[16], hits[16], m = count - b < 16 ? count - b : 16;

@@ -1,0 +1,217 @@
+// Runs what a GPU would compile of the rasteriser's kernels, on a CPU: launches from a file in, how they end out.
+// `device_text.py` writes kernels.inc and the launches, and says how this is built and what is compared.
+//
+// A block has 128 threads, in warps of 32. Plain, each is a fiber with a stack of its own, and they take turns at votes,
+// shuffles and barriers: quick, always in the same order, and a barrier that not all reach is told. With THREADS each is
+// a thread of the system, for the thread sanitizer. Blocks run one after the other: shared memory is static.
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <vector>
+#ifdef THREADS
+#include <barrier>
+#include <thread>
+#else
+#include <ucontext.h>
+#endif
+
+constexpr int BLOCK = 128, WARP = 32;
+struct alignas(16) float4 { float x, y, z, w; };
+
+#ifdef THREADS
+thread_local int tid_now;
+struct Meeting {
+    std::barrier<> all{BLOCK}, warp[4] = {std::barrier<>(WARP), std::barrier<>(WARP), std::barrier<>(WARP),
+                                          std::barrier<>(WARP)};
+};
+std::unique_ptr<Meeting> meeting;
+static void meet_block() { meeting->all.arrive_and_wait(); }
+static void meet_warp() { meeting->warp[tid_now / WARP].arrive_and_wait(); }
+#else
+int tid_now;
+enum { RUNS, AT_WARP, AT_BLOCK, ENDED };
+struct Fiber { ucontext_t at; int state; };
+static Fiber fibers[BLOCK];
+static ucontext_t home;
+static void wait_as(int state) { fibers[tid_now].state = state; swapcontext(&fibers[tid_now].at, &home); }
+static void meet_block() { wait_as(AT_BLOCK); }
+static void meet_warp() { wait_as(AT_WARP); }
+#endif
+
+static int votes[BLOCK];
+static float values[BLOCK];
+static bool vote(bool mine) {
+    votes[tid_now] = mine;
+    meet_warp();
+    bool any = false;
+    for (int i = 0; i < WARP; i++) any |= votes[tid_now / WARP * WARP + i] != 0;
+    meet_warp();
+    return any;
+}
+static float swapped(float mine, int mask) {
+    values[tid_now] = mine;
+    meet_warp();
+    const float its = values[tid_now ^ mask];
+    meet_warp();
+    return its;
+}
+template <class To, class From> static To same_bits(From x) { To y; memcpy(&y, &x, sizeof y); return y; }
+static void add(float* at, float value) {
+    auto* place = (std::atomic<float>*)at;
+    float before = place->load(std::memory_order_relaxed);
+    while (!place->compare_exchange_weak(before, before + value, std::memory_order_relaxed)) {}
+}
+static void add(unsigned long long* at, unsigned long long value) {
+    ((std::atomic<unsigned long long>*)at)->fetch_add(value, std::memory_order_relaxed);
+}
+static void raise_to(int* at, int value) {
+    auto* place = (std::atomic<int>*)at;
+    int before = place->load(std::memory_order_relaxed);
+    while (before < value && !place->compare_exchange_weak(before, value, std::memory_order_relaxed)) {}
+}
+
+#define __shared__ static
+#define __any_sync(mask, x) vote(x)
+#define __shfl_xor_sync(mask, v, lanes) swapped(v, lanes)
+#define __fdividef(a, b) ((a) / (b))
+#define __float_as_int same_bits<int, float>
+#define __int_as_float same_bits<float, int>
+#define atomicAdd add
+#define atomicMax raise_to
+#define SAME(flag) __atomic_store_n(&flag, 1, __ATOMIC_RELAXED)
+#define asm(text) (y = exp2f(x))
+#define WP_TILE_THREAD_IDX tid_now
+#define WP_TILE_SYNC() meet_block()
+#define __CUDA_ARCH__ 890
+#include "kernels.inc"
+#undef asm
+
+static Kernel kernel_now;
+static Args* args_now;
+static int block_now;
+
+#ifdef THREADS
+static bool run_block() {
+    meeting = std::make_unique<Meeting>();
+    std::vector<std::thread> threads;
+    for (int t = 0; t < BLOCK; t++)
+        threads.emplace_back([t] {
+            tid_now = t;
+            kernel_now(*args_now, block_now * BLOCK + t);
+            meeting->warp[t / WARP].arrive_and_drop();
+            meeting->all.arrive_and_drop();
+        });
+    for (auto& thread : threads) thread.join();
+    return true;
+}
+#else
+constexpr size_t STACK = 128 << 10;
+static void begin() {
+    kernel_now(*args_now, block_now * BLOCK + tid_now);
+    fibers[tid_now].state = ENDED;
+    swapcontext(&fibers[tid_now].at, &home);
+}
+static bool all_of(int first, int count, int state) {
+    for (int i = first; i < first + count; i++) if (fibers[i].state != state && fibers[i].state != ENDED) return false;
+    return true;
+}
+static bool run_block() {
+    static std::vector<char> stacks(BLOCK * STACK);
+    for (int t = 0; t < BLOCK; t++) {
+        getcontext(&fibers[t].at);
+        fibers[t].at.uc_stack.ss_sp = stacks.data() + t * STACK;
+        fibers[t].at.uc_stack.ss_size = STACK;
+        fibers[t].at.uc_link = &home;
+        makecontext(&fibers[t].at, begin, 0);
+        fibers[t].state = RUNS;
+    }
+    for (;;) {
+        for (tid_now = 0; tid_now < BLOCK; tid_now++)
+            if (fibers[tid_now].state == RUNS) swapcontext(&home, &fibers[tid_now].at);
+        if (all_of(0, BLOCK, ENDED)) return true;
+        bool moved = false;
+        for (int first = 0; first < BLOCK; first += WARP) {
+            // A vote or shuffle names all 32 lanes: one that has ended never comes.
+            bool met = true;
+            for (int i = first; i < first + WARP; i++) met &= fibers[i].state == AT_WARP;
+            for (int i = first; met && i < first + WARP; i++) fibers[i].state = RUNS;
+            moved |= met;
+        }
+        if (!moved && all_of(0, BLOCK, AT_BLOCK)) {
+            for (auto& fiber : fibers) if (fiber.state == AT_BLOCK) fiber.state = RUNS;
+            moved = true;
+        }
+        if (!moved) return false;
+    }
+}
+#endif
+
+static FILE* file;
+static void take(void* into, size_t bytes) {
+    if (bytes && fread(into, 1, bytes, file) != bytes) { fprintf(stderr, "the launches end too early\n"); exit(2); }
+}
+
+// Each launch: kernel, threads, sizes, near; then per pointer whether there is one, bytes, before and after on fibers.
+int main(int argc, char** argv) {
+    file = fopen(argv[1], "rb");
+    const int most = argc > 2 ? atoi(argv[2]) : 1 << 30;
+    int launches, bad = 0;
+    take(&launches, 4);
+    for (int l = 0; l < launches; l++) {
+        char name[64];
+        int threads, sizes[SIZES];
+        float near;
+        take(name, 64); take(&threads, 4); take(sizes, sizeof sizes); take(&near, 4);
+        std::vector<void*> at(POINTERS);
+        std::vector<std::vector<char>> want(POINTERS);
+        for (int i = 0; i < POINTERS; i++) {
+            int64_t bytes;
+            take(&bytes, 8);
+            if (bytes < 0) continue;
+            // As large as the tensor and not a byte more: the address sanitizer knows where it ends.
+            if (posix_memalign(&at[i], 16, bytes ? bytes : 1)) return 2;
+            take(at[i], bytes);
+            want[i].resize(bytes);
+            take(want[i].data(), bytes);
+        }
+        Args args;
+        fill(args, at, sizes, near);
+        kernel_now = nullptr;
+        for (auto& entry : TABLE) if (!strcmp(entry.name, name)) kernel_now = entry.run;
+        if (!kernel_now) { fprintf(stderr, "no kernel %s\n", name); return 2; }
+        args_now = &args;
+        const int blocks = (threads + BLOCK - 1) / BLOCK;
+        bool whole = blocks <= most, met = true;
+        for (block_now = 0; block_now < std::min(blocks, most) && met; block_now++) met = run_block();
+        printf("{\"kernel\": \"%s\", \"blocks\": %d, \"whole\": %s, \"met\": %s, \"differs\": {", name, blocks,
+               whole ? "true" : "false", met ? "true" : "false");
+        bool first = true;
+        for (int i = 0; i < POINTERS && whole && met; i++) {
+            if (!at[i] || want[i].empty() || !memcmp(at[i], want[i].data(), want[i].size())) continue;
+            double off = 0.0, norm = 0.0;
+            const size_t words = want[i].size() / 4;
+            size_t other = 0;
+            for (size_t j = 0; j < words; j++) {
+                float x, y;
+                memcpy(&x, (char*)at[i] + 4 * j, 4); memcpy(&y, want[i].data() + 4 * j, 4);
+                other += memcmp(&x, &y, 4) != 0;
+                if (std::isnan(x) && std::isnan(y)) continue;
+                if (IS_FLOAT[i]) { off += double(x - y) * (x - y); norm += double(y) * y; }
+            }
+            printf("%s\"%s\": [%zu, %zu, %.3e]", first ? "" : ", ", NAMES[i], other, words,
+                   IS_FLOAT[i] ? sqrt(off / std::max(norm, 1e-30)) : 1e9);
+            first = false;
+        }
+        printf("}}\n");
+        fflush(stdout);
+        bad += !met;
+        for (void* p : at) free(p);
+    }
+    return bad ? 1 : 0;
+}

@@ -1,0 +1,317 @@
+"""A lens that was handed over as an ST map, as a formula: both ways, for pictures of any size, past the map's edge too.
+
+A map is samples of something smooth, often with the noise of 16-bit floats, and often it ends where the undistorted
+picture does while the way back has to look beyond. So a polynomial in x and y is kept in its place, of the lowest
+degree that meets every sample (`map_reading`), in the direction in which that is the lower: most models of lenses are
+such polynomials in one of the two, and go on past the edge as the lens does. numpy alone, float64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from ..array_types import between_nodes, linear_solution, meshgrid
+from ..contract import ExitCode, JobError
+
+ST_MAP = "ST_MAP"
+"""What stands in solve.json where COLMAP's models have their names."""
+_ROWS = 64
+_NODE_PX, _LEAST_NODES = 8.0, 40
+"""Pixels between two places at which a way without a formula is found; how many of them there are at least."""
+_MOST_STEPS = 60
+_DONE_PX, _WRONG_PX = 1e-9, 1e-6
+"""Newton ends when no pixel is farther than the first from where it should be, and has failed beyond the second."""
+_BEYOND = 0.5
+"""How far out of the polynomial's box the search for a way back may go, in boxes."""
+_NONE_PX = 1e-3
+"""A lens that moves no pixel of a picture by more is none."""
+_GRID = 33
+"""Points along a side at which a picture is tested for a fold."""
+_SLACK_PX = 0.02
+"""How far out of the original a pixel of the plate may lie: maps are no better."""
+_LEAST_WINDOW, _MOST_WINDOW = 0.1, 2.0
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """A smooth way from one plane to another: two polynomials in x and y, in Chebyshev's terms."""
+
+    degree: int
+    """Most of the sum of both exponents."""
+    box: tuple[float, float, float, float]
+    """Least x, least y, most x, most y: what is -1 to 1 for the terms."""
+    terms: tuple[float, ...]
+    """[2, K]: of x and of y, in the order of `exponents`."""
+
+    def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points [N, 2] to points [N, 2]."""
+        return self._values(points, self._tables)
+
+    def slopes(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The derivative [N, 2, 2] at points [N, 2]: row result, column input."""
+        x, y = self._derived
+        return np.stack([self._values(points, x), self._values(points, y)], axis=-1)
+
+    def of_grid(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points [len(y), len(x), 2] of all pairs: much quicker than one by one."""
+        left, above = self._vanders(x, y)
+        return np.stack([above @ table @ left.T for table in self._tables], axis=-1)
+
+    @cached_property
+    def _tables(self) -> NDArray[np.float64]:
+        """[2, degree + 1, degree + 1]: of each result by exponent of y, then of x."""
+        tables = np.zeros((2, self.degree + 1, self.degree + 1))
+        x, y = exponents(self.degree)
+        tables[:, y, x] = np.reshape(self.terms, (2, -1))
+        return tables
+
+    @cached_property
+    def _derived(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As `_tables`, of the derivatives by x and by y."""
+        if not self.degree:
+            return np.zeros_like(self._tables), np.zeros_like(self._tables)
+        found = [chebyshev.chebder(self._tables, axis=axis) for axis in (2, 1)]
+        along, down = np.pad(found[0], ((0, 0), (0, 0), (0, 1))), np.pad(found[1], ((0, 0), (0, 1), (0, 0)))
+        width, height = self.box[2] - self.box[0], self.box[3] - self.box[1]
+        return np.asarray(along * 2.0 / width, np.float64), np.asarray(down * 2.0 / height, np.float64)
+
+    def _values(self, points: NDArray[np.float64], tables: NDArray[np.float64]) -> NDArray[np.float64]:
+        left, above = self._vanders(points[:, 0], points[:, 1])
+        return np.stack([((above @ table) * left).sum(1) for table in tables], axis=-1)
+
+    def _vanders(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        u = (x - self.box[0]) * (2.0 / (self.box[2] - self.box[0])) - 1.0
+        v = (y - self.box[1]) * (2.0 / (self.box[3] - self.box[1])) - 1.0
+        one, two = (chebyshev.chebvander(axis, self.degree) for axis in (u, v))
+        return np.asarray(one, np.float64), np.asarray(two, np.float64)
+
+
+def exponents(degree: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Exponents of x and of y of all terms up to a degree, [K] each."""
+    x, y = np.meshgrid(np.arange(degree + 1), np.arange(degree + 1))
+    kept = (x + y <= degree).ravel()
+    return x.ravel()[kept], y.ravel()[kept]
+
+
+def fitted(points: NDArray[np.float64], values: NDArray[np.float64], degree: int, box: Sequence[float]) -> Polynomial:
+    """The polynomial of a degree that takes `points` [N, 2] nearest to `values` [N, 2], by least squares."""
+    whole = Polynomial(degree, (box[0], box[1], box[2], box[3]), ())
+    left, above = whole._vanders(points[:, 0], points[:, 1])  # pyright: ignore[reportPrivateUsage]
+    x, y = exponents(degree)
+    terms = np.linalg.lstsq(left[:, x] * above[:, y], values, rcond=None)[0]
+    return Polynomial(degree, whole.box, tuple(float(term) for term in terms.T.ravel()))
+
+
+@dataclass(frozen=True)
+class MapLens:
+    """The lens of an ST map, and which part of the map's undistorted picture the undistorted frames show.
+
+    Both planes of the polynomial are 0 to 1 over a whole picture, x to the right, y down: of the original frames, and
+    of the undistorted picture as the map's maker has it, in whose middle the undistorted frames lie.
+    """
+
+    width: int
+    """Pixels of the working frames, original and undistorted."""
+    height: int
+    """Pixels."""
+    bend: Polynomial
+    """From one of the two planes to the other."""
+    forward: bool = True
+    """True if `bend` goes from the undistorted picture to the original."""
+    window: tuple[float, float] = (1.0, 1.0)
+    """Width and height of the undistorted frames as shares of the map's undistorted picture."""
+    intrinsics: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
+    """fx, fy, cx, cy of the undistorted frames, pixels, once a solve has found them."""
+
+    @property
+    def params(self) -> list[float]:
+        """All but the size and the intrinsics as numbers, for solve.json."""
+        head = [float(self.forward), float(self.bend.degree), *self.window, *self.bend.box]
+        return [*head, *self.bend.terms]
+
+    @classmethod
+    def from_params(
+        cls, width: int, height: int, params: Sequence[float], K: Sequence[float] = (1.0, 1.0, 0.0, 0.0)
+    ) -> MapLens:
+        """What `params` told, for frames of a size in pixels with intrinsics `K`. ValueError for other numbers."""
+        values = [float(value) for value in params]
+        forward, degree = (int(value) for value in values[:2])
+        terms = tuple(values[8:])
+        if forward not in (0, 1) or not 0 <= degree < 100 or len(terms) != (degree + 1) * (degree + 2):
+            raise ValueError(f"{len(values)} numbers of an ST map's lens are not its degree's")
+        bend = Polynomial(degree, (values[4], values[5], values[6], values[7]), terms)
+        return cls(width, height, bend, bool(forward), (values[2], values[3]), (K[0], K[1], K[2], K[3]))
+
+    @cached_property
+    def is_none(self) -> bool:
+        """True if original and undistorted frames are the same."""
+        around = _around(self.width, self.height)
+        return bool(np.abs(self.to_original(around) - around).max() < _NONE_PX)
+
+    @property
+    def slopes_in_the_middle(self) -> tuple[float, float]:
+        """Pixels of the original frame per pixel of the undistorted one in its middle, to the right and down."""
+        middle = np.array([[0.5 * self.width, 0.5 * self.height]])
+        ends = self.to_original(middle + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]))
+        return float(ends[1, 0] - ends[0, 0]), float(ends[3, 1] - ends[2, 1])
+
+    def to_original(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels [N, 2] of the undistorted frame -> where they lie in the original one.
+
+        JobError (SOLVE) where there is no way.
+        """
+        points = self.map_of_plate(pixels)
+        at = self.bend(points) if self.forward else self._back(points)
+        return at * (self.width, self.height)
+
+    def to_plate(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels [N, 2] of the original frame -> where they lie in the undistorted one, or beyond its border.
+
+        JobError (SOLVE) where there is no way back.
+        """
+        points = pixels / (self.width, self.height)
+        at = self._back(points) if self.forward else self.bend(points)
+        return ((at - 0.5) / self.window + 0.5) * (self.width, self.height)
+
+    def where(self, width: int, height: int) -> NDArray[np.float32]:
+        """[height, width, 2]: where each pixel of an undistorted plate lies in the original, both of that size.
+
+        x and y in pixels, centres at +0.5. JobError as `to_original`.
+        """
+        ratio = np.array([width / self.width, height / self.height])
+        x, y = (np.arange(width) + 0.5) / ratio[0], (np.arange(height) + 0.5) / ratio[1]
+        if not self.forward:
+            return self._where_between(x, y, ratio)
+        out = np.empty((height, width, 2), np.float32)
+        for top in range(0, height, _ROWS):
+            rows = y[top : top + _ROWS]
+            corner = self.map_of_plate(np.stack([x, np.zeros_like(x)], 1))
+            side = self.map_of_plate(np.stack([np.zeros_like(rows), rows], 1))
+            at = self.bend.of_grid(corner[:, 0], side[:, 1]) * (self.width, self.height)
+            out[top : top + _ROWS] = at * ratio
+        return out
+
+    def _where_between(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], ratio: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """`where` by Newton at every eighth pixel, and smoothly between: 0.5 s for HD, every pixel would take 11."""
+        nodes = [
+            np.linspace(0.0, length, max(_LEAST_NODES, math.ceil(length * scale / _NODE_PX)) + 1)
+            for length, scale in zip((self.width, self.height), ratio, strict=True)
+        ]
+        grid = np.stack(meshgrid(nodes[0], nodes[1]), -1)
+        at = self.to_original(grid.reshape(-1, 2)).reshape(grid.shape) * ratio
+        planes = [between_nodes((nodes[0], nodes[1]), at[..., n], x, y) for n in (0, 1)]
+        return np.stack(planes, axis=-1).astype(np.float32)
+
+    def check(self) -> None:
+        """JobError (SOLVE) if the lens folds over within the original frame or within the undistorted one."""
+        x, y = np.linspace(0.0, self.width, _GRID), np.linspace(0.0, self.height, _GRID)
+        original = np.stack(meshgrid(x, y), -1).reshape(-1, 2)
+        if self.forward:
+            seen = self.map_of_plate(np.concatenate([original, self.to_plate(original)]))
+        else:
+            seen = np.concatenate([original, self.to_original(original)]) / (self.width, self.height)
+        if not np.linalg.det(self.bend.slopes(seen)).min() > 0.0:
+            raise _folded()
+
+    def map_of_plate(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels [N, 2] of the undistorted frame -> places in the map's undistorted picture, 0 to 1, y down."""
+        return (pixels / (self.width, self.height) - 0.5) * self.window + 0.5
+
+    def _back(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where `bend` takes to `wanted` [N, 2], by Newton's method to 1e-6 px and better. JobError if nowhere."""
+        size = np.array([self.width, self.height])
+        low, high = np.array(self.bend.box[:2]), np.array(self.bend.box[2:])
+        reach = _BEYOND * (high - low)
+        at = self._start(wanted)
+        error = np.inf
+        with np.errstate(all="ignore"):
+            for _ in range(_MOST_STEPS):
+                off = self.bend(at) - wanted
+                error = float(np.abs(off * size).max(initial=0.0))
+                if not error > _DONE_PX:  # done, or not a number any more
+                    break
+                (a, b), (c, d) = np.moveaxis(self.bend.slopes(at), 0, -1)
+                det = a * d - b * c
+                at[:, 0] -= (d * off[:, 0] - b * off[:, 1]) / det
+                at[:, 1] -= (a * off[:, 1] - c * off[:, 0]) / det
+                at = np.clip(at, low - reach, high + reach)
+        if not error < _WRONG_PX:
+            raise _folded()
+        return at
+
+    def _start(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A first guess for `_back`: as if the map bent nothing."""
+        middle = np.array([[0.5, 0.5]])
+        return 0.5 + linear_solution(self.bend.slopes(middle)[0], (wanted - self.bend(middle)).T).T
+
+
+def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) -> MapLens:
+    """The same lens with the widest window in which no pixel of the undistorted frames falls outside of the original
+    ones: as wide as the map's own picture where it ends there, so that its pixels stay what they are.
+
+    Args:
+        lens: of any window.
+        shape: width over height of the map's undistorted picture.
+        known: least x, least y, most x, most y of that picture beyond which nobody said where to look; None: all is
+            known.
+
+    Raises:
+        JobError: (SOLVE) no part of the picture is whole.
+    """
+    ratio = lens.width / lens.height / shape
+    sides = np.array([min(1.0, ratio), min(1.0, 1.0 / ratio)])
+    border = _around(lens.width, lens.height)
+    size = np.array([lens.width, lens.height])
+
+    def tried(share: float) -> MapLens:
+        x, y = sides * share
+        return replace(lens, window=(float(x), float(y)))
+
+    def inside(share: float) -> bool:
+        made = tried(share)
+        points = made.map_of_plate(border)
+        if known is not None and not ((points > known[:2]) & (points < known[2:])).all():
+            return False
+        try:
+            at = made.to_original(border)
+        except JobError:
+            return False
+        return bool(((at > 0.5 - _SLACK_PX) & (at < size - 0.5 + _SLACK_PX)).all())
+
+    low, high = _LEAST_WINDOW, _MOST_WINDOW
+    if not inside(low):
+        raise JobError(
+            "The ST map leaves no part of the picture that is whole.",
+            "Is it of this lens? The other way round is --st-map-way.",
+            ExitCode.SOLVE,
+        )
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if inside(middle) else (low, middle)
+    # Pixel centres end half a pixel before the picture does.
+    return tried(1.0 if 1.0 <= low <= 1.0 + 3.0 / min(lens.width, lens.height) else low)
+
+
+def _around(width: int, height: int) -> NDArray[np.float64]:
+    """[N, 2]: pixel centres of a picture's border, and of its middle row and column."""
+    x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
+    lines = [np.stack([x, np.full_like(x, at)], 1) for at in (y[0], y[len(y) // 2], y[-1])]
+    lines += [np.stack([np.full_like(y, at), y], 1) for at in (x[0], x[len(x) // 2], x[-1])]
+    return np.concatenate(lines).astype(np.float64, copy=False)
+
+
+def _folded() -> JobError:
+    return JobError(
+        "The lens of the ST map folds over towards the picture's corners: there is no way back through it.",
+        "Ask for a map with overscan, or for the one of the other way round (--st-map-way), which may reach farther.",
+        ExitCode.SOLVE,
+    )

@@ -1,0 +1,372 @@
+"""Reads an ST map that somebody hands over into the lens that it holds, or says in one sentence why it holds none.
+
+What is taken: red is s, 0 to 1 from left to right, green is t, 0 to 1 from the bottom (Nuke's STMap, Flame, Blender's
+Map UV) or from the top, which its own slope tells; coordinates are of the whole picture that is looked into, and a
+pixel's centre lies at (i + 0.5) / size. The map's own picture is its display window: pixels outside of that, and a map
+larger than the footage, are overscan. `--st-map-way` says which picture the map is of, for a map does not:
+
+    undistort   of the undistorted one: where to look in the original (what takes the lens out of a plate)
+    redistort   of the original: where to look in the undistorted one (what puts it back into a render)
+
+Values that are 0 in both channels, transparent, or cut off at 0 and 1 say nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from ..contract import ST_MAP_WAYS, ExitCode, JobError, Reporter
+from ..footage.images import error_of
+from ..footage.oiio_types import bits_of, channel_names
+from .map_lens import MapLens, Polynomial, fitted, widest
+
+UNDISTORT, REDISTORT = ST_MAP_WAYS
+PAIRS = (("r", "g"), ("red", "green"), ("u", "v"), ("s", "t"), ("x", "y"))
+"""What programs call the two channels, in small letters."""
+DEGREES = (1, 3, 5, 7, 9, 11, 13, 15)
+CLOSE_PX = 5e-3
+"""A polynomial that is nowhere farther from the map's values, in pixels of the footage, is the map."""
+ROUGH_PX = 0.1
+"""One that is farther than this, over what the file's rounding explains, is not: such a map is not smooth."""
+NO_GAIN = 0.996
+"""Times the error by which a higher degree has to be better: what is left then is noise."""
+STRAIGHT_PX = 0.05
+"""A map that bends no pixel farther holds no lens."""
+SHAPE = 0.03
+"""How much higher or flatter than wide a map may show the middle of the picture."""
+_CUT = 0.02
+"""How far beyond the picture an undistorting map is heeded, as a share of it."""
+_SAMPLES, _CHECKED = 8_000, 60_000
+_LEAST_SHARE = 0.5
+_LARGEST = 32_768
+
+
+@dataclass
+class _Map:
+    """What a file holds."""
+
+    s: NDArray[np.float64]
+    """[h, w]: to the right, 0 to 1."""
+    t: NDArray[np.float64]
+    """[h, w]: down, 0 to 1, once it is known which way it counts."""
+    known: NDArray[np.bool_]
+    """[h, w]: where the map says something."""
+    at: tuple[int, int]
+    """Column and row of the first pixel in the map's own picture."""
+    size: tuple[int, int]
+    """Width and height of that picture, pixels."""
+    rounding: float
+    """Largest step between two values of the file near 1."""
+
+
+def fingerprint(path: str) -> str:
+    """Hash of a map's file. JobError (USAGE) if it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        with open(path, "rb") as source:
+            while block := source.read(1 << 20):
+                digest.update(block)
+    except OSError as error:
+        raise _refused(f"The ST map {path} cannot be read: {error.strerror or error}.", "Check the path.") from error
+    return digest.hexdigest()
+
+
+def read_lens(path: str, way: str, layer: str, frames: dict[str, Any], report: Reporter) -> MapLens:
+    """The lens of a map, for the working frames.
+
+    Args:
+        path: the file.
+        way: one of `contract.ST_MAP_WAYS`.
+        layer: the layer that holds it; empty: red and green, or the only pair there is.
+        frames: frames.json of the import.
+        report: hears what was assumed, and what the map leaves open.
+
+    Returns:
+        The lens with the widest window in which the undistorted frames are whole, without intrinsics.
+
+    Raises:
+        JobError: (USAGE or SOLVE) what is wrong with the file, and what to do.
+    """
+    name = f"The ST map {Path(path).name}"
+    read = _read(Path(path), layer, name)
+    size = int(frames["width"]), int(frames["height"])
+    source = tuple(int(n) for n in frames.get("source_size") or size)
+    scale = np.array(source, np.float64)
+    undistorted, original = _samples(read, way, name, report)
+    if read.rounding * scale.max() > ROUGH_PX:
+        report.warning(
+            f"{name} has 16-bit floats, whose steps are up to {read.rounding * float(scale.max()):.1f} pixels of this "
+            "footage: it is smoothed.",
+            "Ask for 32 bits.",
+        )
+    found = _fit(undistorted, original, read, scale)
+    if found.off.max() > ROUGH_PX + 2.0 * read.rounding * scale.max():
+        worst = (undistorted if way == UNDISTORT else original)[int(found.off.argmax())] * read.size
+        raise _refused(
+            f"{name} is no smooth map of a lens: at column {worst[0]:.0f}, row {worst[1]:.0f} it is "
+            f"{found.off.max():.2f} pixels off from what is around it.",
+            "Write it as an uncompressed or zip-compressed EXR of 32 bits, of the lens alone, without stabilising.",
+        )
+    _check_bend(found, name, scale, read.rounding, report)
+    aspect = float(frames.get("reading", {}).get("pixel_aspect", 1.0))
+    lens = MapLens(size[0], size[1], found.bend, found.forward)
+    shape = _shape(read, lens, way, source, aspect, name)
+    half = 0.5 / np.array(read.size)
+    known = (*(undistorted.min(0) - half), *(undistorted.max(0) + half)) if way == UNDISTORT else None
+    lens = widest(lens, shape, known)
+    lens.check()
+    if known is not None:
+        _say_what_is_open(lens, known, name, report)
+    return lens
+
+
+# ------------------------------------------------------------------------------------------------- the file
+
+
+def _read(path: Path, layer: str, name: str) -> _Map:
+    """The two channels, and where they say something. JobError (USAGE) as `read_lens`."""
+    opened = oiio.ImageInput.open(str(path)) if path.is_file() else None
+    if opened is None:
+        why = error_of() if path.is_file() else "it is not there"
+        raise _refused(f"{name} cannot be read: {why.rstrip('.')}.", "Name an EXR file.")
+    try:
+        part, channels, alpha = _channels(opened, layer, name)
+        opened.seek_subimage(part, 0)
+        spec = opened.spec()
+        bits = bits_of(spec)
+        kind = str(spec.format)
+        if kind not in ("float", "half", "double", "uint16", "uint") or bits <= 12:
+            raise _refused(
+                f"{name} has {bits} bits a channel, which cannot tell places in a picture to less than a pixel.",
+                "Write it as an EXR of 32 bits.",
+            )
+        if max(spec.full_width, spec.full_height, spec.width, spec.height) > _LARGEST:
+            raise _refused(f"{name} is {spec.full_width} x {spec.full_height}.", f"Choose up to {_LARGEST} a side.")
+        pixels = opened.read_image(part, 0, 0, spec.nchannels, oiio.FLOAT)
+        if pixels is None:
+            raise _refused(f"{name} cannot be read: {error_of(opened)}.", "Write it again.")
+    finally:
+        opened.close()
+    pixels = np.asarray(pixels, np.float64).reshape(spec.height, spec.width, -1)
+    s, t = pixels[..., channels[0]], pixels[..., channels[1]]
+    bad = ~(np.isfinite(s) & np.isfinite(t))
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise _refused(
+            f"{name} holds {int(bad.sum())} pixels that are no numbers (NaN), the first at column {column}, row {row}.",
+            "Write it without holes: 0 in both channels says that there is nothing.",
+        )
+    known = (s != 0.0) | (t != 0.0)
+    if alpha is not None:
+        known &= pixels[..., alpha] > 0.0
+    if min(s.min(), t.min()) >= 0.0 and max(s.max(), t.max()) <= 1.0:  # cut off there
+        known &= (s > 0.0) & (s < 1.0) & (t > 0.0) & (t < 1.0)
+    rounding = {"half": 2.0**-11, "uint16": 2.0**-16}.get(kind, 2.0**-24)
+    at = spec.x - spec.full_x, spec.y - spec.full_y
+    return _Map(s, t, known, at, (spec.full_width, spec.full_height), rounding)
+
+
+def _channels(opened: oiio.ImageInput, layer: str, name: str) -> tuple[int, tuple[int, int], int | None]:
+    """Part, the two channels, and alpha if there is one. JobError lists the layers where it is not clear which."""
+    found: list[tuple[str, int, tuple[int, int], int | None]] = []
+    part = 0
+    while opened.seek_subimage(part, 0) and (part == 0 or opened.format_name() == "openexr"):
+        spec = opened.spec()
+        named = [one.lower() for one in channel_names(spec)]
+        several = spec.get_int_attribute("oiio:subimages") > 1
+        title = str(spec.getattribute("oiio:subimagename") or "") if several else ""
+        for prefix in dict.fromkeys(one.rpartition(".")[0] for one in named):
+            dot = prefix + "." if prefix else ""
+            pair = next((p for p in PAIRS if all(dot + one in named for one in p)), None)
+            if pair is not None:
+                alpha = named.index(dot + "a") if dot + "a" in named else None
+                places = named.index(dot + pair[0]), named.index(dot + pair[1])
+                found.append((prefix or title.lower(), part, places, alpha))
+        part += 1
+    names = ", ".join(one[0] or "red and green without a name" for one in found)
+    wanted = layer.lower()
+    matching = [x for x in found if not wanted or wanted in (x[0], x[0].rpartition(".")[2])]
+    if not found:
+        raise _refused(f"{name} has no red and green channel.", "Write s into red and t into green.")
+    if not matching:
+        raise _refused(f"{name} has no layer {layer!r} with two channels of coordinates.", f"It has: {names}.")
+    plain = [x for x in matching if not x[0]] if not wanted else [x for x in matching if x[0] == wanted]
+    if len(matching) > 1 and len(plain) != 1:
+        raise _refused(f"{name} has several layers that may be meant: {names}.", "Choose one: --st-map-layer.")
+    chosen = (plain or matching)[0]
+    return chosen[1], chosen[2], chosen[3]
+
+
+# ------------------------------------------------------------------------------------------------- the lens in it
+
+
+def _samples(read: _Map, way: str, name: str, report: Reporter) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places in the undistorted picture [N, 2] and in the original [N, 2] that a map says are one, y down, 0 to 1.
+
+    JobError as `read_lens`.
+    """
+    columns, rows = (_spread(length) for length in read.s.shape[::-1])
+    at = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    known = read.known[at[:, 1], at[:, 0]]
+    points = (at + 0.5 + read.at) / read.size
+    values = np.stack([read.s[at[:, 1], at[:, 0]], read.t[at[:, 1], at[:, 0]]], -1)
+    own = known & ((points > 0.0) & (points < 1.0)).all(1)
+    if own.sum() < _LEAST_SHARE * ((points > 0.0) & (points < 1.0)).all(1).sum() or own.sum() < 100:
+        raise _refused(
+            f"{name} has coordinates in {100 * float(own.mean()):.0f} % of its picture only.",
+            "Is it an ST map? Red should grow from left to right, green from the bottom to the top.",
+        )
+    slope = fitted(points[own], values[own], 1, (0.0, 0.0, 1.0, 1.0)).slopes(np.array([[0.5, 0.5]]))[0]
+    across, down = float(slope[0, 0]), float(slope[1, 1])
+    if max(abs(float(slope[0, 1])), abs(float(slope[1, 0]))) > min(abs(across), abs(down)):
+        raise _refused(f"{name} has s and t in each other's place, or is turned.", "Red is s, green is t.")
+    if abs(across) < 0.25 or abs(down) < 0.25:
+        raise _refused(
+            f"{name} holds no places: red grows by {across:.3f} from left to right, where about 1 is expected.",
+            "Displacements are no ST map: add each pixel's own place, (x + 0.5) / width and (y + 0.5) / height.",
+        )
+    if across < 0.0:
+        raise _refused(f"{name} is mirrored: its red falls from left to right.", "Flip it, and the footage alike.")
+    if across > 8.0 or abs(down) > 8.0:
+        raise _refused(
+            f"{name} holds pixels (up to {float(np.abs(values[own]).max()):.0f}), not shares of the picture.",
+            "Divide red by the width and green by the height of the picture that is looked into.",
+        )
+    if down > 0.0:
+        report.warning(f"{name} counts t from the top: it is taken so.")
+    else:
+        values[:, 1] = 1.0 - values[:, 1]
+    if way == REDISTORT:
+        return values[known], points[known]
+    own = known & ((values > -_CUT) & (values < 1.0 + _CUT)).all(1)  # where no picture is, a model may do anything
+    return points[own], values[own]
+
+
+def _spread(length: int) -> NDArray[np.int64]:
+    """Some indices of an axis, its ends among them."""
+    return np.unique(np.linspace(0, length - 1, min(length, round(_CHECKED**0.5))).round().astype(np.int64))
+
+
+@dataclass
+class _Fit:
+    """A polynomial in the place of a map."""
+
+    bend: Polynomial
+    forward: bool
+    """From the undistorted picture to the original, or back."""
+    points: NDArray[np.float64]
+    """[N, 2]: places from which it goes."""
+    off: NDArray[np.float64]
+    """[N]: how far it is from what the map says of them, pixels of the footage."""
+
+    @property
+    def error(self) -> float:
+        """Root of the mean square of `off`."""
+        return float(np.sqrt((self.off**2).mean()))
+
+
+def _fit(
+    undistorted: NDArray[np.float64], original: NDArray[np.float64], read: _Map, scale: NDArray[np.float64]
+) -> _Fit:
+    """The polynomial of the lowest degree that explains a map's pairs of places [N, 2], in the better direction."""
+    few = np.unique(np.linspace(0, len(original) - 1, _SAMPLES).astype(np.int64))
+    # The ends of what is known hold the curve.
+    few = np.union1d(few, np.flatnonzero((np.abs(undistorted - 0.5) >= np.abs(undistorted - 0.5).max(0)).any(1)))
+
+    def tried(degree: int, forward: bool) -> _Fit:
+        points, values = (undistorted, original) if forward else (original, undistorted)
+        half = 0.5 / np.array(read.size)
+        box = (*(points.min(0) - half), *(points.max(0) + half))
+        bend = fitted(points[few], values[few], degree, box)
+        return _Fit(bend, forward, points, np.hypot(*((bend(points) - values) * scale).T))
+
+    best: dict[bool, _Fit] = {}
+    for degree in DEGREES:
+        for forward in (True, False):
+            made, before = tried(degree, forward), best.get(forward)
+            if made.off.max() < CLOSE_PX:
+                return made
+            if before is None or made.error < NO_GAIN * before.error:
+                best[forward] = made
+        both = min(best.values(), key=lambda one: one.error)
+        if both.bend.degree < degree and both.error < read.rounding * scale.max():
+            break  # what is left is the file's rounding
+    return min(best.values(), key=lambda one: one.error)
+
+
+def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: float, report: Reporter) -> None:
+    """JobError for a map that folds over, or only shifts."""
+    grid = found.points[:: max(1, len(found.points) // 20_000)]
+    turned = np.linalg.det(found.bend.slopes(grid))
+    if not turned.min() > 0.0:
+        worst = 100.0 * grid[int(turned.argmin())]
+        raise _refused(
+            f"{name} folds over: at {worst[0]:.0f} % of the width and {worst[1]:.0f} % of the height two of its pixels "
+            "look at one place.",
+            "It is no map of a lens there: write it with less overscan, or with 0 in both channels there.",
+        )
+    at, seen = (grid - 0.5) * scale, (found.bend(grid) - 0.5) * scale
+    plain = np.concatenate([at, np.ones((len(at), 1))], 1)  # what only shifts and scales
+    straight = np.linalg.lstsq(plain, seen, rcond=None)[0]
+    if np.abs(plain @ straight - seen).max() > STRAIGHT_PX + rounding * scale.max():
+        return
+    shift = straight[2] if found.forward else -straight[2]
+    if np.abs(shift).max() > 2.0 * STRAIGHT_PX + 0.5 * rounding * scale.max():
+        raise _refused(
+            f"{name} bends nothing, but moves the whole picture by {shift[0]:.2f} and {shift[1]:.2f} pixels.",
+            "A pixel's centre is at (i + 0.5) / size; from i / size everything lies half a pixel off.",
+        )
+    report.warning(f"{name} bends nothing: the footage is taken to be without a lens.")
+
+
+def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect: float, name: str) -> float:
+    """Width over height of the undistorted picture in square pixels. JobError if the map is of another picture.
+
+    In the middle a lens is as high as wide: that tells the shape of the picture that the map looks into, however much
+    overscan it has.
+    """
+    # Of a window that is the whole of the map's picture, in shares of both.
+    slope = lens.slopes_in_the_middle
+    width, height = read.size
+    ours = source[0] / source[1]
+    fits: dict[float, float] = {}
+    for stretch in {1.0, aspect}:  # of anamorphic footage a map may have the footage's own pixels, or square ones
+        own = stretch * width / height
+        if way == UNDISTORT:
+            fits[own] = slope[0] / slope[1] * ours / own
+        elif abs(own / ours - 1.0) < 0.01:
+            fits[ours] = slope[0] / slope[1]
+    best = min(fits, key=lambda own: abs(math.log(fits[own])), default=None)
+    if best is None or abs(math.log(fits[best])) > SHAPE:
+        raise _refused(
+            f"{name} is {width} x {height}, the footage {source[0]} x {source[1]}: it is of a picture of another "
+            "shape.",
+            "Ask for the map at the footage's size; overscan may come on top of that.",
+        )
+    return best
+
+
+def _say_what_is_open(lens: MapLens, known: tuple[Any, ...], name: str, report: Reporter) -> None:
+    """A warning where the way back goes beyond what the map shows."""
+    x, y = np.linspace(0.5, lens.width - 0.5, 41), np.linspace(0.5, lens.height - 0.5, 41)
+    at = lens.map_of_plate(lens.to_plate(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)))
+    pixel = 1.0 / np.array([lens.width, lens.height])
+    lost = ((at < np.array(known[:2]) - pixel) | (at > np.array(known[2:]) + pixel)).any(1)
+    if lost.any():
+        report.warning(
+            f"{name} ends before the original picture does ({100 * float(lost.mean()):.0f} % of it is not in the map): "
+            "there the way back is continued from what is.",
+            "A map with overscan, or the one of the other way round (--st-map-way redistort), tells it.",
+        )
+
+
+def _refused(message: str, hint: str) -> JobError:
+    return JobError(message, hint, ExitCode.USAGE)

@@ -1,0 +1,62 @@
+"""A clip whose lens is known before the solve: its frames without the lens, for the mapper to see."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..contract import Reporter
+from ..footage.display import display_of
+from ..footage.images import read_frame, write_png
+from ..shot import Shot, make_folder
+from .map_lens import ST_MAP, MapLens
+from .undistort import Undistorter, of_frames
+
+_WRITERS = 2
+
+
+class Straight:
+    """Working frames that went through a lens's map, in a folder of their own."""
+
+    folder: Path
+    """Holds a picture of each frame's name."""
+    undistort: Undistorter
+    """What took the lens out."""
+    focal_scale: float
+    """Focal length of the straight frames over that of the original ones, both in pixels."""
+
+    def __init__(self, shot: Shot, frames: dict[str, Any], lens: MapLens, folder: Path, report: Reporter) -> None:
+        """Writes those of `frames` (frames.json) into `folder`. JobError where the lens has no way, Cancelled."""
+        self.folder, self._lens = folder, lens
+        across, down = lens.slopes_in_the_middle
+        self.focal_scale = 2.0 / (across + down)
+        self._where = lens.where(lens.width, lens.height)
+        self.undistort = Undistorter(self._where)
+        of_frame = of_frames(self.undistort, self._where, display_of(frames))
+        make_folder(folder)
+
+        def one(frame: dict[str, Any]) -> int:
+            write_png(folder / Path(frame["file"]).name, of_frame(read_frame(shot.frames / frame["file"])))
+            return frame["frame"]
+
+        rows = frames["frames"]
+        with ThreadPoolExecutor(_WRITERS) as pool:
+            waiting = [pool.submit(one, frame) for frame in rows]
+            try:
+                for done, future in enumerate(waiting, start=1):
+                    report.check_cancelled()
+                    report.progress("solve: lens", done, len(rows), f"frame {future.result()}")
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+
+    def told(self, scratch: Path) -> dict[str, Any]:
+        """What of the worker's answer is another, as its pictures were straight; and so is its map in `scratch`."""
+        file = scratch / "undistort_0.npz"
+        with np.load(file, allow_pickle=False) as data:
+            pinhole = data["pinhole"]
+        np.savez(file, pinhole=pinhole, where=self._where, model=ST_MAP, params=np.array(self._lens.params))
+        return {"camera_model": ST_MAP, "distortion": []}
