@@ -6,6 +6,7 @@
     python3 splannequin.py doctor                   what this machine can do
     python3 splannequin.py test                     all tests
     python3 splannequin.py bench --quick            the method against ground truth, with a report
+    python3 splannequin.py farm export SHOT ...     a job for a render farm (docs/farm.md)
     python3 splannequin.py setup                    make the environments and stop
 
 The backend lives in `.venv`; Blender as a Python module lives in `.venv-bpy-X.Y` (their numpy versions exclude each

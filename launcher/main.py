@@ -15,6 +15,7 @@ from pathlib import Path
 from torch_backend.contract import INPUT, ExitCode
 from torch_backend.shot import is_disk_full, write_json
 
+from . import farm
 from .blender import BPY_WHEELS
 from .children import run_child
 from .commands import bench, freeze, setup
@@ -66,6 +67,10 @@ def _interrupt(number: int, frame: object) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["farm-host"]:
+        return farm.host(words[1:])
+    if words and words[0] in ("farm", "farm-task"):
+        return farm.task(words[0], words[1:])
     module = {"freeze": ["torch_backend", "freeze"], "bench": ["benchmarks.bench"]}.get(words[0] if words else "")
     if module and {"-h", "--help"} & set(words) and backend_environment().ready():
         return run_child([backend_environment().python, "-P", "-m", *module, "--help"], cwd=HERE)

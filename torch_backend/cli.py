@@ -310,6 +310,39 @@ def stmaps(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
+def farm(args: argparse.Namespace, console: Console) -> int:
+    """`farm export SHOT... --output DIR`: a job for a render farm; `farm measure`: what tasks took, as rates."""
+    from .farm import cost, export, rates, records
+
+    output = Path(args.output).absolute()
+    if args.action == "measure":
+        found = rates.measure(record for shot in args.shots for record in records.read(Path(shot)))
+        if not found:
+            raise contract.JobError("No task of a farm left figures in these shots.", "", ExitCode.USAGE)
+        write_json(output / export.RATES_FILE, rates.to_json(found))
+        print(output / export.RATES_FILE, file=console.stream)
+        return ExitCode.OK
+    asked = export.Asked(
+        args.shots, output, args.t_star or "", args.t_star_list, args.frames, args.bake, args.shots_folder,
+        args.shots_per_job, args.request, args.rates, contract.trains_anew(args),
+    )  # fmt: skip
+    args.t_star = None  # instants are takes of their own; see `FarmWords`
+    told, files = export.export(asked, contract.requested_params(args))
+    if console.as_json:
+        print(json.dumps({"written": [str(p) for p in files], **dataclasses.asdict(told)}), file=console.stream)
+        return ExitCode.OK
+    for line in [*cost.sentences(told, args.rates or "of docs/farm.md"), *map(str, files)]:
+        print(line, file=console.stream)
+    return ExitCode.OK
+
+
+def farm_task(args: argparse.Namespace, console: Console) -> int:
+    """`farm-task STEP --shot SHOT --request FILE ...`: one task of a farm's job; words of its own go to the engine."""
+    from .farm_task import run_task
+
+    return run_task(args)
+
+
 def _give_up(error: OSError, where: Path, hint: str = "Choose another --output folder.") -> NoReturn:
     """Ends the command on a folder that cannot be written, in one sentence."""
     refusal = path_error(error) or contract.JobError(
@@ -355,7 +388,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(args: argparse.Namespace, console: Console) -> int:
-    if args.command in contract.COMMANDS:
+    if args.command in contract.COMMANDS and args.command not in _OTHERS:
         return freeze_clip(args, console) if _is_whole(args) else one_step(args, console)
     return _OTHERS[args.command](args, console)
 
@@ -365,5 +398,8 @@ def _is_whole(args: argparse.Namespace) -> bool:
     return args.command == "freeze" and not contract.freezes_a_shot(args)
 
 
-_OTHERS = {"status": status, "doctor": doctor, "export": export, "stmaps": stmaps, "run-job": run_job, "live": live}
+_OTHERS = {
+    "status": status, "doctor": doctor, "export": export, "stmaps": stmaps, "run-job": run_job, "live": live,
+    "farm": farm, "farm-task": farm_task,
+}  # fmt: skip
 """Verb -> what it does, of those that start no job of a shot."""

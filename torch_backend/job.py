@@ -24,7 +24,7 @@ from . import contract
 from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status
 from .contract import new_job as new_job
 from .shot import Shot, disk_error, is_disk_full, path_error, working_on, write_json
-from .writer import only_writer
+from .writer import only_writer, patient_writer
 
 _CANCEL_POLL_SECONDS = 0.2
 _PROGRESS_SECONDS = 0.1
@@ -96,6 +96,11 @@ class JobReporter:
         if self._cancelled:
             raise Cancelled
 
+    def waiting(self, why: str) -> None:
+        """The job has not begun, and waits for its turn. Raises `Cancelled` as `check_cancelled`."""
+        self.progress("waiting", 0, 1, why)
+        self.check_cancelled()
+
     @property
     def heard(self) -> bool:
         """True if somebody listens to the events as they come."""
@@ -166,7 +171,9 @@ class JobReporter:
                 pass
 
 
-def run_job(folder: str | Path, listener: Listener | None = None, alone: bool = True) -> tuple[int, Any]:
+def run_job(
+    folder: str | Path, listener: Listener | None = None, alone: bool = True, patient: bool = False
+) -> tuple[int, Any]:
     """Runs the request in `folder` to its end. Returns (exit code, result or None); never raises for a failed job.
 
     Args:
@@ -174,6 +181,7 @@ def run_job(folder: str | Path, listener: Listener | None = None, alone: bool = 
         listener: hears every event.
         alone: be the shot's only writer, and fail in words if there is one. Without, several may train runs of
             different names at once: the caller sees to it that nothing else is written.
+        patient: wait for another writer instead, and take the shot from one that died on another computer.
     """
     folder = Path(folder).absolute()
     try:
@@ -186,17 +194,20 @@ def run_job(folder: str | Path, listener: Listener | None = None, alone: bool = 
     with working_on(Path(request.shot).absolute(), folder.parent.parent):
         reporter = JobReporter(folder, request.kind, listener)
         with contextlib.ExitStack() as held, _signals_cancel(reporter):  # held until the last status is written
-            return _run(request, reporter, held if alone else None)
+            return _run(request, reporter, held if alone else None, patient)
 
 
-def _run(request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack | None) -> tuple[int, Any]:
+def _run(
+    request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack | None, patient: bool
+) -> tuple[int, Any]:
     result: Any = None
     state, code, message, hint = "done", int(ExitCode.OK), "", ""
     try:
         params = request.typed_params()
         shot = Shot.open(request.shot)
+        words = shot.root, request.kind, reporter.folder.name
         if held is not None:
-            held.enter_context(only_writer(shot.root, request.kind, reporter.folder.name))
+            held.enter_context(patient_writer(*words, reporter.waiting) if patient else only_writer(*words))
         reporter.check_cancelled()
         with _kept_in_place(shot, request.kind):
             result = RUNNERS[request.kind](shot, params, reporter)

@@ -13,7 +13,7 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 from . import contract
@@ -24,6 +24,9 @@ _SECONDS = 5.0
 """How long the lock is tried for while others come and go."""
 _LENGTH = 1024
 """Bytes of every lock: it is taken over in its place, by one write of as many."""
+SILENCE_SECONDS = 180.0
+"""A writer on another computer that has told nothing for so long is dead: three times as long as network disks keep
+what they were told."""
 _BARE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -46,6 +49,75 @@ def only_writer(root: Path, kind: str, job: str) -> Generator[Writer]:
         _release(root, mine, folder)
         if folder is not None:
             os.close(folder)
+
+
+@contextlib.contextmanager
+def patient_writer(
+    root: Path, kind: str, job: str, waiting: Callable[[str], None], silence: float = SILENCE_SECONDS
+) -> Generator[Writer]:
+    """`only_writer` that waits for whoever holds the shot, and takes it from one that died on another computer.
+
+    For render farms, which start what was killed again elsewhere: nobody is there to delete the lock.
+
+    Args:
+        waiting: called every now and then with a sentence that says for whom; what it raises ends the waiting.
+        silence: seconds, by this computer's clock alone, without a sign of life after which a writer counts as dead.
+
+    Raises:
+        JobError: the shot cannot be written.
+    """
+    heard, since = None, time.monotonic()
+    with contextlib.ExitStack() as held:
+        while True:
+            try:
+                mine = held.enter_context(only_writer(root, kind, job))
+                break
+            except JobError as error:
+                holder = _read_writer(root)
+                if holder is None or not holder.works():
+                    if error.exit_code != ExitCode.USAGE:
+                        raise
+                    holder = None
+                waiting(error.message)
+            sign = None if holder is None else (holder, _heartbeat(root, holder))
+            if sign != heard:
+                heard, since = sign, time.monotonic()
+            elif holder is not None and holder.host != contract.computer_name() and time.monotonic() - since > silence:
+                _bury(root, holder)
+            time.sleep(min(1.0, silence / 4))
+        yield mine
+
+
+def _read_writer(root: Path) -> Writer | None:
+    try:
+        return contract.read_writer(root)
+    except (OSError, ValueError):
+        return None
+
+
+def _heartbeat(root: Path, holder: Writer) -> object:
+    """What a writer's job told last; None if that cannot be read. It is compared with itself, not with a clock."""
+    try:
+        job = contract.ShotFolder(root).jobs / contract.checked_name(holder.job, "job")
+        return contract.read_json(job / contract.STATUS_FILE, contract.SHORT_JSON).get("heartbeat")
+    except (OSError, ValueError):
+        return None
+
+
+def _bury(root: Path, dead: Writer) -> None:
+    """Takes away the lock of a writer that gave no sign of life. One that was made meanwhile is put back."""
+    path = contract.ShotFolder(root).lock
+    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
+    try:
+        os.rename(path, beside)
+    except OSError:
+        return  # another one was faster
+    try:
+        with contextlib.suppress(OSError, ValueError):
+            if contract.from_dict(Writer, json.loads(beside.read_bytes())) != dead:
+                os.link(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
 
 
 def _take(root: Path, mine: Writer) -> None:

@@ -31,7 +31,10 @@ class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
         layout.prop(settings_of(scene_in(context)), "insert_at")
         name = "splannequin.insert_freeze"
         layout.operator(name, text="Insert in Compositor Only", icon=icons.of(name))
-        for name in ("splannequin.freeze_as_warp", "splannequin.combine_cg", "splannequin.remove_shot"):
+        for name in (
+            "splannequin.freeze_as_warp", "splannequin.combine_cg", "splannequin.export_for_farm",
+            "splannequin.remove_shot",
+        ):  # fmt: skip
             layout.operator(name, icon=icons.of(name))
 
 

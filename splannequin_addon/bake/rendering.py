@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +15,10 @@ from .. import compat
 from ..scene import paths
 
 DIGITS = "######"
+COMPOSITED = "composited"
+"""Folder of the pictures, in the output folder of a bake."""
+_BESIDE = ".part-"
+"""Begins the name of a folder in which a part of a bake is made."""
 _DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (what Blender gives a new file)
 
 
@@ -32,6 +39,63 @@ def choose_output(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
     folder = default_output(shot, take)
     scene.render.filepath = paths.blend_path(folder / DIGITS)
     return [f"Output path set to {folder}."]
+
+
+def render_beside(
+    scene: bpy.types.Scene,
+    folder: Path,
+    png: bool,
+    on_frame: Callable[[int, int], None] | None = None,
+    check_cancelled: Callable[[], None] | None = None,
+) -> list[int]:
+    """`render`, but a picture comes to its place whole: the same frames may be rendered twice at once, or killed.
+
+    JobError also if the scene writes a movie, of which there are no parts.
+    """
+    if not png and scene.render.is_movie_format:
+        raise contract.JobError(
+            "The .blend writes a movie, which cannot be made in parts.",
+            "Choose pictures as its output format.",
+            contract.ExitCode.BAKE,
+        )
+    beside = folder / f"{_BESIDE}{uuid.uuid4().hex}"
+    _without_stamps(scene)
+    try:
+        numbers = render(scene, beside, png, on_frame, check_cancelled)
+        for made in sorted(beside.iterdir()):
+            os.replace(made, folder / made.name)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return numbers
+
+
+def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
+    """The scene's range, if all of its pictures are in `folder`; what killed parts left there is removed.
+
+    JobError names the first that lacks.
+    """
+    scene.render.filepath = str(folder / DIGITS)
+    scene.render.use_file_extension = True
+    if png:
+        compat.set_png(scene.render.image_settings)
+    wanted = list(frames_of(scene))
+    lost = [n for n in wanted if not Path(scene.render.frame_path(frame=n)).is_file()]
+    if lost:
+        raise contract.JobError(
+            f"{folder} lacks {len(lost)} of {len(wanted)} frames, the first is {lost[0]}.",
+            "Bake the part that it belongs to again.",
+            contract.ExitCode.BAKE,
+        )
+    for left in folder.glob(f"{_BESIDE}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    return wanted
+
+
+def _without_stamps(scene: bpy.types.Scene) -> None:
+    """What Blender writes into a picture's metadata of when and where it was made: the same frame is the same bytes."""
+    render = scene.render
+    render.use_stamp_date = render.use_stamp_time = render.use_stamp_render_time = False
+    render.use_stamp_memory = render.use_stamp_hostname = render.use_stamp_filename = False
 
 
 def render(

@@ -17,7 +17,7 @@ from ..process.steps import Step, View
 from ..scene import scene_setup
 from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
-from . import freeze_group, insertion, operators, panel, progress, shown_take
+from . import farm, freeze_group, insertion, operators, panel, progress, shown_take
 
 
 class Bake(Step):
@@ -29,7 +29,7 @@ class Bake(Step):
     button = "Bake and Render"
     again = "Bake Again"
     needs = "Freeze first."
-    classes = (*operators.CLASSES, *panel.CLASSES)
+    classes = (*operators.CLASSES, *farm.CLASSES, *panel.CLASSES)
     parts = (progress,)
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:

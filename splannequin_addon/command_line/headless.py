@@ -25,7 +25,7 @@ import bpy
 from ...torch_backend import contract
 from ...torch_backend.contract import ExitCode
 from ..access import scene_in, settings_of
-from ..bake import insertion, rendering
+from ..bake import farm_job, insertion, rendering
 from ..freeze import takes
 from ..process import backend, begin, jobs, steps
 from ..scene import paths, scene_setup, sequences
@@ -141,6 +141,28 @@ def export(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
+def export_for_farm(args: argparse.Namespace, console: Console) -> int:
+    """`farm export SHOT... --output DIR`: a job for a render farm; `farm measure`: rates of what its tasks took."""
+    output = _output(args)
+    shots = [shot if "://" in shot else str(Path(shot).absolute()) for shot in args.shots]
+    files = [str(Path(file).absolute()) if file else "" for file in (args.t_star_list, args.shots_folder, args.rates)]
+    words = farm_job.Words(
+        args.action, args.t_star or "", files[0], args.frames, args.bake, files[1], args.shots_per_job, files[2]
+    )
+    args.t_star = None  # instants are takes of their own
+    requests: dict[str, Any] = {kind: dataclasses.asdict(params) for kind, params in asked(args).items()}
+    if not contract.trains_anew(args):
+        del requests["train"]
+    if args.request:
+        for kind, values in contract.read_json(args.request).items():
+            requests[kind] = {**requests.get(kind, {}), **values}
+    question = farm_job.begin(shots, output, words, requests)
+    question.wait()
+    for line in farm_job.written(question):
+        print(line, flush=True)
+    return ExitCode.OK
+
+
 def train(args: argparse.Namespace, console: Console) -> int:
     """`train SHOT`."""
     return _one_step(args, console, "train", args.shot)
@@ -201,6 +223,8 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
             ExitCode.USAGE,
         )
     span = range(first, last + 1, args.step if args.step > 0 else scene.frame_step)
+    if args.part != "all":
+        return _bake_a_part(args, scene, fresh, shot, output, span, console)
     stale = backend.available() and takes.may_be_stale(shot, args.take)
     if stale or not takes.complete(shot, args.take, span):
         params = takes.take_params(shot, args.take) or contract.FreezeParams(take=args.take, only_missing=True)
@@ -215,6 +239,39 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
     jobs.write_json(path, {**summary, **baked})
     console.say(f"Composited frames: {baked['composited_dir']}")
+    return ExitCode.OK
+
+
+def _bake_a_part(
+    args: argparse.Namespace,
+    scene: bpy.types.Scene,
+    fresh: bool,
+    shot: Path,
+    output: Path,
+    span: range,
+    console: Console,
+) -> int:
+    """`bake --part frames` and `--part file`: a bake that several computers make together, of a take that is there."""
+    if not takes.complete(shot, args.take, span):
+        raise contract.JobError(
+            f"Take {args.take} of {shot.name} lacks frames from {span.start} to {span.stop - 1}.",
+            "Freeze it first: a part of a bake freezes none.",
+            ExitCode.BAKE,
+        )
+    if cameras.find(scene, shot, "CAMERA") is None and contract.ShotFolder(shot).cameras.is_file():
+        arrival.load_camera(scene, shot)
+    _set_up(scene, fresh, shot, args.take, console, span, args.as_warp or None)
+    folder = output / rendering.COMPOSITED
+    if args.part == "frames":
+        rendering.render_beside(
+            scene, folder, fresh, lambda done, total: console.progress("baking", done, total), _stop_if_interrupted
+        )
+        return ExitCode.OK
+    numbers = rendering.gathered(scene, folder, fresh)
+    _save(scene, output / "shot.blend", folder)
+    summary = {"version": 1, "shot": str(shot), "take": args.take, **_told(output, numbers)}
+    jobs.write_json(output / contract.SUMMARY_FILE, summary)
+    console.say(f"Composited frames: {folder}")
     return ExitCode.OK
 
 
@@ -301,22 +358,33 @@ def _bake(
     warp: bool | None = None,
 ) -> dict[str, Any]:
     """Compositor, render of `span` (None: the scene's range), shot.blend; returns what the summary tells of it."""
+    _set_up(scene, fresh, shot, take, console, span, warp)
+    folder = output / rendering.COMPOSITED
+    numbers = rendering.render(
+        scene, folder, fresh, lambda done, total: console.progress("baking", done, total), _stop_if_interrupted
+    )
+    _save(scene, output / "shot.blend", folder)
+    return _told(output, numbers)
+
+
+def _set_up(
+    scene: bpy.types.Scene, fresh: bool, shot: Path, take: str, console: Console, span: range | None, warp: bool | None
+) -> None:
+    """A take in the compositor of a scene, whose range is `span` then (None: as it is)."""
     changes = insertion.fit_take(scene, shot, take, fresh) if fresh or scene_setup.fitted(scene) else []
     if span is not None:
         scene.frame_start, scene.frame_end, scene.frame_step = span.start, span.stop - 1, span.step
     changes += insertion.insert_freeze(scene, shot, take, warp)
     for change in changes:
         console.say(f"  {change}")
-    folder = output / "composited"
-    blend = output / "shot.blend"
-    numbers = rendering.render(
-        scene, folder, fresh, lambda done, total: console.progress("baking", done, total), _stop_if_interrupted
-    )
-    _save(scene, blend, folder)
+
+
+def _told(output: Path, numbers: list[int]) -> dict[str, Any]:
+    """What a summary tells of a bake."""
     return {
-        "composited_dir": str(folder),
+        "composited_dir": str(output / rendering.COMPOSITED),
         "composited_frames": len(numbers),
-        "blend": str(blend),
+        "blend": str(output / "shot.blend"),
         "blender_version": bpy.app.version_string,
     }
 
@@ -377,6 +445,7 @@ _DOES = {
     "bake": bake_take,
     "stmaps": write_stmaps,
     "export": export,
+    "farm": export_for_farm,
     "status": status,
     "doctor": doctor,
 }

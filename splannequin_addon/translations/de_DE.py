@@ -776,6 +776,19 @@ BACKEND: dict[str, str] = {
     "Choose a frame of the shot.": "Ein Bild des Shots wählen.",
     "No space left in {}: {}.": "Kein Platz mehr in {}: {}.",
     "Free some space or choose another output folder, then start again: finished work is kept.": "Platz schaffen oder einen anderen Ausgabeordner wählen, dann neu starten: Fertiges bleibt.",
+    "Import a clip first": "Zuerst einen Clip importieren",
+    "The .blend writes a movie, which cannot be made in parts.": "Die .blend-Datei schreibt einen Film, der nicht in Teilen entstehen kann.",
+    "Choose pictures as its output format.": "Als Ausgabeformat Bilder wählen.",
+    "{} lacks {} of {} frames, the first is {}.": "{} fehlen {} von {} Bildern, das erste ist {}.",
+    "Bake the part that it belongs to again.": "Den Teil, zu dem es gehört, neu backen.",
+    "Export for Farm": "Für Renderfarm exportieren",
+    "Write this shot as a job for a render farm, as Open Job Description: what it lacks, the take in parts, and what that will cost": "Diese Einstellung als Auftrag für eine Renderfarm schreiben, als Open Job Description: was ihr fehlt, den Take in Teilen, und was das kosten wird",
+    "Folder to write the job into": "Ordner, in den der Auftrag geschrieben wird",
+    "Instants": "Augenblicke",
+    "Frames at which time stands still, with commas, a take for each; empty: t*": "Bilder, bei denen die Zeit stillsteht, mit Kommas, je ein Take; leer: t*",
+    "Frames per Task": "Bilder je Aufgabe",
+    "Frames of the take that one task freezes": "Bilder des Takes, die eine Aufgabe einfriert",
+    "Render the take through Blender's compositor on the farm, too": "Den Take auf der Farm auch durch Blenders Compositor rendern",
 }
 """The commonest of what the backend says; the rest of its sentences stay English."""
 

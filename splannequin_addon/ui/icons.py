@@ -15,6 +15,7 @@ OF: dict[str, Icon] = {
     "splannequin.clear_motion": "TRASH",
     "splannequin.combine_cg": "MESH_CUBE",
     "splannequin.export_cameras": "EXPORT",
+    "splannequin.export_for_farm": "NETWORK_DRIVE",
     "splannequin.freeze": "FREEZE",
     "splannequin.import_clip": "IMPORT",
     "splannequin.freeze_as_warp": "MOD_WARP",

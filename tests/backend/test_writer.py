@@ -16,7 +16,7 @@ import pytest
 from torch_backend import contract, job
 from torch_backend.contract import ExitCode, JobError, Writer
 from torch_backend.shot import Shot, atomic_path, make_folder, working_on, write_json
-from torch_backend.writer import only_writer
+from torch_backend.writer import _bury, only_writer, patient_writer
 
 CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
 ELSEWHERE = "elsewhere (0a1b2c3d)"
@@ -174,7 +174,7 @@ CROWD = """
 import dataclasses, json, os, random, sys, time
 from pathlib import Path
 from torch_backend import contract
-from torch_backend.writer import only_writer
+from torch_backend.writer import _bury, only_writer, patient_writer
 
 root, dead, mark, seed = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), int(sys.argv[4])
 random.seed(seed)
@@ -260,3 +260,67 @@ def test_folders_of_a_shot_that_is_worked_on_are_made_only_inside_it(tmp_path):
         make_folder(tmp_path / "elsewhere" / "deep")
     make_folder(tmp_path / "b" / "runs")
     assert (root / "runs" / "main").is_dir() and (tmp_path / "b" / "runs").is_dir()
+
+
+def foreign_job(shot) -> tuple[Writer, Path]:
+    """A lock of another computer, and its job's folder."""
+    folder = job.new_job(shot, "train", contract.TrainParams())
+    put_lock(shot, Writer(ELSEWHERE, 77, 1.0, "train", folder.name, time.time()))
+    return contract.read_writer(shot.root), folder
+
+
+def beat(folder: Path, at: float) -> None:
+    status = contract.Status("train", "running", 77, 1.0, 1.0, at, host=ELSEWHERE)
+    write_json(folder / contract.STATUS_FILE, dataclasses.asdict(status))
+
+
+def test_a_patient_writer_takes_the_shot_from_one_that_fell_silent_elsewhere_and_from_no_other(shot):
+    """By this computer's clock alone: the other's may be an hour off."""
+    _, folder = foreign_job(shot)
+    told: list[str] = []
+
+    def waiting(why: str) -> None:
+        told.append(why)
+        if len(told) < 8:  # it lives: beats are of no clock of ours
+            beat(folder, 1e6 + len(told))
+
+    with patient_writer(shot.root, "freeze", "mine", waiting, silence=0.4) as mine:
+        assert len(told) >= 8 and "The training of a.splannequin has been running on elsewhere" in told[0]
+        assert contract.read_writer(shot.root) == mine
+    assert not lock_of(shot).exists() and not list(shot.root.glob(".lock*"))
+
+
+def test_a_patient_writer_waits_for_one_of_its_own_computer_however_silent(shot):
+    pid = os.getpid()
+    put_lock(shot, Writer(contract.computer_name(), pid, contract.process_start(pid), "train", "silent", time.time()))
+    asked: list[str] = []
+
+    def waiting(why: str) -> None:
+        asked.append(why)
+        if len(asked) == 6:
+            lock_of(shot).unlink()
+
+    with patient_writer(shot.root, "train", "mine", waiting, silence=0.05) as mine:
+        assert len(asked) >= 6 and mine.job == "mine"
+
+
+def test_a_lock_that_changed_hands_is_not_taken_for_the_dead_ones(shot):
+    dead, _ = foreign_job(shot)
+    put_lock(shot, dataclasses.replace(dead, job="another"))
+    _bury(shot.root, dead)
+    assert contract.read_writer(shot.root).job == "another"
+    assert [p.name for p in shot.root.glob(".lock*")] == []
+
+
+def test_a_patient_job_says_for_whom_it_waits_and_can_be_cancelled(shot):
+    _, before = foreign_job(shot)
+    folder = job.new_job(shot, "solve", contract.SolveParams())
+    heard: list[contract.Event] = []
+
+    def listen(event: contract.Event) -> None:
+        heard.append(event)
+        beat(before, time.time())
+        (folder / contract.CANCEL_FILE).touch()
+
+    assert job.run_job(folder, listen, patient=True) == (ExitCode.CANCELLED, None)
+    assert heard[0].data["stage"] == "waiting" and "has been running on elsewhere" in heard[0].data["message"]

@@ -6,6 +6,7 @@
     jobs            a job's folder: request, status, events
     processes       children, and which process lives
     lock            one writer per shot
+    path_rules      where files of another computer lie on this one
     shot_folder     where everything of a shot lies
     unborn          what a failed import leaves behind
     files, typed    reading what may come from anywhere, and plain JSON into dataclasses
@@ -46,6 +47,7 @@ from .command_line import (
     notes,
     options_for,
     requested_params,
+    trains_anew,
 )
 from .errors import (
     Cancelled,
@@ -146,6 +148,10 @@ from .options import (
     SolveParams,
     TrainParams,
     check_params,
+)
+from .path_rules import (
+    RULES_VARIABLE,
+    mapped,
 )
 from .processes import (
     GRACE_SECONDS,
@@ -310,6 +316,7 @@ __all__ = [
     "QUERIES",
     "RAW_FOLDER",
     "REQUEST_FILE",
+    "RULES_VARIABLE",
     "RUNS_FOLDER",
     "SHORT_JSON",
     "SHOT_SUFFIX",
@@ -392,6 +399,7 @@ __all__ = [
     "limits_of",
     "locked",
     "make_folder",
+    "mapped",
     "measured",
     "need_disk",
     "new_job",
@@ -422,6 +430,7 @@ __all__ = [
     "runs_job",
     "runs_still",
     "summarise",
+    "trains_anew",
     "try_lock",
     "verdict_lines",
     "verdict_of",

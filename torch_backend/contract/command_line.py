@@ -10,7 +10,7 @@ from typing import Any
 
 from .errors import ExitCode, JobError
 from .option_table import Option, default_of, options_of
-from .options import FreezeParams
+from .options import FreezeParams, TrainParams
 from .shot_folder import INFO_FILE, SHOT_SUFFIX
 from .verbs import VERBS, Verb
 
@@ -85,6 +85,8 @@ def _add_options(parser: argparse.ArgumentParser, name: str, verb: Verb, side: s
             words.update(metavar=spec.metavar, choices=spec.choices or None)
             if one.name in verb.shown:
                 words["metavar"], words["help"] = verb.shown[one.name]
+            if spec.many:
+                words["nargs"] = "+"
             if spec.flag.startswith("--"):
                 own = unset.get(one.name)
                 words["required"] = spec.required
@@ -147,6 +149,12 @@ def _refuse_what_a_clip_wants(args: argparse.Namespace) -> None:
             "Leave it out: the verb of its own step has it.",
             ExitCode.USAGE,
         )
+
+
+def trains_anew(args: argparse.Namespace) -> bool:
+    """True if an option was said that only a training heeds: a finished run is not what is wanted."""
+    dests = {spec.dest for _, spec in options_for(args.command, TrainParams)} - {"run", "device"}
+    return bool(dests & set(getattr(args, "said", {})))
 
 
 def notes(args: argparse.Namespace) -> list[str]:

@@ -46,6 +46,8 @@ class Option:
     """Text to value, ValueError on what cannot be; None: as the field's type."""
     switch: bool = False
     """The flag takes no value, and turns the field over: what is True without it is False with it."""
+    many: bool = False
+    """It takes one value or several, and is a list; what stands without a flag may be repeated."""
     is_path: bool = False
     """The value is a path, handed on as an absolute one; an address (with ://) as it is."""
     commands: tuple[str, ...] = ()

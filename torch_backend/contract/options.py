@@ -55,6 +55,7 @@ class ImportParams:
         "",
         flag="clip",
         is_path=True,
+        commands=("import", "freeze"),
         help="video file, image sequence or pattern (shot.####.exr)",
         label="Clip",
         tip="Video file, or one image of a numbered sequence, of people holding still",

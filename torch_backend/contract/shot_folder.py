@@ -11,6 +11,7 @@ runs/NAME/                       a run: `RunFolder`
 takes/NAME/                      frozen frames: `TakeFolder`
 jobs/ID/                         requests and what became of them: `jobs`
 paths/, tracking/                cameras that Blender sent
+farm/                            what tasks of a render farm took
 trash/                           what was removed and is being deleted
 """
 
@@ -157,6 +158,11 @@ class ShotFolder:
     @property
     def lock(self) -> Path:
         return self.root / WRITER_FILE
+
+    @property
+    def farm(self) -> Path:
+        """What tasks of a render farm took."""
+        return self.root / "farm"
 
     @property
     def trash(self) -> Path:

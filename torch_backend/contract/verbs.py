@@ -84,6 +84,14 @@ class BakeWords:
     """Where frames of the take that are missing are frozen."""
     blend: str = option("", flag="--blend", help=".blend to insert the freeze into", words="a new scene")
     """.blend to insert the freeze into; empty: a new scene."""
+    part: str = option(
+        "all",
+        flag="--part",
+        choices=("all", "frames", "file"),
+        help="`all`; for several computers at once: `frames` (the pictures alone, each renamed into its place whole), "
+        "then once `file` (shot.blend and summary.json alone)",
+    )
+    """all; frames: the pictures alone; file: shot.blend and summary.json alone."""
     as_warp: bool = option(
         False,
         flag="--as-warp",
@@ -150,6 +158,89 @@ class LiveWords:
     """Where to draw."""
 
 
+@dataclass
+class FarmWords:
+    """Shots for a render farm."""
+
+    action: str = option("export", flag="action", choices=("export", "measure"), help="`export` or `measure`")
+    """export: a job for a farm. measure: what the tasks of shots that a farm worked on took, as rates."""
+    shots: tuple[str, ...] = option(
+        "", flag="shots", many=True, metavar="SHOT", help="shot folders; or clips, of which shots are made on the farm"
+    )
+    """Shot folders, or clips."""
+    output: str = option("", flag="--output", metavar="DIR", required=True, help="folder for the job's files")
+    """Folder for template.json and parameters.json; of `measure` for rates.json."""
+    t_star: str | None = option(
+        None,
+        flag="--t-star",
+        metavar="N,N",
+        help="frames at which time stands still, each a take of its own",
+        words="one, suggested from support and sharpness",
+    )
+    """Instants of every shot, with commas; None: one, suggested."""
+    t_star_list: str = option(
+        "",
+        flag="--t-star-list",
+        metavar="FILE",
+        help="text with a line for each shot: its name, and its instants",
+        words="the same for all",
+    )
+    """File with a line per shot: NAME N N N."""
+    frames: int = option(10, flag="--frames", metavar="N", help="frames of a task of freeze and bake")
+    """Frames of one task."""
+    bake: bool = option(
+        False, flag="--bake", switch=True, help="through Blender's compositor, too: OUTPUT_FOLDER/SHOT/TAKE/composited"
+    )
+    """Bake each take."""
+    shots_folder: str = option(
+        "", flag="--shots-folder", metavar="DIR", help="where shots of clips are made", words="beside each clip"
+    )
+    """Folder for shots of clips; empty: beside each."""
+    shots_per_job: int = option(15, flag="--shots-per-job", metavar="N", help="shots of one template, at most")
+    """Shots of one template: farms limit how long it may be."""
+    request: str = option(
+        "",
+        flag="--request",
+        metavar="FILE",
+        help="parameters of the steps as JSON, {step: {name: value}}, in the place of options",
+        words="the options",
+    )
+    """JSON file of parameters, over what the options say."""
+    rates: str = option(
+        "", flag="--rates", metavar="FILE", help="rates.json of `farm measure`, to estimate with", words="ours"
+    )
+    """Measured rates for the estimate."""
+
+
+@dataclass
+class TaskWords:
+    """One task of a farm's job."""
+
+    step: str = option(
+        "",
+        flag="step",
+        choices=("import", "solve", "train", "open", "freeze", "finish", "bake", "deliver"),
+        help="what is to be done",
+    )
+    """Step of the template."""
+    shot: str = option("", flag="--shot", metavar="SHOT", required=True, help="shot folder")
+    """Shot folder, as this computer has it."""
+    request: str = option("", flag="--request", metavar="FILE", required=True, help="what the template asks for")
+    """JSON: parameters of the steps, and names of the takes."""
+    paths: tuple[str, ...] = option("", flag="--paths", metavar="STEP.NAME=PATH", many=True, help="paths of parameters")
+    """Paths among the parameters, as this computer has them."""
+    t_star: str = option("", flag="--t-star", metavar="N", help="instant of the take", words="suggested")
+    """Instant of the take."""
+    first: int = option(0, flag="--first", metavar="N", help="first frame of the part")
+    """First frame of the part."""
+    frames: int = option(0, flag="--frames", metavar="N", help="frames of the part", words="the whole take")
+    """How many frames the part has; 0: the whole take."""
+    output: str = option("", flag="--output", metavar="DIR", help="folder for what is baked")
+    """Folder for what is baked."""
+    path_rules: str = option("", flag="--path-rules", metavar="FILE", help="the engine's path mapping rules")
+    """File of the engine's path mapping rules."""
+
+
 @dataclass(frozen=True)
 class Verb:
     """A word of the command lines, and what it asks for."""
@@ -190,6 +281,8 @@ VERBS: dict[str, Verb] = {
     "stmaps": Verb("ST maps of the lens, both ways, into the shot's solve folder", MapWords),
     "export": Verb("cameras and points of a solved shot for other programs", ExportWords),
     "status": Verb("jobs of a shot", ShotWords),
+    "farm": Verb("a job for a render farm, as Open Job Description, and what it will cost", FarmWords, PARAMS),
+    "farm-task": Verb("one task of such a job (what the farm starts)", TaskWords, sides=(BACKEND,), json=False),
     "doctor": Verb("what this environment can do, as JSON", DoctorWords, json=False),
     "run-job": Verb("the job in a folder (what Blender starts)", JobWords, sides=(BACKEND,)),
     "live": Verb(

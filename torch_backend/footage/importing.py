@@ -23,6 +23,7 @@ from ..contract import (
     Reporter,
     frame_file,
     later,
+    mapped,
     read_json,
 )
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
@@ -143,9 +144,10 @@ def load_frames(shot: Shot) -> dict[str, Any]:
 
 
 def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
-    """Where a shot's footage may lie: as it was named, beside the shot with which it was moved, in the same folder."""
+    """Where a shot's footage may lie: where a farm has what was named so, as it was named, beside the shot with which
+    it was moved, in the same folder."""
     named, beside = shot.info().source, str(record.get("beside") or "")
-    places = [named] if named else []
+    places = [mapped(named), named] if named else []
     if beside:
         places.append(str((shot.root / beside).resolve()))
     if named:

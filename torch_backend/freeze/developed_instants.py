@@ -57,6 +57,10 @@ class Instants:
         """Numbers of the frames that are developed, ascending."""
         return sorted(int(t) for t in self.keys)
 
+    def is_kept(self, t_star: float) -> bool:
+        """True if an instant lies developed in the run's folder."""
+        return t_star not in self._held and self._kept(t_star) is not None
+
     def prepare(self, t_stars: Iterable[float], report: Reporter) -> None:
         """Develops those of `t_stars` that are to be and are not there yet. `Cancelled` leaves no half of one."""
         missing = [t for t in dict.fromkeys(t_stars) if t in self.keys and self._kept(t) is None]
@@ -92,10 +96,15 @@ class Instants:
 
         frozen = self._field(t_star)
         made = _make(self.shot, self.run, self.scene, int(t_star), frozen, self.config, check)
+        # Another job may have developed it meanwhile, and others may be at work with that one: the first stays.
+        there = self._kept(t_star)
+        made = made if there is None else there
         self._at = t_star, made
         report.progress("developing", n + 1, count, f"t* {int(t_star)}")
         if self.run.stale:
             self._held[t_star] = made
+            return made
+        if there is not None:
             return made
         try:
             _save(self.shot, self.run, int(t_star), frozen, made, self.keys[t_star])

@@ -414,6 +414,7 @@ def linear_spec(
     if len(set(formats)) > 1:  # else the writer passes over them
         spec.channelformats = formats
     spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # else the writer puts the hour there: a frame is the same whenever it was made
     spec.attribute("oiio:ColorSpace", COLOR_SPACE.format(light))
     spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), PRIMARIES[light][1])
     if light != LIGHTS[0]:

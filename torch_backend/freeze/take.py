@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,43 +76,14 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
 
     Returns the take's figures (also in take.json). JobError in words if it cannot be done.
     """
-    run = load_run(shot, params.run, choose_device(params.device, report, "Freezing"))
-    scene = load_scene(shot)
-    t_star = choose_t_star(shot, scene, run, params, report)
-    width, height = output_size(shot, scene, params)
-    whole = plan(scene, params, t_star, width, height)
-    frames = in_range(whole, params)
-    folder = shot.own(shot.take(params.take))
-    for inner in (TAKE_PREVIEW_FOLDER, TAKE_REDISTORT.parent, WARPS):
-        shot.own(folder / inner)
-    beyond = margin(shot, params, width, height, intrinsics(whole))
-    grain = plate_grain(shot, scene) if params.grain else None
-    # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
-    plate = (shot.info().width, round(shot.info().width * height / width))
-    if params.detail == "on" or params.develop == "on":
-        find_motion(shot, report)  # of shots solved before the solve looked for it
-    detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
-    instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
-    spec = FrameSpec(
-        run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail),
-        footage_light(shot),
-        _start(shot),
-    )  # fmt: skip
-    keys = {f.frame: spec.key(f) for f in whole}
-    key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))
-    done = _prepare(folder, keys, key, params, detail is not None)
-    left = sum(f.frame not in done for f in frames)
-    each = spec.whole[0] * spec.whole[1] * (20.0 + (6.0 if grain else 0.0) + (24.0 if detail else 0.0))
-    need_disk(folder, left * each, "the take")
-    try:
-        shares = _render_all(folder, frames, done, scene, spec, keys, report)
-        frames_on_disk = done | {f.frame for f in frames}
-        facts = _finish(
-            shot, scene, params, t_star, [f for f in whole if f.frame in frames_on_disk], spec, key, shares, report
-        )
-    except OSError as error:
-        raise (disk_error(folder) if is_disk_full(error) else error) from error
-    if run.stale:
+    take = planned(shot, params, report)
+    frames = in_range(take.whole, params)
+    done = _prepare(take.folder, take.keys, take.key, params, take.spec.detail is not None)
+    shares = render_frames(take, frames, done, report)
+    frames_on_disk = done | {f.frame for f in frames}
+    facts = finish(shot, params, take, [f for f in take.whole if f.frame in frames_on_disk], shares, report)
+    shot.update(t_star=take.t_star)
+    if take.spec.run.stale:
         report.warning(
             "The run was trained while it was frozen: the take shows what it was before.", "Freeze it again."
         )
@@ -179,6 +150,59 @@ class FrameSpec:
             *([self.light] if self.light != LIGHTS[0] else []),
             *([self.instants.keys[output.t_star]] if output.t_star in self.instants.keys else []),
         )
+
+
+@dataclass(frozen=True)
+class PlannedTake:
+    """What a take will show, before any of it is rendered."""
+
+    folder: Path
+    """takes/NAME."""
+    scene: Scene
+    """Of the shot."""
+    t_star: int
+    """Frame at which time stands still."""
+    whole: list[OutputFrame]
+    """All frames that it can have."""
+    spec: FrameSpec
+    """What they have in common."""
+    keys: dict[int, str]
+    """Frame -> `FrameSpec.key`."""
+    key: str
+    """`take_key`."""
+
+
+def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | None = None) -> PlannedTake:
+    """What `params` ask for. Nothing of the take is written; motion mattes are, if the shot has none.
+
+    `t_star`: the instant, where it is settled already; None: as `params` say, or suggested. JobError in words if it
+    cannot be done.
+    """
+    run = load_run(shot, params.run, choose_device(params.device, report, "Freezing"))
+    scene = load_scene(shot)
+    if t_star is None:
+        t_star = choose_t_star(shot, scene, run, params, report)
+    width, height = output_size(shot, scene, params)
+    whole = plan(scene, params, t_star, width, height)
+    folder = shot.own(shot.take(params.take))
+    for inner in (TAKE_PREVIEW_FOLDER, TAKE_REDISTORT.parent, WARPS):
+        shot.own(folder / inner)
+    beyond = margin(shot, params, width, height, intrinsics(whole))
+    grain = plate_grain(shot, scene) if params.grain else None
+    # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
+    plate = (shot.info().width, round(shot.info().width * height / width))
+    if params.detail == "on" or params.develop == "on":
+        find_motion(shot, report)  # of shots solved before the solve looked for it
+    detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
+    instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
+    spec = FrameSpec(
+        run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail),
+        footage_light(shot),
+        _start(shot),
+    )  # fmt: skip
+    keys = {f.frame: spec.key(f) for f in whole}
+    key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))
+    return PlannedTake(folder, scene, t_star, whole, spec, keys, key)
 
 
 def plate_detail(
@@ -272,23 +296,14 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams,
     A frame that is not asked for now stays if it is right: a part of the range does not undo the rest of the take.
     """
     state = folder / TAKE_STATE_FILE
-    if not state.is_file() and frames_in([*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]):
-        raise JobError(
-            f"{folder} holds numbered pictures that were not made here.",
-            "Name another take, or move them away.",
-            ExitCode.FREEZE,
-        )
-    make_folder(folder / TAKE_PREVIEW_FOLDER)
-    if with_warps:
-        make_folder(folder / WARPS)
+    make_folders(folder, with_warps)
     # Frames without a key of their own are of before grain, too.
     old_are_right = not params.grain and not with_warps and state.is_file() and read_json(state).get("key") == key
     done: set[int] = set()
     for n in frames_in(folder.glob("*.exr")) if params.only_missing else ():
         stored_key = read_key(folder / frame_file(n, ".exr"))
         right = n in keys and (stored_key == keys[n] or (stored_key == "" and old_are_right))
-        warped = not with_warps or (folder / WARPS / frame_file(n, ".exr")).is_file()
-        if right and warped and (folder / TAKE_PREVIEW_FOLDER / frame_file(n, ".png")).is_file():
+        if right and is_whole(folder, n, with_warps):
             done.add(n)
     pictures = [*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]
     stale = [p for p in pictures if _FRAME.fullmatch(p.stem)]
@@ -300,16 +315,49 @@ def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams,
     return done
 
 
+def make_folders(folder: Path, with_warps: bool) -> None:
+    """Makes a take's folder. JobError if it holds frames of someone else's."""
+    pictures = [*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]
+    if not (folder / TAKE_STATE_FILE).is_file() and frames_in(pictures):
+        raise JobError(
+            f"{folder} holds numbered pictures that were not made here.",
+            "Name another take, or move them away.",
+            ExitCode.FREEZE,
+        )
+    make_folder(folder / TAKE_PREVIEW_FOLDER)
+    if with_warps:
+        make_folder(folder / WARPS)
+
+
+def is_whole(folder: Path, frame: int, with_warps: bool) -> bool:
+    """True if what belongs beside a frame of a take is there."""
+    warped = not with_warps or (folder / WARPS / frame_file(frame, ".exr")).is_file()
+    return warped and (folder / TAKE_PREVIEW_FOLDER / frame_file(frame, ".png")).is_file()
+
+
 def frames_in(paths: Iterable[Path]) -> list[int]:
     """Numbers of those files that are frames, ascending."""
     return sorted(int(p.stem) for p in paths if _FRAME.fullmatch(p.stem))
 
 
-def _render_all(
-    folder: Path, frames: list[OutputFrame], done: set[int], scene: Scene, spec: FrameSpec, keys: dict[int, str],
-    report: Reporter,
+def render_frames(
+    take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter
 ) -> dict[int, Tensor]:  # fmt: skip
-    """Renders and writes what is not done. Returns frame number -> [h, w] share of plate, small, of those rendered."""
+    """Renders and writes those of `frames` that are not done, if the disk has room for them.
+
+    Returns frame number -> [h, w] share of plate, small, of those rendered. JobError if the disk is full.
+    """
+    spec, left = take.spec, sum(f.frame not in done for f in frames)
+    each = spec.whole[0] * spec.whole[1] * (20.0 + (6.0 if spec.grain else 0.0) + (24.0 if spec.detail else 0.0))
+    need_disk(take.folder, left * each, "the take")
+    try:
+        return _render_all(take, frames, done, report)
+    except OSError as error:
+        raise (disk_error(take.folder) if is_disk_full(error) else error) from error
+
+
+def _render_all(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> dict[int, Tensor]:
+    folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
     shares: dict[int, Tensor] = {}
     spec.instants.prepare((f.t_star for f in frames if f.frame not in done), report)
     with WriteBeside() as out:
@@ -483,12 +531,26 @@ def scene_linear(color: np.ndarray, alpha: np.ndarray, display: Display) -> np.n
     return display.premultiplied_to_light(np.concatenate([capped, alpha[..., None]], axis=2))
 
 
-def _finish(
-    shot: Shot, scene: Scene, params: FreezeParams, t_star: int, frames: list[OutputFrame], spec: FrameSpec, key: str,
-    shares: dict[int, Tensor], report: Reporter,
+def finish(
+    shot: Shot, params: FreezeParams, take: PlannedTake, frames: list[OutputFrame], shares: dict[int, Tensor],
+    report: Reporter,
 ) -> dict[str, Any]:  # fmt: skip
-    """Contact sheet, video, PLY and take.json of all frames that the take has by now; they are on disk."""
-    folder, run, size = shot.take(params.take), spec.run, spec.size
+    """Contact sheet, video, PLY and take.json of all frames that the take has by now; they are on disk.
+
+    Returns what take.json holds. `shares` as `render_frames` gives them. JobError if the disk is full.
+    """
+    try:
+        return _finish(shot, params, take, frames, shares, report)
+    except OSError as error:
+        raise (disk_error(take.folder) if is_disk_full(error) else error) from error
+
+
+def _finish(
+    shot: Shot, params: FreezeParams, take: PlannedTake, frames: list[OutputFrame], shares: dict[int, Tensor],
+    report: Reporter,
+) -> dict[str, Any]:  # fmt: skip
+    folder, scene, t_star, spec = take.folder, take.scene, take.t_star, take.spec
+    run, size = spec.run, spec.size
     numbers = [f.frame for f in frames]
     report.progress("finishing the take", 0, 3, "contact sheet")
     previews = [folder / TAKE_PREVIEW_FOLDER / frame_file(n, ".png") for n in numbers]
@@ -508,7 +570,7 @@ def _finish(
     redistort = _redistort(shot, folder, size, spec.beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
-        "key": key,
+        "key": take.key,
         "take": params.take,
         "run": params.run,
         "t_star_frame": t_star,
@@ -536,7 +598,6 @@ def _finish(
         **({} if verdict is None else {"verdict": vars(verdict)}),
     }
     write_json(folder / TAKE_FILE, facts)
-    shot.update(t_star=t_star)
     report.image("contact sheet", sheet)
     report.progress("finishing the take", 3, 3, "done")
     return facts

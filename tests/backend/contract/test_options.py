@@ -11,7 +11,11 @@ from torch_backend import cli, contract
 from torch_backend.contract import option_table
 
 ROOT = Path(__file__).resolve().parents[3]
-NEEDED = {"import": ("s.splannequin", "a.mp4"), "freeze": ("a.mp4",)}
+NEEDED = {
+    "import": ("s.splannequin", "a.mp4"),
+    "freeze": ("a.mp4",),
+    "farm": ("export", "s.splannequin", "--output", "job"),
+}
 """What a command cannot do without."""
 
 
@@ -94,14 +98,14 @@ def test_no_parameter_of_a_step_is_passed_over_by_its_station(kind, station):
 
 
 @pytest.mark.parametrize(
-    ("side", "file"),
+    ("side", "files"),
     [
-        (contract.BACKEND, "torch_backend/cli.py"),
-        (contract.BLENDER, "splannequin_addon/command_line/headless.py"),
+        (contract.BACKEND, ("torch_backend/cli.py", "torch_backend/farm_task.py")),
+        (contract.BLENDER, ("splannequin_addon/command_line/headless.py",)),
     ],
 )
-def test_no_word_of_a_verb_is_passed_over_by_its_side(side, file):
-    read = read_of([ROOT / file], ("args",))
+def test_no_word_of_a_verb_is_passed_over_by_its_side(side, files):
+    read = read_of([ROOT / file for file in files], ("args",))
     for name, verb in contract.VERBS.items():
         if side in verb.sides:
             dests = {told.dest for _, told in contract.options_for(name, verb.words, side)}

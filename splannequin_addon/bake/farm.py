@@ -1,0 +1,108 @@
+"""Export for Farm: the shot and what the artist set, handed to the backend, which writes the job."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from ..access import Outcome, scene_in, settings_of
+from ..freeze import own_camera, takes
+from ..process import children, job_timer, steps
+from ..properties import BoolProperty, IntProperty, StringProperty
+from ..shot import inventory, selection
+from ..translations import tr
+from . import farm_job
+
+
+def requests_of(scene: bpy.types.Scene, shot: Path) -> dict[str, Any]:
+    """Step -> parameters of what is to be done for the scene's shot: the freeze, and what it lacks before it.
+
+    The artist's camera is read, if the take is seen from one.
+    """
+    state = inventory.read(shot)
+    found: dict[str, Any] = {}
+    if not state.solve:
+        found["solve"] = steps.STEPS["solve"].params(scene)
+    if settings_of(scene).run_name not in state.runs:
+        found["train"] = steps.STEPS["train"].params(scene)
+    camera = takes.read_camera(scene, "freeze") if own_camera.follows_camera(scene) else None
+    found["freeze"] = camera or steps.STEPS["freeze"].params(scene)
+    return found
+
+
+class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
+    """Write this shot as a job for a render farm, as Open Job Description: what it lacks, the take in parts, and what
+    that will cost"""
+
+    bl_idname = "splannequin.export_for_farm"
+    bl_label = "Export for Farm"
+    bl_options = {"REGISTER"}
+
+    directory = StringProperty(
+        name="Folder", description="Folder to write the job into", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
+    filter_folder = BoolProperty(
+        name="Folders", description="Show folders", default=True, options={"HIDDEN", "SKIP_SAVE"}
+    )
+    instants = StringProperty(
+        name="Instants", description="Frames at which time stands still, with commas, a take for each; empty: t*"
+    )
+    frames = IntProperty(
+        name="Frames per Task", description="Frames of the take that one task freezes", default=10, min=1, max=100_000
+    )
+    bake = BoolProperty(
+        name="Bake", description="Render the take through Blender's compositor on the farm, too", default=False
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a shot."""
+        folder = selection.shot_folder(scene_in(context))
+        if folder is None or not inventory.read(folder).info:
+            cls.poll_message_set(tr("Import a clip first"))
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
+        """Asks for a folder."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> Outcome:
+        """Has the backend write; in a window the panel tells when it is done."""
+        scene = scene_in(context)
+        shot = selection.shot_folder(scene)
+        if shot is None or not self.directory:
+            self.report({"ERROR"}, "No folder was given")
+            return {"CANCELLED"}
+        folder = Path(os.path.abspath(bpy.path.abspath(self.directory)))
+        words = farm_job.Words(t_star=self.instants, frames=self.frames, bake=self.bake)
+        try:
+            asked = farm_job.begin([str(shot)], folder, words, requests_of(scene, shot))
+            if bpy.app.background:
+                for line in farm_job.written(asked):
+                    self.report({"INFO"}, line)
+                return {"FINISHED"}
+        except (contract.JobError, OSError, ValueError) as error:
+            sentence = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
+            self.report({"ERROR"}, tr(sentence))
+            return {"CANCELLED"}
+        job_timer.watch_of(shot).failures.pop("bake", None)
+        job_timer.when_answered(asked, lambda: _tell(shot, asked))
+        return {"FINISHED"}
+
+
+def _tell(shot: Path, asked: children.Question) -> None:
+    """Puts what came of an export onto the panel."""
+    watch = job_timer.watch_of(shot)
+    try:
+        watch.notes["bake"] = farm_job.written(asked)
+    except contract.JobError as error:
+        watch.failures["bake"] = (error.message, error.hint)
+
+
+CLASSES = (SPLANNEQUIN_OT_export_for_farm,)

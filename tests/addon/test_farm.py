@@ -1,0 +1,118 @@
+"""Export for Farm, the button and the verb, with the real backend; and a bake in parts, by several at once."""
+
+import json
+import subprocess
+import sys
+
+import bpy
+import pytest
+
+
+@pytest.fixture
+def run(addon, capfd):
+    """run(*arguments) is (exit code, standard output, standard error)."""
+
+    def call(*arguments) -> tuple[int, str, str]:
+        capfd.readouterr()
+        code = addon("command_line.headless").main([str(a) for a in arguments])
+        out, err = capfd.readouterr()
+        return code, out, err
+
+    return call
+
+
+@pytest.fixture
+def imported(shot, contract):
+    """The shot, as an import leaves its record."""
+    there = contract.ShotFolder(shot)
+    frames = [{"frame": n, "file": f"raw/{n:06d}.png"} for n in range(5, 8)]
+    record = json.loads(there.listing.read_text()) if there.listing.is_file() else {"width": 64, "height": 36}
+    contract.write_json(there.listing, {**record, "frames": record.get("frames") or frames})
+    return shot
+
+
+def kinds(template):
+    return [step["name"].rpartition(": ")[2] for step in template["steps"]]
+
+
+def request_of(template, kind):
+    step = next(step for step in template["steps"] if step["name"].endswith(f": {kind}"))
+    return json.loads(step["script"]["embeddedFiles"][0]["data"])
+
+
+def test_the_button_writes_a_job_with_what_the_artist_set(scene, imported, tmp_path):
+    scene.splannequin.shot_path = str(imported)
+    scene.splannequin.take_name = "hero"
+    scene.splannequin.choose_t_star = True
+    scene.splannequin.t_star = 6
+    out = tmp_path / "job"
+    assert bpy.ops.splannequin.export_for_farm(directory=str(out), frames=2, bake=True) == {"FINISHED"}
+    template = json.loads((out / "template.json").read_text())
+    assert kinds(template)[-5:] == ["open", "freeze", "finish", "bake", "deliver"]
+    asked = request_of(template, "freeze")
+    assert asked["takes"] == {"6": "hero"} and asked["freeze"]["only_missing"]
+    (places,) = {str(one["parameterSpace"]["taskParameterDefinitions"][0]["range"]) for one in template["steps"]}
+    assert places == str([str(imported)])
+
+
+def test_the_button_says_what_is_wrong(scene, imported, tmp_path, contract):
+    scene.splannequin.shot_path = str(imported)
+    with pytest.raises(RuntimeError, match="t\\* is frame 900"):
+        bpy.ops.splannequin.export_for_farm(directory=str(tmp_path / "job"), instants="900")
+    with pytest.raises(RuntimeError, match="No folder was given"):
+        bpy.ops.splannequin.export_for_farm()
+
+
+def test_the_verb_writes_what_the_backends_own_does(run, imported, tmp_path, addon):
+    out = tmp_path / "job"
+    words = ["--t-star", "5,7", "--frames", "2", "--freeze-width", "48", "--device", "cpu"]
+    code, said, err = run("farm", "export", imported, "--output", out, *words)
+    assert code == 0, err
+    assert "template.json" in said and "core-hours" in said
+    template = json.loads((out / "template.json").read_text())
+    command = [addon("process.backend").python(), "-P", "-m", "torch_backend", "farm", "export", str(imported)]
+    own = tmp_path / "own"
+    environ = addon("process.children").backend_environ(addon("process.backend").package_root())
+    subprocess.run([*command, "--output", str(own), *words], check=True, env=environ, cwd=tmp_path)
+    assert json.loads((own / "template.json").read_text()) == template
+    assert run("farm", "measure", imported, "--output", out)[0] == 2, "nothing was measured"
+
+
+def test_a_bake_in_parts_is_the_bake_at_once(run, shot, tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    bake = ["bake", "--shot", shot, "--take", "freeze", "--output"]
+    assert run(*bake, whole, "--part", "frames")[0] == 0
+    assert sorted(p.name for p in whole.iterdir()) == ["composited"]
+    assert run(*bake, parts, "--part", "frames", "--first", "6", "--last", "7")[0] == 0
+    code, _, err = run(*bake, parts, "--part", "file")
+    assert code == 7 and "lacks 1 of 3 frames, the first is 5" in err
+    (parts / "composited" / ".part-killed").mkdir()
+    assert run(*bake, parts, "--part", "frames", "--first", "5", "--last", "6")[0] == 0
+    assert run(*bake, parts, "--part", "file")[0] == 0
+    assert sorted(p.name for p in parts.iterdir()) == ["composited", "shot.blend", "summary.json"]
+    made = {p.name: p.read_bytes() for p in (parts / "composited").iterdir()}
+    assert made == {p.name: p.read_bytes() for p in (whole / "composited").iterdir()} and len(made) == 3
+    assert json.loads((parts / "summary.json").read_text())["composited_frames"] == 3
+
+
+def test_a_part_of_a_bake_freezes_nothing(run, shot, tmp_path):
+    code, _, err = run("bake", "--shot", shot, "--take", "none", "--output", tmp_path, "--part", "frames")
+    assert code == 7 and "a part of a bake freezes none" in err and sys.executable not in err
+
+
+def test_what_the_shot_lacks_is_asked_for_and_nothing_else(scene, imported, addon, contract):
+    scene.splannequin.shot_path = str(imported)
+    there = contract.ShotFolder(imported)
+    assert set(addon("bake.farm").requests_of(scene, imported)) == {"freeze"}, "it is solved, and has this run"
+    scene.splannequin.run_name = "other"
+    assert set(addon("bake.farm").requests_of(scene, imported)) == {"train", "freeze"}
+    for record in (there.solve_record, there.cameras):
+        record.unlink(missing_ok=True)
+    assert set(addon("bake.farm").requests_of(scene, imported)) == {"solve", "train", "freeze"}
+
+
+def test_no_request_is_written_where_there_is_no_backend(addon, tmp_path, monkeypatch, contract):
+    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "absent"))
+    with pytest.raises(contract.JobError, match="does not exist"):
+        addon("bake.farm_job").begin([], tmp_path / "job", addon("bake.farm_job").Words(), {})
+    assert not (tmp_path / "job").exists()

@@ -1,0 +1,39 @@
+"""Shots that look imported, for what only reads their records."""
+
+import dataclasses
+
+import pytest
+
+from torch_backend.contract import FreezeParams, ImportParams, ShotFolder, SolveParams, TrainParams, write_json
+
+
+def imported(root, name, first=1, last=20, size=(640, 360), source=(1920, 1080)):
+    """A shot folder with the records of an import."""
+    shot = ShotFolder(root / f"{name}.splannequin")
+    write_json(shot.info_path, {"version": 1, "name": name, "first": first, "last": last})
+    frames = [{"frame": n, "file": f"raw/{n:06d}.png"} for n in range(first, last + 1)]
+    record = {"frames": frames, "width": size[0], "height": size[1], "source_size": list(source)}
+    write_json(shot.listing, record)
+    return shot
+
+
+@pytest.fixture
+def requests():
+    """requests(**freeze) is what a command line asks for without options, but for those of the freeze."""
+
+    def made(**freeze):
+        params = FreezeParams(only_missing=True)
+        return {
+            "import": ImportParams(),
+            "solve": SolveParams(),
+            "train": TrainParams(),
+            "freeze": dataclasses.replace(params, **freeze),
+        }
+
+    return made
+
+
+@pytest.fixture
+def shot(tmp_path):
+    """shot(name, ...) makes an imported shot in the test's folder."""
+    return lambda name, **words: imported(tmp_path / "shots", name, **words)

@@ -1,0 +1,111 @@
+"""Tasks, their amounts, rates of what was measured, and what a job costs by them."""
+
+import dataclasses
+import math
+
+import pytest
+
+from torch_backend.contract import JobError, write_json
+from torch_backend.farm import rates
+from torch_backend.farm.cost import estimate, needs, sentences
+from torch_backend.farm.rates import Rate, measure, read_rates, to_json
+from torch_backend.farm.shots import gather
+from torch_backend.farm.work import MOST_VALUES, PER_FRAME, PER_STEP, steps_of
+
+ONE = {kind: Rate(1.0, 0.0, 2.0, 1000) for kind in rates.MEASURED}
+"""Every task takes a second, on two cores."""
+
+
+def shots_of(shot, requests, count=1, instants=(4, 12), **words):
+    roots = [str(shot(f"shot{n}", **words).root) for n in range(count)]
+    return gather(roots, requests(), list(instants), {}, "")
+
+
+def test_a_take_is_cut_into_parts_that_are_all_of_it(shot, requests):
+    (one,) = shots_of(shot, requests, last=23)
+    steps = {step.kind: step for step in steps_of(one, 10, True)}
+    assert list(steps) == ["solve", "train", "open", "freeze", "finish", "bake", "deliver"]
+    assert steps["freeze"].starts == [1, 11, 21] and len(list(steps["freeze"].tasks())) == 6
+    frame = 1920 * 1080 / 1e6 + PER_FRAME
+    assert steps["freeze"].amounts == pytest.approx({1: 10 * frame, 11: 10 * frame, 21: 3 * frame})
+    assert sum(steps["freeze"].amounts.values()) == pytest.approx(steps["finish"].amounts[0])
+    assert [step.kind for step in steps_of(one, 10, False)][-1] == "finish"
+
+
+def test_a_part_is_longer_where_a_take_would_have_more_than_a_template_may(shot, requests):
+    (one,) = shots_of(shot, requests, last=5000)
+    steps = {step.kind: step for step in steps_of(one, 1, False)}
+    assert steps["freeze"].part == 5 and len(steps["freeze"].starts) == 1000 <= MOST_VALUES
+
+
+def test_a_training_costs_its_steps_and_pixels_and_an_instant_too(shot, requests):
+    (one,) = shots_of(shot, requests)
+    amounts = {step.kind: step.amounts[0] for step in steps_of(one, 10, False) if 0 in step.amounts}
+    assert amounts["train"] == pytest.approx(2000 * (320 * 180 / 1e6 + PER_STEP))
+    assert amounts["open"] == pytest.approx(300 * (640 * 360 / 1e6 + PER_STEP))
+    one.requests["train"].update(iterations=100, width=64)
+    one.requests["freeze"]["develop"] = "off"
+    amounts = {step.kind: step.amounts[0] for step in steps_of(one, 10, False) if 0 in step.amounts}
+    assert amounts["train"] == pytest.approx(100 * (64 * 36 / 1e6 + PER_STEP)) and amounts["open"] == 0.0
+
+
+def test_what_a_job_costs(shot, requests):
+    found = shots_of(shot, requests, count=3)
+    steps = [step for one in found for step in steps_of(one, 5, False)]
+    told = estimate(steps, ONE, True, False)
+    # a shot: solve, train, 2 opened, 2 x 4 parts, 2 finished
+    assert (told.shots, told.tasks) == (3, 3 * 14)
+    assert told.core_hours == pytest.approx(3 * 14 * 2.0 / 3600)
+    assert told.card_hours == pytest.approx(3 * (1 + 2 + 8) / 3600), "train, open and freeze"
+    session = rates.SESSION_SECONDS
+    assert told.critical_seconds == pytest.approx(5.0 + session)
+    assert told.on_hosts[1] == pytest.approx(3 * 14 + session)
+    assert told.on_hosts[100] == pytest.approx(told.critical_seconds)
+    assert 3 * 14 / 2 + session <= told.on_hosts[2] < 3 * 14 * 0.7
+    assert told.disk_gb == pytest.approx(3 * (2 * 20 * 1920 * 1080 * 50 + 100e6) / 1e9, rel=0.01)
+    said = "\n".join(sentences(told, "of nobody"))
+    assert "3 shots, 42 tasks. By rates of nobody" in said and "freeze       24 tasks" in said
+    assert estimate(steps, ONE, False, False).card_hours == 0.0
+
+
+def test_hosts_are_asked_for_what_was_seen_and_half_as_much_again():
+    asked = needs({"train": Rate(1, 1, 1, 2000), "bake": Rate(1, 1, 1, 700)}, True, 2.0)
+    assert (asked["train"].memory_mib, asked["train"].gpu) == (3072, True)
+    assert (asked["bake"].memory_mib, asked["bake"].gpu) == (1536, False)
+
+
+def record(step, amount, seconds, cpu=None, memory=800):
+    return {"step": step, "amount": amount, "seconds": seconds, "cpu_seconds": cpu or seconds, "memory_mib": memory}
+
+
+def test_rates_are_measured_from_what_tasks_took():
+    records = [record("freeze", a, 4.0 + 2.0 * a, cpu=2 * (4.0 + 2.0 * a), memory=900 + a) for a in (1, 2, 5)]
+    records += [record("train", 100, 65.0), record("open", 0, 9.0), record("open", 0, 11.0), record("nap", 1, 1)]
+    records += [{"step": "freeze"}, record("finish", 10, 0.5)]
+    found = measure(records)
+    assert found["freeze"].fixed == pytest.approx(4.0) and found["freeze"].per_unit == pytest.approx(2.0)
+    assert (found["freeze"].cores, found["freeze"].memory_mib) == (2.0, 905)
+    assert found["train"].seconds(100) == pytest.approx(65.0), "one amount: what is fixed is the usual"
+    assert found["train"].fixed == rates.MEASURED["train"].fixed
+    assert found["open"].seconds(0) == pytest.approx(10.0)
+    assert found["finish"].seconds(10) == pytest.approx(0.5), "never more than was taken"
+    assert set(found) == {"freeze", "train", "open", "finish"}
+
+
+def test_more_work_never_takes_less_time():
+    fell = measure([record("freeze", a, 10.0 - a) for a in (1, 2, 3)])["freeze"]
+    assert (fell.fixed, fell.per_unit) == (8.0, 0.0)
+    steep = measure([record("freeze", a, 5.0 * a - 4.0) for a in (1, 2, 3)])["freeze"]
+    assert steep.fixed == 0.0 and steep.per_unit == pytest.approx(3.0)
+
+
+def test_rates_of_a_file_stand_in_the_place_of_ours(tmp_path):
+    file = tmp_path / "rates.json"
+    write_json(file, to_json({"train": Rate(1.0, 2.0, 3.0, 4)}))
+    read = read_rates(file)
+    assert read["train"] == Rate(1.0, 2.0, 3.0, 4) and read["freeze"] == rates.MEASURED["freeze"]
+    for wrong in ({"version": 2}, {"version": 1, "rates": {"nap": dataclasses.asdict(Rate(1, 1, 1, 1))}}, {}):
+        write_json(file, wrong)
+        with pytest.raises(JobError, match="holds no rates"):
+            read_rates(file)
+    assert all(math.isfinite(rate.seconds(1.0)) for rate in rates.MEASURED.values())

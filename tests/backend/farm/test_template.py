@@ -1,0 +1,148 @@
+"""The job template: valid, without a path of ours outside of what is mapped, one chain of steps per shot."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from torch_backend import cli
+from torch_backend.contract import JobError, write_json
+from torch_backend.farm import export as exporting
+from torch_backend.farm.template import read_request
+
+
+@pytest.fixture
+def shots(shot):
+    """Two shots; the name of one holds what would be a reference in a template."""
+    hall, other = shot("hall").root, shot("kitchen", last=23)
+    write_json(other.info_path, {"version": 1, "name": "kit {{chen}}"})
+    return [str(hall), str(other.root)]
+
+
+@pytest.fixture
+def job(tmp_path, shots, capsys):
+    """job(*words) is (template, parameters, folder) of `farm export` of both shots with these words."""
+
+    def made(*words):
+        folder = tmp_path / "job"
+        assert cli.main(["farm", "export", *shots, "--output", str(folder), *words]) == 0, capsys.readouterr().err
+        return *(json.loads((folder / name).read_text()) for name in ("template.json", "parameters.json")), folder
+
+    return made
+
+
+def named(template, name):
+    return next(step for step in template["steps"] if step["name"] == name)
+
+
+def space(step):
+    return {one["name"]: one for one in step["parameterSpace"]["taskParameterDefinitions"]}
+
+
+def test_the_kept_library_finds_nothing_wrong(job):
+    pytest.importorskip("openjd.cli")
+    *_, folder = job("--t-star", "4,12", "--bake", "--ignore-mask", "mask.png", "--device", "cuda")
+    template = folder / "template.json"
+    for words in (["check", template], ["summary", template, "-p", f"file://{folder / 'parameters.json'}"]):
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", "openjd", *map(str, words)], capture_output=True, text=True, cwd=folder
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert "'hall: freeze' (4 total Tasks)" in done.stdout
+
+
+def test_each_shot_has_a_chain_of_its_own(job):
+    template, *_ = job("--t-star", "4,12", "--bake")
+    kinds = ["solve", "train", "open", "freeze", "finish", "bake", "deliver"]
+    for shot in ("hall", "kit __chen__"):
+        for before, kind in zip([None, *kinds], kinds, strict=False):
+            waits = named(template, f"{shot}: {kind}").get("dependencies", [])
+            assert waits == ([{"dependsOn": f"{shot}: {before}"}] if before else [])
+    assert len(template["steps"]) == 14
+
+
+def test_tasks_are_instants_and_parts(job):
+    template, *_ = job("--t-star", "4,12", "--frames", "8")
+    freeze = space(named(template, "kit __chen__: freeze"))
+    assert freeze["TStar"]["range"] == [4, 12] and freeze["First"]["range"] == [1, 9, 17]
+    assert set(space(named(template, "hall: finish"))) == {"Shot", "TStar"}
+    assert set(space(named(template, "hall: train"))) == {"Shot"}
+    template, *_ = job()
+    assert set(space(named(template, "hall: open"))) == {"Shot"}, "the instant is suggested"
+
+
+def strings(node, at=()):
+    if isinstance(node, str):
+        yield at, node
+    elif isinstance(node, dict):
+        for key, value in node.items():
+            yield from strings(value, (*at, key))
+    elif isinstance(node, list):
+        for value in node:
+            yield from strings(value, at)
+
+
+def test_paths_of_the_submitting_computer_stand_only_where_they_are_mapped(job, tmp_path):
+    (tmp_path / "mask.png").touch()
+    template, values, _ = job("--t-star", "4", "--bake", "--people-mask", str(tmp_path / "mask.png"))
+    types = {one["name"]: one["type"] for one in template["parameterDefinitions"]}
+    ours = (str(tmp_path), str(exporting.SOFTWARE), sys.executable)
+    mapped = 0
+    for step in template["steps"]:
+        for one in step["parameterSpace"]["taskParameterDefinitions"]:
+            if one["type"] == "PATH":
+                mapped += len(one.pop("range"))
+    assert mapped == 14
+    assert not [(at, text) for at, text in strings(template) if any(path in text for path in ours)]
+    assert {name for name, value in values.items() if any(path in value for path in ours)} == {
+        "Splannequin", "OutputFolder", "SolvePeopleMask",
+    }  # fmt: skip
+    assert all(types[name] == "PATH" for name in ("Splannequin", "OutputFolder", "SolvePeopleMask"))
+    words = named(template, "hall: solve")["script"]["actions"]["onRun"]["args"]
+    assert "solve.people_mask={{Param.SolvePeopleMask}}" in words
+    assert "--paths" not in named(template, "hall: train")["script"]["actions"]["onRun"]["args"]
+
+
+def test_what_a_task_is_asked_for_comes_out_of_its_file_again(job, tmp_path):
+    (tmp_path / "request.json").write_text('{"freeze": {"t_star_per_frame": {"3": 4.0}, "camera_path": ""}}')
+    template, *_ = job("--freeze-width", "320", "--request", str(tmp_path / "request.json"))
+    file = named(template, "kit __chen__: freeze")["script"]["embeddedFiles"][0]
+    assert "{{" not in file["data"]
+    (tmp_path / "out.json").write_text(file["data"])
+    request = read_request(tmp_path / "out.json")
+    assert request["freeze"]["width"] == 320 and request["freeze"]["t_star_per_frame"] == {"3": 4.0}
+    assert (request["takes"], request["first"], request["last"]) == ({"": "freeze"}, 1, 23)
+    write_json(tmp_path / "out.json", {**request, "version": 2})
+    with pytest.raises(JobError, match="is no request"):
+        read_request(tmp_path / "out.json")
+
+
+def test_hosts_with_a_card_are_asked_for_where_one_is_wanted(job):
+    for device, cards in (("cuda", ["train", "open", "freeze"]), ("auto", [])):
+        template, *_ = job("--device", device)
+        found = [
+            step["name"]
+            for step in template["steps"]
+            if {"name": "amount.worker.gpu", "min": 1} in step["hostRequirements"]["amounts"]
+        ]
+        assert found == [f"{shot}: {kind}" for kind in cards for shot in ("hall", "kit __chen__")]
+
+
+def test_many_shots_are_several_jobs(shots, tmp_path):
+    assert cli.main(["farm", "export", *shots, "--output", str(tmp_path), "--shots-per-job", "1"]) == 0
+    names = [json.loads((tmp_path / f"job-00{n}" / "template.json").read_text())["name"] for n in (1, 2)]
+    assert names == ["Splannequin: hall", "Splannequin: kit __chen__"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--frames", "0"), "--frames is 0"),
+        (("--t-star", "99"), "t* is frame 99: hall has frames 1 to 20"),
+        (("--rates", "no.json"), "no.json holds no rates"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(shots, tmp_path, words, said, capsys):
+    assert cli.main(["farm", "export", *shots, "--output", str(tmp_path / "job"), *words]) == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,119 @@
+"""Tasks of a farm's job: on another folder layout, by the engine's path mapping; and what they say when they fail."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torch_backend import cli
+from torch_backend.contract import ExitCode, JobError, ShotFolder
+from torch_backend.farm.work import PER_FRAME
+from torch_backend.freeze.exr import read_frozen_exr
+
+ROOT = Path(__file__).resolve().parents[2]
+PLAIN = ("--develop", "off", "--detail", "off", "--no-grain")
+
+
+@pytest.fixture(scope="module")
+def submitted(trained, tmp_path_factory):
+    """The trained shot on the computer that submits, and the job's folder."""
+    world, _ = trained
+    home = tmp_path_factory.mktemp("artist")
+    shutil.copytree(world.shot.root, home / "shots" / "tiny.splannequin")
+    words = ["--output", str(home / "job"), "--t-star", "104,110", "--frames", "8", *PLAIN]
+    assert cli.main(["farm", "export", str(home / "shots" / "tiny.splannequin"), *words]) == 0
+    return home
+
+
+def test_a_template_of_one_layout_runs_on_another(submitted, tmp_path):
+    pytest.importorskip("openjd.cli")
+    there = tmp_path / "farm"
+    shutil.copytree(submitted / "shots", there / "shots")
+    rules = [
+        {
+            "source_path_format": "POSIX",
+            "source_path": str(submitted / "shots"),
+            "destination_path": str(there / "shots"),
+        },
+        {"source_path_format": "POSIX", "source_path": "/software", "destination_path": str(ROOT)},
+    ]
+    (there / "rules.json").write_text(json.dumps({"version": "pathmapping-1.0", "path_mapping_rules": rules}))
+    values = json.loads((submitted / "job" / "parameters.json").read_text())
+    values |= {"Splannequin": "/software", "HostPython": sys.executable, "BackendPython": sys.executable}
+    template = str(submitted / "job" / "template.json")
+    command = [sys.executable, "-P", "-m", "openjd", "run", template, "-p", json.dumps(values)]
+    command += ["--path-mapping-rules", f"file://{there / 'rules.json'}", "--no-run-dependencies"]
+    before = sorted(p.relative_to(submitted) for p in submitted.rglob("*"))
+    said = ""
+    for step, first in (("open", None), ("freeze", 101), ("freeze", 109), ("finish", None)):
+        task = [f"Shot={submitted / 'shots' / 'tiny.splannequin'}", "TStar=110", *([f"First={first}"] if first else [])]
+        words = [word for one in task for word in ("-tp", one)]
+        done = subprocess.run([*command, "--step", f"tiny: {step}", *words], capture_output=True, text=True)
+        said += done.stdout
+        assert done.returncode == 0, done.stdout + done.stderr
+    take = ShotFolder(there / "shots" / "tiny.splannequin").take("freeze_0110")
+    assert [int(p.stem) for p in sorted(take.glob("*.exr"))] == list(range(101, 117))
+    assert read_frozen_exr(take / "000109.exr").metadata.t_star_frame == 110
+    assert json.loads((take / "take.json").read_text())["exr_dir"] == str(take)
+    assert sorted(p.relative_to(submitted) for p in submitted.rglob("*")) == before, "nothing where it was submitted"
+    assert "openjd_progress: 100.0" in said and "tiny, freeze freeze_0110: freezing" in said
+    took = json.loads((there / "shots" / "tiny.splannequin" / "farm" / "freeze-110-109.json").read_text())
+    assert took["amount"] == pytest.approx(8 * (64 * 48 / 1e6 + PER_FRAME), abs=1e-3) and took["cpu_seconds"] > 0
+
+
+@pytest.fixture
+def task(submitted, tmp_path, capsys):
+    """task(step, *words) runs a task of the job in this process: (exit code, lines for the engine)."""
+    template = json.loads((submitted / "job" / "template.json").read_text())
+
+    def run(step, *words):
+        found = next((one for one in template["steps"] if one["name"] == f"tiny: {step}"), None)
+        (tmp_path / "request.json").write_text(found["script"]["embeddedFiles"][0]["data"])
+        shot = str(submitted / "shots" / "tiny.splannequin")
+        code = cli.main(["farm-task", step, "--shot", shot, "--request", str(tmp_path / "request.json"), *words])
+        return code, [line for line in capsys.readouterr().out.splitlines() if line.startswith("openjd_")]
+
+    return run
+
+
+def test_a_task_that_fails_says_of_which_shot_and_take_and_what_to_do(task):
+    code, said = task("freeze", "--t-star=104", "--first=101", "--frames", "8")
+    assert code == ExitCode.FREEZE
+    assert said == [
+        "openjd_fail: tiny, freeze freeze_0104: Take freeze_0104 of tiny.splannequin was not opened. Run its step "
+        "`open` first."
+    ]
+
+
+def test_a_request_that_is_none_is_said(submitted, tmp_path, capsys):
+    shot = str(submitted / "shots" / "tiny.splannequin")
+    (tmp_path / "none.json").write_text("[]")
+    assert cli.main(["farm-task", "open", "--shot", shot, "--request", str(tmp_path / "none.json")]) == ExitCode.USAGE
+    assert "openjd_fail: tiny.splannequin, open: " in capsys.readouterr().out
+
+
+def test_a_host_without_blender_says_so(task, monkeypatch, submitted, tmp_path, capsys):
+    from torch_backend.farm_task import BLENDER_VARIABLE
+
+    monkeypatch.delenv(BLENDER_VARIABLE, raising=False)
+    request = {"version": 1, "name": "tiny", "amounts": {}, "takes": {"104": "a"}, "freeze": {}, "first": 1, "last": 2}
+    (tmp_path / "request.json").write_text(json.dumps(request))
+    shot = str(submitted / "shots" / "tiny.splannequin")
+    words = ["--shot", shot, "--request", str(tmp_path / "request.json"), "--t-star=104", "--output", str(tmp_path)]
+    assert cli.main(["farm-task", "bake", *words]) == ExitCode.ENVIRONMENT
+    assert "openjd_fail: tiny, bake a: This host was given no Blender." in capsys.readouterr().out
+
+
+def test_paths_among_the_parameters_are_those_of_this_computer():
+    from torch_backend.farm_task import asked_of
+
+    args = cli.parser().parse_args(
+        ["farm-task", "solve", "--shot", "s", "--request", "r", "--paths", "solve.people_mask=/mnt/a.png", "train.x=1"]
+    )
+    params = asked_of(args, {"solve": {"focal_mm": 35.0}}, "solve")
+    assert (params.focal_mm, params.people_mask) == (35.0, "/mnt/a.png")
+    with pytest.raises((ValueError, JobError), match="focal length"):
+        asked_of(args, {"solve": {"focal_mm": 1e9}}, "solve")

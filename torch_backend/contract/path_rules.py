@@ -1,0 +1,67 @@
+"""Where files of another computer lie on this one: the path mapping rules of a render farm.
+
+The engine that runs a farm writes them to a file (Open Job Description, `pathmapping-1.0`). What a shot remembers of
+the computer that it was made on, its footage above all, is looked for by them.
+"""
+
+from __future__ import annotations
+
+import ntpath
+import os
+import posixpath
+from pathlib import Path
+from typing import Any, cast
+
+from .files import LONGEST_JSON, is_json_object, read_json
+
+RULES_VARIABLE = "SPLANNEQUIN_PATH_RULES"
+"""Environment variable that names the file of rules."""
+
+
+def mapped(path: str, rules: list[dict[str, Any]] | None = None) -> str:
+    """A path by the first rule that fits, those of longer sources first; as it is where none does.
+
+    Args:
+        path: absolute, of the computer that wrote it down, whatever its system.
+        rules: each with source_path_format (POSIX or WINDOWS), source_path and destination_path; None: those of the
+            file that `RULES_VARIABLE` names, none without one.
+
+    Raises:
+        ValueError: the file of rules is none, by its name.
+    """
+    known = rules if rules is not None else _told()
+    for rule in sorted(known, key=lambda rule: -len(str(rule["source_path"]))):
+        windows = str(rule["source_path_format"]).upper() == "WINDOWS"
+        rest = _below(path, str(rule["source_path"]), windows)
+        if rest is not None:
+            return os.path.join(str(rule["destination_path"]), *rest)
+    return path
+
+
+def _below(path: str, source: str, windows: bool) -> list[str] | None:
+    """Parts of a path below a folder; None if it does not lie in it."""
+    kind = ntpath if windows else posixpath
+    if not (kind.isabs(path) or (windows and kind.splitdrive(path)[0])):
+        return None
+    whole, folder = _parts(path, windows), _parts(source, windows)
+    same = [p.lower() for p in whole] if windows else whole, [p.lower() for p in folder] if windows else folder
+    return whole[len(folder) :] if same[0][: len(folder)] == same[1] else None
+
+
+def _parts(path: str, windows: bool) -> list[str]:
+    text = path.replace("\\", "/") if windows else path
+    return [part for part in text.split("/") if part not in ("", ".")]
+
+
+def _told() -> list[dict[str, Any]]:
+    file = os.environ.get(RULES_VARIABLE, "")
+    if not file or not Path(file).is_file():
+        return []
+    data = read_json(Path(file), LONGEST_JSON)
+    rules: Any = data.get("path_mapping_rules") or []
+    wanted = {"source_path_format", "source_path", "destination_path"}
+    told = cast("list[Any]", rules) if isinstance(rules, list) else [None]
+    found = [rule for rule in told if is_json_object(rule) and wanted <= set(rule)]
+    if len(found) != len(told):
+        raise ValueError(f"{file} holds no path mapping rules as Open Job Description writes them")
+    return found

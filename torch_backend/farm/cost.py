@@ -1,0 +1,137 @@
+"""What a job will cost, by measured rates: core-hours, card-hours, disk, and the critical path."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from .rates import SESSION_SECONDS, Rate
+from .shots import FarmShot
+from .template import Needs
+from .work import Step, disk_bytes
+
+ON_A_CARD = ("train", "open", "freeze")
+"""Steps that a graphics card does, where one is asked for."""
+SPARE = 1.5
+"""Memory that is asked for, over what was seen."""
+MIB_PER_MEGAPIXEL = 160
+"""Memory that a take's frames want by their size: docs/benchmarks.md, "What a frame costs", 640 x 360 against 4K."""
+_OF_FRAMES = ("open", "freeze", "finish", "bake")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One kind of step of a job."""
+
+    kind: str
+    tasks: int
+    seconds: float
+    """Wall seconds of all its tasks, one after the other."""
+    core_seconds: float
+    """Processor seconds."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A whole job."""
+
+    rows: list[Row]
+    shots: int
+    tasks: int
+    core_hours: float
+    card_hours: float
+    """0 where no card is asked for."""
+    disk_gb: float
+    """What the takes, and what is made on the way, will occupy."""
+    critical_seconds: float
+    """How long the job takes at least, however many hosts there are: the longest chain of tasks."""
+    on_hosts: dict[int, float]
+    """Hosts -> seconds until the last task has ended, each with one task at a time."""
+
+
+def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bool) -> Estimate:
+    """The cost of a job.
+
+    Args:
+        steps: of all shots, a shot's in their order.
+        rates: step's kind -> rate.
+        card: a graphics card is asked for.
+        bake: takes are baked.
+    """
+    shots: dict[str, FarmShot] = {step.shot.name: step.shot for step in steps}
+    chains = [[_times(step, rates) for step in steps if step.shot.name == name] for name in shots]
+    rows: list[Row] = []
+    for kind in dict.fromkeys(step.kind for step in steps):
+        every = [seconds for step in steps if step.kind == kind for seconds in _times(step, rates)]
+        rows.append(Row(kind, len(every), sum(every), sum(every) * rates[kind].cores))
+    tasks = sum(row.tasks for row in rows)
+    return Estimate(
+        rows,
+        len(shots),
+        tasks,
+        sum(row.core_seconds for row in rows) / 3600.0,
+        sum(row.seconds for row in rows if row.kind in ON_A_CARD) / 3600.0 if card else 0.0,
+        sum(disk_bytes(shot, bake) for shot in shots.values()) / 1e9,
+        max((sum(max(times) for times in chain) for chain in chains), default=0.0) + SESSION_SECONDS,
+        {hosts: _makespan(chains, hosts) for hosts in (1, 2, 10, 100)},
+    )
+
+
+def needs(rates: dict[str, Rate], card: bool, megapixels: float) -> dict[str, Needs]:
+    """What hosts are asked for, by what was measured; `megapixels` of the largest take's frames."""
+    found: dict[str, Needs] = {}
+    for kind, rate in rates.items():
+        memory = SPARE * rate.memory_mib + (MIB_PER_MEGAPIXEL * megapixels if kind in _OF_FRAMES else 0.0)
+        found[kind] = Needs(int(-(-memory // 512) * 512), card and kind in ON_A_CARD)
+    return found
+
+
+def sentences(told: Estimate, rates_from: str) -> list[str]:
+    """An estimate for people, line by line."""
+    lines = [f"{told.shots} shots, {told.tasks} tasks. By rates {rates_from}, on hosts that do one task at a time:"]
+    for row in told.rows:
+        lines.append(f"  {row.kind:<8} {row.tasks:>6} tasks {_hours(row.seconds):>10}")
+    lines.append(f"Processor: {told.core_hours:.2f} core-hours.")
+    if told.card_hours:
+        lines.append(f"Card: {told.card_hours:.2f} card-hours, if a card is no faster than the rates say.")
+    lines.append(f"Disk: up to {told.disk_gb:.1f} GB.")
+    ends = ", ".join(f"{hosts} {_hours(seconds)}" for hosts, seconds in told.on_hosts.items())
+    lines.append(f"Until the last task ends, by hosts: {ends}; never under {_hours(told.critical_seconds)}.")
+    return lines
+
+
+def _times(step: Step, rates: dict[str, Rate]) -> list[float]:
+    rate = rates[step.kind]
+    return [rate.seconds(amount) for amount in step.tasks()]
+
+
+def _makespan(chains: list[list[list[float]]], hosts: int) -> float:
+    """When the last task ends, if a free host takes the next one of the earliest shot that has one ready.
+
+    `chains`: shot -> step -> seconds of each task.
+    """
+    free = [SESSION_SECONDS] * hosts
+    heapq.heapify(free)
+    ready = [(SESSION_SECONDS, n) for n, chain in enumerate(chains) if chain]
+    heapq.heapify(ready)
+    at = [0] * len(chains)
+    last = 0.0
+    while ready:
+        since, n = heapq.heappop(ready)
+        ends = since
+        for seconds in chains[n][at[n]]:
+            end = max(heapq.heappop(free), since) + seconds
+            heapq.heappush(free, end)
+            ends = max(ends, end)
+        at[n] += 1
+        last = max(last, ends)
+        if at[n] < len(chains[n]):
+            heapq.heappush(ready, (ends, n))
+    return last
+
+
+def _hours(seconds: float) -> str:
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.1f} min" if seconds < 5400.0 else f"{seconds / 3600.0:.1f} h"

@@ -1,0 +1,103 @@
+"""What a unit of work takes: measured here, or on the farm that it is asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..contract import ExitCode, JobError, from_dict, read_json
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Of one kind of step, on one host."""
+
+    fixed: float
+    """Seconds that a task takes whatever it has to do: starting, loading."""
+    per_unit: float
+    """Seconds per unit of `work.Step.amounts`."""
+    cores: float
+    """Processor cores that it keeps busy, in the mean."""
+    memory_mib: int
+    """Most memory in MiB that was seen."""
+
+    def seconds(self, amount: float) -> float:
+        """How long a task takes."""
+        return self.fixed + self.per_unit * amount
+
+
+MEASURED: dict[str, Rate] = {
+    "import": Rate(3.0, 0.03, 1.0, 400),
+    "solve": Rate(5.0, 3.4, 1.0, 1000),
+    "train": Rate(4.0, 0.228, 1.0, 1500),
+    "open": Rate(3.5, 0.153, 1.0, 1000),
+    "freeze": Rate(3.8, 0.43, 1.0, 1250),
+    "finish": Rate(3.2, 0.03, 1.0, 700),
+    "bake": Rate(4.2, 0.11, 1.0, 600),
+    "deliver": Rate(4.1, 0.0, 1.0, 500),
+}
+"""Step -> rate on one core of the processor of docs/farm.md, which says how they were measured."""
+SESSION_SECONDS = 2.0
+"""Seconds that entering the job's environment takes once it is set up, per session of a host."""
+
+
+def measure(records: Iterable[dict[str, Any]]) -> dict[str, Rate]:
+    """Rates by what tasks took (`records.read`), for those steps that there are records of.
+
+    Where tasks had different amounts to do, what is fixed and what grows are told apart by least squares, neither below
+    zero; else the fixed part is that of `MEASURED`, as far as the tasks took that long.
+    """
+    by_step: dict[str, list[tuple[float, float, float, float]]] = {}
+    for record in records:
+        try:
+            row = tuple(float(record[name]) for name in ("amount", "seconds", "cpu_seconds", "memory_mib"))
+            by_step.setdefault(str(record["step"]), []).append(row)  # type: ignore[arg-type]
+        except (KeyError, TypeError, ValueError):
+            continue
+    return {step: _fitted(step, np.array(rows)) for step, rows in sorted(by_step.items()) if step in MEASURED}
+
+
+def _fitted(step: str, rows: np.ndarray) -> Rate:
+    amounts, seconds = rows[:, 0], rows[:, 1]
+    usual = MEASURED[step]
+    fixed, per = min(usual.fixed, float(seconds.mean())), 0.0
+    if np.ptp(amounts) > 0.2 * amounts.max():
+        per, fixed = (float(v) for v in np.polyfit(amounts, seconds, 1))
+        if per < 0.0:
+            fixed, per = float(seconds.mean()), 0.0
+        elif fixed < 0.0:
+            fixed, per = 0.0, float(seconds.sum() / amounts.sum())
+    elif amounts.mean() > 0.0:
+        per = max(0.0, float(seconds.mean()) - fixed) / float(amounts.mean())
+    else:
+        fixed = float(seconds.mean())
+    cores = float(rows[:, 2].sum() / max(1e-9, seconds.sum()))
+    return Rate(round(fixed, 4), round(per, 6), round(max(0.1, cores), 3), int(rows[:, 3].max()))
+
+
+def to_json(rates: dict[str, Rate]) -> dict[str, Any]:
+    """Rates as rates.json holds them."""
+    return {"version": VERSION, "rates": {step: dataclasses.asdict(rate) for step, rate in rates.items()}}
+
+
+def read_rates(path: str | Path) -> dict[str, Rate]:
+    """`MEASURED` with those of a file in their place. JobError if it is no such file."""
+    try:
+        told = read_json(path)
+        if told.get("version") != VERSION:
+            raise ValueError("it is not of this version")
+        own = {str(step): from_dict(Rate, rate) for step, rate in dict(told["rates"]).items()}
+        if set(own) - set(MEASURED):
+            raise ValueError(f"it names the step {sorted(set(own) - set(MEASURED))[0]}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise JobError(
+            f"{path} holds no rates: {error}.", "Give the rates.json of `farm measure`.", ExitCode.USAGE
+        ) from error
+    return MEASURED | own

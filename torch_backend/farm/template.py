@@ -1,0 +1,238 @@
+"""The job template of Open Job Description (2023-09), as JSON, and its parameters.
+
+Each shot has a chain of steps of its own, so that one that fails holds up no other; a step has a task for each instant
+and each part of its frames. No path of the computer that submits stands in a command: shots and clips are task
+parameters of type PATH, the program's folder and what else options name are job parameters of type PATH, so that the
+engine's path mapping reaches all of them.
+
+Source: https://github.com/OpenJobDescription/openjd-specifications/wiki/2023-09-Template-Schemas
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..contract import PARAMS, SHOT_SUFFIX, ExitCode, JobError, write_json
+from ..contract.files import is_json_object
+from ..contract.option_table import MASK_ALPHA, mask_path, options_of
+from .shots import FarmShot
+from .work import STEPS, Step
+
+VERSION = "jobtemplate-2023-09"
+TEMPLATE_FILE, PARAMETERS_FILE, VALUES_FILE = "template.json", "parameters.json", "parameter_values.json"
+"""The template; its parameters as `openjd run --job-param file://...` takes them, and as a bundle of Deadline Cloud."""
+NOTIFY_SECONDS = 60
+"""A training that is cancelled has so long for its checkpoint."""
+_SAYS = {
+    "import": "Footage into the shot folder",
+    "solve": "Cameras, and what moves",
+    "train": "Gaussians, and what of them moves",
+    "open": "The instant is chosen and developed: what all parts of a take share",
+    "freeze": "Frozen frames, a part of a take in each task",
+    "finish": "Contact sheet, video, PLY and take.json of the whole take",
+    "bake": "Frames through Blender's compositor, a part of a take in each task",
+    "deliver": "shot.blend and summary.json of what is baked",
+}
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a computer must have for the tasks of a step."""
+
+    memory_mib: int
+    """Memory in MiB."""
+    gpu: bool
+    """A graphics card that the backend can use."""
+    cores: int = 1
+    """Processor cores."""
+
+
+def job_template(name: str, steps: Sequence[Step], needs: dict[str, Needs], bake: bool) -> dict[str, Any]:
+    """The template of a job.
+
+    Args:
+        name: of the job.
+        steps: of all shots, a shot's one after the other.
+        needs: step's kind -> what it needs.
+        bake: takes go through Blender, too: hosts are given one.
+
+    Raises:
+        JobError: a path holds braces, which a template cannot say.
+    """
+    paths = paths_of([step.shot for step in steps])
+    parameters: list[dict[str, Any]] = [
+        _parameter("Splannequin", "Folder of Splannequin on the hosts: it holds splannequin.py", "IN"),
+        _parameter("HostPython", "Any Python from 3.8 on the hosts, to begin with"),
+        _parameter("BackendPython", "Python with Splannequin's packages on the hosts; empty: it is set up"),
+        _parameter("Home", "Folder of the hosts where it is set up once; empty: Splannequin's own folder"),
+    ]
+    if bake:
+        parameters += [
+            _parameter("Blender", "Blender's program on the hosts; empty: a bpy wheel is set up, or it is on the PATH"),
+            _parameter("OutputFolder", "Folder for what is baked: SHOT/TAKE/composited", "OUT"),
+        ]
+    parameters += [_parameter(each, f"Path of the option {each}", "IN", "FILE") for each in sorted(paths)]
+    return {
+        "specificationVersion": VERSION,
+        "name": _refused(name),
+        "description": "Frozen frames by Splannequin. Every task may run twice, also at once, and after a kill.",
+        "parameterDefinitions": parameters,
+        "jobEnvironments": [_environment(bake)],
+        "steps": [_step(step, before, needs[step.kind], paths, bake) for step, before in _chained(steps)],
+    }
+
+
+def job_values(software: Path, shots: Sequence[FarmShot], output: Path, bake: bool) -> dict[str, str]:
+    """Values of a template's job parameters, as they are on the computer that submits."""
+    values = {"Splannequin": str(software), "HostPython": "python3", "BackendPython": "", "Home": ""}
+    if bake:
+        values |= {"Blender": "", "OutputFolder": str(output)}
+    return values | paths_of(shots)
+
+
+def write_job(folder: Path, template: dict[str, Any], values: dict[str, str]) -> list[Path]:
+    """Writes the files of a job into a folder, which is made; returns them. OSError if it cannot be written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    bundle = {"parameterValues": [{"name": name, "value": value} for name, value in values.items()]}
+    files = {TEMPLATE_FILE: template, PARAMETERS_FILE: values, VALUES_FILE: bundle}
+    for name, data in files.items():
+        write_json(folder / name, data)
+    return [folder / name for name in files]
+
+
+def paths_of(shots: Sequence[FarmShot]) -> dict[str, str]:
+    """Job parameter -> path, of all options of the shots' steps that name files."""
+    found: dict[str, str] = {}
+    for shot in shots:
+        for kind, values in shot.requests.items():
+            for field in _path_fields(kind):
+                if values[field] and values[field] != MASK_ALPHA and (kind, field) not in _ITS_OWN:
+                    found[_parameter_name(kind, field)] = values[field]
+    return found
+
+
+_ITS_OWN = {("import", "source"), ("freeze", "camera_path")}
+"""Paths that each shot has its own of: a task parameter, and a file in the shot."""
+
+
+def _path_fields(kind: str) -> list[str]:
+    return [one.name for one, spec in options_of(PARAMS[kind]) if spec.is_path or spec.parse is mask_path]
+
+
+def _parameter_name(kind: str, field: str) -> str:
+    return "".join(word.capitalize() for word in [kind, *field.split("_")])
+
+
+def _parameter(name: str, text: str, flow: str = "", of: str = "DIRECTORY") -> dict[str, Any]:
+    if flow:
+        return {"name": name, "type": "PATH", "objectType": of, "dataFlow": flow, "description": text}
+    default = "python3" if name == "HostPython" else ""
+    return {"name": name, "type": "STRING", "default": default, "description": text}
+
+
+def _environment(bake: bool) -> dict[str, Any]:
+    """Entered once per session of a host: everything that is installed is pinned, and there already the second time."""
+    words = ["--python", "{{Param.BackendPython}}", "--home", "{{Param.Home}}"]
+    words += ["--blender", "{{Param.Blender}}", "--bake"] if bake else []
+    enter = {"command": "{{Param.HostPython}}", "args": [_LAUNCHER, "farm-host", *words]}
+    return {"name": "Splannequin", "script": {"actions": {"onEnter": enter}}}
+
+
+_LAUNCHER = "{{Param.Splannequin}}/splannequin.py"
+
+
+def _chained(steps: Sequence[Step]) -> list[tuple[Step, str]]:
+    """Each step with the name of the one of its shot that it waits for; empty for a shot's first."""
+    last: dict[str, str] = {}
+    found: list[tuple[Step, str]] = []
+    for step in sorted(steps, key=lambda step: STEPS.index(step.kind)):
+        found.append((step, last.get(step.shot.name, "")))
+        last[step.shot.name] = step.name
+    return found
+
+
+def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bool) -> dict[str, Any]:
+    shot, kind = step.shot, step.kind
+    words = [_LAUNCHER, "farm-task", kind, "--shot", "{{Task.Param.Shot}}", "--request", "{{Task.File.Request}}"]
+    words += ["--path-rules", "{{Session.PathMappingRulesFile}}"]
+    space: list[dict[str, Any]] = [{"name": "Shot", "type": "PATH", "range": [_refused(str(shot.root))]}]
+    said: list[str] = []
+    if kind == "import":
+        space.append({"name": "Clip", "type": "PATH", "range": [_refused(shot.clip)]})
+        said.append("import.source={{Task.Param.Clip}}")
+    for field in _path_fields(kind) if kind in PARAMS else ():
+        name = _parameter_name(kind, field)
+        if name in paths and shot.requests[kind][field] == paths[name]:
+            said.append(f"{kind}.{field}={{{{Param.{name}}}}}")
+    if said:
+        words += ["--paths", *said]
+    if any(step.t_stars):
+        space.append({"name": "TStar", "type": "INT", "range": [int(t) for t in step.t_stars]})
+        words.append("--t-star={{Task.Param.TStar}}")  # a negative one is no option
+    if step.starts:
+        space.append({"name": "First", "type": "INT", "range": step.starts})
+        words += ["--first={{Task.Param.First}}", "--frames", str(step.part)]
+    if kind in ("bake", "deliver"):
+        words += ["--output", "{{Param.OutputFolder}}"]
+    action = {
+        "command": "{{Param.HostPython}}",
+        "args": words,
+        "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": NOTIFY_SECONDS},
+    }
+    asked = _request(step)
+    template: dict[str, Any] = {"name": step.name, "description": f"{_SAYS[kind]}."}
+    if before:
+        template["dependencies"] = [{"dependsOn": before}]
+    amounts: list[dict[str, Any]] = [{"name": "amount.worker.vcpu", "min": needs.cores}]
+    amounts.append({"name": "amount.worker.memory", "min": needs.memory_mib})
+    if needs.gpu:
+        amounts.append({"name": "amount.worker.gpu", "min": 1})
+    template["hostRequirements"] = {"amounts": amounts}
+    template["parameterSpace"] = {"taskParameterDefinitions": space}
+    files = [{"name": "Request", "type": "TEXT", "filename": "request.json", "data": asked}]
+    template["script"] = {"actions": {"onRun": action}, "embeddedFiles": files}
+    return template
+
+
+def _request(step: Step) -> str:
+    """What a task is asked for, as the text of a file: parameters without paths, and the takes' names."""
+    shot, kind = step.shot, step.kind
+    asked = kind if kind in PARAMS else "freeze"
+    values = dict(shot.requests[asked])
+    for field in _path_fields(asked):
+        if values[field] and values[field] != MASK_ALPHA and (asked, field) != ("freeze", "camera_path"):
+            values[field] = ""
+    amounts = {str(start): round(amount, 4) for start, amount in step.amounts.items()}
+    request: dict[str, Any] = {"version": 1, "name": shot.name, "amounts": amounts, asked: values}
+    if asked == "freeze":
+        request |= {"takes": shot.takes, "first": shot.first, "last": shot.last}
+    # Two braces begin a reference. JSON itself never has two: with an indent each stands on a line of its own.
+    return json.dumps(request, indent=1, sort_keys=True).replace("{{", "{\\u007b")
+
+
+def _refused(text: str) -> str:
+    """`text`, which stands in the template as it is. JobError if the engine would read a reference in it."""
+    if "{{" in text or re.search(r"[\x00-\x1f]", text):
+        raise JobError(f"{text!r} cannot stand in a template.", "Rename it without {{.", ExitCode.USAGE)
+    return text
+
+
+def read_request(path: str | Path) -> dict[str, Any]:
+    """What `_request` wrote. JobError if it is none, or from a newer version."""
+    try:
+        data: Any = json.loads(Path(path).read_text(encoding="utf-8"))
+        if not is_json_object(data) or data.get("version") != 1:
+            raise ValueError("it is not of this version")
+    except (OSError, ValueError) as error:
+        raise JobError(f"{path} is no request of a farm's template: {error}.", "", ExitCode.USAGE) from error
+    return data
+
+
+def shot_name(root: Path) -> str:
+    """Folder of a shot below the output folder."""
+    return root.name.removesuffix(SHOT_SUFFIX)

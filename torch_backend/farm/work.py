@@ -1,0 +1,120 @@
+"""Tasks of a job, and how much each has to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from ..contract import PRESET_STEPS, PRESET_WIDTHS
+from ..freeze.develop import DevelopConfig
+from .shots import FarmShot
+
+STEPS = ("import", "solve", "train", "open", "freeze", "finish", "bake", "deliver")
+"""Of a shot, in their order: each begins when all of the one before has succeeded."""
+MOST_VALUES = 1024
+"""Values of a task parameter, at most, as Open Job Description has it."""
+
+
+PER_STEP, PER_FRAME = 0.16, 0.9
+"""Megapixels that a training step, and a frozen frame, cost whatever their size; measured, see docs/farm.md."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of one shot."""
+
+    shot: FarmShot
+    kind: str
+    """One of `STEPS`."""
+    t_stars: list[str]
+    """Instants that it has a task for each; empty: it knows no takes."""
+    starts: list[int]
+    """First frames of the parts that each of them is made in; empty: it is made as one."""
+    part: int
+    """Frames of a part."""
+    amounts: dict[int, float]
+    """First frame of a part, 0 where there are none -> how much a task has to do: megapixels of pictures that are read;
+    of training steps and frozen frames with what each costs whatever its size."""
+
+    @property
+    def name(self) -> str:
+        """Of the template's step."""
+        return f"{self.shot.name}: {self.kind}"
+
+    def tasks(self) -> Iterator[float]:
+        """The amount of work of each task."""
+        for _ in self.t_stars or [""]:
+            yield from (self.amounts[start] for start in self.starts or [0])
+
+
+def steps_of(shot: FarmShot, part: int, bake: bool) -> list[Step]:
+    """What is to be done for a shot, in order; what is done already has no step.
+
+    `part`: frames of a task of freeze and bake; more where a take would have over 1024 of them.
+    """
+    part = max(1, part, -(-shot.frames // MOST_VALUES))
+    starts = list(range(shot.first, shot.last + 1, part))
+    wide, high = take_size(shot)
+    each = wide * high / 1e6 + PER_FRAME
+    sizes = {start: min(part, shot.last + 1 - start) * each for start in starts}
+    working = shot.working[0] * shot.working[1] / 1e6
+    whole = {0: shot.frames * each}
+    every = list(shot.takes)
+    plain: list[tuple[str, float]] = []
+    if shot.clip:
+        plain.append(("import", shot.frames * shot.source[0] * shot.source[1] / 1e6))
+    if not shot.solved:
+        plain.append(("solve", shot.frames * working))
+    if not shot.trained:
+        plain.append(("train", _training(shot)))
+    steps = [Step(shot, kind, [], [], part, {0: amount}) for kind, amount in plain]
+    steps.append(Step(shot, "open", every, [], part, {0: _developing(shot)}))
+    steps.append(Step(shot, "freeze", every, starts, part, sizes))
+    steps.append(Step(shot, "finish", every, [], part, whole))
+    if bake:
+        steps.append(Step(shot, "bake", every, starts, part, sizes))
+        steps.append(Step(shot, "deliver", every, [], part, whole))
+    return steps
+
+
+def take_size(shot: FarmShot) -> tuple[int, int]:
+    """Width and height in pixels of a shot's frozen frames, without overscan."""
+    width = int(shot.requests["freeze"]["width"]) or shot.source[0]
+    return width, max(16, round(shot.source[1] * width / shot.source[0]))
+
+
+def _training(shot: FarmShot) -> float:
+    asked: dict[str, Any] = shot.requests["train"]
+    steps = asked["iterations"] or PRESET_STEPS[asked["preset"]]
+    return steps * (_trained_width(shot) ** 2 * _shape(shot) / 1e6 + PER_STEP)
+
+
+def _trained_width(shot: FarmShot) -> int:
+    """Pixels of the training's pictures."""
+    asked: dict[str, Any] = shot.requests["train"]
+    return min(asked["width"] or PRESET_WIDTHS[asked["preset"]] or shot.working[0], shot.working[0])
+
+
+def _developing(shot: FarmShot) -> float:
+    """Of an instant; 0 where it is not developed."""
+    if shot.requests["freeze"]["develop"] != "on":
+        return 0.0
+    usual, trained = DevelopConfig(), _trained_width(shot)
+    width = min(max(usual.width, trained), shot.working[0])
+    steps = round(usual.steps * max(1.0, trained / usual.width))
+    return steps * (width**2 * _shape(shot) / 1e6 + PER_STEP)
+
+
+def _shape(shot: FarmShot) -> float:
+    return shot.working[1] / shot.working[0]
+
+
+def disk_bytes(shot: FarmShot, bake: bool) -> float:
+    """What a shot's takes will occupy, and what is made on the way, in bytes."""
+    wide, high = take_size(shot)
+    freeze = shot.requests["freeze"]
+    each = wide * high * (20.0 + (6.0 if freeze["grain"] else 0.0) + (24.0 if freeze["detail"] == "on" else 0.0))
+    taken = shot.frames * (each + (3.0 * wide * high if bake else 0.0)) * len(shot.takes)
+    working = shot.working[0] * shot.working[1] * 4.0 * shot.frames
+    return taken + (working if shot.clip else 0.0) + (0.0 if shot.trained else 100e6)

@@ -1,0 +1,150 @@
+"""A take in parts, for many computers at once: opened once, frozen in parts, finished once.
+
+    open_take      what all parts share: the instant is chosen and developed, and what the take shows is written down
+    freeze_part    frames of a range; any number of parts at once, in any order, on any computer
+    finish_take    contact sheet, video, PLY and take.json, when all frames are there
+
+Each may run twice, also at once, and after it was killed: nothing that is right is removed, every file is renamed into
+its place whole, and two who make the same frame write the same bytes. Nobody holds the shot's lock: parts of different
+takes, and of one, do not wait for each other.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ..contract import (
+    TAKE_FILE,
+    TAKE_PREVIEW_FOLDER,
+    TAKE_STATE_FILE,
+    ExitCode,
+    FreezeParams,
+    JobError,
+    Reporter,
+    frame_file,
+    read_json,
+)
+from ..shot import Shot, content_key, write_json
+from .exr import read_key
+from .take import PlannedTake, finish, frames_in, is_whole, make_folders, planned, render_frames
+from .take_cameras import in_range
+from .warp import FOLDER as WARPS
+
+
+def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
+    """Begins a take: chooses its instant, develops it if that is wanted, and writes state.json.
+
+    Returns {t_star, first, last, frames}: what parts are to be made of. JobError in words if it cannot be done.
+    """
+    take = planned(shot, params, report)
+    make_folders(take.folder, take.spec.detail is not None)
+    take.spec.instants.prepare((f.t_star for f in take.whole), report)
+    _refuse_undeveloped(take)
+    chosen = in_range(take.whole, params)
+    told = take.folder / TAKE_FILE
+    if told.is_file() and not _same_take(told, take):
+        told.unlink(missing_ok=True)  # what it tells of goes, frame by frame
+    state = {"version": 1, "key": take.key, "t_star": take.t_star, "frames": _all_keys(take)}
+    write_json(take.folder / TAKE_STATE_FILE, state)
+    return {"t_star": take.t_star, "first": chosen[0].frame, "last": chosen[-1].frame, "frames": len(chosen)}
+
+
+def freeze_part(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
+    """Renders those frames of `params.first` to `params.last` that an opened take lacks.
+
+    A range without a frame is no error: the last part of a take may be empty. Returns {frames, rendered}. JobError if
+    the take was not opened, or not as this computer sees it.
+    """
+    take = _opened(shot, params, report)
+    _refuse_undeveloped(take)
+    try:
+        frames = in_range(take.whole, params)
+    except JobError:
+        frames = []
+    done = {f.frame for f in frames if is_right(take, f.frame)}
+    render_frames(take, frames, done, report)
+    if take.spec.run.stale:
+        raise JobError(
+            "The run was trained while it was frozen.", "Open the take again, then freeze its parts.", ExitCode.FREEZE
+        )
+    return {"frames": len(frames), "rendered": len(frames) - len(done)}
+
+
+def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
+    """Completes an opened take whose frames from `params.first` to `params.last` are all there.
+
+    Frames of before that are not right any more are removed. Returns what take.json holds. JobError names frames that
+    lack.
+    """
+    take = _opened(shot, params, report)
+    wanted = in_range(take.whole, params)
+    right = {f.frame for f in take.whole if is_right(take, f.frame)}
+    lacking = [f.frame for f in wanted if f.frame not in right]
+    if lacking:
+        raise JobError(
+            f"Take {params.take} of {shot.root.name} lacks {len(lacking)} of {len(wanted)} frames, the first is "
+            f"{lacking[0]}.",
+            "Run the part that it belongs to again.",
+            ExitCode.FREEZE,
+        )
+    for number in frames_in(take.folder.glob("*.exr")):
+        if number not in right:
+            for old in _files_of(take.folder, number):
+                old.unlink(missing_ok=True)
+    return finish(shot, params, take, [f for f in take.whole if f.frame in right], {}, report)
+
+
+def is_right(take: PlannedTake, frame: int) -> bool:
+    """True if a frame of the take is on disk as it would be rendered now."""
+    key = read_key(take.folder / frame_file(frame, ".exr")) if frame in take.keys else None
+    return key is not None and key == take.keys[frame] and is_whole(take.folder, frame, take.spec.detail is not None)
+
+
+def _files_of(folder: Path, frame: int) -> list[Path]:
+    exr, preview = frame_file(frame, ".exr"), frame_file(frame, ".png")
+    return [folder / exr, folder / WARPS / exr, folder / TAKE_PREVIEW_FOLDER / preview]
+
+
+def _all_keys(take: PlannedTake) -> str:
+    """Changes with anything that any frame of the take shows."""
+    return content_key(sorted(take.keys.items()))
+
+
+def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
+    """The take as `open_take` settled it. JobError if it did not, or if this computer would render something else."""
+    try:
+        state = read_json(shot.take(params.take) / TAKE_STATE_FILE)
+        t_star = int(state["t_star"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise JobError(
+            f"Take {params.take} of {shot.root.name} was not opened.", "Run its step `open` first.", ExitCode.FREEZE
+        ) from None
+    take = planned(shot, params, report, t_star)
+    if state.get("key") != take.key or state.get("frames") != _all_keys(take):
+        raise JobError(
+            f"Take {params.take} of {shot.root.name} was opened with another run, other footage or other settings than "
+            "this computer sees.",
+            "See that the footage can be read here and that nobody trains the run, then run the step `open` again.",
+            ExitCode.FREEZE,
+        )
+    return take
+
+
+def _refuse_undeveloped(take: PlannedTake) -> None:
+    """JobError if an instant of the take is not kept where every part finds it: parts that made their own would not
+    match."""
+    lacking = [int(t) for t in take.spec.instants.keys if not take.spec.instants.is_kept(t)]
+    if lacking:
+        raise JobError(
+            f"The developed instant {lacking[0]} is not kept with the run.",
+            "Run the step `open` again; it says why, if it cannot be written.",
+            ExitCode.FREEZE,
+        )
+
+
+def _same_take(told: Path, take: PlannedTake) -> bool:
+    try:
+        return read_json(told).get("key") == take.key
+    except (OSError, ValueError):
+        return False
