@@ -23,7 +23,7 @@ from ..scene.ownership import TAG
 from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
-_SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "shot_seen")
+_SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "ignore_path", "people_path", "shot_seen")
 """Settings of a shot that hold a path."""
 _saving: list[str] = []
 """What `_holders` held before the file that is being saved was given its own."""
@@ -132,7 +132,7 @@ def _after_load(*_: object) -> None:
 def _known(path: Path, name: str) -> bool:
     """True if what the setting `name` is about is there; of a clip its shot is enough."""
     try:
-        if name in ("clip", "cameras_path", "st_map"):
+        if name in ("clip", "cameras_path", "st_map", "ignore_path", "people_path"):
             return _there(path) or (name == "clip" and contract.ShotFolder(selection.beside(path)).info_path.is_file())
         return contract.ShotFolder(path).info_path.is_file()
     except OSError:

@@ -55,6 +55,16 @@ def test_a_project_that_is_moved_as_a_whole_works_on(addon, project):
     )
 
 
+@pytest.mark.parametrize("name", ["ignore_path", "people_path", "st_map", "cameras_path"])
+def test_what_a_solve_is_given_is_found_again_in_a_project_that_is_moved(addon, project, name):
+    (project / "given.exr").touch()
+    setattr(bpy.context.scene.splannequin, name, str(project / "given.exr"))
+    blend(project)
+    there = moved(project)
+    held = opened(there).splannequin
+    assert addon("scene.paths").absolute(getattr(held, name)) == str(there / "given.exr")
+
+
 def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
     blend(project)
     copy = Path(shutil.copytree(project, project.with_name("copy")))
