@@ -26,6 +26,8 @@ NEWS_SECONDS = 60.0
 """Legs whose output is kept until they end say this often how far they are."""
 
 
+BACKEND_APART = ("tests/backend/freeze", "tests/backend/train", "tests/backend/report", "tests/backend/card")
+"""Half of the backend's tests by what they take: a leg of their own, beside which the others run."""
 ADDON_TESTS = ("tests/addon", "tests/addon_free")
 """Those that run in Blender. The second need none: the backend's leg runs them too."""
 
@@ -142,9 +144,13 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
     backend = backend_environment(testing=True)
     set_up(backend, sys.executable)
     legs: list[Leg] = []
-    if backend_paths:  # the longest first
-        command = [backend.python, "-P", "-m", "pytest", "--ignore=tests/addon", *backend_paths, *rest]
-        legs.append(Leg("backend", command, output / "junit-backend.xml"))
+    pytest = [backend.python, "-P", "-m", "pytest"]
+    apart = BACKEND_APART if not pytest_args and not series else ()
+    if apart:  # the longest first
+        legs.append(Leg("backend, one half", [*pytest, *apart], output / "junit-backend-half.xml"))
+    if backend_paths:
+        ignored = [f"--ignore={path}" for path in ("tests/addon", *apart)]
+        legs.append(Leg("backend", [*pytest, *ignored, *backend_paths, *rest], output / "junit-backend.xml"))
     if not pytest_args and not series:
         legs += checkers(backend.python)
     if addon_paths:

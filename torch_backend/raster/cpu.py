@@ -281,7 +281,8 @@ class _Rasterize(torch.autograd.Function):
             "grad_sh_rest": sh_rest,
         }
         # The first camera's threads clear them: zeroing a million Gaussians' harmonics here takes a tenth of a step.
-        out = {name: None if p is None else torch.empty_like(p) for name, p in parameters.items()}
+        empty = torch.empty_like if ctx.leases else torch.zeros_like
+        out = {name: None if p is None else empty(p) for name, p in parameters.items()}
         grad_view = torch.zeros_like(viewmats)
         stages, blend = _compile(0), _compile(image.shape[-1])
         for norm in ctx.norms:
