@@ -20,14 +20,15 @@ from .errors import LauncherError
 from .places import ROOT
 
 AT_ONCE = 2
-"""Legs that run beside each other where there are as many cores. More would make the tests wait for each other: those
-of the backend and those of the add-on take nearly all of the time."""
+"""Legs that run beside each other where there are as many cores. More would make the tests wait for each other: a test
+takes little more than one core."""
 NEWS_SECONDS = 60.0
 """Legs whose output is kept until they end say this often how far they are."""
 
 
-BACKEND_APART = ("tests/backend/freeze", "tests/backend/train", "tests/backend/report", "tests/backend/card")
-"""Half of the backend's tests by what they take: a leg of their own, beside which the others run."""
+BACKEND_APART = ("tests/backend/solve", "tests/backend/raster", "tests/backend/footage", "tests/backend/card")
+"""Half of the backend's tests by what they take: a leg of their own, beside which the others run. They share no run that
+was trained for them."""
 ADDON_TESTS = ("tests/addon", "tests/addon_free")
 """Those that run in Blender. The second need none: the backend's leg runs them too."""
 
