@@ -27,8 +27,8 @@ NEWS_SECONDS = 60.0
 
 
 BACKEND_APART = ("tests/backend/solve", "tests/backend/raster", "tests/backend/footage", "tests/backend/card")
-"""Half of the backend's tests by what they take: a leg of their own, beside which the others run. They share no run that
-was trained for them."""
+"""Half of the backend's tests by what they take: a leg of their own, beside which the others run. None of them needs
+the run that the others train once."""
 ADDON_TESTS = ("tests/addon", "tests/addon_free")
 """Those that run in Blender. The second need none: the backend's leg runs them too."""
 
