@@ -67,7 +67,7 @@ class DetailedFrame:
     depth: Tensor
     """[H, W] as in `FrozenImage`."""
     support: Tensor
-    """[H, W] as in `FrozenImage`."""
+    """[H, W] in 0..1: 1: what is seen stands still, or was seen near t*; 0: how it looked at t* nobody saw."""
     motion: Tensor
     """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell. On the clip's own
     poses 1 also where the frame's own plate shows what moves and is let go of: where it is 0 that plate may stand."""
@@ -198,8 +198,9 @@ class Detailer:
             image.color if ours else torch.empty(rows, columns, 3, device="cpu"),
             image.alpha if ours else image.alpha.clone(), splat.color, splat.alpha,
             torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
-            image.support, resized(posed.moved, columns, rows), leading, st, matte,
-            torch.zeros(rows, columns, 3, device="cpu"), self.scene.display,
+            torch.minimum(image.support, 1.0 - resized(posed.unseen, columns, rows)),
+            resized(posed.moved, columns, rows), leading, st, matte, torch.zeros(rows, columns, 3, device="cpu"),
+            self.scene.display,
         )  # fmt: skip
         for band in parts:
             filling = None if fillers is None else fill(self.seen, self.config, posed, fillers, matte, band)

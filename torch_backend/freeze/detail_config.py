@@ -25,6 +25,8 @@ class DetailConfig:
     doubt: float = 0.05
     """Sum of weights at which a pixel is half plate, half splats: what plates say is believed in part, as it is wrong
     in part. On truth the best share of a single plate's residual in what moves is 0.4 to 0.65."""
+    known_at: tuple[float, ...] = (0.0, -1.0, 1.0)
+    """Seconds from t* at whose plates it is asked whether what moves was seen near t*."""
     travel: float = 0.5
     """Pixels that the model moves a point by, from t* to the frame's own plate, from which on that plate is not
     believed there if it bears the motion out: sways too small for the flow."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from ..torch_types import norm
 from .bands import bands
 from .detail_config import DetailConfig
-from .frozen import OutputFrame
+from .frozen import SUPPORT_SECONDS, OutputFrame
 from .posed import PosedFrame, displacements, parallax
 from .regions import closed, grown, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
@@ -40,8 +42,8 @@ def leading_matte(
     """(matte [H, W] of the leading plate, its ST [H, W, 2], True if that is the identity).
 
     Also settles `posed.motion`: by the mattes of plate t* where that sees the point, else by the model's;
-    `posed.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so; and
-    `posed.moved`.
+    `posed.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so;
+    `posed.moved` and `posed.unseen`.
     """
     rows, columns = posed.image.alpha.shape
     lead = sightings.seen(leading, posed.points)
@@ -53,6 +55,7 @@ def leading_matte(
     else:
         posed.motion = torch.maximum(posed.motion, lead.moving) if own else posed.motion
     posed.moved = posed.motion
+    posed.unseen = _unseen(sightings, config, posed, torch.maximum(posed.motion, lead.visible * lead.moving), usable)
     st, within = _places(sightings, posed, leading, own, size)
     if own and leading != output.frame:  # its own plate is withheld
         return torch.zeros(rows, columns, device="cpu"), st, own
@@ -76,6 +79,26 @@ def leading_matte(
         error = parallax(sightings, config, posed, leading, posed.depth)
         matte = matte * lead.visible * torch.exp(-error.square())
     return resized(matte, columns, rows) * within, st, own
+
+
+def _unseen(sightings: Sightings, config: DetailConfig, posed: PosedFrame, moving: Tensor, usable: list[int]) -> Tensor:
+    """[h, w] in 0..1: how little of what moves (`moving`) plates near t* show; the further from t*, the less they know.
+
+    Gaussians that moved but were never opened are seen all along, so their own support does not say it.
+    """
+    seconds = {frame: float(sightings.scene.seconds[sightings.index[frame]]) for frame in usable}
+    if not seconds:
+        return moving
+    at, points = moving > 0.5, posed.points[moving > 0.5]
+    known = torch.zeros(len(points), device="cpu")
+    t_star = float(sightings.scene.seconds[sightings.index[posed.t]])
+    for offset in config.known_at if len(points) else ():
+        near = min(seconds, key=lambda frame: abs(seconds[frame] - t_star - offset))
+        trust = math.exp(-abs(seconds[near] - t_star) / SUPPORT_SECONDS)
+        known = torch.maximum(known, trust * sightings.seen(near, points).visible)
+    out = torch.zeros_like(moving)
+    out[at] = moving[at] * (1.0 - known)
+    return out
 
 
 def _free(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor | None:

@@ -44,6 +44,8 @@ class PosedFrame:
     """[h, w] in 0..1: where plates of other times are believed only if they agree with the model."""
     moved: Tensor
     """[h, w] in 0..1: what moves in the clip, at t* or in the frame's own plate; else `motion`."""
+    unseen: Tensor
+    """[h, w] in 0..1: what moves, and is in no plate near t*: how it looked then nobody knows."""
 
     @property
     def centre(self) -> Tensor:
@@ -78,7 +80,9 @@ def posed_frame(
     motion = resized(image.motion, w, h)
     own = _is_own(sightings, output, width, height)
     nothing = torch.zeros_like(motion)
-    return PosedFrame(output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing, motion)
+    return PosedFrame(
+        output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing, motion, nothing
+    )  # fmt: skip
 
 
 def _is_own(sightings: Sightings, output: OutputFrame, width: int, height: int) -> bool:

@@ -29,7 +29,9 @@ MovingOf = Callable[[int], "Tensor | None"]
 DOUBT = 0.4
 """How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
 _LENGTHS_OF = 640.0
-_VIEWS, _VIEWS_BYTES = 66, 400e6
+_VIEWS, _VIEWS_BYTES = 90, 700e6
+"""Plates kept at most. Between two uses of a plate, 16 frames apart, 80 others are looked at: with fewer every one was
+made three times on its way through a take."""
 _RESIDUALS_BYTES = 250e6
 _FINEST = 1280
 """Width at which the model's own render of a plate is made at most: splats show no more, and 4K costs memory."""
@@ -174,7 +176,8 @@ class Sightings:
         if frame not in self._views:
             self._views[frame] = self._make_view(frame)
             width, height = self.size
-            each = 20.0 * width * height + 12.0 * len(self.rows)
+            shown = 6.0 if self.size == (self.plates.width, self.plates.height) else 0.0
+            each = (20.0 + shown) * width * height + 12.0 * len(self.rows)
             room = _VIEWS_BYTES - 24.0 * self.plates.width * self.plates.height  # frames of 4K need it more
             while len(self._views) > max(12, min(_VIEWS, room / each)):
                 self._views.popitem(last=False)

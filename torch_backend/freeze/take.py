@@ -66,7 +66,7 @@ from .write_beside import WriteBeside
 
 TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
-DETAIL_VERSION = 4
+DETAIL_VERSION = 5
 """The same, of frames made of plates."""
 _FRAME = re.compile(r"-?\d+")
 
@@ -368,7 +368,7 @@ def _render_all(take: PlannedTake, frames: list[OutputFrame], done: Set[int], re
                 continue
             image = _render(output, scene, spec, report)
             if isinstance(image, DetailedFrame):
-                shares[output.frame] = small_share(image.plate)
+                shares[output.frame] = small_share(image.plate, image.support)
             write = functools.partial(_write, folder, output, image, scene, spec, keys[output.frame])
             out.write(write, sum(value.nbytes for value in vars(image).values() if isinstance(value, Tensor)))
             del image, write  # at 4K the next frame needs their gigabyte
@@ -491,8 +491,12 @@ def _write_warp(folder: Path, output: OutputFrame, made: DetailedFrame, spec: Fr
     )
 
 
-def small_share(plate: Tensor) -> Tensor:
-    """[H, W] share of plate, averaged to a picture about 160 pixels wide, for figures."""
+def small_share(plate: Tensor, support: Tensor) -> Tensor:
+    """[H, W] share of plate, averaged to a picture about 160 pixels wide, for figures.
+
+    A plate that shows what nobody saw near t* is none for the instant, by so much as `support` [H, W] says.
+    """
+    plate = torch.minimum(plate, support)
     height, width = plate.shape
     small = min(width, 160)
     return resized(plate, small, max(4, round(height * small / width)))
@@ -616,9 +620,10 @@ def _made_of(folder: Path, numbers: list[int], spec: FrameSpec, shares: dict[int
     if spec.detail is None:
         return {}
     for n in (n for n in numbers if n not in shares):
-        layers = read_frozen_exr(folder / frame_file(n, ".exr")).detail
-        if layers is not None:
-            shares[n] = small_share(from_numpy(np.asarray(layers.plate, np.float32)))
+        frame = read_frozen_exr(folder / frame_file(n, ".exr"))
+        if frame.detail is not None:
+            plate, support = (np.asarray(layer, np.float32) for layer in (frame.detail.plate, frame.support))
+            shares[n] = small_share(from_numpy(plate), from_numpy(support))
     return {"detail": detail_facts(shares), "warp_dir": str(folder / WARPS)}
 
 

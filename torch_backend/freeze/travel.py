@@ -12,7 +12,7 @@ from ..scene import Scene
 from ..train import LoadedRun
 from .frozen import FrozenGaussians, freeze_at
 
-_KEPT = 64
+_KEPT = 90
 """Frames whose changes are kept: of 25,000 open Gaussians about 3 MB each."""
 
 

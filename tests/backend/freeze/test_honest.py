@@ -12,6 +12,7 @@ from torch_backend.deformation import Deformation, Deltas
 from torch_backend.freeze.detail import DetailConfig, Detailer
 from torch_backend.freeze.regions import closed, grown, opened
 from torch_backend.freeze.sightings import SightingConfig
+from torch_backend.freeze.take import small_share
 
 FRAME, T_STAR = 3, 11
 """The board stands wholly apart in these two."""
@@ -203,3 +204,17 @@ def test_opening_and_closing_are_those_of_their_masks():
     found, want = closed(torn, 4).numpy()[inner], ndimage.binary_closing(mask, side)[inner]
     assert (found == want).mean() > 0.95 and want.mean() > mask[inner].mean() + 0.1, "at half size, so nearly"
     assert (found >= mask[inner]).all() and (closed(torn, 0).numpy() == mask).all()
+
+
+def test_what_moves_and_no_plate_near_t_star_shows_is_a_guess(world):
+    """Its Gaussians are known at every time, as those that were never opened are: the plates have to say it."""
+    output = world.output(FRAME, T_STAR)
+    board = narrowed(world.truth(output)[1], 6)
+    wall = ~widened(world.seen_at(FRAME)[1] | world.truth(output)[1], 24)
+    seen, guessed = world.make(output), world.make(output, withheld=[n for n in range(1, 14) if n != FRAME])
+    assert seen.support.numpy()[board].min() > 0.95
+    assert guessed.support.numpy()[board].max() < 0.05
+    for made in (seen, guessed):
+        assert made.support.numpy()[wall].min() > 0.99
+    shares = [float(small_share(made.plate, made.support).mean()) for made in (seen, guessed)]
+    assert shares[0] - shares[1] > 0.8 * float(torch.from_numpy(board).float().mean())
