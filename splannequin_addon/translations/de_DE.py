@@ -753,6 +753,7 @@ BACKEND: dict[str, str] = {
     "Choose t* in frames {} to {}, or train on that range alone.": "t* in den Bildern {} bis {} wählen oder nur auf diesem Bereich trainieren.",
     "Paint who walks in the motion matte, or take a range in which all hold still.": "Wer geht, in die Bewegungsmatte malen, oder einen Bereich nehmen, in dem alle stillhalten.",
     "{} % of the picture is plate, {} % is a guess.": "{} % des Bildes sind Plate, {} % sind geraten.",
+    "Most of it in frame {}: {} %.": "Das meiste in Bild {}: {} %.",
     "Mostly a guess in {}.": "Meist geraten in {!t}.",
     "If nothing moves there, paint it black in the motion matte.": "Bewegt sich dort nichts, es in der Bewegungsmatte schwarz malen.",
     "Keep the camera nearer to the clip's own path there.": "Die Kamera dort näher an der Bahn des Clips halten.",

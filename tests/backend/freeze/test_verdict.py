@@ -33,6 +33,16 @@ def test_a_take_of_plates_is_good():
     assert judge_take(facts(around=0.001)).lines() == ["Good. 99 % of the picture is plate, 1 % is a guess."]
 
 
+def test_the_worst_frame_is_named_where_no_place_is():
+    told = facts()
+    told["detail"]["per_frame"][36]["plate_share"] = 0.86
+    verdict = judge_take(told)
+    assert verdict is not None and verdict.word == "good"
+    assert verdict.lines()[1:] == ["Most of it in frame 37: 14 %."]
+    told["detail"]["per_frame"][36]["plate_share"] = 0.91
+    assert judge_take(told).lines()[1:] == []
+
+
 def test_a_guess_at_the_end_is_told_with_frames_place_and_what_to_do():
     verdict = judge_take(facts(lost=range(31, 41)))
     assert verdict is not None and verdict.word == "fair"
