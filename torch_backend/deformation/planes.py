@@ -158,12 +158,9 @@ def penalty(
     planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]], threads: int | None = None
 ) -> Tensor:
     """Sum over planes [1, C, H, W] of weighted means: squared second differences down and along, and |1 - plane|."""
-    if not supports(planes):
-        raise ValueError("planes should be float32, channels last, and on the CPU have a multiple of 16 features")
-    scaled: list[tuple[float, float, float]] = []
-    for plane, (down, along, still) in zip(planes, weights, strict=True):
-        _, c, h, w = plane.shape
-        scaled.append((down / max(1, c * (h - 2) * w), along / max(1, c * h * (w - 2)), still / (c * h * w)))
     if planes[0].is_cuda:
-        return planes_cuda.penalty(planes, scaled)
+        return planes_cuda.penalty(planes, weights)
+    if not supports(planes):
+        raise ValueError("planes should be float32 on the CPU, channels last, with a multiple of 16 features")
+    scaled = planes_cuda.over_counts(planes, weights)
     return applied(_Bend, torch.tensor(scaled, device="cpu"), threads, *planes)

@@ -27,8 +27,9 @@ from ..torch_types import AutogradContext, applied, once_differentiable, split
 
 _KERNELS = Path(__file__).with_name("kernels")
 
-refused = False
-"""Did the card's self-test find these kernels wrong? Then `supports` says no, and torch's own path serves."""
+refused = ""
+"""What the card's self-test has against these kernels (`train.device`); then `supports` says no, and torch's own path
+serves. Of the process, as the card is."""
 
 
 class Kernels(NamedTuple):
@@ -179,11 +180,19 @@ class _Bend(torch.autograd.Function):
         return None, *_like(flat * grads[0], planes)
 
 
-def penalty(planes: Sequence[Tensor], scaled: Sequence[tuple[float, float, float]]) -> Tensor:
-    """`planes.penalty` on the planes' device, with weights that are already divided by their counts.
+def over_counts(
+    planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]]
+) -> tuple[tuple[float, float, float], ...]:
+    """Weights of `penalty`, each over how many values its mean is of."""
+    scaled: list[tuple[float, float, float]] = []
+    for plane, (down, along, still) in zip(planes, weights, strict=True):
+        _, c, h, w = plane.shape
+        scaled.append((down / max(1, c * (h - 2) * w), along / max(1, c * h * (w - 2)), still / (c * h * w)))
+    return tuple(scaled)
 
-    ValueError unless `supports` takes the planes.
-    """
+
+def penalty(planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]]) -> Tensor:
+    """`planes.penalty` on the planes' device. ValueError unless `supports` takes the planes."""
     if not supports(planes):
         raise ValueError("planes should be float32 on one device, channels last, and aligned to 16 bytes")
-    return applied(_Bend, tuple(scaled), *planes)
+    return applied(_Bend, over_counts(planes, weights), *planes)

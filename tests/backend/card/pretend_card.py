@@ -248,6 +248,7 @@ def pretended_card() -> Iterator[Card]:
     import torch_backend.raster.ssim_cuda as ssim_cuda
     import torch_backend.train.adam as adam
     import torch_backend.train.device as chosen
+    from torch_backend.train.self_test import SelfTest
 
     saved: list[tuple[Any, str, Any]] = []
 
@@ -286,7 +287,7 @@ def pretended_card() -> Iterator[Card]:
     patch(torch.cuda, "memory_allocated", lambda device=None: CARD.live)
     patch(torch.cuda, "synchronize", lambda device=None: None)
     patch(chosen, "cuda_refusal", lambda: "")
-    patch(chosen, "card_problem", lambda: "")  # it would ask a process of its own, which has no such card
+    patch(chosen, "card_verdict", SelfTest)  # it would ask a process of its own, which has no such card
     for module in (native, ssim_cuda, adam, planes_cuda):
         patch(module, "launch_on", launch_on)
     patch(cuda._Launcher, "__init__", launcher)

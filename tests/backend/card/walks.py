@@ -83,28 +83,26 @@ def steps(folder: Path, *runs: str) -> dict[str, Any]:
 
 
 def launches(folder: Path, *methods: str) -> dict[str, Any]:
-    """Per method: launches of a step with the field whose kernels are used, and refused; of a tenth and others alike.
-
-    torch's operators and kernels of ours, a launch each at the least.
-    """
+    """Per method: launches of six steps with our kernels for the field's planes, and with torch's operators: kernels of
+    ours and operators, a launch each at the least."""
     from torch_backend.deformation import planes_cuda
 
     world, quiet = small_world(folder)
     told: dict[str, Any] = {}
     for method in methods:
         counts: dict[str, list[int]] = {}
-        for name, refused in (("ours", False), ("torch", True)):
+        for name, refused in (("ours", ""), ("torch", "it is wrong")):
             planes_cuda.refused = refused
             try:
                 with pretended_card():
                     trainer = new_trainer(world, quiet, method, "support", False)
-                    _steps(trainer, 6)
+                    _steps(trainer, 6)  # the field is there, and its tables
                     for _ in range(6):
                         before = CARD.operators + sum(CARD.launched.values())
                         _steps(trainer, 1)
                         counts.setdefault(name, []).append(CARD.operators + sum(CARD.launched.values()) - before)
             finally:
-                planes_cuda.refused = False
+                planes_cuda.refused = ""
         told[method] = counts
     return told
 
