@@ -1,10 +1,10 @@
 """Our kernels as a GPU compiles them (`__CUDA_ARCH__`), run on a CPU, plain and under sanitizers.
 
 What Warp's cpu device runs of the text is its other side: shuffles through memory, no votes, plain atomics. Here every
-launch of a few small scenes (the rasteriser's, on fibers), of SSIM, of Adam and of a field's planes is written down with
-its buffers before and after on that device, and `device_text.cpp` does it again with real votes and shuffles per warp,
-and atomics. What it cannot show: races between blocks, other streams, memory that was never written, the roundings of
-a GPU's own exp2 and division.
+launch of a few small scenes (the rasteriser's, on fibers), of SSIM and the loss, of Adam and of a field's planes is
+written down with its buffers before and after on that device, and `device_text.cpp` does it again with real votes and
+shuffles per warp, and atomics. What it cannot show: races between blocks, other streams, memory that was never written,
+the roundings of a GPU's own exp2 and division.
 
     python -m benchmarks.device_text                the launches against Warp's cpu device
     python -m benchmarks.device_text --sanitize     once more under address and undefined, and under thread (minutes)
@@ -81,17 +81,17 @@ class Launches:
                 whole, body = f"{name}{channels or ''}", (source.blending(channels) if channels else source.stages())
                 notes.bodies[whole] = _raster_function(whole, body[name])
                 values = [(True, int(getattr(args, pointer)), pointer) for pointer in NAMES]
-                values += [(False, int(getattr(args, size)) & 0xFFFFFFFF, size) for size in source.SIZES]
-                values.append((False, *struct.unpack("<I", struct.pack("<f", float(args.near))), "near"))
+                values += [(False, _bits(int(getattr(args, size))), size) for size in source.SIZES]
+                values.append((False, _bits(float(args.near)), "near"))
                 notes._note(whole, threads, values, lambda: call(self, name, args, threads, channels))
 
-        def noting_launch(kernel: Any, dim: int, inputs: list[int], device: torch.device) -> None:
+        def noting_launch(kernel: Any, dim: int, inputs: list[Any], device: torch.device) -> None:
             if dim:
                 whole = kernel.key + kernel.module.name[len(kernel.module.name.rstrip("0123456789")) :]
-                kinds = [(arg.label, arg.type is not wp.int32) for arg in kernel.adj.args]
-                notes.bodies[whole] = _plain_function(whole, kinds, kernel)
+                notes.bodies[whole] = _plain_function(whole, kernel)
                 values = [
-                    (points, value & (2**64 - 1), label) for (label, points), value in zip(kinds, inputs, strict=True)
+                    (arg.type is wp.uint64, _bits(value), arg.label)
+                    for arg, value in zip(kernel.adj.args, inputs, strict=True)
                 ]
                 notes._note(whole, dim, values, lambda: launch_on[0](kernel, dim, inputs, device))
 
@@ -154,15 +154,27 @@ def _bytes(tensor: torch.Tensor) -> bytes:
     return _flat(tensor).view(torch.uint8).numpy().tobytes()
 
 
+def _bits(value: float) -> int:
+    """An int's, or a float's as float32."""
+    return struct.unpack("<I", struct.pack("<f", value))[0] if isinstance(value, float) else value & (2**64 - 1)
+
+
 def _raster_function(whole: str, body: str) -> str:
     """A kernel of the rasteriser: its arguments are a structure that `fill` makes once for a launch."""
     return _function(whole, f"Args& args = args_of_launch;\n{body}")
 
 
-def _plain_function(whole: str, kinds: list[tuple[str, bool]], kernel: Any) -> str:
+_TAKEN = {
+    wp.uint64: "uint64_t {} = values[{}];", wp.int32: "int {} = (int)values[{}];",
+    wp.float32: "float {} = same_bits<float>((int)values[{}]);",
+}  # fmt: skip
+
+
+def _plain_function(whole: str, kernel: Any) -> str:
     """A kernel whose arguments are numbers and pointers, and whose threads know nothing of each other."""
-    (native,) = (cell.cell_contents for cell in kernel.func.__closure__ if hasattr(cell.cell_contents, "native_snippet"))
-    taken = "".join(f"const {'uint64_t' if wide else 'int'} {name} = values[{i}]; " for i, (name, wide) in enumerate(kinds))
+    held = [cell.cell_contents for cell in kernel.func.__closure__]
+    (native,) = (each for each in held if hasattr(each, "native_snippet"))
+    taken = "".join(f"const {_TAKEN[arg.type].format(arg.label, i)} " for i, arg in enumerate(kernel.adj.args))
     return _function(whole, f"{taken}const int tid = task;\n{native.native_snippet}")
 
 
@@ -185,7 +197,8 @@ def _kernels(bodies: dict[str, str]) -> str:
     text += f"args_of_launch.near = same_bits<float>((int)values[{near}]); }}\n"
     rows = [f'{{"{name}", {name}, {int(name.startswith("raster_"))}}}' for name in sorted(bodies)]
     text += "".join(bodies[name] for name in sorted(bodies))
-    return text + f"static const struct {{ const char* name; Kernel run; bool blocks; }} TABLE[] = {{{', '.join(rows)}}};\n"
+    text += "static const struct { const char* name; Kernel run; bool blocks; } "
+    return text + f"TABLE[] = {{{', '.join(rows)}}};\n"
 
 
 def build(folder: Path, which: str = "plain") -> Path:
@@ -298,14 +311,17 @@ def note_scenes(launches: Launches) -> list[tuple[int, int]]:
 
 
 def note_others(launches: Launches) -> None:
-    """SSIM, Adam and a field's planes with their gradients: odd sizes, rows out of view, a step that is left out, points
-    that are nowhere and beyond the rim, planes of one node, channels that are no multiple of four."""
+    """SSIM, the loss, Adam and a field's planes with their gradients: odd sizes, pixels that are ignored, rows out of
+    view, a step that is left out, points that are nowhere and beyond the rim, planes of one node, channels that are no
+    multiple of four."""
     g = torch.Generator().manual_seed(12)
     with launches.noted():
         for shape in ((11, 11, 1), (17, 23, 3)):
             image, target = torch.rand(2, *shape, generator=g)
             ssim_cuda.ssim(image.requires_grad_(), target).backward()
             ssim_cuda.ssim(image.detach(), target)
+            ignored = torch.rand(shape[:2], generator=g) > 0.7
+            ssim_cuda.photometric(image, target, 0.2, ignored).backward()
         leaves = [torch.nn.Parameter(torch.randn(*size, generator=g)) for size in ((70, 3), (1300, 4), (5,))]
         options = [{"rows": True}, {"clamp": (-0.5, 0.5)}, {"lr": 0.1}]
         groups = [{"params": [leaf], **more} for leaf, more in zip(leaves, options, strict=True)]

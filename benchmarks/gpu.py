@@ -242,9 +242,10 @@ def _short_list(stage: Stage, name: str) -> dict[str, Any]:
 
 
 def _planes(stage: Stage) -> dict[str, Any]:
-    """Samples, penalty and gradients of a field's planes, ms: our kernels, and torch's operators (dry: the processor's).
+    """Samples, penalty and gradients of a field's planes, ms: by our kernels, and by torch's operators.
 
-    Of 100,000 points at one instant, as in a step, which add to two rows of the time planes."""
+    Of 100,000 points at one instant, as in a step, which add to two rows of the time planes.
+    """
     g, count = torch.Generator().manual_seed(0), 300 if stage.dry else 100_000
     field = HexPlane(HexPlaneConfig(time_nodes=40), torch.tensor([[-1.0] * 3, [1.0] * 3]), g).to(stage.device)
     where, when = (2.0 * torch.rand(count, 3, generator=g) - 1.0).to(stage.device), field.box.new_full((1,), 0.4)

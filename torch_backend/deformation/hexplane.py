@@ -72,8 +72,8 @@ class HexPlaneConfig(HostConfig):
     never along x), the box of the first points, all harmonics move, and means are pulled through the lookup (on)."""
 
     def row_bytes(self) -> int:
-        """A level's product and its gradient (torch's own operators: six samples and their products), and a layer before
-        and after it bends: the trunk's, five heads'; on the way back the gradients of three layers."""
+        """A level's product and its gradient (by torch's own operators six samples and their products), and a layer
+        before and after it bends: the trunk's, five heads'; on the way back the gradients of three layers."""
         kept = 12 if planes_cuda.refused else 2
         return 4 * (kept * self.features * len(self.levels) + self.width * (2 * (1 + len(_WIDTHS)) + 3))
 

@@ -1,10 +1,10 @@
 """Feature planes of the HexPlane, compiled: samples and their product, smoothness, and both gradients.
 
 torch's own path (`hexplane`) is the specification and serves every other device and type; planes on an NVIDIA GPU go to
-`planes_cuda`. On the CPU a few thousand scattered samples leave torch waiting for memory: a plane's channels lie a plane
-apart, and six small operators per sample each cost more than their arithmetic. Here channels lie together
-(`channels_last`), one pass makes the product of a level's six samples, and the gradients of a plane are one worker's, so
-that any number of threads gives the same bits.
+`planes_cuda`. On the CPU a few thousand scattered samples leave torch waiting for memory: a plane's channels lie a
+plane apart, and six small operators per sample each cost more than their arithmetic. Here channels lie together
+(`channels_last`), one pass makes the product of a level's six samples, and the gradients of a plane are one worker's,
+so that any number of threads gives the same bits.
 """
 
 from __future__ import annotations

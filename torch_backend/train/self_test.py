@@ -32,6 +32,7 @@ from ..raster import RasterOutput, RasterSettings, rasterize, ssim, ssim_cuda
 from ..shot import write_json
 from ..torch_types import backward, norm_of_all
 from .adam import FusedAdam
+from .losses import photometric
 
 SELF_TEST_VERSION = 2
 _SECONDS = 240.0
@@ -235,20 +236,27 @@ def _frame(device: torch.device) -> list[Check]:
 
 
 def _loss(device: torch.device) -> list[Check]:
-    """SSIM and its gradient."""
+    """SSIM, the loss that it is part of, and their gradients."""
     g = torch.Generator(device="cpu").manual_seed(4)
     image, target = torch.rand(2, 40, 56, 3, generator=g, device="cpu")
-    found: list[tuple[Tensor, Tensor]] = []
-    for where, body in ((torch.device("cpu"), ssim.ssim), (device, ssim_cuda.ssim)):
-        leaf = image.to(where, copy=True).requires_grad_()
-        value = body(leaf, target.to(where))
-        backward(value)
-        found.append((value, _gradient(leaf)))
-    (value, gradient), (here, gradient_here) = found
-    return [
-        Check("SSIM", _relative(here, value), _EXACT),
-        Check("the gradient of SSIM", _relative(gradient_here, gradient), _EXACT),
-    ]
+    ignored = torch.rand(40, 56, generator=g, device="cpu") > 0.9
+
+    def compared(what: str, bodies: tuple[Callable[..., Tensor], Callable[..., Tensor]], *more: Any) -> list[Check]:
+        found: list[tuple[Tensor, Tensor]] = []
+        for where, body in zip((torch.device("cpu"), device), bodies, strict=True):
+            leaf = image.to(where, copy=True).requires_grad_()
+            there = [each.to(where) if isinstance(each, Tensor) else each for each in more]
+            value = body(leaf, target.to(where), *there)
+            backward(value)
+            found.append((value, _gradient(leaf)))
+        (value, gradient), (here, gradient_here) = found
+        return [
+            Check(what, _relative(here, value), _EXACT),
+            Check(f"the gradient of {what}", _relative(gradient_here, gradient), _EXACT),
+        ]
+
+    checks = compared("SSIM", (ssim.ssim, ssim_cuda.ssim))
+    return [*checks, *compared("the loss", (photometric, ssim_cuda.photometric), 0.2, ignored)]
 
 
 def _adam(device: torch.device) -> list[Check]:

@@ -232,8 +232,8 @@ def self_test(folder: Path) -> dict[str, Any]:
 
 
 WALKS = {
-    "steps": steps, "launches": launches, "resume": resume, "station": station, "step_bytes": step_bytes, "memory_ends": memory_ends,
-    "self_test": self_test,
+    "steps": steps, "launches": launches, "resume": resume, "station": station, "step_bytes": step_bytes,
+    "memory_ends": memory_ends, "self_test": self_test,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The GPU's planes against torch's grid_sample at float64: on Warp's cpu device everywhere, on the GPU where there is one.
+"""The GPU's planes against torch's grid_sample at float64: on Warp's cpu device everywhere, on a GPU if there is one.
 
 What a GPU compiles of them, run on the CPU: tests/backend/raster/test_device_text.py.
 """
@@ -137,9 +137,10 @@ def test_what_it_does_not_take_is_refused_and_what_the_self_test_refused_is_torc
     assert planes_cuda.supports(taken)
     assert not planes_cuda.supports(exact._by_level())
     assert not planes_cuda.supports([p.detach().contiguous() for p in taken])
-    for call in (lambda p: planes_cuda.features(torch.zeros(1, 4), p), lambda p: planes_cuda.penalty(p, [(1, 1, 1)] * 12)):
-        with pytest.raises(ValueError, match="float32 on one device"):
-            call(exact._by_level())
+    with pytest.raises(ValueError, match="float32 on one device"):
+        planes_cuda.features(torch.zeros(1, 4), exact._by_level())
+    with pytest.raises(ValueError, match="float32 on one device"):
+        planes_cuda.penalty(exact._by_level(), [(1.0, 1.0, 1.0)] * 12)
     monkeypatch.setattr(planes_cuda, "refused", "a kernel does not build or run on it")
     assert not planes_cuda.supports(taken)
     assert HexPlaneConfig().row_bytes() > 1024  # torch's path keeps every sample
