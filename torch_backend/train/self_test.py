@@ -277,7 +277,8 @@ def _adam(device: torch.device) -> list[Check]:
 def _planes(device: torch.device) -> list[Check]:
     """Samples of a field's planes and their product, the penalty, and the gradients of both."""
     g = torch.Generator(device="cpu").manual_seed(6)
-    sizes, at = [(9, 11), (9, 7), (11, 7), (5, 9), (5, 11), (5, 7)], 2.4 * torch.rand(257, 4, generator=g) - 1.2
+    sizes = [(9, 11), (9, 7), (11, 7), (5, 9), (5, 11), (5, 7)]
+    at = 2.4 * torch.rand(257, 4, generator=g, device="cpu") - 1.2
     made = [torch.rand(1, planes.LANES, *size, generator=g, device="cpu") + 0.5 for size in sizes]
     pull = torch.randn(len(at), planes.LANES, generator=g, device="cpu")
     found: list[dict[str, Tensor]] = []
