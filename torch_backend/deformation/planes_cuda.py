@@ -42,8 +42,8 @@ class Kernels(NamedTuple):
 
 
 def source(name: str, channels: int) -> str:
-    """Text of kernel `name` of `Kernels`."""
-    text = kernel_text(_KERNELS / f"plane_{name}.cu").replace("@CHANNELS@", str(channels))
+    """Text of the kernel `name`, as its file is called."""
+    text = kernel_text(_KERNELS / f"{name}.cu").replace("@CHANNELS@", str(channels))
     return text.replace("@WIDTH@", str(4 if channels % 4 == 0 else 1))
 
 
@@ -64,25 +64,25 @@ def kernels(channels: int) -> Kernels:
             tid: wp.int32,
         ): ...  # fmt: skip
 
-        sample.__name__ = sample.__qualname__ = f"plane_{name}_native"
+        sample.__name__ = sample.__qualname__ = f"{name}_native"
         native = func_native(source(name, channels))(sample)
 
         def entry(tables: wp.uint64, wheres: wp.uint64, pulls: wp.uint64, results: wp.uint64, levels: wp.int32):
             native(tables, wheres, pulls, results, levels, wp.tid())
 
-        return wp.Kernel(entry, key=f"plane_{name}", module=module, options=options)
+        return wp.Kernel(entry, key=name, module=module, options=options)
 
     def bend(
         tables: wp.uint64, weights: wp.uint64, terms: wp.uint64, grads: wp.uint64, planes: wp.int32, tid: wp.int32
     ): ...
 
-    native = func_native(source("penalty", channels))(bend)
+    native = func_native(source("plane_penalty", channels))(bend)
 
     def penalty_entry(tables: wp.uint64, weights: wp.uint64, terms: wp.uint64, grads: wp.uint64, planes: wp.int32):
         native(tables, weights, terms, grads, planes, wp.tid())
 
     penalising = wp.Kernel(penalty_entry, key="plane_penalty", module=module, options=options)
-    return Kernels(sampling("samples"), sampling("gradients"), sampling("points"), penalising)
+    return Kernels(sampling("plane_samples"), sampling("plane_gradients"), sampling("plane_points"), penalising)
 
 
 def supports(planes: Sequence[Tensor]) -> bool:

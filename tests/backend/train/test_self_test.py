@@ -53,11 +53,11 @@ def test_kernels_that_compute_something_else_are_found(other_adam, monkeypatch):
 @pytest.mark.parametrize(
     ("kernel", "old", "new", "wrong"),
     [
-        ("samples", "at.weight[3] * e.c[c]", "0.f", "the field comes out wrong on it"),
-        ("gradients", "before *= s[k]", "before *= s[0]", "the gradient of its planes comes out wrong on it"),
-        ("points", "sx[k] = at[k].dx", "sx[k] = at[k].dy", "the gradient of its points comes out wrong on it"),
-        ("penalty", "z[-step] -", "z[-1] -", "the field's smoothness comes out wrong on it"),
-        ("penalty", "const float gap", "constfloat gap", "a kernel does not build or run on it ("),
+        ("plane_samples", "at.weight[3] * e.c[c]", "0.f", "the field comes out wrong on it"),
+        ("plane_gradients", "before *= s[k]", "before *= s[0]", "the gradient of its planes comes out wrong on it"),
+        ("plane_points", "sx[k] = at[k].dx", "sx[k] = at[k].dy", "the gradient of its points comes out wrong on it"),
+        ("plane_penalty", "z[-step] -", "z[-1] -", "the field's smoothness comes out wrong on it"),
+        ("plane_penalty", "const float gap", "constfloat gap", "a kernel does not build or run on it ("),
     ],
 )
 def test_where_only_the_fields_kernels_are_wrong_torch_stands_in_for_them(
