@@ -327,10 +327,11 @@ def note_others(launches: Launches) -> None:
         groups = [{"params": [leaf], **more} for leaf, more in zip(leaves, options, strict=True)]
         optimizer = adam.FusedAdam(groups, lr=0.01, kernel=True)
         for spoilt in (False, True, False):
-            for leaf in leaves:
-                leaf.grad = torch.randn(leaf.shape, generator=g)
+            grads = [torch.randn(leaf.shape, generator=g) for leaf in leaves]
             if spoilt:
-                leaves[1].grad[::3] = float("nan")
+                grads[1][::3] = float("nan")
+            for leaf, grad in zip(leaves, grads, strict=True):
+                leaf.grad = grad
             visible = torch.rand(70, generator=g) > 0.4
             optimizer.step(visible=visible, guard=[torch.ones(3)])
         for channels, columns in ((16, 7), (5, 7), (8, 1)):
