@@ -1,4 +1,4 @@
-// Runs what a GPU would compile of the rasteriser's kernels, on a CPU: launches from a file in, how they end out.
+// Runs what a GPU would compile of our kernels, on a CPU: launches from a file in, how they end out.
 // `device_text.py` writes kernels.inc and the launches, and says how this is built and what is compared.
 //
 // A block has 128 threads, in warps of 32. Plain, each is a fiber with a stack of its own, and they take turns at votes,
@@ -84,17 +84,20 @@ static void raise_to(int* at, int value) {
 #define __int_as_float same_bits<float, int>
 #define atomicAdd add
 #define atomicMax raise_to
+namespace wp { using int64 = long long; using std::pow; using std::sqrt; }
 #define SAME(flag) __atomic_store_n(&flag, 1, __ATOMIC_RELAXED)
 #define asm(text) (y = exp2f(x))
 #define WP_TILE_THREAD_IDX tid_now
 #define WP_TILE_SYNC() meet_block()
 #define __CUDA_ARCH__ 890
+using Kernel = void (*)(const uint64_t*, int);
 #include "kernels.inc"
 #undef asm
 
 static Kernel kernel_now;
-static Args* args_now;
-static int block_now;
+static std::vector<uint64_t> values_now;
+static int block_now, tasks_now;
+static void run_task(int task) { if (task < tasks_now) kernel_now(values_now.data(), task); }
 
 #ifdef THREADS
 static bool run_block() {
@@ -103,7 +106,7 @@ static bool run_block() {
     for (int t = 0; t < BLOCK; t++)
         threads.emplace_back([t] {
             tid_now = t;
-            kernel_now(*args_now, block_now * BLOCK + t);
+            run_task(block_now * BLOCK + t);
             meeting->warp[t / WARP].arrive_and_drop();
             meeting->all.arrive_and_drop();
         });
@@ -113,7 +116,7 @@ static bool run_block() {
 #else
 constexpr size_t STACK = 128 << 10;
 static void begin() {
-    kernel_now(*args_now, block_now * BLOCK + tid_now);
+    run_task(block_now * BLOCK + tid_now);
     fibers[tid_now].state = ENDED;
     swapcontext(&fibers[tid_now].at, &home);
 }
@@ -157,7 +160,25 @@ static void take(void* into, size_t bytes) {
     if (bytes && fread(into, 1, bytes, file) != bytes) { fprintf(stderr, "the launches end too early\n"); exit(2); }
 }
 
-// Each launch: kernel, threads, sizes, near; then per pointer whether there is one, bytes, before and after on fibers.
+// What a pointer leads to: where it was when the launch was noted, and where it is now.
+struct Region {
+    char name[32];
+    int kind;  // 1: floats, 2: a table with addresses among its words
+    uint64_t was;
+    void* at = nullptr;
+    std::vector<char> want;
+};
+static std::vector<Region> regions;
+static uint64_t moved(uint64_t address) {
+    for (auto& region : regions) if (region.was == address) return (uint64_t)region.at;
+    return address;
+}
+static void move_words(void* table, size_t bytes) {
+    for (size_t i = 0; i < bytes / 8; i++) ((uint64_t*)table)[i] = moved(((uint64_t*)table)[i]);
+}
+
+// Each launch: kernel, threads; its values, each with whether it is a pointer; then what pointers lead to: name, kind,
+// address, bytes, before and after on Warp's cpu device.
 int main(int argc, char** argv) {
     file = fopen(argv[1], "rb");
     const int most = argc > 2 ? atoi(argv[2]) : 1 << 30;
@@ -165,53 +186,60 @@ int main(int argc, char** argv) {
     take(&launches, 4);
     for (int l = 0; l < launches; l++) {
         char name[64];
-        int threads, sizes[SIZES];
-        float near;
-        take(name, 64); take(&threads, 4); take(sizes, sizeof sizes); take(&near, 4);
-        std::vector<void*> at(POINTERS);
-        std::vector<std::vector<char>> want(POINTERS);
-        for (int i = 0; i < POINTERS; i++) {
+        int threads, values, count;
+        take(name, 64); take(&threads, 4); take(&values, 4);
+        std::vector<int> points(values);
+        values_now.resize(values);
+        for (int i = 0; i < values; i++) { take(&points[i], 4); take(&values_now[i], 8); }
+        take(&count, 4);
+        regions.assign(count, {});
+        for (auto& region : regions) {
             int64_t bytes;
-            take(&bytes, 8);
-            if (bytes < 0) continue;
+            take(region.name, 32); take(&region.kind, 4); take(&region.was, 8); take(&bytes, 8);
             // As large as the tensor and not a byte more: the address sanitizer knows where it ends.
-            if (posix_memalign(&at[i], 16, bytes ? bytes : 1)) return 2;
-            take(at[i], bytes);
-            want[i].resize(bytes);
-            take(want[i].data(), bytes);
+            if (posix_memalign(&region.at, 16, bytes ? bytes : 1)) return 2;
+            take(region.at, bytes);
+            region.want.resize(bytes);
+            take(region.want.data(), bytes);
         }
-        Args args;
-        fill(args, at, sizes, near);
+        for (auto& region : regions) if (region.kind == 2) {
+            move_words(region.at, region.want.size()); move_words(region.want.data(), region.want.size()); }
+        for (int i = 0; i < values; i++) if (points[i]) values_now[i] = moved(values_now[i]);
         kernel_now = nullptr;
-        for (auto& entry : TABLE) if (!strcmp(entry.name, name)) kernel_now = entry.run;
-        if (!kernel_now) { fprintf(stderr, "no kernel %s\n", name); return 2; }
-        args_now = &args;
         const int blocks = (threads + BLOCK - 1) / BLOCK;
+        for (auto& entry : TABLE) if (!strcmp(entry.name, name)) {
+            kernel_now = entry.run;
+            tasks_now = entry.blocks ? blocks * BLOCK : threads;
+            if (entry.blocks) fill(values_now.data()); }
+        if (!kernel_now) { fprintf(stderr, "no kernel %s\n", name); return 2; }
         bool whole = blocks <= most, met = true;
-        for (block_now = 0; block_now < std::min(blocks, most) && met; block_now++) met = run_block();
+        const int count_now = std::min(blocks, most);  // spread over the launch where they are not all
+        for (int i = 0; i < count_now && met; i++) { block_now = (int64_t)i * blocks / count_now; met = run_block(); }
         printf("{\"kernel\": \"%s\", \"blocks\": %d, \"whole\": %s, \"met\": %s, \"differs\": {", name, blocks,
                whole ? "true" : "false", met ? "true" : "false");
         bool first = true;
-        for (int i = 0; i < POINTERS && whole && met; i++) {
-            if (!at[i] || want[i].empty() || !memcmp(at[i], want[i].data(), want[i].size())) continue;
+        for (auto& [label, kind, was, at, want] : regions) {
+            if (!whole || !met || want.empty() || !memcmp(at, want.data(), want.size())) continue;
             double off = 0.0, norm = 0.0;
-            const size_t words = want[i].size() / 4;
+            const size_t words = want.size() / 4;
             size_t other = 0;
             for (size_t j = 0; j < words; j++) {
                 float x, y;
-                memcpy(&x, (char*)at[i] + 4 * j, 4); memcpy(&y, want[i].data() + 4 * j, 4);
+                memcpy(&x, (char*)at + 4 * j, 4); memcpy(&y, want.data() + 4 * j, 4);
                 other += memcmp(&x, &y, 4) != 0;
                 if (std::isnan(x) && std::isnan(y)) continue;
-                if (IS_FLOAT[i]) { off += double(x - y) * (x - y); norm += double(y) * y; }
+                const double gap = x == y ? 0.0 : std::isfinite(x) && std::isfinite(y) ? double(x) - y : 1e9;
+                off += gap * gap;
+                norm += std::isfinite(y) ? double(y) * y : 0.0;
             }
-            printf("%s\"%s\": [%zu, %zu, %.3e]", first ? "" : ", ", NAMES[i], other, words,
-                   IS_FLOAT[i] ? sqrt(off / std::max(norm, 1e-30)) : 1e9);
+            printf("%s\"%s\": [%zu, %zu, %.3e]", first ? "" : ", ", label, other, words,
+                   kind == 1 ? std::min(sqrt(off / std::max(norm, 1e-30)), 1e9) : 1e9);
             first = false;
         }
         printf("}}\n");
         fflush(stdout);
         bad += !met;
-        for (void* p : at) free(p);
+        for (auto& region : regions) free(region.at);
     }
     return bad ? 1 : 0;
 }

@@ -1,11 +1,12 @@
-"""The rasteriser's kernels as a GPU compiles them (`__CUDA_ARCH__`), run on a CPU, plain and under sanitizers.
+"""Our kernels as a GPU compiles them (`__CUDA_ARCH__`), run on a CPU, plain and under sanitizers.
 
-What the fibers run of the text is its other side: shuffles through memory, no votes, plain atomics. Here every launch
-of a few small scenes is written down with its buffers before and after on the fibers, and `device_text.cpp` does it
-again with real votes and shuffles per warp, and atomics. What it cannot show: races between blocks, other streams,
-memory that was never written, the roundings of a GPU's own exp2 and division.
+What Warp's cpu device runs of the text is its other side: shuffles through memory, no votes, plain atomics. Here every
+launch of a few small scenes (the rasteriser's, on fibers), of SSIM and the loss, of Adam and of a field's planes is
+written down with its buffers before and after on that device, and `device_text.cpp` does it again with real votes and
+shuffles per warp, and atomics. What it cannot show: races between blocks, other streams, memory that was never written,
+the roundings of a GPU's own exp2 and division.
 
-    python -m benchmarks.device_text                the launches against the fibers
+    python -m benchmarks.device_text                the launches against Warp's cpu device
     python -m benchmarks.device_text --sanitize     once more under address and undefined, and under thread (minutes)
 """
 
@@ -20,14 +21,17 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
+import warp as wp
 
-from torch_backend.raster import RasterSettings, cuda, rasterize
+from torch_backend.deformation import planes_cuda
+from torch_backend.raster import RasterSettings, cuda, rasterize, ssim_cuda
 from torch_backend.raster import cuda_source as source
+from torch_backend.train import adam
 
 NAMES = [name for names in source.POINTERS.values() for name in names]
 BUILDS = {
@@ -36,10 +40,10 @@ BUILDS = {
     "thread": ["-O1", "-g", "-fsanitize=thread", "-DTHREADS"],
 }
 """Name -> flags of the compiler."""
-BACKWARD = ("raster_blend_backward", "raster_project_backward")
-"""Kernels whose sums are of another order on a GPU; all others agree with the fibers to the bit."""
+BACKWARD = ("raster_blend_backward", "raster_project_backward", "plane_gradients")
+"""Kernels whose sums are of another order on a GPU; all others agree with Warp's cpu device to the bit."""
 
-SAME = {"live = 1;": "SAME(live);", "many = 1;": "SAME(many);"}
+SAME = {name + " = 1;": f"SAME({name});" for name in ("live", "many", "bad[0]")}
 """Flags into which several threads of a block write the same 1, which CUDA allows and C++ does not: all that the thread
 sanitizer is kept from telling."""
 
@@ -50,87 +54,151 @@ def compiler() -> str | None:
 
 
 class Launches:
-    """Launches of the CUDA body on fibers, with all that their pointers point to before and after."""
+    """Launches of our kernels on Warp's cpu device, with all that their pointers lead to before and after."""
 
     def __init__(self) -> None:
         self.records: list[bytes] = []
-        self.kernels: set[tuple[str, int]] = set()
+        self.bodies: dict[str, str] = {}
+        """Name of a kernel that was launched -> its function."""
+        self._known: dict[int, torch.Tensor] = {}
 
     @contextlib.contextmanager
     def noted(self) -> Iterator[None]:
-        """Notes every launch within."""
-        pointed: dict[int, dict[str, torch.Tensor | None]] = {}
-        point, call = cuda._point, cuda._Launcher.__call__
+        """Notes every launch within. A pointer is known by the tensor that was asked for it; those tensors stay."""
+        call, ask, modules = cuda._Launcher.__call__, torch.Tensor.data_ptr, (ssim_cuda, adam, planes_cuda)
+        launch_on = [module.launch_on for module in modules]
+        notes = self
 
-        def noting_point(args: Any, **tensors: torch.Tensor | None) -> None:
-            pointed.setdefault(id(args), {}).update(tensors)
-            point(args, **tensors)
+        def noting_ask(self: torch.Tensor) -> int:
+            address = ask(self)
+            before = notes._known.get(address)
+            if address and (before is None or before.nbytes < self.nbytes):
+                notes._known[address] = self.detach()
+            return address
 
         def noting_call(self: Any, name: str, args: Any, threads: int, channels: int = 0) -> None:
-            tensors = pointed[id(args)]
-            before = {key: _bytes(value) for key, value in tensors.items()}
-            call(self, name, args, threads, channels)
             if threads:
-                notes.kernels.add((name, channels))
-                notes.records.append(_record(f"{name}{channels or ''}", threads, args, tensors, before))
+                whole, body = f"{name}{channels or ''}", (source.blending(channels) if channels else source.stages())
+                notes.bodies[whole] = _raster_function(whole, body[name])
+                values = [(True, int(getattr(args, pointer)), pointer) for pointer in NAMES]
+                values += [(False, _bits(int(getattr(args, size))), size) for size in source.SIZES]
+                values.append((False, _bits(float(args.near)), "near"))
+                notes._note(whole, threads, values, lambda: call(self, name, args, threads, channels))
 
-        notes = self
-        cuda._point, cuda._Launcher.__call__ = noting_point, noting_call  # type: ignore[method-assign]
+        def noting_launch(kernel: Any, dim: int, inputs: list[Any], device: torch.device) -> None:
+            if dim:
+                whole = kernel.key + kernel.module.name[len(kernel.module.name.rstrip("0123456789")) :]
+                notes.bodies[whole] = _plain_function(whole, kernel)
+                values = [
+                    (arg.type is wp.uint64, _bits(value), arg.label)
+                    for arg, value in zip(kernel.adj.args, inputs, strict=True)
+                ]
+                notes._note(whole, dim, values, lambda: launch_on[0](kernel, dim, inputs, device))
+
+        torch.Tensor.data_ptr = noting_ask  # type: ignore[method-assign]
+        cuda._Launcher.__call__ = noting_call  # type: ignore[method-assign]
+        for module in modules:
+            module.launch_on = noting_launch  # type: ignore[attr-defined]
         try:
             yield
         finally:
-            cuda._point, cuda._Launcher.__call__ = point, call  # type: ignore[method-assign]
+            del torch.Tensor.data_ptr  # its base's is found again
+            cuda._Launcher.__call__ = call  # type: ignore[method-assign]
+            for module, plain in zip(modules, launch_on, strict=True):
+                module.launch_on = plain  # type: ignore[attr-defined]
+            self._known.clear()
+
+    def _note(self, name: str, threads: int, values: list[tuple[bool, int, str]], launch: Callable[[], None]) -> None:
+        """Carries a launch out; its record. Values: (is it a pointer, bits, name)."""
+        reached: dict[int, tuple[str, torch.Tensor]] = {}
+        for points, value, label in values:
+            if points and value:
+                self._reach(value, label, reached)
+        before = {address: _bytes(tensor) for address, (_, tensor) in reached.items()}
+        launch()
+        parts = [name.encode().ljust(64, b"\0"), struct.pack("<ii", threads, len(values))]
+        parts += [struct.pack("<iQ", points, value) for points, value, _ in values]
+        parts.append(struct.pack("<i", len(reached)))
+        for address, (label, tensor) in reached.items():
+            kind = 1 if tensor.is_floating_point() else 2 if self._is_table(tensor) else 0
+            parts += [label.encode().ljust(32, b"\0"), struct.pack("<iQq", kind, address, len(before[address]))]
+            parts += [before[address], _bytes(tensor)]
+        self.records.append(b"".join(parts))
+
+    def _reach(self, address: int, label: str, reached: dict[int, tuple[str, torch.Tensor]]) -> None:
+        """The tensor at an address, and those that its own numbers lead to. KeyError if nobody asked for one."""
+        if address in reached:
+            return
+        tensor = self._known[address]
+        reached[address] = (label, tensor)
+        if self._is_table(tensor):
+            for n, word in enumerate(_flat(tensor).tolist()):
+                if word in self._known:
+                    self._reach(word, f"{label}.{n}", reached)
+
+    def _is_table(self, tensor: torch.Tensor) -> bool:
+        return tensor.dtype == torch.int64 and any(word in self._known for word in _flat(tensor).tolist())
 
     def write(self, folder: Path) -> None:
         """launches.bin and kernels.inc, for `build` and `run`."""
         (folder / "launches.bin").write_bytes(struct.pack("<i", len(self.records)) + b"".join(self.records))
-        (folder / "kernels.inc").write_text(_kernels(sorted(self.kernels)), encoding="utf-8")
+        (folder / "kernels.inc").write_text(_kernels(self.bodies), encoding="utf-8")
 
 
-def _bytes(tensor: torch.Tensor | None) -> bytes | None:
-    if tensor is None:
-        return None
-    return tensor.detach().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes() if tensor.numel() else b""
+def _flat(tensor: torch.Tensor) -> torch.Tensor:
+    """The numbers of a dense tensor as they lie in memory."""
+    return tensor.detach().as_strided((tensor.numel(),), (1,))
 
 
-def _record(
-    name: str, threads: int, args: Any, tensors: dict[str, torch.Tensor | None], before: dict[str, bytes | None]
-) -> bytes:
-    sizes = [int(getattr(args, size)) for size in source.SIZES]
-    parts = [name.encode().ljust(64, b"\0"), struct.pack(f"<i{len(sizes)}if", threads, *sizes, float(args.near))]
-    for pointer in NAMES:
-        was = before.get(pointer)
-        if was is None:
-            parts.append(struct.pack("<q", -1))
-        else:
-            parts += [struct.pack("<q", len(was)), was, _bytes(tensors[pointer]) or b""]
-    return b"".join(parts)
+def _bytes(tensor: torch.Tensor) -> bytes:
+    return _flat(tensor).view(torch.uint8).numpy().tobytes()
 
 
-def _kernels(used: list[tuple[str, int]]) -> str:
-    """The parameter structure, and a function for each kernel that was launched."""
+def _bits(value: float) -> int:
+    """An int's, or a float's as float32."""
+    return struct.unpack("<I", struct.pack("<f", value))[0] if isinstance(value, float) else value & (2**64 - 1)
+
+
+def _raster_function(whole: str, body: str) -> str:
+    """A kernel of the rasteriser: its arguments are a structure that `fill` makes once for a launch."""
+    return _function(whole, f"Args& args = args_of_launch;\n{body}")
+
+
+_TAKEN = {
+    wp.uint64: "uint64_t {} = values[{}];", wp.int32: "int {} = (int)values[{}];",
+    wp.float32: "float {} = same_bits<float>((int)values[{}]);",
+}  # fmt: skip
+
+
+def _plain_function(whole: str, kernel: Any) -> str:
+    """A kernel whose arguments are numbers and pointers, and whose threads know nothing of each other."""
+    held = [cell.cell_contents for cell in kernel.func.__closure__]
+    (native,) = (each for each in held if hasattr(each, "native_snippet"))
+    taken = "".join(f"const {_TAKEN[arg.type].format(arg.label, i)} " for i, arg in enumerate(kernel.adj.args))
+    return _function(whole, f"{taken}const int tid = task;\n{native.native_snippet}")
+
+
+def _function(whole: str, body: str) -> str:
+    for flag, named in SAME.items():
+        body = body.replace(flag, named)
+    # Macros of a kernel's text end with it.
+    defined = {line.split()[1].split("(")[0] for line in body.splitlines() if line.startswith("#define")}
+    text = f"static void {whole}(const uint64_t* values, int task) {{\n{body}\n}}\n"
+    return text + "".join(f"#undef {macro}\n" for macro in sorted(defined))
+
+
+def _kernels(bodies: dict[str, str]) -> str:
+    """The rasteriser's parameter structure, and a function for each kernel that was launched."""
     fields = "".join(f"uint64_t {name}; " for name in NAMES) + "".join(f"int {name}; " for name in source.SIZES)
-    filled = "".join(f"args.{name} = (uint64_t)at[{i}]; " for i, name in enumerate(NAMES))
-    filled += "".join(f"args.{name} = sizes[{i}]; " for i, name in enumerate(source.SIZES))
-    text = f"struct Args {{ {fields}float near; }};\nusing Kernel = void (*)(Args&, int);\n"
-    text += f"enum {{ POINTERS = {len(NAMES)}, SIZES = {len(source.SIZES)} }};\n"
-    text += f"static void fill(Args& args, const std::vector<void*>& at, const int* sizes, float near) {{ {filled}"
-    text += "args.near = near; }\n"
-    named = ", ".join(f'"{name}"' for name in NAMES)
-    floats = ", ".join(str(int("float" in kind)) for kind, names in source.POINTERS.items() for _ in names)
-    text += f"static const char* const NAMES[] = {{{named}}};\nstatic const int IS_FLOAT[] = {{{floats}}};\n"
-    table: list[str] = []
-    for name, channels in used:
-        body = source.blending(channels)[name] if channels else source.stages()[name]
-        whole = f"{name}{channels or ''}"
-        for flag, named in SAME.items():
-            body = body.replace(flag, named)
-        # Macros of a kernel's text end with it.
-        defined = {line.split()[1].split("(")[0] for line in body.splitlines() if line.startswith("#define")}
-        text += f"static void {whole}(Args& args, int task) {{\n{body}\n}}\n"
-        text += "".join(f"#undef {macro}\n" for macro in sorted(defined))
-        table.append(f'{{"{whole}", {whole}}}')
-    return text + f"static const struct {{ const char* name; Kernel run; }} TABLE[] = {{{', '.join(table)}}};\n"
+    filled = "".join(f"args_of_launch.{name} = values[{i}]; " for i, name in enumerate([*NAMES, *source.SIZES]))
+    near = len(NAMES) + len(source.SIZES)
+    text = f"struct Args {{ {fields}float near; }};\nstatic Args args_of_launch;\n"
+    text += f"static void fill(const uint64_t* values) {{ {filled}"
+    text += f"args_of_launch.near = same_bits<float>((int)values[{near}]); }}\n"
+    rows = [f'{{"{name}", {name}, {int(name.startswith("raster_"))}}}' for name in sorted(bodies)]
+    text += "".join(bodies[name] for name in sorted(bodies))
+    text += "static const struct { const char* name; Kernel run; bool blocks; } "
+    return text + f"TABLE[] = {{{', '.join(rows)}}};\n"
 
 
 def build(folder: Path, which: str = "plain") -> Path:
@@ -155,7 +223,7 @@ def run(program: Path, most: int = 1 << 30) -> tuple[list[dict[str, Any]], str]:
 
 
 def judge(rows: list[dict[str, Any]], bound: float = 1e-5) -> list[str]:
-    """What is wrong with launches: barriers that not all reach, figures that are not the fibers'."""
+    """What is wrong with launches: barriers that not all reach, figures that are not those of Warp's cpu device."""
     wrong: list[str] = []
     for row in rows:
         if not row["met"]:
@@ -242,6 +310,41 @@ def note_scenes(launches: Launches) -> list[tuple[int, int]]:
     return hits
 
 
+def note_others(launches: Launches) -> None:
+    """SSIM, the loss, Adam and a field's planes with their gradients: odd sizes, pixels that are ignored, rows out of
+    view, a step that is left out, points that are nowhere and beyond the rim, planes of one node, channels that are no
+    multiple of four."""
+    g = torch.Generator().manual_seed(12)
+    with launches.noted():
+        for shape in ((11, 11, 1), (17, 23, 3)):
+            image, target = torch.rand(2, *shape, generator=g)
+            ssim_cuda.ssim(image.requires_grad_(), target).backward()
+            ssim_cuda.ssim(image.detach(), target)
+            ignored = torch.rand(shape[:2], generator=g) > 0.7
+            ssim_cuda.photometric(image, target, 0.2, ignored).backward()
+        leaves = [torch.nn.Parameter(torch.randn(*size, generator=g)) for size in ((70, 3), (1300, 4), (5,))]
+        options = [{"rows": True}, {"clamp": (-0.5, 0.5)}, {"lr": 0.1}]
+        groups = [{"params": [leaf], **more} for leaf, more in zip(leaves, options, strict=True)]
+        optimizer = adam.FusedAdam(groups, lr=0.01, kernel=True)
+        for spoilt in (False, True, False):
+            grads = [torch.randn(leaf.shape, generator=g) for leaf in leaves]
+            if spoilt:
+                grads[1][::3] = float("nan")
+            for leaf, grad in zip(leaves, grads, strict=True):
+                leaf.grad = grad
+            visible = torch.rand(70, generator=g) > 0.4
+            optimizer.step(visible=visible, guard=[torch.ones(3)])
+        for channels, columns in ((16, 7), (5, 7), (8, 1)):
+            sizes = [(5, 6), (9, columns), (9, 6), (3, columns), (3, 6), (3, 9)]
+            planes = [torch.rand(1, channels, *size, generator=g) + 0.5 for size in (*sizes, *sizes)]
+            planes = [p.contiguous(memory_format=torch.channels_last).requires_grad_() for p in planes]
+            where = 1.3 * torch.randn(77, 4, generator=g)
+            where[:3] = torch.tensor([[float("nan")] * 4, [float("inf")] * 4, [-1.0, 1.0, 0.0, 1.0]])
+            features = planes_cuda.features(where.requires_grad_(), planes)
+            features.backward(torch.randn(features.shape, generator=g))
+            planes_cuda.penalty(planes, [(0.5, 0.3, 0.1)] * 12).backward()
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--sanitize", action="store_true", help="under address, undefined and thread sanitizers, too")
@@ -253,6 +356,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as made:
         launches = Launches()
         note_scenes(launches)
+        note_others(launches)
         launches.write(Path(made))
         for which in BUILDS if sanitize else ("plain",):
             rows, said = run(build(Path(made), which), 4 if which == "thread" else 1 << 30)

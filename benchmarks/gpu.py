@@ -2,8 +2,9 @@
 
 Stages, of at most 8 minutes each; docs/gpu.md says what each answers:
   environment  the self-test, kernels compiled cold and warm, the tests that need a card
-  sanitizer    compute-sanitizer's four tools over the rasteriser's tests
-  raster       W2, W3 and W4 against gsplat in one run, where a step's time goes, what a list that is too short costs
+  sanitizer    compute-sanitizer's four tools over the tests of the rasteriser and of a field's planes
+  raster       W2, W3 and W4 against gsplat in one run, where a step's time goes, what a list that is too short costs,
+               what a field's planes take
   training     a solved shot (--shot) on both devices, two seeds: PSNR, ms a step, how often the host waits
   limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, views a second, a CUDA graph
 
@@ -34,6 +35,7 @@ from benchmarks import raster as raster_bench
 from benchmarks.workload import WORKLOADS, room
 from torch_backend.cli import card_facts
 from torch_backend.contract import METRICS_FILE, CameraPath, FreezeParams, JobError, LiveView, TrainParams, program
+from torch_backend.deformation import HexPlane, HexPlaneConfig, planes_cuda
 from torch_backend.freeze import freeze_shot
 from torch_backend.live import LiveSession
 from torch_backend.native import default_threads
@@ -51,6 +53,7 @@ SECONDS = 480.0
 """Of a stage."""
 TESTS = (
     "tests/backend/raster/test_cuda.py",
+    "tests/backend/deformation/test_planes_cuda.py",
     "tests/backend/raster/test_ssim_cuda.py",
     "tests/backend/train/test_device.py",
 )
@@ -135,12 +138,15 @@ class Stage:
 
 COMPILE = """
 import sys, time, torch
+from torch_backend.deformation import planes_cuda
 from torch_backend.raster import cuda, ssim_cuda
 since = time.perf_counter()
 device = torch.device(sys.argv[1])
 cuda.warm_up(int(sys.argv[2]), device)
 image = torch.rand(16, 16, 3, device=device)
 ssim_cuda.ssim(image, image)
+plane = torch.rand(1, 16, 8, 8, device=device).contiguous(memory_format=torch.channels_last)
+planes_cuda.penalty([plane], [(1.0, 1.0, 1.0)])
 if device.type == "cuda":
     torch.cuda.synchronize()
 print(round(time.perf_counter() - since, 2))
@@ -167,7 +173,8 @@ def sanitizer(stage: Stage) -> None:
     if tool is None and not stage.dry:
         stage.found["sanitizer"] = {"failed": "compute-sanitizer (of the CUDA toolkit) is not on the PATH"}
         return
-    tests = [sys.executable, "-P", "-m", "pytest", "-q", TESTS[0], "-k", "first_call" if stage.dry else "cuda"]
+    picked = (TESTS[0], "-k", "first_call") if stage.dry else (*TESTS[:2], "-k", "cuda")
+    tests = [sys.executable, "-P", "-m", "pytest", "-q", *picked]
     for name in TOOLS:
         before = [] if tool is None else [tool, "--tool", name, "--error-exitcode", "99", "--target-processes", "all"]
         stage.part(name, lambda before=before: stage.child([*before, *tests], SECONDS / len(TOOLS)), needs=20.0)
@@ -190,6 +197,7 @@ def raster(stage: Stage) -> None:
     largest = "W0" if stage.dry else "W4"
     stage.part("profile", lambda: _profile(stage, largest), needs=30.0)
     stage.part("short_list", lambda: _short_list(stage, largest), needs=30.0)
+    stage.part("planes", lambda: _planes(stage), needs=20.0)
 
 
 def _profile(stage: Stage, name: str) -> dict[str, Any]:
@@ -231,6 +239,33 @@ def _short_list(stage: Stage, name: str) -> dict[str, Any]:
         cuda._HITS_MAX, cuda._HITS_STEP = most, step
         cuda.forget_demands()
     return times
+
+
+def _planes(stage: Stage) -> dict[str, Any]:
+    """Samples, penalty and gradients of a field's planes, ms: by our kernels, and by torch's operators.
+
+    Of 100,000 points at one instant, as in a step, which add to two rows of the time planes.
+    """
+    g, count = torch.Generator().manual_seed(0), 300 if stage.dry else 100_000
+    field = HexPlane(HexPlaneConfig(time_nodes=40), torch.tensor([[-1.0] * 3, [1.0] * 3]), g).to(stage.device)
+    where, when = (2.0 * torch.rand(count, 3, generator=g) - 1.0).to(stage.device), field.box.new_full((1,), 0.4)
+    pull = torch.randn(count, 32, generator=g).to(stage.device)
+    times: dict[str, Any] = {}
+    for name, refused in (("ours_ms", ""), ("torch_ms", "for comparison")):
+        planes_cuda.refused = refused
+        try:
+            spent: list[float] = []
+            for _ in range(3 if stage.dry else 30):
+                field.zero_grad()
+                stage.wait()
+                since = time.perf_counter()
+                torch.autograd.backward([field.features_at(where, when), field.regularisation()], [pull, None])
+                stage.wait()
+                spent.append(time.perf_counter() - since)
+            times[name] = round(1e3 * sorted(spent)[len(spent) // 2], 3)
+        finally:
+            planes_cuda.refused = ""
+    return {"points": count, **times}
 
 
 # --------------------------------------------------------------------------------------------------------- training

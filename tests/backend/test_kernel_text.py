@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from torch_backend.deformation import planes_cuda
 from torch_backend.kernel_text import kernel_text
 from torch_backend.raster import cpu_source, cuda_source
 
@@ -34,10 +35,11 @@ def test_a_file_without_a_head_is_named(tmp_path):
 def test_every_kernel_file_is_used_and_no_placeholder_is_left():
     texts = [cpu_source.stages_source(), cpu_source.blend_source(3)]
     texts += [*cuda_source.stages().values(), *cuda_source.blending(3).values()]
+    texts += [planes_cuda.source(name, 16) for name in ("plane_samples", "plane_gradients", "plane_points")]
+    texts.append(planes_cuda.source("plane_penalty", 16))
     assert not [found for text in texts for found in re.findall(r"@\w+@|#include", text)]
-    folder = BACKEND / "raster" / "kernels"
     sources = [path.read_text(encoding="utf-8") for path in BACKEND.rglob("*.py")]
-    sources += [path.read_text(encoding="utf-8") for path in folder.rglob("*/*.c*")]
+    sources += [path.read_text(encoding="utf-8") for path in BACKEND.rglob("kernels/**/*.c*")]
     for path in BACKEND.rglob("kernels/**/*.c*"):
         named = re.compile(rf'"{path.name}"|"{path.stem}"')
         assert any(named.search(text) for text in sources), path

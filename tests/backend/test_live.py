@@ -28,6 +28,7 @@ from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.live import _TINT, _TINTED, LiveSession, Superseded, _Waiting
 from torch_backend.train import device
+from torch_backend.train.self_test import SelfTest
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -90,7 +91,7 @@ def test_ready_tells_what_there_is_to_freeze(session, trained):
 def test_ready_says_why_the_card_is_not_used(session, trained, monkeypatch):
     assert session[1]["note"] == "", "on the processor by wish"
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
-    monkeypatch.setattr(device, "card_problem", lambda: "a frame comes out wrong on it")
+    monkeypatch.setattr(device, "card_verdict", lambda: SelfTest(problem="a frame comes out wrong on it"))
     note = LiveSession(trained[0].shot, "main", "auto").facts()["note"]
     assert note.startswith("Scrubbing uses the processor, not the graphics card: ") and "doctor --gpu" in note
 

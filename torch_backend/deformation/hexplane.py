@@ -22,6 +22,7 @@ from torch.nn import functional as F
 
 from ..torch_types import unflatten
 from . import planes as compiled
+from . import planes_cuda
 from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_scale
 
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
@@ -71,9 +72,10 @@ class HexPlaneConfig(HostConfig):
     never along x), the box of the first points, all harmonics move, and means are pulled through the lookup (on)."""
 
     def row_bytes(self) -> int:
-        """Six samples and their products a level, and a layer before and after it bends: the trunk's, five heads'; on
-        the way back the gradients of three layers."""
-        return 4 * (12 * self.features * len(self.levels) + self.width * (2 * (1 + len(_WIDTHS)) + 3))
+        """A level's product and its gradient (by torch's own operators six samples and their products), and a layer
+        before and after it bends: the trunk's, five heads'; on the way back the gradients of three layers."""
+        kept = 12 if planes_cuda.refused else 2
+        return 4 * (kept * self.features * len(self.levels) + self.width * (2 * (1 + len(_WIDTHS)) + 3))
 
 
 def _reference(iterations: int) -> HexPlaneConfig:

@@ -1,9 +1,10 @@
-"""Feature planes of the HexPlane on the CPU, compiled: samples and their product, smoothness, and both gradients.
+"""Feature planes of the HexPlane, compiled: samples and their product, smoothness, and both gradients.
 
-torch's own path (`hexplane`) is the specification and serves every other device and type. A few thousand scattered
-samples leave it waiting for memory: a plane's channels lie a plane apart, and six small operators per sample each cost
-more than their arithmetic. Here channels lie together (`channels_last`), one pass makes the product of a level's six
-samples, and the gradients of a plane are one worker's, so that any number of threads gives the same bits.
+torch's own path (`hexplane`) is the specification and serves every other device and type; planes on an NVIDIA GPU go to
+`planes_cuda`. On the CPU a few thousand scattered samples leave torch waiting for memory: a plane's channels lie a
+plane apart, and six small operators per sample each cost more than their arithmetic. Here channels lie together
+(`channels_last`), one pass makes the product of a level's six samples, and the gradients of a plane are one worker's,
+so that any number of threads gives the same bits.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from torch import Tensor
 from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet
 from ..torch_types import AutogradContext, applied, once_differentiable
+from . import planes_cuda
 
 LANES = 16
-"""The number of features must be a multiple of this."""
+"""On the CPU, the number of features must be a multiple of this."""
 _POINTS = 64
 """Points per unit of work."""
 
@@ -55,7 +57,9 @@ def warm_up(channels: int = 16) -> None:
 
 
 def supports(planes: Sequence[Tensor]) -> bool:
-    """Whether this module takes these planes: float32 on the CPU, channels last, features a multiple of `LANES`."""
+    """Whether this module takes these planes: float32, channels last, and on the CPU features a multiple of `LANES`."""
+    if planes[0].is_cuda:
+        return planes_cuda.supports(planes)
     return all(
         p.dtype == torch.float32 and p.device.type == "cpu" and p.shape[1] % LANES == 0
         and p.is_contiguous(memory_format=torch.channels_last) for p in planes
@@ -119,6 +123,8 @@ def features(where: Tensor, planes: Sequence[Tensor], threads: int | None = None
     six per level in the order of the axes xy, xz, yz, xt, yt, zt (first along a row). ValueError unless `supports`
     takes the planes.
     """
+    if planes[0].is_cuda:
+        return planes_cuda.features(where, planes)
     if not supports(planes):
         raise ValueError("planes should be float32 on the CPU, channels last, with a multiple of 16 features")
     return applied(_Product, where.float().contiguous(), threads, *planes)
@@ -152,10 +158,9 @@ def penalty(
     planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]], threads: int | None = None
 ) -> Tensor:
     """Sum over planes [1, C, H, W] of weighted means: squared second differences down and along, and |1 - plane|."""
+    if planes[0].is_cuda:
+        return planes_cuda.penalty(planes, weights)
     if not supports(planes):
         raise ValueError("planes should be float32 on the CPU, channels last, with a multiple of 16 features")
-    scaled: list[tuple[float, float, float]] = []
-    for plane, (down, along, still) in zip(planes, weights, strict=True):
-        _, c, h, w = plane.shape
-        scaled.append((down / max(1, c * (h - 2) * w), along / max(1, c * h * (w - 2)), still / (c * h * w)))
+    scaled = planes_cuda.over_counts(planes, weights)
     return applied(_Bend, torch.tensor(scaled, device="cpu"), threads, *planes)

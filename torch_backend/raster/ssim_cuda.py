@@ -1,10 +1,12 @@
-"""Mean SSIM of float32 images on a GPU with its gradient: a Warp kernel in four passes, nothing read back.
+"""Mean SSIM of float32 images on a GPU, alone or in the photometric loss, with its gradient: a Warp kernel in four
+passes, nothing read back.
 
 The mathematics and the notation are those of `ssim`: separable blurs of x - 0.5, y - 0.5, x^2 + y^2 and x y, cut at the
 border and renormalised per axis; the backward blur is the plain one of values multiplied by the reciprocal weight sums
 first. Passes: 0 blurs down the columns, 1 along the rows and takes the score and the gradient's fields, 2 blurs these
-down, 3 along, and puts the gradient together. A thread is one value of one pixel. The same kernel runs on Warp's cpu
-device, where tests compare it with float64.
+down, 3 along, and puts the gradient together. A thread is one value of one pixel. What is summed up is
+base + share * SSIM + plain * |x - y|, so that the loss of `train.losses` is one call, without operators of torch round
+it. The same kernel runs on Warp's cpu device, where tests compare it with float64.
 """
 
 import functools
@@ -31,17 +33,22 @@ def kernel() -> Any:
     source = kernel_text(_SOURCE).replace("@HALF@", str(WINDOW // 2)).replace("@TAPS@", taps)
 
     def ssim_pass(
-        images: wp.uint64, targets: wp.uint64, blurreds: wp.uint64, backs: wp.uint64, scores: wp.uint64,
+        images: wp.uint64, targets: wp.uint64, ignoreds: wp.uint64, blurreds: wp.uint64, backs: wp.uint64,
+        scores: wp.uint64, base: wp.float32, share: wp.float32, plain: wp.float32,
         height: wp.int32, width: wp.int32, channels: wp.int32, stage: wp.int32, tid: wp.int32,
     ): ...  # fmt: skip
 
     native = func_native(source)(ssim_pass)
 
     def entry(
-        images: wp.uint64, targets: wp.uint64, blurreds: wp.uint64, backs: wp.uint64, scores: wp.uint64,
+        images: wp.uint64, targets: wp.uint64, ignoreds: wp.uint64, blurreds: wp.uint64, backs: wp.uint64,
+        scores: wp.uint64, base: wp.float32, share: wp.float32, plain: wp.float32,
         height: wp.int32, width: wp.int32, channels: wp.int32, stage: wp.int32,
     ):  # fmt: skip
-        native(images, targets, blurreds, backs, scores, height, width, channels, stage, wp.tid())
+        native(
+            images, targets, ignoreds, blurreds, backs, scores, base, share, plain, height, width, channels, stage,
+            wp.tid(),
+        )  # fmt: skip
 
     return wp.Kernel(entry, key="ssim_pass", module=wp.get_module(__name__), options={"enable_backward": False})
 
@@ -50,16 +57,20 @@ class _Ssim(torch.autograd.Function):
     """Autograd's view; the gradient is linear in the incoming one, so it is computed along with the value."""
 
     @staticmethod
-    def forward(ctx: AutogradContext, image: Tensor, target: Tensor) -> Tensor:
+    def forward(
+        ctx: AutogradContext, image: Tensor, target: Tensor, ignored: Tensor | None, mix: tuple[float, float, float]
+    ) -> Tensor:
+        """`mix`: base, share, plain."""
         image, target = image.contiguous(), target.contiguous()
+        ignored = None if ignored is None else ignored.contiguous().view(torch.uint8)
         height, width, channels = image.shape
         differentiable = ctx.needs_input_grad[0]
         blurred, score = image.new_empty(4, *image.shape), torch.empty_like(image)
         back = image.new_empty(3, *image.shape) if differentiable else None
         for stage in range(4 if differentiable else 2):
             inputs = [
-                image.data_ptr(), target.data_ptr(), blurred.data_ptr(), 0 if back is None else back.data_ptr(),
-                score.data_ptr(), height, width, channels, stage,
+                image.data_ptr(), target.data_ptr(), 0 if ignored is None else ignored.data_ptr(), blurred.data_ptr(),
+                0 if back is None else back.data_ptr(), score.data_ptr(), *mix, height, width, channels, stage,
             ]  # fmt: skip
             launch_on(kernel(), image.numel(), inputs, image.device)
         ctx.save_for_backward(None if back is None else back[0])
@@ -67,9 +78,9 @@ class _Ssim(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor, None, None, None]:
         gradient: Tensor = ctx.saved_tensors[0]
-        return grads[0] * gradient, None
+        return grads[0] * gradient, None, None, None
 
 
 def supports(image: Tensor, target: Tensor) -> bool:
@@ -85,6 +96,22 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
     ValueError if the shapes differ, a side is smaller than the window, or `supports` says no.
     """
+    _check(image, target)
+    return applied(_Ssim, image, target, None, (0.0, 1.0, 0.0))
+
+
+def photometric(image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None = None) -> Tensor:
+    """`train.losses.photometric` of two float32 images [H, W, C] of one device; ignored: bool [H, W] there.
+
+    ValueError if the shapes differ, a side is smaller than the window, or `supports` says no.
+    """
+    _check(image, target)
+    if ignored is not None and (ignored.shape != image.shape[:2] or ignored.dtype != torch.bool):
+        raise ValueError(f"ignored should be bool {[*image.shape[:2]]}, got {ignored.dtype} {[*ignored.shape]}")
+    return applied(_Ssim, image, target, ignored, (dssim, -dssim, 1.0 - dssim))
+
+
+def _check(image: Tensor, target: Tensor) -> None:
     if image.ndim != 3 or image.shape != target.shape or min(image.shape[:2]) < WINDOW or image.shape[2] < 1:
         raise ValueError(
             f"SSIM needs two [H, W, C] images of one shape and at least {WINDOW} px, "
@@ -95,4 +122,3 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
             f"SSIM here takes float32 images of one device and a target without gradient, got "
             f"{image.dtype} on {image.device} and {target.dtype} on {target.device}"
         )
-    return applied(_Ssim, image, target)

@@ -6,8 +6,9 @@ import torch
 
 from ..cards import why_unused
 from ..contract import DEVICES, ExitCode, JobError, Reporter
+from ..deformation import planes_cuda
 from ..native import initialised_warp
-from .self_test import card_problem
+from .self_test import SelfTest, card_verdict
 
 _HINT = "Choose --device cpu, or auto."
 _REPORT = (
@@ -28,6 +29,12 @@ def choose_device(requested: str, report: Reporter | None = None, doing: str = "
     device, unused = decide_device(requested)
     if report is not None and unused is not None:
         report.warning(*unused_words(unused, doing))
+    if report is not None and device.type == "cuda" and planes_cuda.refused:
+        report.warning(
+            f"{doing} computes what moves with PyTorch's own operators, which takes longer: the graphics card failed "
+            f"that part of its self-test ({planes_cuda.refused}).",
+            _REPORT,
+        )
     return device
 
 
@@ -41,8 +48,10 @@ def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]
     if requested == "cpu":
         return torch.device("cpu"), None
     refusal = cuda_refusal()
-    unused = _unused(refusal)
-    if not refusal and unused is None:
+    found = None if refusal else card_verdict()  # asked once: a card that does not answer is waited for
+    unused = _unused(refusal) if found is None else _failed(found)
+    if found is not None and unused is None:
+        planes_cuda.refused = found.planes
         return torch.device("cuda"), None
     if requested == "cuda":
         sentence, advice = unused or (refusal, "")
@@ -71,8 +80,12 @@ def cuda_refusal() -> str:
 
 def failed_self_test() -> tuple[str, str] | None:
     """What the self-test found wrong with a card that could be used, and what to do about it; None if nothing."""
-    problem = card_problem()
-    return (f"The graphics card failed its self-test: {problem}.", _REPORT) if problem else None
+    return _failed(card_verdict())
+
+
+def _failed(found: SelfTest) -> tuple[str, str] | None:
+    """`failed_self_test`, of what it found."""
+    return (f"The graphics card failed its self-test: {found.problem}.", _REPORT) if found.problem else None
 
 
 def unused_card() -> tuple[str, str] | None:

@@ -22,6 +22,8 @@ def photometric(image: Tensor, target: Tensor, dssim: float, ignored: Tensor | N
     Pixels `ignored`, bool [H, W], teach nothing: the image stands there in the place of the target, and no gradient
     leaves it.
     """
+    if min(image.shape[:2]) >= _WINDOW and dssim > 0 and image.is_cuda and ssim_cuda.supports(image, target):
+        return ssim_cuda.photometric(image, target, dssim, ignored)
     if ignored is not None:
         shown = image.detach()
         image, target = (torch.where(ignored[..., None], shown, one) for one in (image, target))

@@ -1,4 +1,5 @@
-"""The self-test of a card: a small frame and its gradients, a loss and a step of Adam, against the processor's bodies.
+"""The self-test of a card: a small frame and its gradients, a loss, a step of Adam, the planes of a field, against the
+processor's bodies.
 
 It runs in a process of its own (`python -m torch_backend doctor --gpu`), because what a kernel breaks on a card stays
 broken for the process that launched it, and because a driver may hang. What it found is kept beside Warp's compiled
@@ -25,13 +26,15 @@ from torch import Tensor
 from .. import __version__
 from ..cards import nvidia_cards
 from ..contract import ExitCode, check_version, content_key, from_dict, python_child, read_json
+from ..deformation import planes, planes_cuda
 from ..native import initialised_warp
 from ..raster import RasterOutput, RasterSettings, rasterize, ssim, ssim_cuda
 from ..shot import write_json
 from ..torch_types import backward, norm_of_all
 from .adam import FusedAdam
+from .losses import photometric
 
-SELF_TEST_VERSION = 1
+SELF_TEST_VERSION = 2
 _SECONDS = 240.0
 """A card that has not answered by then hangs; cold, the kernels take tens of seconds to compile."""
 _GAUSSIANS, _WIDTH, _HEIGHT = 300, 64, 48
@@ -67,6 +70,8 @@ class SelfTest:
     """Driver, card and versions that it speaks of."""
     problem: str = ""
     """What is wrong, in a sentence; empty if nothing is."""
+    planes: str = ""
+    """The same of the kernels of the field's planes alone, for which torch's own operators can stand in on the card."""
     lasting: bool = True
     """Will it be so the next time, too? Not if the card was full, or did not answer."""
     seconds: float = 0.0
@@ -85,22 +90,32 @@ def self_test_key() -> str:
 def run_self_test(device: torch.device, key: str = "") -> SelfTest:
     """Tests the kernels on `device`; on 'cpu' the CUDA kernels run on fibers, for tests. Never raises for a failure."""
     found, since = SelfTest(key=key), time.perf_counter()
-    try:
-        found.checks = [*_frame(device), *_loss(device), *_adam(device)]
-    except torch.OutOfMemoryError:
-        found.problem, found.lasting = "its memory is taken by other programs", False
-    except Exception as error:  # whatever a driver, a compiler or a kernel comes up with is what this test is for
-        words = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        found.problem = f"a kernel does not build or run on it ({words})"
-    for check in found.checks:
-        if not check.error <= check.bound and not found.problem:
-            found.problem = f"{check.what} comes out wrong on it ({check.error:.1e} off, {check.bound:.0e} is allowed)"
+    found.problem = _problem(found, lambda: [*_frame(device), *_loss(device), *_adam(device)])
+    if not found.problem:  # last: a kernel that breaks the card breaks it for the process
+        found.planes = _problem(found, lambda: _planes(device))
     found.seconds = round(time.perf_counter() - since, 2)
     return found
 
 
-def card_problem(folder: Path | None = None, test: Callable[[str], SelfTest] | None = None) -> str:
-    """What a self-test has against this machine's card; empty if nothing. Tests it if it was not yet.
+def _problem(found: SelfTest, compare: Callable[[], list[Check]]) -> str:
+    """Notes what `compare` finds; what is wrong with it, in a sentence."""
+    try:
+        checks = compare()
+    except torch.OutOfMemoryError:
+        found.lasting = False
+        return "its memory is taken by other programs"
+    except Exception as error:  # whatever a driver, a compiler or a kernel comes up with is what this test is for
+        words = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        return f"a kernel does not build or run on it ({words})"
+    found.checks += checks
+    wrong = next((check for check in checks if not check.error <= check.bound), None)
+    if wrong is None:
+        return ""
+    return f"{wrong.what} comes out wrong on it ({wrong.error:.1e} off, {wrong.bound:.0e} is allowed)"
+
+
+def card_verdict(folder: Path | None = None, test: Callable[[str], SelfTest] | None = None) -> SelfTest:
+    """What a self-test found of this machine's card. Tests it if it was not yet.
 
     Args:
         folder: where the verdict is kept (default: beside Warp's kernels).
@@ -111,7 +126,7 @@ def card_problem(folder: Path | None = None, test: Callable[[str], SelfTest] | N
     if found is None or found.key != key:
         found = (test or tested_apart)(key)
         keep(found, place.parent)
-    return found.problem
+    return found
 
 
 def keep(found: SelfTest, folder: Path) -> None:
@@ -221,22 +236,27 @@ def _frame(device: torch.device) -> list[Check]:
 
 
 def _loss(device: torch.device) -> list[Check]:
-    """SSIM and its gradient."""
+    """SSIM, the loss that it is part of, and their gradients."""
     g = torch.Generator(device="cpu").manual_seed(4)
     image, target = torch.rand(2, 40, 56, 3, generator=g, device="cpu")
-    found: list[tuple[Tensor, Tensor]] = []
-    for where, body in ((torch.device("cpu"), ssim.ssim), (device, ssim_cuda.ssim)):
-        leaf = image.to(where, copy=True).requires_grad_()
-        value = body(leaf, target.to(where))
-        backward(value)
-        if leaf.grad is None:
-            raise RuntimeError("SSIM has no gradient")
-        found.append((value, leaf.grad))
-    (value, gradient), (here, gradient_here) = found
-    return [
-        Check("SSIM", _relative(here, value), _EXACT),
-        Check("the gradient of SSIM", _relative(gradient_here, gradient), _EXACT),
-    ]
+    ignored = torch.rand(40, 56, generator=g, device="cpu") > 0.9
+
+    def compared(what: str, bodies: tuple[Callable[..., Tensor], Callable[..., Tensor]], *more: Any) -> list[Check]:
+        found: list[tuple[Tensor, Tensor]] = []
+        for where, body in zip((torch.device("cpu"), device), bodies, strict=True):
+            leaf = image.to(where, copy=True).requires_grad_()
+            there = [each.to(where) if isinstance(each, Tensor) else each for each in more]
+            value = body(leaf, target.to(where), *there)
+            backward(value)
+            found.append((value, _gradient(leaf)))
+        (value, gradient), (here, gradient_here) = found
+        return [
+            Check(what, _relative(here, value), _EXACT),
+            Check(f"the gradient of {what}", _relative(gradient_here, gradient), _EXACT),
+        ]
+
+    checks = compared("SSIM", (ssim.ssim, ssim_cuda.ssim))
+    return [*checks, *compared("the loss", (photometric, ssim_cuda.photometric), 0.2, ignored)]
 
 
 def _adam(device: torch.device) -> list[Check]:
@@ -252,3 +272,37 @@ def _adam(device: torch.device) -> list[Check]:
             optimizer.step()
         found.append(parameter.detach().cpu() - start)
     return [Check("a step of Adam", _relative(found[1], found[0]), _EXACT)]
+
+
+def _planes(device: torch.device) -> list[Check]:
+    """Samples of a field's planes and their product, the penalty, and the gradients of both."""
+    g = torch.Generator(device="cpu").manual_seed(6)
+    sizes = [(9, 11), (9, 7), (11, 7), (5, 9), (5, 11), (5, 7)]
+    at = 2.4 * torch.rand(257, 4, generator=g, device="cpu") - 1.2
+    made = [torch.rand(1, planes.LANES, *size, generator=g, device="cpu") + 0.5 for size in sizes]
+    pull = torch.randn(len(at), planes.LANES, generator=g, device="cpu")
+    found: list[dict[str, Tensor]] = []
+    for where, body in ((torch.device("cpu"), planes), (device, planes_cuda)):
+        leaves = [p.to(where).contiguous(memory_format=torch.channels_last).requires_grad_() for p in made]
+        points = at.to(where, copy=True).requires_grad_()
+        features = body.features(points, leaves)
+        backward((features * pull.to(where)).sum())
+        told = {"the field": features, "the gradient of its points": _gradient(points)}
+        told["the gradient of its planes"] = _gradients(leaves)
+        for leaf in leaves:
+            leaf.grad = None
+        value = body.penalty(leaves, [(1.0, 0.5, 0.1)] * 6)
+        backward(value)
+        found.append({**told, "the field's smoothness": value, "the gradient of its smoothness": _gradients(leaves)})
+    truth, seen = found
+    return [Check(what, _relative(seen[what], value), _EXACT) for what, value in truth.items()]
+
+
+def _gradient(leaf: Tensor) -> Tensor:
+    if leaf.grad is None:
+        raise RuntimeError("a leaf has no gradient")
+    return leaf.grad
+
+
+def _gradients(leaves: list[Tensor]) -> Tensor:
+    return torch.cat([_gradient(leaf).flatten() for leaf in leaves])

@@ -32,6 +32,8 @@ _ASKED = {
 }  # fmt: skip
 """Operators whose answer, or its size, the host has to wait for."""
 _INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index"}
+_NOTHING = {"empty", "empty_strided", "empty_like", "new_empty", "new_empty_strided", "detach", "lift_fresh", "set_"}
+"""Operators that launch nothing, beside views."""
 _COPIES = {"copy_", "_to_copy", "copy", "_copy_from"}
 _LENIENT = {
     "where", "lerp", "lerp_", "fill_", "masked_fill", "masked_fill_", "index_fill", "clamp", "clamp_min", "clamp_max",
@@ -51,6 +53,8 @@ class Card:
         """Operator and place in the backend -> how often the host waited for the card."""
         self.launched: collections.Counter[str] = collections.Counter()
         """Kernel of ours -> launches."""
+        self.operators = 0
+        """torch's operators that did something on the card: each is a launch at least."""
         self.limit = 8 << 30
         """Bytes there are."""
         self.live = self.peak = 0
@@ -212,6 +216,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if name in _INDEXED and touches:
         _check_index(func, name, args)
     _count_waits(name, args, kwargs, to_card, touches)
+    CARD.operators += (touches or to_card) and not func.is_view and name not in _NOTHING
     held = {**kwargs, "device": torch.device("cpu")} if to_card else dict(kwargs)
     held.pop("pin_memory", None)
     if name == "_to_copy":
@@ -237,11 +242,13 @@ class _Mode(TorchDispatchMode):
 @contextlib.contextmanager
 def pretended_card() -> Iterator[Card]:
     """All below has one NVIDIA card, with `CARD.limit` bytes."""
+    import torch_backend.deformation.planes_cuda as planes_cuda
     import torch_backend.native as native
     import torch_backend.raster.cuda as cuda
     import torch_backend.raster.ssim_cuda as ssim_cuda
     import torch_backend.train.adam as adam
     import torch_backend.train.device as chosen
+    from torch_backend.train.self_test import SelfTest
 
     saved: list[tuple[Any, str, Any]] = []
 
@@ -280,8 +287,8 @@ def pretended_card() -> Iterator[Card]:
     patch(torch.cuda, "memory_allocated", lambda device=None: CARD.live)
     patch(torch.cuda, "synchronize", lambda device=None: None)
     patch(chosen, "cuda_refusal", lambda: "")
-    patch(chosen, "card_problem", lambda: "")  # it would ask a process of its own, which has no such card
-    for module in (native, ssim_cuda, adam):
+    patch(chosen, "card_verdict", SelfTest)  # it would ask a process of its own, which has no such card
+    for module in (native, ssim_cuda, adam, planes_cuda):
         patch(module, "launch_on", launch_on)
     patch(cuda._Launcher, "__init__", launcher)
     patch(cuda._Launcher, "__call__", launch)

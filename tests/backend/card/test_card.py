@@ -15,6 +15,12 @@ def test_a_step_on_a_card_waits_for_nothing_but_at_the_tenth(walk, run):
     assert told["waits"] == {}
 
 
+def test_the_fields_kernels_take_the_place_of_hundreds_of_launches(walk):
+    told = walk("launches")["hexplane"]
+    fewer = [torchs - ours for ours, torchs in zip(told["ours"], told["torch"], strict=True)]
+    assert min(fewer) >= 100 and max(fewer) >= 500  # with the penalty, and the gradients of both
+
+
 def test_a_run_is_resumed_on_a_card_at_a_round_of_growth(walk):
     told = walk("resume")
     assert told["iteration"] == 6 and told["after"] > told["before"]
@@ -51,6 +57,7 @@ def test_where_memory_ends_without_a_field_the_least_go(walk):
 def test_a_card_is_tested_before_its_first_use(walk):
     told = walk("self_test")
     assert told["sound"] == "" and told["checks"] > 8
-    assert {"raster_project_backward", "ssim_pass", "adam"} <= set(told["launched"])
+    planes = {"plane_samples", "plane_gradients", "plane_points", "plane_penalty"}
+    assert {"raster_project_backward", "ssim_pass", "adam", *planes} <= set(told["launched"])
     assert "an illegal memory access" in told["broken"] and "see the log" not in told["broken"]
     assert told["full"] == ["its memory is taken by other programs", False]

@@ -82,6 +82,31 @@ def steps(folder: Path, *runs: str) -> dict[str, Any]:
     return told
 
 
+def launches(folder: Path, *methods: str) -> dict[str, Any]:
+    """Per method: launches of six steps with our kernels for the field's planes, and with torch's operators: kernels of
+    ours and operators, a launch each at the least."""
+    from torch_backend.deformation import planes_cuda
+
+    world, quiet = small_world(folder)
+    told: dict[str, Any] = {}
+    for method in methods:
+        counts: dict[str, list[int]] = {}
+        for name, refused in (("ours", ""), ("torch", "it is wrong")):
+            planes_cuda.refused = refused
+            try:
+                with pretended_card():
+                    trainer = new_trainer(world, quiet, method, "support", False)
+                    _steps(trainer, 6)  # the field is there, and its tables
+                    for _ in range(6):
+                        before = CARD.operators + sum(CARD.launched.values())
+                        _steps(trainer, 1)
+                        counts.setdefault(name, []).append(CARD.operators + sum(CARD.launched.values()) - before)
+            finally:
+                planes_cuda.refused = ""
+        told[method] = counts
+    return told
+
+
 def resume(folder: Path, method: str) -> dict[str, Any]:
     """A run that is resumed just before a round of growth: moments are cloned before the optimiser's next step."""
     world, quiet = small_world(folder)
@@ -207,8 +232,8 @@ def self_test(folder: Path) -> dict[str, Any]:
 
 
 WALKS = {
-    "steps": steps, "resume": resume, "station": station, "step_bytes": step_bytes, "memory_ends": memory_ends,
-    "self_test": self_test,
+    "steps": steps, "launches": launches, "resume": resume, "station": station, "step_bytes": step_bytes,
+    "memory_ends": memory_ends, "self_test": self_test,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from torch_backend.shot import Shot, write_json
 from torch_backend.train import device, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 from torch_backend.train.run import solve_key
+from torch_backend.train.self_test import SelfTest
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +105,7 @@ def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(tra
 def test_a_freeze_says_why_it_does_not_use_the_card(trained, quiet, monkeypatch):
     world, _ = trained
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
-    monkeypatch.setattr(device, "card_problem", lambda: "a frame comes out wrong on it")
+    monkeypatch.setattr(device, "card_verdict", lambda: SelfTest(problem="a frame comes out wrong on it"))
     small = dict(take="no card", t_star=105, first=105, last=105, detail="off", develop="off")
     for asked, times in (("auto", 1), ("cpu", 0)):
         report = quiet()

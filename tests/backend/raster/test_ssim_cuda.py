@@ -1,4 +1,5 @@
-"""The GPU's SSIM kernel against float64: on Warp's cpu device everywhere, on the GPU where there is one."""
+"""The GPU's SSIM kernel, alone and in the loss, against float64: on Warp's cpu device everywhere, on a GPU if there is
+one."""
 
 import pytest
 import torch
@@ -43,10 +44,29 @@ def test_strided_images_are_taken():
     assert float(ssim_cuda.ssim(wide[:, ::2], target)) == float(ssim_cuda.ssim(image, target))
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("hides", [False, True])
+def test_the_loss_and_its_gradient_match_float64(device, hides):
+    image, target = pair(37, 23, 3)
+    image[3, 4] = target[3, 4]  # the slope of |x - y| is 0 there
+    ignored = torch.rand(37, 23, generator=torch.Generator().manual_seed(6)) > 0.8 if hides else None
+    x, x64 = image.to(device, copy=True).requires_grad_(), image.double().requires_grad_()
+    given = None if ignored is None else ignored.to(device)
+    value = ssim_cuda.photometric(x, target.to(device), 0.2, given)
+    expected = losses.photometric(x64, target.double(), 0.2, ignored)
+    assert float(value.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
+    (3.0 * value).backward()
+    (3.0 * expected).backward()
+    assert float((x.grad.cpu() - x64.grad).norm() / x64.grad.norm()) <= 1e-5
+    if ignored is not None:
+        assert not x.grad.cpu()[ignored].any()
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_losses_choose_it_for_cuda_images():
     image, target = (t.cuda() for t in pair(30, 40, 3))
     assert float(losses.ssim(image, target)) == float(ssim_cuda.ssim(image, target))
+    assert float(losses.photometric(image, target, 0.2)) == float(ssim_cuda.photometric(image, target, 0.2))
 
 
 def test_refuses_what_it_cannot_do():
@@ -56,6 +76,9 @@ def test_refuses_what_it_cannot_do():
         ssim_cuda.ssim(torch.zeros(20, 20, 3, dtype=torch.float64), torch.zeros(20, 20, 3, dtype=torch.float64))
     with pytest.raises(ValueError, match="without gradient"):
         ssim_cuda.ssim(torch.zeros(20, 20, 3), torch.zeros(20, 20, 3, requires_grad=True))
+    for ignored in (torch.zeros(20, 21, dtype=torch.bool), torch.zeros(20, 20)):
+        with pytest.raises(ValueError, match="ignored should be bool"):
+            ssim_cuda.photometric(torch.zeros(20, 20, 3), torch.zeros(20, 20, 3), 0.2, ignored)
 
 
 @pytest.mark.parametrize("arch", [75, 90, 120])

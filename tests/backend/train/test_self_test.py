@@ -12,8 +12,9 @@ import pytest
 import torch
 
 from torch_backend.contract import JobError
+from torch_backend.deformation import planes_cuda
 from torch_backend.train import adam, choose_device, device, self_test
-from torch_backend.train.self_test import SelfTest, card_problem, run_self_test
+from torch_backend.train.self_test import SelfTest, card_verdict, run_self_test
 
 
 @pytest.fixture
@@ -44,9 +45,54 @@ def test_kernels_that_compute_something_else_are_found(other_adam, monkeypatch):
     monkeypatch.setattr(self_test, "_frame", lambda device: [])  # walked on a pretended card
     other_adam("r[1] * (g[i] - m[i])", "1.02f * r[1] * (g[i] - m[i])")
     found = run_self_test(torch.device("cpu"))
-    assert len(found.checks) == 3 and found.lasting
+    assert len(found.checks) == 5 and found.lasting
     assert [c.what for c in found.checks if not c.error <= c.bound] == ["a step of Adam"]
     assert found.problem.startswith("a step of Adam comes out wrong on it")
+
+
+@pytest.mark.parametrize(
+    ("kernel", "old", "new", "wrong"),
+    [
+        ("plane_samples", "at.weight[3] * e.c[c]", "0.f", "the field comes out wrong on it"),
+        ("plane_gradients", "before *= s[k]", "before *= s[0]", "the gradient of its planes comes out wrong on it"),
+        ("plane_points", "sx[k] = at[k].dx", "sx[k] = at[k].dy", "the gradient of its points comes out wrong on it"),
+        ("plane_penalty", "z[-step] -", "z[-1] -", "the field's smoothness comes out wrong on it"),
+        ("plane_penalty", "const float gap", "constfloat gap", "a kernel does not build or run on it ("),
+    ],
+)
+def test_where_only_the_fields_kernels_are_wrong_torch_stands_in_for_them(
+    kernel, old, new, wrong, monkeypatch, quiet, capfd
+):
+    source = planes_cuda.source
+    assert old in source(kernel, 16)
+
+    def other(name: str, channels: int) -> str:
+        return source(name, channels).replace(old, new) if name == kernel else source(name, channels)
+
+    for name in ("_frame", "_loss", "_adam"):
+        monkeypatch.setattr(self_test, name, lambda where: [])
+    monkeypatch.setattr(planes_cuda, "source", other)
+    monkeypatch.setattr(planes_cuda, "refused", "")
+    planes_cuda.kernels.cache_clear()
+    try:
+        found = run_self_test(torch.device("cpu"))
+    finally:
+        monkeypatch.setattr(planes_cuda, "source", source)
+        planes_cuda.kernels.cache_clear()
+    assert found.problem == "" and found.planes.startswith(wrong) and found.lasting
+    monkeypatch.setattr(device, "cuda_refusal", lambda: "")
+    monkeypatch.setattr(device, "card_verdict", lambda: found)
+    report = quiet()
+    assert choose_device("auto", report, "Training").type == "cuda" and device.unused_card() is None
+    ((_, sentence, advice),) = report.events
+    assert sentence.startswith("Training computes what moves with PyTorch's own operators") and found.planes in sentence
+    assert "doctor --gpu" in advice
+    plane = torch.ones(1, 16, 3, 3).contiguous(memory_format=torch.channels_last)
+    assert not planes_cuda.supports([plane])
+    monkeypatch.setattr(device, "card_verdict", SelfTest)
+    assert choose_device("auto", report, "Training").type == "cuda" and len(report.events) == 1
+    assert planes_cuda.supports([plane])
+    capfd.readouterr()
 
 
 def test_a_kernel_that_does_not_build_is_a_sentence(other_adam, monkeypatch, capfd):
@@ -65,30 +111,35 @@ def test_a_card_is_tested_once_and_again_after_an_update(tmp_path: Path, cards):
         return SelfTest(key=key, problem="it is broken", checks=[self_test.Check("a frame", 0.5, 0.01)])
 
     cards("NVIDIA GeForce RTX 4070, 580.65.06, 8.9")
-    assert [card_problem(tmp_path, test) for _ in range(3)] == ["it is broken"] * 3
+    assert [card_verdict(tmp_path, test).problem for _ in range(3)] == ["it is broken"] * 3
     assert len(asked) == 1
     kept = json.loads((tmp_path / "splannequin-card.json").read_text())
     assert kept["checks"] == [{"what": "a frame", "error": 0.5, "bound": 0.01}]
     cards("NVIDIA GeForce RTX 4070, 590.10.01, 8.9")
-    card_problem(tmp_path, test)
+    card_verdict(tmp_path, test)
     assert len(asked) == 2 and asked[0] != asked[1]
     (tmp_path / "splannequin-card.json").write_text("[]")  # damaged: as if it were not there
-    assert card_problem(tmp_path, test) == "it is broken" and len(asked) == 3
+    assert card_verdict(tmp_path, test).problem == "it is broken" and len(asked) == 3
 
 
 def test_what_may_be_otherwise_the_next_time_is_not_kept(tmp_path: Path):
     def full(key: str) -> SelfTest:
         return SelfTest(key=key, problem="its memory is taken by other programs", lasting=False)
 
-    assert card_problem(tmp_path, full) and not list(tmp_path.iterdir())
-    assert card_problem(tmp_path, lambda key: SelfTest(key=key)) == ""
-    assert card_problem(tmp_path, full) == "", "it was sound, and is not asked again"
+    assert card_verdict(tmp_path, full).problem and not list(tmp_path.iterdir())
+    assert card_verdict(tmp_path, lambda key: SelfTest(key=key)).problem == ""
+    assert card_verdict(tmp_path, full).problem == "", "it was sound, and is not asked again"
 
 
 def test_a_card_that_does_not_answer_is_waited_for_once(monkeypatch, quiet):
     asked = []
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
-    monkeypatch.setattr(device, "card_problem", lambda: asked.append(1) or "it did not answer within 240 s")
+
+    def silent() -> SelfTest:
+        asked.append(1)
+        return SelfTest(problem="it did not answer within 240 s")
+
+    monkeypatch.setattr(device, "card_verdict", silent)
     report = quiet()
     assert choose_device("auto", report, "Freezing").type == "cpu" and len(asked) == 1
     ((_, sentence, advice),) = report.events
@@ -99,7 +150,8 @@ def test_a_card_that_does_not_answer_is_waited_for_once(monkeypatch, quiet):
 
 def test_a_card_that_fails_is_not_used_and_said(monkeypatch):
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
-    monkeypatch.setattr(device, "card_problem", lambda: "a frame comes out wrong on it (2e-01 off, 1e-02 is allowed)")
+    wrong = "a frame comes out wrong on it (2e-01 off, 1e-02 is allowed)"
+    monkeypatch.setattr(device, "card_verdict", lambda: SelfTest(problem=wrong))
     assert choose_device("auto").type == "cpu"
     sentence, advice = device.unused_card()
     assert sentence.startswith("The graphics card failed its self-test: a frame comes out wrong")
@@ -107,7 +159,7 @@ def test_a_card_that_fails_is_not_used_and_said(monkeypatch):
     with pytest.raises(JobError, match="failed its self-test") as refused:
         choose_device("cuda")
     assert "--device cpu" in refused.value.hint
-    monkeypatch.setattr(device, "card_problem", lambda: "")
+    monkeypatch.setattr(device, "card_verdict", SelfTest)
     assert choose_device("auto").type == choose_device("cuda").type == "cuda" and device.unused_card() is None
 
 

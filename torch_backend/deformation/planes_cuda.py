@@ -1,0 +1,198 @@
+"""Feature planes of the HexPlane on a GPU: Warp kernels, one launch for a job of `planes`, nothing read back.
+
+torch's own path (`hexplane`) launches six samplers and their products a level, and as many ways back. Here one launch
+samples all planes of all levels and multiplies, one adds up the gradients of all planes, a third, where it is wanted,
+makes those of the points; one does the penalty of all planes with its gradient. Samples are made anew on the way back:
+a level's six would take as much memory as a Gaussian's harmonics, and the planes lie in the card's cache.
+
+The planes' gradients are sums by atomics: their last bits depend on the order, which no two runs on a card share, as
+those of the rasteriser do. Everything else here gives the same bits every time. Any number of features is taken. The
+same kernels run on Warp's cpu device, where tests compare them with float64.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ..kernel_text import kernel_text
+from ..native import func_native, initialised_warp, launch_on
+from ..torch_types import AutogradContext, applied, once_differentiable, split
+
+_KERNELS = Path(__file__).with_name("kernels")
+
+refused = ""
+"""What the card's self-test has against these kernels (`train.device`); then `supports` says no, and torch's own path
+serves. Of the process, as the card is."""
+
+
+class Kernels(NamedTuple):
+    """The kernels for one number of channels."""
+
+    samples: Any
+    gradients: Any
+    points: Any
+    penalty: Any
+
+
+def source(name: str, channels: int) -> str:
+    """Text of the kernel `name`, as its file is called."""
+    text = kernel_text(_KERNELS / f"{name}.cu").replace("@CHANNELS@", str(channels))
+    return text.replace("@WIDTH@", str(4 if channels % 4 == 0 else 1))
+
+
+def module_name(channels: int) -> str:
+    """Name of the Warp module that holds the kernels."""
+    return f"{__name__}.planes{channels}"
+
+
+@functools.lru_cache(maxsize=8)
+def kernels(channels: int) -> Kernels:
+    """The Warp kernels; compiled for a device at their first launch there, all at once."""
+    initialised_warp()
+    module, options = wp.get_module(module_name(channels)), {"enable_backward": False}
+
+    def sampling(name: str) -> Any:
+        def sample(
+            tables: wp.uint64, wheres: wp.uint64, pulls: wp.uint64, results: wp.uint64, levels: wp.int32,
+            tid: wp.int32,
+        ): ...  # fmt: skip
+
+        sample.__name__ = sample.__qualname__ = f"{name}_native"
+        native = func_native(source(name, channels))(sample)
+
+        def entry(tables: wp.uint64, wheres: wp.uint64, pulls: wp.uint64, results: wp.uint64, levels: wp.int32):
+            native(tables, wheres, pulls, results, levels, wp.tid())
+
+        return wp.Kernel(entry, key=name, module=module, options=options)
+
+    def bend(
+        tables: wp.uint64, weights: wp.uint64, terms: wp.uint64, grads: wp.uint64, planes: wp.int32, tid: wp.int32
+    ): ...
+
+    native = func_native(source("plane_penalty", channels))(bend)
+
+    def penalty_entry(tables: wp.uint64, weights: wp.uint64, terms: wp.uint64, grads: wp.uint64, planes: wp.int32):
+        native(tables, weights, terms, grads, planes, wp.tid())
+
+    penalising = wp.Kernel(penalty_entry, key="plane_penalty", module=module, options=options)
+    return Kernels(sampling("plane_samples"), sampling("plane_gradients"), sampling("plane_points"), penalising)
+
+
+def supports(planes: Sequence[Tensor]) -> bool:
+    """Whether this module takes these planes: float32 on one device (CUDA, or the CPU for tests), channels last."""
+    device = planes[0].device
+    return not refused and device.type in ("cpu", "cuda") and all(
+        p.dtype == torch.float32 and p.device == device and p.data_ptr() % 16 == 0
+        and p.is_contiguous(memory_format=torch.channels_last) for p in planes
+    )  # fmt: skip
+
+
+@functools.lru_cache(maxsize=64)
+def _on_device(rows: tuple[tuple[float, ...], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A small table on the device. Planes stay where they are for a run, so it is sent once."""
+    values = torch.tensor(rows, dtype=dtype, device="cpu", pin_memory=device.type == "cuda")
+    return values.to(device, non_blocking=True)
+
+
+def _table(planes: Sequence[Tensor]) -> Tensor:
+    """[planes, 4] int64: a plane's address, H, W, and how many values the planes before it have."""
+    rows: list[tuple[int, ...]] = []
+    before = 0
+    for plane in planes:
+        rows.append((plane.data_ptr(), plane.shape[2], plane.shape[3], before))
+        before += plane.numel()
+    return _on_device(tuple(rows), torch.int64, planes[0].device)
+
+
+def _like(flat: Tensor, planes: Sequence[Tensor]) -> list[Tensor]:
+    """Views of a flat tensor that lie in it one after the other, each as its plane does."""
+    parts = split(flat, [p.numel() for p in planes])
+    shapes = [(1, p.shape[2], p.shape[3], p.shape[1]) for p in planes]
+    return [part.view(shape).permute(0, 3, 1, 2) for part, shape in zip(parts, shapes, strict=True)]
+
+
+class _Product(torch.autograd.Function):
+    """Features of points, with gradients for the planes and the points."""
+
+    @staticmethod
+    def forward(ctx: AutogradContext, where: Tensor, *planes: Tensor) -> Tensor:
+        channels, levels = planes[0].shape[1], len(planes) // 6
+        features = where.new_empty(len(where), levels * channels)
+        width = 4 if channels % 4 == 0 else 1
+        inputs = [_table(planes).data_ptr(), where.data_ptr(), 0, features.data_ptr(), levels]
+        launch_on(kernels(channels).samples, features.numel() // width, inputs, where.device)
+        ctx.save_for_backward(where, *planes)
+        return features
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        saved: tuple[Tensor, ...] = ctx.saved_tensors
+        where, *planes = saved
+        channels, levels, pull = planes[0].shape[1], len(planes) // 6, grads[0].contiguous()
+        made, table = kernels(channels), _table(planes)
+        flat = where.new_zeros(sum(p.numel() for p in planes))
+        inputs = [table.data_ptr(), where.data_ptr(), pull.data_ptr(), flat.data_ptr(), levels]
+        launch_on(made.gradients, pull.numel(), inputs, where.device)
+        points = None
+        if ctx.needs_input_grad[0]:
+            points = torch.empty_like(where)
+            inputs = [table.data_ptr(), where.data_ptr(), pull.data_ptr(), points.data_ptr(), levels]
+            launch_on(made.points, len(where), inputs, where.device)
+        return points, *_like(flat, planes)
+
+
+def features(where: Tensor, planes: Sequence[Tensor]) -> Tensor:
+    """`planes.features` on the device of `where` and the planes. ValueError unless `supports` takes the planes."""
+    if not supports(planes):
+        raise ValueError("planes should be float32 on one device, channels last, and aligned to 16 bytes")
+    return applied(_Product, where.float().contiguous(), *planes)
+
+
+class _Bend(torch.autograd.Function):
+    """The penalty's value; its gradient is computed along with it, being linear in the incoming one."""
+
+    @staticmethod
+    def forward(ctx: AutogradContext, weights: tuple[tuple[float, ...], ...], *planes: Tensor) -> Tensor:
+        terms = planes[0].new_empty(sum(p.numel() for p in planes))
+        grads = torch.empty_like(terms) if any(ctx.needs_input_grad) else None
+        scales = _on_device(weights, torch.float32, terms.device)
+        inputs = [
+            _table(planes).data_ptr(), scales.data_ptr(), terms.data_ptr(), 0 if grads is None else grads.data_ptr(),
+            len(planes),
+        ]  # fmt: skip
+        launch_on(kernels(planes[0].shape[1]).penalty, terms.numel(), inputs, terms.device)
+        ctx.save_for_backward(grads, *planes)
+        return terms.sum(dtype=torch.float64).float()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        saved: tuple[Tensor, ...] = ctx.saved_tensors
+        flat, *planes = saved
+        return None, *_like(flat * grads[0], planes)
+
+
+def over_counts(
+    planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]]
+) -> tuple[tuple[float, float, float], ...]:
+    """Weights of `penalty`, each over how many values its mean is of."""
+    scaled: list[tuple[float, float, float]] = []
+    for plane, (down, along, still) in zip(planes, weights, strict=True):
+        _, c, h, w = plane.shape
+        scaled.append((down / max(1, c * (h - 2) * w), along / max(1, c * h * (w - 2)), still / (c * h * w)))
+    return tuple(scaled)
+
+
+def penalty(planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]]) -> Tensor:
+    """`planes.penalty` on the planes' device. ValueError unless `supports` takes the planes."""
+    if not supports(planes):
+        raise ValueError("planes should be float32 on one device, channels last, and aligned to 16 bytes")
+    return applied(_Bend, over_counts(planes, weights), *planes)
