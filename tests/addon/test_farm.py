@@ -93,6 +93,10 @@ def test_a_bake_in_parts_is_the_bake_at_once(run, shot, tmp_path):
     made = {p.name: p.read_bytes() for p in (parts / "composited").iterdir()}
     assert made == {p.name: p.read_bytes() for p in (whole / "composited").iterdir()} and len(made) == 3
     assert json.loads((parts / "summary.json").read_text())["composited_frames"] == 3
+    bpy.ops.wm.read_homefile(use_empty=True)  # shot.blend is no file of the artist's
+    assert run(*bake, tmp_path / "alone")[0] == 0
+    assert made == {p.name: p.read_bytes() for p in (tmp_path / "alone" / "composited").iterdir()}
+    assert not [name for name, data in made.items() if b"tEXtFrame" in data], "its digits are those of the range"
 
 
 def test_a_part_of_a_bake_freezes_nothing(run, shot, tmp_path):
