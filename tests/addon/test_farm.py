@@ -118,5 +118,5 @@ def test_what_the_shot_lacks_is_asked_for_and_nothing_else(scene, imported, addo
 def test_no_request_is_written_where_there_is_no_backend(addon, tmp_path, monkeypatch, contract):
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "absent"))
     with pytest.raises(contract.JobError, match="does not exist"):
-        addon("bake.farm_job").begin([], tmp_path / "job", addon("bake.farm_job").Words(), {})
+        addon("bake.farm_job").begin(contract.FarmWords(output=str(tmp_path / "job")), {})
     assert not (tmp_path / "job").exists()

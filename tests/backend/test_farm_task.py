@@ -10,7 +10,7 @@ import pytest
 
 from torch_backend import cli
 from torch_backend.contract import ExitCode, JobError, ShotFolder
-from torch_backend.farm.work import PER_FRAME
+from torch_backend.farm.work import FIRST_FRAMES, PER_WORKING
 from torch_backend.freeze.exr import read_frozen_exr
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,7 +61,8 @@ def test_a_template_of_one_layout_runs_on_another(submitted, tmp_path):
     assert sorted(p.relative_to(submitted) for p in submitted.rglob("*")) == before, "nothing where it was submitted"
     assert "openjd_progress: 100.0" in said and "tiny, freeze freeze_0110: freezing" in said
     took = json.loads((there / "shots" / "tiny.splannequin" / "farm" / "freeze-110-109.json").read_text())
-    assert took["amount"] == pytest.approx(8 * (64 * 48 / 1e6 + PER_FRAME), abs=1e-3) and took["cpu_seconds"] > 0
+    amount = (8 + (8 + FIRST_FRAMES) * PER_WORKING) * 64 * 48 / 1e6
+    assert took["amount"] == pytest.approx(amount, abs=1e-3) and took["cpu_seconds"] > 0
 
 
 @pytest.fixture
