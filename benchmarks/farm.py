@@ -40,7 +40,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CLIP = ROOT / "examples" / "sitting.mp4"
 CLIP_FRAMES = 74
 OTHER_FRAMES = 20
-"""Of the shot that rates are measured on: its parts of 8 frames, and one of 4, tell apart what is fixed and what grows."""
+"""Of the shot that rates are measured on: parts of 8 frames, and one of 4, tell apart what is fixed and what grows."""
 TASKSET = ("taskset", "--cpu-list")
 
 
