@@ -314,24 +314,21 @@ def farm(args: argparse.Namespace, console: Console) -> int:
     """`farm export SHOT... --output DIR`: a job for a render farm; `farm measure`: what tasks took, as rates."""
     from .farm import cost, export, rates, records
 
-    output = Path(args.output).absolute()
-    if args.action == "measure":
-        found = rates.measure(record for shot in args.shots for record in records.read(Path(shot)))
+    words: contract.FarmWords = contract.words_of(args)
+    output = Path(words.output)
+    if words.action == "measure":
+        found = rates.measure(record for shot in words.shots for record in records.read(Path(shot)))
         if not found:
             raise contract.JobError("No task of a farm left figures in these shots.", "", ExitCode.USAGE)
         write_json(output / export.RATES_FILE, rates.to_json(found))
         print(output / export.RATES_FILE, file=console.stream)
         return ExitCode.OK
-    asked = export.Asked(
-        args.shots, output, args.t_star or "", args.t_star_list, args.frames, args.bake, args.shots_folder,
-        args.shots_per_job, args.request, args.rates, contract.trains_anew(args),
-    )  # fmt: skip
     args.t_star = None  # instants are takes of their own; see `FarmWords`
-    told, files = export.export(asked, contract.requested_params(args))
+    told, files = export.export(words, contract.requested_params(args), contract.trains_anew(args))
     if console.as_json:
         print(json.dumps({"written": [str(p) for p in files], **dataclasses.asdict(told)}), file=console.stream)
         return ExitCode.OK
-    for line in [*cost.sentences(told, args.rates or "of docs/farm.md"), *map(str, files)]:
+    for line in [*cost.sentences(told, words.rates or "of docs/farm.md"), *map(str, files)]:
         print(line, file=console.stream)
     return ExitCode.OK
 

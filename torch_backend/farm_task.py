@@ -28,7 +28,7 @@ from . import contract
 from .contract import Cancelled, Event, ExitCode, FreezeParams, JobError, ShotFolder
 from .contract.files import is_json_object
 from .farm import records
-from .farm.template import read_request, shot_name
+from .farm.request import read_request, shot_name
 from .job import new_job, run_job
 from .shot import Shot, disk_error, is_disk_full, path_error
 

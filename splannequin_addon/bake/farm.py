@@ -80,9 +80,11 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
             self.report({"ERROR"}, "No folder was given")
             return {"CANCELLED"}
         folder = Path(os.path.abspath(bpy.path.abspath(self.directory)))
-        words = farm_job.Words(t_star=self.instants, frames=self.frames, bake=self.bake)
+        words = contract.FarmWords(
+            shots=(str(shot),), output=str(folder), t_star=self.instants, frames=self.frames, bake=self.bake
+        )
         try:
-            asked = farm_job.begin([str(shot)], folder, words, requests_of(scene, shot))
+            asked = farm_job.begin(words, requests_of(scene, shot))
             if bpy.app.background:
                 for line in farm_job.written(asked):
                     self.report({"INFO"}, line)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,61 +14,29 @@ REQUEST = "request.json"
 """Parameters of the steps, in the job's folder."""
 
 
-@dataclass(frozen=True)
-class Words:
-    """What a job for a farm is asked for, besides the parameters of its steps; as `contract.verbs.FarmWords`."""
-
-    action: str = "export"
-    """export or measure."""
-    t_star: str = ""
-    """Instants with commas; empty: the scene's."""
-    t_star_list: str = ""
-    """File with instants of each shot; empty: none."""
-    frames: int = 10
-    """Frames of a task."""
-    bake: bool = False
-    """Takes go through Blender, too."""
-    shots_folder: str = ""
-    """Where shots of clips are made; empty: beside each."""
-    shots_per_job: int = 0
-    """Shots of one template; 0: the backend's own number."""
-    rates: str = ""
-    """Rates to estimate with; empty: the backend's own."""
-
-
-def begin(shots: Sequence[str], output: Path, words: Words, requests: dict[str, Any]) -> children.Question:
-    """Has the backend write a job, without waiting.
+def begin(words: contract.FarmWords, requests: dict[str, Any]) -> children.Question:
+    """Has the backend write a job, or what tasks took, without waiting.
 
     Args:
-        shots: shot folders and clips.
-        output: folder for the job.
-        words: what it is asked for.
-        requests: step -> its parameters, those of `contract.PARAMS` or dicts of some of them; written into `output`.
+        words: what is asked for; paths among it are absolute.
+        requests: step -> its parameters, those of `contract.PARAMS` or dicts of some of them; written into the job's
+            folder.
 
     Raises:
         contract.JobError: there is no backend, or it cannot be started; OSError: the folder cannot be written.
     """
     backend.python()  # before anything is written
-    said = ["farm", words.action, *shots, "--output", str(output)]
+    device: list[str] = []
     if words.action == "export":
         told: dict[str, dict[str, Any]] = {
             kind: params if is_json_object(params) else dataclasses.asdict(params) for kind, params in requests.items()
         }
-        contract.write_json(output / REQUEST, told)
-        said += ["--request", str(output / REQUEST), "--frames", str(words.frames)]
+        request = Path(words.output) / REQUEST
+        contract.write_json(request, told)
+        words = dataclasses.replace(words, request=str(request))
         if told.get("freeze", {}).get("device"):
-            said += ["--device", told["freeze"]["device"]]
-        if words.shots_per_job:
-            said += ["--shots-per-job", str(words.shots_per_job)]
-        for flag, value in (
-            ("--t-star", words.t_star),
-            ("--t-star-list", words.t_star_list),
-            ("--shots-folder", words.shots_folder),
-            ("--rates", words.rates),
-        ):
-            said += [f"{flag}={value}"] if value else []
-        said += ["--bake"] if words.bake else []
-    return backend.ask(*said)
+            device = ["--device", told["freeze"]["device"]]
+    return backend.ask("farm", *contract.said_of(words), *device)
 
 
 def written(asked: children.Question) -> list[str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import bpy
@@ -59,9 +60,9 @@ def render_beside(
             contract.ExitCode.BAKE,
         )
     beside = folder / f"{_BESIDE}{uuid.uuid4().hex}"
-    _without_stamps(scene)
     try:
-        numbers = render(scene, beside, png, on_frame, check_cancelled)
+        with _without_stamps(scene):
+            numbers = render(scene, beside, png, on_frame, check_cancelled)
         for made in sorted(beside.iterdir()):
             os.replace(made, folder / made.name)
     finally:
@@ -91,11 +92,23 @@ def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
     return wanted
 
 
-def _without_stamps(scene: bpy.types.Scene) -> None:
-    """What Blender writes into a picture's metadata of when and where it was made: the same frame is the same bytes."""
-    render = scene.render
-    render.use_stamp_date = render.use_stamp_time = render.use_stamp_render_time = False
-    render.use_stamp_memory = render.use_stamp_hostname = render.use_stamp_filename = False
+_STAMPS = ("date", "time", "render_time", "memory", "hostname", "filename", "frame")
+"""Of what Blender writes into a picture's metadata: what tells when and where it was made; the frame's number, too, for
+that is padded to the digits of the range's last."""
+
+
+@contextlib.contextmanager
+def _without_stamps(scene: bpy.types.Scene) -> Generator[None]:
+    """Meanwhile the same frame is the same bytes, whoever renders it, and in whatever range."""
+    names = [f"use_stamp_{name}" for name in _STAMPS]
+    before = {name: bool(getattr(scene.render, name)) for name in names}
+    try:
+        for name in names:
+            setattr(scene.render, name, False)
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(scene.render, name, value)
 
 
 def render(
@@ -110,7 +123,7 @@ def render(
     Args:
         scene: a scene with the freeze inserted.
         folder: where the pictures go.
-        png: write 8-bit RGB PNG; else what the scene's output format says.
+        png: write 8-bit RGB PNG, without Blender's stamps; else what the scene's output format says.
         on_frame: called with (frames done, frames in all).
         check_cancelled: called between frames; what it raises ends the bake. Frames written so far stay, a movie file
             is closed and holds them.
@@ -144,7 +157,8 @@ def render(
     now = scene.frame_current
     bpy.app.handlers.render_write.append(count)
     try:
-        bpy.ops.render.render(animation=True, scene=scene.name)
+        with _without_stamps(scene) if png else contextlib.nullcontext():
+            bpy.ops.render.render(animation=True, scene=scene.name)
     except RuntimeError as error:
         raise contract.JobError(
             f"Blender could not render the scene: {str(error).strip()}",

@@ -143,12 +143,8 @@ def export(args: argparse.Namespace, console: Console) -> int:
 
 def export_for_farm(args: argparse.Namespace, console: Console) -> int:
     """`farm export SHOT... --output DIR`: a job for a render farm; `farm measure`: rates of what its tasks took."""
-    output = _output(args)
-    shots = [shot if "://" in shot else str(Path(shot).absolute()) for shot in args.shots]
-    files = [str(Path(file).absolute()) if file else "" for file in (args.t_star_list, args.shots_folder, args.rates)]
-    words = farm_job.Words(
-        args.action, args.t_star or "", files[0], args.frames, args.bake, files[1], args.shots_per_job, files[2]
-    )
+    _output(args)
+    words: contract.FarmWords = contract.words_of(args)
     args.t_star = None  # instants are takes of their own
     requests: dict[str, Any] = {kind: dataclasses.asdict(params) for kind, params in asked(args).items()}
     if not contract.trains_anew(args):
@@ -156,7 +152,7 @@ def export_for_farm(args: argparse.Namespace, console: Console) -> int:
     if args.request:
         for kind, values in contract.read_json(args.request).items():
             requests[kind] = {**requests.get(kind, {}), **values}
-    question = farm_job.begin(shots, output, words, requests)
+    question = farm_job.begin(words, requests)
     question.wait()
     for line in farm_job.written(question):
         print(line, flush=True)

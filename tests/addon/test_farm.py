@@ -93,6 +93,10 @@ def test_a_bake_in_parts_is_the_bake_at_once(run, shot, tmp_path):
     made = {p.name: p.read_bytes() for p in (parts / "composited").iterdir()}
     assert made == {p.name: p.read_bytes() for p in (whole / "composited").iterdir()} and len(made) == 3
     assert json.loads((parts / "summary.json").read_text())["composited_frames"] == 3
+    bpy.ops.wm.read_homefile(use_empty=True)  # shot.blend is no file of the artist's
+    assert run(*bake, tmp_path / "alone")[0] == 0
+    assert made == {p.name: p.read_bytes() for p in (tmp_path / "alone" / "composited").iterdir()}
+    assert not [name for name, data in made.items() if b"tEXtFrame" in data], "its digits are those of the range"
 
 
 def test_a_part_of_a_bake_freezes_nothing(run, shot, tmp_path):
@@ -114,5 +118,5 @@ def test_what_the_shot_lacks_is_asked_for_and_nothing_else(scene, imported, addo
 def test_no_request_is_written_where_there_is_no_backend(addon, tmp_path, monkeypatch, contract):
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "absent"))
     with pytest.raises(contract.JobError, match="does not exist"):
-        addon("bake.farm_job").begin([], tmp_path / "job", addon("bake.farm_job").Words(), {})
+        addon("bake.farm_job").begin(contract.FarmWords(output=str(tmp_path / "job")), {})
     assert not (tmp_path / "job").exists()

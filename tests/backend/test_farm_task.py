@@ -1,6 +1,7 @@
 """Tasks of a farm's job: on another folder layout, by the engine's path mapping; and what they say when they fail."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import pytest
 
 from torch_backend import cli
 from torch_backend.contract import ExitCode, JobError, ShotFolder
-from torch_backend.farm.work import PER_FRAME
+from torch_backend.farm.work import FIRST_FRAMES, PER_WORKING
 from torch_backend.freeze.exr import read_frozen_exr
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,7 +62,25 @@ def test_a_template_of_one_layout_runs_on_another(submitted, tmp_path):
     assert sorted(p.relative_to(submitted) for p in submitted.rglob("*")) == before, "nothing where it was submitted"
     assert "openjd_progress: 100.0" in said and "tiny, freeze freeze_0110: freezing" in said
     took = json.loads((there / "shots" / "tiny.splannequin" / "farm" / "freeze-110-109.json").read_text())
-    assert took["amount"] == pytest.approx(8 * (64 * 48 / 1e6 + PER_FRAME), abs=1e-3) and took["cpu_seconds"] > 0
+    amount = (8 + (8 + FIRST_FRAMES) * PER_WORKING) * 64 * 48 / 1e6
+    assert took["amount"] == pytest.approx(amount, abs=1e-3) and took["cpu_seconds"] > 0
+
+
+def test_a_task_that_only_hands_on_to_blender_loads_no_torch():
+    """It takes longer to load than a part takes to bake."""
+    seen = "import sys, torch_backend.farm_task; sys.exit(int('torch' in sys.modules))"
+    assert (
+        subprocess.run([sys.executable, "-P", "-c", seen], env={**os.environ, "PYTHONPATH": str(ROOT)}).returncode == 0
+    )
+
+
+def test_what_a_task_says_and_its_exit_status_reach_the_engine(tmp_path):
+    """It ends at once, past what Python does at its end."""
+    words = ["farm-task", "solve", "--shot", str(tmp_path / "s"), "--request", str(tmp_path / "none.json")]
+    command = [sys.executable, "-P", "-m", "torch_backend", *words]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert done.returncode == ExitCode.USAGE
+    assert done.stdout.startswith("openjd_fail: s, solve: ") and done.stdout.endswith(".\n")
 
 
 @pytest.fixture

@@ -47,7 +47,9 @@ from .command_line import (
     notes,
     options_for,
     requested_params,
+    said_of,
     trains_anew,
+    words_of,
 )
 from .errors import (
     Cancelled,
@@ -237,6 +239,7 @@ from .verbs import (
     COMMANDS,
     INPUT,
     VERBS,
+    FarmWords,
     Verb,
 )
 from .writing import (
@@ -350,6 +353,7 @@ __all__ = [
     "Cancelled",
     "Event",
     "ExitCode",
+    "FarmWords",
     "FrameLayer",
     "FreezeParams",
     "ImportParams",
@@ -429,11 +433,13 @@ __all__ = [
     "restore_folder",
     "runs_job",
     "runs_still",
+    "said_of",
     "summarise",
     "trains_anew",
     "try_lock",
     "verdict_lines",
     "verdict_of",
+    "words_of",
     "working_on",
     "write_atomic",
     "write_json",

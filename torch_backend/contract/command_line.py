@@ -121,10 +121,33 @@ def _values(args: argparse.Namespace, name: str, cls: type, unset: Mapping[str, 
         value = getattr(args, spec.dest)
         if spec.switch:
             value = one.default != value
-        elif spec.is_path and value and "://" not in value:
-            value = str(Path(value).absolute())
+        elif spec.is_path:
+            value = [_absolute(each) for each in value] if spec.many else _absolute(value)
         values[one.name] = unset.get(one.name, value) if value == "" else value
     return values
+
+
+def _absolute(path: str) -> str:
+    """A path as an absolute one; an address, and none, as it is."""
+    return path if not path or "://" in path else str(Path(path).absolute())
+
+
+def words_of(args: argparse.Namespace) -> Any:
+    """What a verb was told besides the parameters of its jobs: an object of its `words`, from parsed arguments."""
+    verb = VERBS[args.command]
+    return verb.words(**_values(args, args.command, verb.words, {}))
+
+
+def said_of(words: Any) -> list[str]:
+    """The arguments, without the verb's name, that `words_of` makes such an object of."""
+    found: list[str] = []
+    for one, spec in options_of(words.__class__):
+        value: Any = getattr(words, one.name)
+        if not spec.flag.startswith("--"):
+            found += [str(each) for each in (value if spec.many else (value,))]
+        elif value != one.default and value is not None:
+            found.append(spec.flag if spec.switch else f"{spec.flag}={value}")
+    return found
 
 
 def is_shot(path: str | Path) -> bool:

@@ -165,10 +165,17 @@ class FarmWords:
     action: str = option("export", flag="action", choices=("export", "measure"), help="`export` or `measure`")
     """export: a job for a farm. measure: what the tasks of shots that a farm worked on took, as rates."""
     shots: tuple[str, ...] = option(
-        "", flag="shots", many=True, metavar="SHOT", help="shot folders; or clips, of which shots are made on the farm"
+        "",
+        flag="shots",
+        many=True,
+        is_path=True,
+        metavar="SHOT",
+        help="shot folders; or clips, of which shots are made on the farm",
     )
     """Shot folders, or clips."""
-    output: str = option("", flag="--output", metavar="DIR", required=True, help="folder for the job's files")
+    output: str = option(
+        "", flag="--output", is_path=True, metavar="DIR", required=True, help="folder for the job's files"
+    )
     """Folder for template.json and parameters.json; of `measure` for rates.json."""
     t_star: str | None = option(
         None,
@@ -181,6 +188,7 @@ class FarmWords:
     t_star_list: str = option(
         "",
         flag="--t-star-list",
+        is_path=True,
         metavar="FILE",
         help="text with a line for each shot: its name, and its instants",
         words="the same for all",
@@ -193,7 +201,12 @@ class FarmWords:
     )
     """Bake each take."""
     shots_folder: str = option(
-        "", flag="--shots-folder", metavar="DIR", help="where shots of clips are made", words="beside each clip"
+        "",
+        flag="--shots-folder",
+        is_path=True,
+        metavar="DIR",
+        help="where shots of clips are made",
+        words="beside each clip",
     )
     """Folder for shots of clips; empty: beside each."""
     shots_per_job: int = option(15, flag="--shots-per-job", metavar="N", help="shots of one template, at most")
@@ -201,15 +214,29 @@ class FarmWords:
     request: str = option(
         "",
         flag="--request",
+        is_path=True,
         metavar="FILE",
         help="parameters of the steps as JSON, {step: {name: value}}, in the place of options",
         words="the options",
     )
     """JSON file of parameters, over what the options say."""
     rates: str = option(
-        "", flag="--rates", metavar="FILE", help="rates.json of `farm measure`, to estimate with", words="ours"
+        "",
+        flag="--rates",
+        is_path=True,
+        metavar="FILE",
+        help="rates.json of `farm measure`, to estimate with",
+        words="ours",
     )
     """Measured rates for the estimate."""
+    session_tasks: int = option(
+        0,
+        flag="--session-tasks",
+        metavar="N",
+        help="for the estimate: tasks of a step that a host does before it enters the job's environment again",
+        words="all that it does of one",
+    )
+    """Tasks of a session, as the farm's engine has them; 0: all that a host does of a step."""
 
 
 @dataclass

@@ -3,6 +3,7 @@
     shots       shots and clips, and the takes that are wanted of them
     work        tasks, and how much each has to do: pixels and steps
     template    the job template and its parameters, as JSON
+    request     what a task is asked for, as it comes out of the template
     rates       what a unit of work takes, measured
     cost        core-hours, card-hours, disk and the critical path, of tasks and rates
 

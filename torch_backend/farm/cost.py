@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .rates import SESSION_SECONDS, Rate
+from .rates import SESSION_SECONDS, TASK_SECONDS, WATCH_CORES, Rate
 from .shots import FarmShot
 from .template import Needs
 from .work import Step, disk_bytes
@@ -18,11 +18,15 @@ SPARE = 1.5
 MIB_PER_MEGAPIXEL = 160
 """Memory that a take's frames want by their size: docs/benchmarks.md, "What a frame costs", 640 x 360 against 4K."""
 _OF_FRAMES = ("open", "freeze", "finish", "bake")
+ENGINE = "engine"
+"""Row of what the farm's engine itself takes; its tasks are sessions."""
+HOSTS = (1, 2, 10, 100)
+"""Numbers of hosts that an estimate tells of."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One kind of step of a job."""
+    """One kind of step of a job, or `ENGINE`."""
 
     kind: str
     tasks: int
@@ -50,7 +54,7 @@ class Estimate:
     """Hosts -> seconds until the last task has ended, each with one task at a time."""
 
 
-def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bool) -> Estimate:
+def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bool, session_tasks: int = 0) -> Estimate:
     """The cost of a job.
 
     Args:
@@ -58,6 +62,7 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
         rates: step's kind -> rate.
         card: a graphics card is asked for.
         bake: takes are baked.
+        session_tasks: tasks of a step that a host does in one session of the engine; 0: all that it does of it.
     """
     shots: dict[str, FarmShot] = {step.shot.name: step.shot for step in steps}
     chains = [[_times(step, rates) for step in steps if step.shot.name == name] for name in shots]
@@ -66,6 +71,10 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
         every = [seconds for step in steps if step.kind == kind for seconds in _times(step, rates)]
         rows.append(Row(kind, len(every), sum(every), sum(every) * rates[kind].cores))
     tasks = sum(row.tasks for row in rows)
+    sessions = sum(step.sessions(session_tasks) for step in steps)
+    engine = SESSION_SECONDS * sessions + TASK_SECONDS * tasks
+    rows.append(Row(ENGINE, sessions, engine, engine + WATCH_CORES * sum(row.seconds for row in rows)))
+    every_host = {hosts: _makespan(chains, hosts, session_tasks) for hosts in HOSTS}
     return Estimate(
         rows,
         len(shots),
@@ -73,8 +82,8 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
         sum(row.core_seconds for row in rows) / 3600.0,
         sum(row.seconds for row in rows if row.kind in ON_A_CARD) / 3600.0 if card else 0.0,
         sum(disk_bytes(shot, bake) for shot in shots.values()) / 1e9,
-        max((sum(max(times) for times in chain) for chain in chains), default=0.0) + SESSION_SECONDS,
-        {hosts: _makespan(chains, hosts) for hosts in (1, 2, 10, 100)},
+        max((sum(max(times) + SESSION_SECONDS + TASK_SECONDS for times in chain) for chain in chains), default=0.0),
+        every_host,
     )
 
 
@@ -91,7 +100,8 @@ def sentences(told: Estimate, rates_from: str) -> list[str]:
     """An estimate for people, line by line."""
     lines = [f"{told.shots} shots, {told.tasks} tasks. By rates {rates_from}, on hosts that do one task at a time:"]
     for row in told.rows:
-        lines.append(f"  {row.kind:<8} {row.tasks:>6} tasks {_hours(row.seconds):>10}")
+        of = "sessions" if row.kind == ENGINE else "tasks"
+        lines.append(f"  {row.kind:<8} {row.tasks:>6} {of:<8} {_hours(row.seconds):>10}")
     lines.append(f"Processor: {told.core_hours:.2f} core-hours.")
     if told.card_hours:
         lines.append(f"Card: {told.card_hours:.2f} card-hours, if a card is no faster than the rates say.")
@@ -106,24 +116,44 @@ def _times(step: Step, rates: dict[str, Rate]) -> list[float]:
     return [rate.seconds(amount) for amount in step.tasks()]
 
 
-def _makespan(chains: list[list[list[float]]], hosts: int) -> float:
+@dataclass(order=True)
+class _Host:
+    """One that does a task at a time."""
+
+    free: float
+    """Second from which on it does nothing."""
+    number: int
+    session: tuple[int, int] = (-1, -1)
+    """Shot and step whose tasks its session is for."""
+    tasks: int = 0
+    """Of that session, done."""
+
+    def does(self, step: tuple[int, int], since: float, seconds: float, session_tasks: int) -> float:
+        """Takes a task of a step that is ready since then; returns when it has ended."""
+        if step != self.session or self.tasks == session_tasks > 0:
+            self.session, self.tasks = step, 0
+            seconds += SESSION_SECONDS
+        self.tasks += 1
+        self.free = max(self.free, since) + TASK_SECONDS + seconds
+        return self.free
+
+
+def _makespan(chains: list[list[list[float]]], hosts: int, session_tasks: int) -> float:
     """When the last task ends, if a free host takes the next one of the earliest shot that has one ready.
 
     `chains`: shot -> step -> seconds of each task.
     """
-    free = [SESSION_SECONDS] * hosts
-    heapq.heapify(free)
-    ready = [(SESSION_SECONDS, n) for n, chain in enumerate(chains) if chain]
-    heapq.heapify(ready)
+    free = [_Host(0.0, number) for number in range(hosts)]
+    ready = [(0.0, n) for n, chain in enumerate(chains) if chain]
     at = [0] * len(chains)
     last = 0.0
     while ready:
         since, n = heapq.heappop(ready)
         ends = since
         for seconds in chains[n][at[n]]:
-            end = max(heapq.heappop(free), since) + seconds
-            heapq.heappush(free, end)
-            ends = max(ends, end)
+            host = heapq.heappop(free)
+            ends = max(ends, host.does((n, at[n]), since, seconds, session_tasks))
+            heapq.heappush(free, host)
         at[n] += 1
         last = max(last, ends)
         if at[n] < len(chains[n]):

@@ -34,25 +34,31 @@ class Rate:
 
 
 MEASURED: dict[str, Rate] = {
-    "import": Rate(3.0, 0.03, 1.0, 400),
-    "solve": Rate(5.0, 3.4, 1.0, 1000),
+    "import": Rate(2.0, 0.15, 1.0, 400),
+    "solve": Rate(4.0, 4.5, 1.0, 1000),
     "train": Rate(4.0, 0.228, 1.0, 1500),
-    "open": Rate(3.5, 0.153, 1.0, 1000),
-    "freeze": Rate(3.8, 0.43, 1.0, 1250),
-    "finish": Rate(3.2, 0.03, 1.0, 700),
-    "bake": Rate(4.2, 0.11, 1.0, 600),
-    "deliver": Rate(4.1, 0.0, 1.0, 500),
+    "open": Rate(4.5, 0.18, 1.0, 1000),
+    "freeze": Rate(4.1, 0.86, 1.0, 1250),
+    "finish": Rate(5.0, 0.89, 1.0, 700),
+    "bake": Rate(2.3, 1.13, 1.0, 600),
+    "deliver": Rate(2.6, 0.0, 1.0, 500),
 }
 """Step -> rate on one core of the processor of docs/farm.md, which says how they were measured."""
-SESSION_SECONDS = 2.0
-"""Seconds that entering the job's environment takes once it is set up, per session of a host."""
+SESSION_SECONDS = 1.3
+"""Seconds of one core that a session of a host takes besides its tasks: the engine begins it, and enters the job's
+environment, which is set up. Seen with openjd-cli 0.8.0, see docs/farm.md."""
+TASK_SECONDS = 0.25
+"""Of each task in it: what `records` cannot see, for the engine starts the task before, and the system clears up its
+memory after."""
+WATCH_CORES = 0.033
+"""Cores that the engine keeps busy while it waits for a task."""
 
 
 def measure(records: Iterable[dict[str, Any]]) -> dict[str, Rate]:
     """Rates by what tasks took (`records.read`), for those steps that there are records of.
 
     Where tasks had different amounts to do, what is fixed and what grows are told apart by least squares, neither below
-    zero; else the fixed part is that of `MEASURED`, as far as the tasks took that long.
+    zero; else both are those of `MEASURED`, slower or faster by as much as the tasks were.
     """
     by_step: dict[str, list[tuple[float, float, float, float]]] = {}
     for record in records:
@@ -67,17 +73,14 @@ def measure(records: Iterable[dict[str, Any]]) -> dict[str, Rate]:
 def _fitted(step: str, rows: np.ndarray) -> Rate:
     amounts, seconds = rows[:, 0], rows[:, 1]
     usual = MEASURED[step]
-    fixed, per = min(usual.fixed, float(seconds.mean())), 0.0
+    slower = float(seconds.mean()) / usual.seconds(float(amounts.mean()))
+    fixed, per = slower * usual.fixed, slower * usual.per_unit
     if np.ptp(amounts) > 0.2 * amounts.max():
         per, fixed = (float(v) for v in np.polyfit(amounts, seconds, 1))
         if per < 0.0:
             fixed, per = float(seconds.mean()), 0.0
         elif fixed < 0.0:
             fixed, per = 0.0, float(seconds.sum() / amounts.sum())
-    elif amounts.mean() > 0.0:
-        per = max(0.0, float(seconds.mean()) - fixed) / float(amounts.mean())
-    else:
-        fixed = float(seconds.mean())
     cores = float(rows[:, 2].sum() / max(1e-9, seconds.sum()))
     return Rate(round(fixed, 4), round(per, 6), round(max(0.1, cores), 3), int(rows[:, 3].max()))
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..contract import PARAMS, SHOT_SUFFIX, ExitCode, JobError, write_json
-from ..contract.files import is_json_object
+from ..contract import PARAMS, ExitCode, JobError, write_json
 from ..contract.option_table import MASK_ALPHA, mask_path, options_of
+from .request import VERSION as REQUEST_VERSION
 from .shots import FarmShot
 from .work import STEPS, Step
 
@@ -208,7 +208,7 @@ def _request(step: Step) -> str:
         if values[field] and values[field] != MASK_ALPHA and (asked, field) != ("freeze", "camera_path"):
             values[field] = ""
     amounts = {str(start): round(amount, 4) for start, amount in step.amounts.items()}
-    request: dict[str, Any] = {"version": 1, "name": shot.name, "amounts": amounts, asked: values}
+    request: dict[str, Any] = {"version": REQUEST_VERSION, "name": shot.name, "amounts": amounts, asked: values}
     if asked == "freeze":
         request |= {"takes": shot.takes, "first": shot.first, "last": shot.last}
     # Two braces begin a reference. JSON itself never has two: with an indent each stands on a line of its own.
@@ -220,19 +220,3 @@ def _refused(text: str) -> str:
     if "{{" in text or re.search(r"[\x00-\x1f]", text):
         raise JobError(f"{text!r} cannot stand in a template.", "Rename it without {{.", ExitCode.USAGE)
     return text
-
-
-def read_request(path: str | Path) -> dict[str, Any]:
-    """What `_request` wrote. JobError if it is none, or from a newer version."""
-    try:
-        data: Any = json.loads(Path(path).read_text(encoding="utf-8"))
-        if not is_json_object(data) or data.get("version") != 1:
-            raise ValueError("it is not of this version")
-    except (OSError, ValueError) as error:
-        raise JobError(f"{path} is no request of a farm's template: {error}.", "", ExitCode.USAGE) from error
-    return data
-
-
-def shot_name(root: Path) -> str:
-    """Folder of a shot below the output folder."""
-    return root.name.removesuffix(SHOT_SUFFIX)

@@ -16,8 +16,12 @@ MOST_VALUES = 1024
 """Values of a task parameter, at most, as Open Job Description has it."""
 
 
-PER_STEP, PER_FRAME = 0.16, 0.9
-"""Megapixels that a training step, and a frozen frame, cost whatever their size; measured, see docs/farm.md."""
+PER_STEP, PER_SOLVED = 0.16, 0.13
+"""Megapixels that a training step and a solved frame cost whatever their size; measured, see docs/farm.md."""
+PER_WORKING, FIRST_FRAMES = 3.6, 3.5
+"""Megapixels of frozen frames that one of working frames costs as much as, for what moves and what a plate shows is
+looked for at their size; and how many frames' worth of that the first of a part is, which meets most plates first.
+From "What a frame costs" in docs/benchmarks.md."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +38,18 @@ class Step:
     part: int
     """Frames of a part."""
     amounts: dict[int, float]
-    """First frame of a part, 0 where there are none -> how much a task has to do: megapixels of pictures that are read;
-    of training steps and frozen frames with what each costs whatever its size."""
+    """First frame of a part, 0 where there are none -> how much a task has to do: megapixels of pictures, of solved
+    frames and training steps with what each costs whatever its size."""
 
     @property
     def name(self) -> str:
         """Of the template's step."""
         return f"{self.shot.name}: {self.kind}"
+
+    def sessions(self, session_tasks: int) -> int:
+        """How often one host enters the job's environment for it: once, or for every so many tasks (0: once)."""
+        tasks = max(1, len(self.t_stars)) * max(1, len(self.starts))
+        return -(-tasks // session_tasks) if session_tasks else 1
 
     def tasks(self) -> Iterator[float]:
         """The amount of work of each task."""
@@ -56,24 +65,26 @@ def steps_of(shot: FarmShot, part: int, bake: bool) -> list[Step]:
     part = max(1, part, -(-shot.frames // MOST_VALUES))
     starts = list(range(shot.first, shot.last + 1, part))
     wide, high = take_size(shot)
-    each = wide * high / 1e6 + PER_FRAME
-    sizes = {start: min(part, shot.last + 1 - start) * each for start in starts}
+    each = wide * high / 1e6
+    lengths = {start: min(part, shot.last + 1 - start) for start in starts}
     working = shot.working[0] * shot.working[1] / 1e6
+    frozen = {start: n * each + (n + FIRST_FRAMES) * PER_WORKING * working for start, n in lengths.items()}
+    baked = {start: n * each for start, n in lengths.items()}
     whole = {0: shot.frames * each}
     every = list(shot.takes)
     plain: list[tuple[str, float]] = []
     if shot.clip:
         plain.append(("import", shot.frames * shot.source[0] * shot.source[1] / 1e6))
     if not shot.solved:
-        plain.append(("solve", shot.frames * working))
+        plain.append(("solve", shot.frames * (working + PER_SOLVED)))
     if not shot.trained:
         plain.append(("train", _training(shot)))
     steps = [Step(shot, kind, [], [], part, {0: amount}) for kind, amount in plain]
     steps.append(Step(shot, "open", every, [], part, {0: _developing(shot)}))
-    steps.append(Step(shot, "freeze", every, starts, part, sizes))
+    steps.append(Step(shot, "freeze", every, starts, part, frozen))
     steps.append(Step(shot, "finish", every, [], part, whole))
     if bake:
-        steps.append(Step(shot, "bake", every, starts, part, sizes))
+        steps.append(Step(shot, "bake", every, starts, part, baked))
         steps.append(Step(shot, "deliver", every, [], part, whole))
     return steps
 
@@ -103,7 +114,7 @@ def _developing(shot: FarmShot) -> float:
     usual, trained = DevelopConfig(), _trained_width(shot)
     width = min(max(usual.width, trained), shot.working[0])
     steps = round(usual.steps * max(1.0, trained / usual.width))
-    return steps * (width**2 * _shape(shot) / 1e6 + PER_STEP)
+    return steps * width**2 * _shape(shot) / 1e6
 
 
 def _shape(shot: FarmShot) -> float:

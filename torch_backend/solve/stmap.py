@@ -192,6 +192,7 @@ def write_map(path: Path, pixels: NDArray[np.float32], key: str = "") -> Path:
     spec = oiio.ImageSpec(width, height, 3, oiio.FLOAT)
     spec.channelnames = ("R", "G", "B")
     spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # as of frozen frames: a map is the same whoever wrote it, whenever
     spec.attribute("oiio:ColorSpace", "data")
     if key:
         spec.attribute("splannequin:key", key)

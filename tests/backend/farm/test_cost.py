@@ -10,10 +10,21 @@ from torch_backend.farm import rates
 from torch_backend.farm.cost import estimate, needs, sentences
 from torch_backend.farm.rates import Rate, measure, read_rates, to_json
 from torch_backend.farm.shots import gather
-from torch_backend.farm.work import MOST_VALUES, PER_FRAME, PER_STEP, steps_of
+from torch_backend.farm.work import (
+    FIRST_FRAMES,
+    MOST_VALUES,
+    PER_SOLVED,
+    PER_STEP,
+    PER_WORKING,
+    steps_of,
+)
 
 ONE = {kind: Rate(1.0, 0.0, 2.0, 1000) for kind in rates.MEASURED}
 """Every task takes a second, on two cores."""
+
+
+PARTS = ((1, 10), (11, 10), (21, 3))
+"""First frame and length of the parts of 23 frames by tens."""
 
 
 def shots_of(shot, requests, count=1, instants=(4, 12), **words):
@@ -26,9 +37,12 @@ def test_a_take_is_cut_into_parts_that_are_all_of_it(shot, requests):
     steps = {step.kind: step for step in steps_of(one, 10, True)}
     assert list(steps) == ["solve", "train", "open", "freeze", "finish", "bake", "deliver"]
     assert steps["freeze"].starts == [1, 11, 21] and len(list(steps["freeze"].tasks())) == 6
-    frame = 1920 * 1080 / 1e6 + PER_FRAME
-    assert steps["freeze"].amounts == pytest.approx({1: 10 * frame, 11: 10 * frame, 21: 3 * frame})
-    assert sum(steps["freeze"].amounts.values()) == pytest.approx(steps["finish"].amounts[0])
+    frame, working = 1920 * 1080 / 1e6, 640 * 360 / 1e6
+    assert steps["finish"].amounts[0] == pytest.approx(23 * frame)
+    assert steps["bake"].amounts == pytest.approx({n: size * frame for n, size in PARTS})
+    assert steps["freeze"].amounts == pytest.approx(
+        {n: size * frame + (size + FIRST_FRAMES) * PER_WORKING * working for n, size in PARTS}
+    )
     assert [step.kind for step in steps_of(one, 10, False)][-1] == "finish"
 
 
@@ -42,7 +56,8 @@ def test_a_training_costs_its_steps_and_pixels_and_an_instant_too(shot, requests
     (one,) = shots_of(shot, requests)
     amounts = {step.kind: step.amounts[0] for step in steps_of(one, 10, False) if 0 in step.amounts}
     assert amounts["train"] == pytest.approx(2000 * (320 * 180 / 1e6 + PER_STEP))
-    assert amounts["open"] == pytest.approx(300 * (640 * 360 / 1e6 + PER_STEP))
+    assert amounts["open"] == pytest.approx(300 * 640 * 360 / 1e6)
+    assert amounts["solve"] == pytest.approx(20 * (640 * 360 / 1e6 + PER_SOLVED))
     one.requests["train"].update(iterations=100, width=64)
     one.requests["freeze"]["develop"] = "off"
     amounts = {step.kind: step.amounts[0] for step in steps_of(one, 10, False) if 0 in step.amounts}
@@ -55,17 +70,33 @@ def test_what_a_job_costs(shot, requests):
     told = estimate(steps, ONE, True, False)
     # a shot: solve, train, 2 opened, 2 x 4 parts, 2 finished
     assert (told.shots, told.tasks) == (3, 3 * 14)
-    assert told.core_hours == pytest.approx(3 * 14 * 2.0 / 3600)
+    own, engine = sum(row.core_seconds for row in told.rows[:-1]), told.rows[-1]
+    assert own == pytest.approx(3 * 14 * 2.0) and told.core_hours == pytest.approx((own + engine.core_seconds) / 3600)
+    beside = 3 * 5 * rates.SESSION_SECONDS + 3 * 14 * rates.TASK_SECONDS
+    assert (engine.kind, engine.tasks) == ("engine", 3 * 5) and engine.seconds == pytest.approx(beside)
+    assert engine.core_seconds == pytest.approx(beside + 3 * 14 * rates.WATCH_CORES), "it watches every second of tasks"
     assert told.card_hours == pytest.approx(3 * (1 + 2 + 8) / 3600), "train, open and freeze"
-    session = rates.SESSION_SECONDS
-    assert told.critical_seconds == pytest.approx(5.0 + session)
-    assert told.on_hosts[1] == pytest.approx(3 * 14 + session)
+    assert told.critical_seconds == pytest.approx(5 * (1.0 + rates.SESSION_SECONDS + rates.TASK_SECONDS))
+    assert told.on_hosts[1] == pytest.approx(3 * 14 + beside)
     assert told.on_hosts[100] == pytest.approx(told.critical_seconds)
-    assert 3 * 14 / 2 + session <= told.on_hosts[2] < 3 * 14 * 0.7
+    assert told.on_hosts[1] / 2 <= told.on_hosts[2] < told.on_hosts[1] * 0.7
     assert told.disk_gb == pytest.approx(3 * (2 * 20 * 1920 * 1080 * 50 + 100e6) / 1e9, rel=0.01)
     said = "\n".join(sentences(told, "of nobody"))
     assert "3 shots, 42 tasks. By rates of nobody" in said and "freeze       24 tasks" in said
+    assert "engine       15 sessions" in said
     assert estimate(steps, ONE, False, False).card_hours == 0.0
+
+
+def test_a_session_is_entered_again_after_so_many_tasks(shot, requests):
+    (one,) = shots_of(shot, requests)
+    steps = steps_of(one, 5, False)
+    keeps, enters = estimate(steps, ONE, False, False), estimate(steps, ONE, False, False, 1)
+    assert [told.rows[-1].tasks for told in (keeps, enters)] == [5, 14]
+    assert estimate(steps, ONE, False, False, 3).rows[-1].tasks == 1 + 1 + 1 + 3 + 1
+    more = 9 * rates.SESSION_SECONDS
+    assert enters.on_hosts[1] - keeps.on_hosts[1] == pytest.approx(more)
+    assert 3600 * (enters.core_hours - keeps.core_hours) == pytest.approx(more)
+    assert enters.critical_seconds == pytest.approx(keeps.critical_seconds), "the first task of each step enters, too"
 
 
 def test_hosts_are_asked_for_what_was_seen_and_half_as_much_again():
@@ -85,10 +116,12 @@ def test_rates_are_measured_from_what_tasks_took():
     found = measure(records)
     assert found["freeze"].fixed == pytest.approx(4.0) and found["freeze"].per_unit == pytest.approx(2.0)
     assert (found["freeze"].cores, found["freeze"].memory_mib) == (2.0, 905)
-    assert found["train"].seconds(100) == pytest.approx(65.0), "one amount: what is fixed is the usual"
-    assert found["train"].fixed == rates.MEASURED["train"].fixed
+    usual = rates.MEASURED["train"]
+    assert found["train"].seconds(100) == pytest.approx(65.0, abs=0.01)
+    share = found["train"].fixed / found["train"].per_unit
+    assert share == pytest.approx(usual.fixed / usual.per_unit, rel=0.01), "one amount: all is slower by as much"
     assert found["open"].seconds(0) == pytest.approx(10.0)
-    assert found["finish"].seconds(10) == pytest.approx(0.5), "never more than was taken"
+    assert found["finish"].seconds(10) == pytest.approx(0.5, abs=0.01)
     assert set(found) == {"freeze", "train", "open", "finish"}
 
 

@@ -9,7 +9,7 @@ import pytest
 from torch_backend import cli
 from torch_backend.contract import JobError, write_json
 from torch_backend.farm import export as exporting
-from torch_backend.farm.template import read_request
+from torch_backend.farm.request import read_request
 
 
 @pytest.fixture

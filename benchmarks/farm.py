@@ -1,0 +1,308 @@
+"""What a farm's job costs and makes, against what was said and against one machine.
+
+    python -m benchmarks.farm --output DIR [--openjd PYTHON] [--blender BLENDER] [--measure]
+
+Makes short clips of the bundled one, exports them as a job from import to bake, and runs it with `openjd run`: two at
+once, each on a core of its own, tasks shuffled, a session for every few tasks. Prints the estimate against what was
+measured: seconds of the processor of every process, engine included, and the clock. Then takes and bakes the same
+instants on one machine, with all its cores, and compares every frame, bit for bit.
+
+`--measure` first runs the job of another clip, of one instant in longer parts, and estimates by the rates of that;
+without it by those of the program. `--openjd` is a Python with openjd-cli (requirements/test.txt). Linux and macOS. The
+machine should do nothing else; the load is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torch_backend.contract import SHOT_SUFFIX, ShotFolder, read_json
+from torch_backend.farm import records
+from torch_backend.farm.cost import HOSTS
+from torch_backend.footage.images import write_png
+from torch_backend.footage.opening import open_source
+
+ROOT = Path(__file__).resolve().parents[1]
+CLIP = ROOT / "examples" / "sitting.mp4"
+CLIP_FRAMES = 74
+OTHER_FRAMES = 20
+"""Of the shot that rates are measured on: parts of 8 frames, and one of 4, tell apart what is fixed and what grows."""
+TASKSET = ("taskset", "--cpu-list")
+
+
+@dataclass(frozen=True)
+class Host:
+    """What tasks find on every host."""
+
+    openjd: str
+    """Python with openjd-cli."""
+    blender: str
+    """Blender's program; empty: a bpy wheel."""
+
+
+@dataclass
+class Job:
+    """A job that is being run."""
+
+    folder: Path
+    host: Host
+    session_tasks: int
+    pending: dict[str, list[dict[str, str]]]
+    """Step -> its tasks that nobody has taken, shuffled."""
+    waits: dict[str, str]
+    """Step -> the one before it."""
+    chance: np.random.Generator
+    left: dict[str, int] = field(default_factory=dict[str, int])
+    """Step -> tasks that are not done."""
+    begun: int = 0
+    """Sessions."""
+    seconds: float = 0.0
+    """Of processors, in all sessions that have ended, with all that they started."""
+    failed: list[str] = field(default_factory=list[str])
+    turn: threading.Condition = field(default_factory=threading.Condition)
+
+    def __post_init__(self) -> None:
+        self.left = {step: len(tasks) for step, tasks in self.pending.items()}
+
+    def take(self) -> tuple[int, str, list[dict[str, str]]] | None:
+        """Number of a session, a step and some of its tasks; waits for one. None: nothing is left, or one failed."""
+        with self.turn:
+            while not self.failed and any(self.pending.values()):
+                ready = [
+                    s for s, tasks in self.pending.items() if tasks and not self.left.get(self.waits.get(s, ""), 0)
+                ]
+                if ready:
+                    step = ready[self.chance.integers(len(ready))]
+                    tasks = self.pending[step]
+                    taken, self.pending[step] = tasks[: self.session_tasks], tasks[self.session_tasks :]
+                    self.begun += 1
+                    return self.begun, step, taken
+                self.turn.wait()
+        return None
+
+    def work(self, core: int | None) -> None:
+        """One host: sessions, one after the other, on one core."""
+        while taken := self.take():
+            number, step, tasks = taken
+            code, seconds = self.session(number, step, tasks, core)
+            with self.turn:
+                self.seconds += seconds
+                self.left[step] -= len(tasks)
+                if code:
+                    self.failed.append(f"Session {number}, {step},")
+                self.turn.notify_all()
+
+    def session(self, number: int, step: str, tasks: list[dict[str, str]], core: int | None) -> tuple[int, float]:
+        """Exit code, and seconds of processors."""
+        values = read_json(self.folder / "parameters.json")
+        values |= {"HostPython": sys.executable, "BackendPython": sys.executable, "Blender": self.host.blender}
+        command = [self.host.openjd, "-P", "-m", "openjd", "run", str(self.folder / "template.json")]
+        command += ["-p", json.dumps(values), "--no-run-dependencies", "--step", step, "--tasks", json.dumps(tasks)]
+        with open(self.folder / f"session-{number:03d}.log", "wb") as log:
+            child = subprocess.Popen(pinned(core, command), stdout=log, stderr=log, env=environ())
+            _, status, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        return child.returncode, used.ru_utime + used.ru_stime
+
+
+def environ() -> dict[str, str]:
+    """Without what would change the environment of tasks."""
+    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "OMP_NUM_THREADS")}
+
+
+def pinned(core: int | None, command: list[str]) -> list[str]:
+    """A command on one core, where the system can do that: a task takes all cores that it may use."""
+    return command if core is None or shutil.which("taskset") is None else [*TASKSET, str(core), *command]
+
+
+def clip_of(folder: Path, name: str, first: int, frames: int, shrink: int) -> str:
+    """Writes frames of the bundled clip as pictures, `shrink` times smaller; returns their pattern."""
+    place = folder / name
+    place.mkdir(parents=True)
+    for number, frame in enumerate(open_source(str(CLIP)).frames(first, first + frames - 1), 1):
+        high, wide = (size // shrink for size in frame.pixels.shape[:2])
+        cut = frame.pixels[: high * shrink, : wide * shrink].reshape(high, shrink, wide, shrink, 3)
+        pixels = np.rint(cut.mean((1, 3), dtype=np.float64)).astype(frame.pixels.dtype)
+        write_png(place / f"{name}.{number:04d}.png", pixels)
+    return str(place / f"{name}.####.png")
+
+
+def exported(folder: Path, clips: Sequence[str], words: Sequence[str]) -> dict[str, Any]:
+    """Exports a job of clips; returns the estimate."""
+    shots = ["--shots-folder", str(folder / "shots")]
+    return json.loads(backend("--json", "farm", "export", *clips, "--output", str(folder), *shots, "--bake", *words))
+
+
+def run(folder: Path, host: Host, session_tasks: int, at_once: int, seed: int) -> tuple[Job, float]:
+    """Runs an exported job; returns it, and how long it took by the clock."""
+    chance = np.random.default_rng(seed)
+    pending: dict[str, list[dict[str, str]]] = {}
+    waits: dict[str, str] = {}
+    for step in read_json(folder / "template.json")["steps"]:
+        space = {one["name"]: one["range"] for one in step["parameterSpace"]["taskParameterDefinitions"]}
+        tasks = [dict(zip(space, map(str, values), strict=True)) for values in product(*space.values())]
+        pending[step["name"]] = [tasks[n] for n in chance.permutation(len(tasks))]
+        for one in step.get("dependencies", []):
+            waits[step["name"]] = one["dependsOn"]
+    job = Job(folder, host, session_tasks, pending, waits, chance)
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    hosts = [
+        threading.Thread(target=job.work, args=(cores[n] if len(cores) >= at_once else None,)) for n in range(at_once)
+    ]
+    began = time.monotonic()
+    for one in hosts:
+        one.start()
+    for one in hosts:
+        one.join()
+    if job.failed:
+        raise SystemExit(f"{job.failed[0]} failed: see its log in {folder}")
+    return job, time.monotonic() - began
+
+
+def told(said: dict[str, Any], job: Job, clock: float, at_once: int) -> None:
+    """Prints the estimate against what was measured."""
+    took: dict[str, list[float]] = {}
+    for shot in sorted((job.folder / "shots").glob(f"*{SHOT_SUFFIX}")):
+        for record in records.read(shot):
+            took.setdefault(record["step"], []).append(record["cpu_seconds"])
+    took["engine"] = [job.seconds - sum(map(sum, took.values()))]
+    print(f"{'step':<10}{'tasks':>6}{'estimate':>12}{'measured':>12}  core-seconds")
+    for row in said["rows"]:
+        print(f"{row['kind']:<10}{row['tasks']:>6}{row['core_seconds']:>12.1f}{sum(took[row['kind']]):>12.1f}")
+    print(f"engine: {job.begun} sessions; estimated {said['rows'][-1]['tasks']} on one host")
+    for what, guess, was in (
+        ("core-seconds", said["core_hours"] * 3600.0, job.seconds),
+        ("seconds by the clock", said["on_hosts"][str(at_once)], clock),
+    ):
+        print(f"{what}: estimated {guess:.0f}, measured {was:.0f}, {100.0 * (guess / was - 1.0):+.0f} %")
+
+
+def alone(folder: Path, there: Path, host: Host) -> None:
+    """Takes and bakes all takes of a job again, from its trained shots, on this machine with all its cores."""
+    for shot in sorted((folder / "shots").glob(f"*{SHOT_SUFFIX}")):
+        copy = there / "shots" / shot.name
+        shutil.copytree(shot, copy, ignore=shutil.ignore_patterns("takes", "farm", "developed", "jobs"))
+        for take in sorted(ShotFolder(shot).takes.iterdir()):
+            t_star = read_json(take / "take.json")["t_star_frame"]
+            backend("freeze", str(copy), "--take", take.name, "--t-star", str(t_star))
+            out = there / "baked" / shot.name.removesuffix(SHOT_SUFFIX) / take.name
+            baked(host, ["--shot", str(copy), "--take", take.name, "--output", str(out)])
+
+
+def backend(*words: str) -> str:
+    """Runs a verb of the backend; returns what it said."""
+    env = environ() | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "torch_backend", *words], cwd=ROOT, env=env, capture_output=True, text=True
+    )
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return done.stdout
+
+
+def baked(host: Host, words: Sequence[str]) -> None:
+    """Bakes a take whole, in the Blender of the hosts."""
+    entered = [
+        str(ROOT / "splannequin.py"),
+        "farm-host",
+        "--bake",
+        "--python",
+        sys.executable,
+        "--blender",
+        host.blender,
+    ]
+    said = subprocess.run([sys.executable, *entered], capture_output=True, text=True, check=True, env=environ()).stdout
+    told = dict(line.removeprefix("openjd_env: ").split("=", 1) for line in said.splitlines() if "=" in line)
+    command: list[str] = json.loads(told["SPLANNEQUIN_BLENDER_COMMAND"])
+    command += [str(ROOT / "splannequin_addon" / "run_in_bpy.py"), *(["--"] if host.blender else []), "bake", *words]
+    env = environ() | {"SPLANNEQUIN_BACKEND_PYTHON": sys.executable}
+    subprocess.run(command, check=True, env=env, stdout=subprocess.DEVNULL)
+
+
+def compared(ours: Path, theirs: Path) -> bool:
+    """Prints how many files of two folders are the same, by folder and kind; True if all are."""
+    same: dict[str, list[bool]] = {}
+    unlike: list[str] = []
+    for path in sorted(p for top in ("shots", "baked") for p in (theirs / top).rglob("*")):
+        name = path.relative_to(theirs)
+        if not path.is_file() or (name.parts[0] == "shots" and "takes" not in name.parts):
+            continue
+        if path.suffix not in (".exr", ".png", ".ply"):
+            continue
+        kind = (
+            f"{'baked' if name.parts[0] == 'baked' else name.parts[4] if len(name.parts) > 5 else 'take'} {path.suffix}"
+        )
+        other = ours / name
+        same.setdefault(kind, []).append(other.is_file() and other.read_bytes() == path.read_bytes())
+        if not same[kind][-1]:
+            unlike.append(str(name))
+    for kind, equal in sorted(same.items()):
+        print(f"{kind:<16}{sum(equal):>5} of {len(equal)} files are the same, bit for bit")
+    for name in unlike[:10]:
+        print(f"  not: {name}")
+    return not unlike
+
+
+def main() -> int:
+    """Runs what the module says; the exit status is 1 where a frame differs."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--output", type=Path, required=True, help="folder, which must not be there")
+    parser.add_argument("--openjd", default=sys.executable, help="Python with openjd-cli")
+    parser.add_argument("--blender", default="", help="Blender's program (default: a bpy wheel)")
+    parser.add_argument("--measure", action="store_true", help="estimate by the rates of another shot, run first")
+    parser.add_argument("--shots", type=int, default=3)
+    parser.add_argument("--length", type=int, default=24, help="frames of a shot")
+    parser.add_argument("--part", type=int, default=3, help="frames of a task")
+    parser.add_argument("--shrink", type=int, default=2, help="of 640 x 480")
+    parser.add_argument("--iterations", type=int, default=60)
+    parser.add_argument("--session-tasks", type=int, default=4)
+    parser.add_argument("--at-once", type=int, default=2, choices=HOSTS)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    host = Host(args.openjd, args.blender)
+    out: Path = args.output.absolute()
+    out.mkdir(parents=True)
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()}", flush=True)
+    asked = ["--iterations", str(args.iterations), "--session-tasks", str(args.session_tasks)]
+    rates: list[str] = []
+    if args.measure:
+        clip = clip_of(out / "clips", "other", 18, OTHER_FRAMES, args.shrink)
+        exported(out / "other", [clip], [*asked, "--t-star", str(OTHER_FRAMES // 2), "--frames", "8"])
+        run(out / "other", host, args.session_tasks, args.at_once, args.seed)
+        backend("farm", "measure", str(out / "other" / "shots" / f"other{SHOT_SUFFIX}"), "--output", str(out))
+        rates = ["--rates", str(out / "rates.json")]
+    names = [f"shot{n + 1}" for n in range(args.shots)]
+    apart = max(1, (CLIP_FRAMES - args.length) // max(1, args.shots - 1))
+    clips = [clip_of(out / "clips", name, 1 + n * apart, args.length, args.shrink) for n, name in enumerate(names)]
+    instants = f"{args.length // 3},{2 * args.length // 3}"
+    asked += ["--t-star", instants, "--frames", str(args.part)]
+    said = exported(out / "job", clips, asked)
+    if rates:
+        guess = f"{said['core_hours'] * 3600:.0f} core-seconds, {said['on_hosts'][str(args.at_once)]:.0f} by the clock"
+        print(f"by the program's own rates: {guess}")
+        said = exported(out / "job", clips, [*asked, *rates])
+    job, clock = run(out / "job", host, args.session_tasks, args.at_once, args.seed)
+    print(f"load {os.getloadavg()}", flush=True)
+    told(said, job, clock, args.at_once)
+    backend("farm", "measure", *map(str, (out / "job" / "shots").iterdir()), "--output", str(out / "job"))
+    print(f"rates of this run: {out / 'job' / 'rates.json'}", flush=True)
+    alone(out / "job", out / "alone", host)
+    return 0 if compared(out / "job", out / "alone") else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
