@@ -139,7 +139,7 @@ def next_rung(best: Attempt, asked: dict[str, Any], done: set[str]) -> Rung | No
     features = Rung(
         "features", f"up to {more} features a frame, faint ones too", {"features": more, "peak": FAINT_PEAK}
     )
-    pairs = Rung("pairs", "more frames matched with each other", {"wide": True})
+    pairs = None if asked.get("wide") else Rung("pairs", "more frames matched with each other", {"wide": True})
     mapper = Rung("global", "all cameras placed at once (global mapper)", {"mapper": "global"})
     free: list[Rung | None] = [None]
     if asked.get("start_focal_px") and not asked.get("focal_px"):

@@ -46,7 +46,7 @@ from .given import doubts, prepare, refuse_misfit, take_over
 from .ladder import climb
 from .lens_verdict import lens_remarks
 from .map_lens import MapLens
-from .masks import facts_of, given_masks, more_features, write_matching, write_undistorted
+from .masks import facts_of, given_masks, more_features, wants_wide, write_matching, write_undistorted
 from .points import filter_points
 from .poses import camera_centre, fill_poses
 from .stored import load_cameras, load_points, load_record
@@ -295,12 +295,13 @@ def _matching(
     undistort: Undistorter | None = None,
 ) -> dict[str, Any]:
     """What the worker is told of features and matches; writes its masks, of frames that went through `undistort`."""
-    options = {"overlap": config.overlap, "features": config.features}
+    options: dict[str, Any] = {"overlap": config.overlap, "features": config.features}
     if not masks:
         return options
     folder = scratch / "not_matched"
     write_matching(masks, {f["frame"]: Path(f["file"]).name for f in frames["frames"]}, folder, undistort)
-    return {**options, "features": round(config.features * more_features(masks)), "masks": str(folder)}
+    options |= {"features": round(config.features * more_features(masks)), "masks": str(folder)}
+    return {**options, "wide": True} if wants_wide(masks) else options
 
 
 def _focal_of_file(frames: dict[str, Any]) -> float:

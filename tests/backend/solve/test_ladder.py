@@ -36,6 +36,12 @@ def rungs(best, **changes):
     return found
 
 
+def test_frames_that_are_matched_widely_already_are_not_matched_so_again():
+    done = {"first", "features"}
+    assert next_rung(attempt("few"), {**ASKED, "wide": True}, done).name == "lens"
+    assert next_rung(attempt("few"), ASKED, done).name == "pairs"
+
+
 MATCHING = [("features", 8192, 0.0025), ("pairs", True)]
 OPENCV, FISHEYE = ("lens", "OPENCV"), ("lens", "OPENCV_FISHEYE")
 

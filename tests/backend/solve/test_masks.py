@@ -24,6 +24,7 @@ from torch_backend.solve.masks import (
     write_matching,
 )
 from torch_backend.solve.motion import MOVING, STILL, UNKNOWN, load_motion
+from torch_backend.solve.solving import _matching
 
 COUNT, FEATURES = 11, 1500
 
@@ -140,6 +141,21 @@ def test_nothing_is_matched_a_little_around_a_mask(tmp_path):
     write_matching({"ignore": mask}, {7: "000007.png"}, tmp_path / "masks")
     written = cv2.imread(str(tmp_path / "masks" / "000007.png.png"), cv2.IMREAD_GRAYSCALE)
     assert (written[97:203, 340] == 0).all() and (written[[96, 203], 340] == 255).all()
+
+
+def test_frames_that_are_largely_masked_are_matched_with_more_than_their_neighbours(tmp_path):
+    def asked(share):
+        covered = np.zeros((48, 64), bool)
+        covered[:, : round(64 * share)] = True
+        mask = Mask("people", (64, 48))
+        for frame in (1, 2):
+            mask.add(frame, covered)
+        mask.share = share
+        frames = {"frames": [{"frame": n, "file": f"00000{n}.png"} for n in (1, 2)]}
+        return _matching(frames, SolveConfig(), {"people": mask}, tmp_path / f"{share}")
+
+    assert "wide" not in asked(0.2) and asked(0.5)["wide"] is True
+    assert asked(0.5)["features"] == 2 * SolveConfig().features
 
 
 def test_a_logo_is_painted_over_before_flow_looks_and_nothing_moves_at_its_rim():
