@@ -48,6 +48,19 @@ class DetailConfig:
     """The same, for what hangs together with such a spot."""
     thin: int = 3
     """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
+    torn: float = 0.06
+    """Low-passed difference between plate t* and the splats, display-referred, from which on what moves is not shown as
+    the splats have it but as that plate does."""
+    torn_too: float = 0.03
+    """The same, for what hangs together with such a spot."""
+    moves: float = 0.25
+    """Share of what is seen that the model has to move there, too."""
+    beside: float = 15.0
+    """Degrees by which plate t* may see it from another side: from further round it shows what is turned away."""
+    rim: int = 2
+    """Pixels along the outline of what plate t* shows in which it does not count."""
+    medians: int = 3
+    """So many times over the median of 5 x 5 pixels' depths is taken there."""
     gap: int = 4
     """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
     sees flickers from pixel to pixel."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from ..torch_types import norm
 from .bands import look_up_near
 from .detail_config import DetailConfig
+from .instant_pixels import InstantPixels, instant_pixels
 from .posed import PosedFrame, displacements, parallax
 from .reproject import blurred, look_up, narrowed, project, resized, unproject, widened
 from .sightings import Sighting, Sightings
@@ -36,6 +37,8 @@ class Fillers:
     """[H, W, 3] float16 each, as `Sightings.residual`."""
     most: float
     """The largest number in any of them, or in a working frame if that is more."""
+    instant: InstantPixels | None = None
+    """Plate t*, where it stands in place of the splats."""
 
 
 @dataclass
@@ -68,7 +71,8 @@ def fillers_of(
     agreed = _agreed(sightings, config, posed, chosen, moved)
     residuals = [sightings.residual(frame) for frame in chosen]
     most = max(sightings.scene.display.most, *(sightings.most(frame) for frame in chosen))
-    return Fillers(chosen, moved, unknown, shown, agreed, residuals, most)
+    instant = instant_pixels(sightings, config, posed, usable)
+    return Fillers(chosen, moved, unknown, shown, agreed, residuals, most, instant)
 
 
 def _shown(
@@ -155,6 +159,11 @@ def fill(
     for n, residual in enumerate(fillers.residuals):
         carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
     filling.color += carried * filling.share[:, None]
+    if fillers.instant is not None:
+        told = look_up(fillers.instant.where, small)
+        filling.color = torch.lerp(filling.color, fillers.instant.at(small, larger), told[:, None])
+        filling.share = torch.lerp(filling.share, torch.ones_like(told), told)
+        filling.source = torch.where(told > 0.5, float(posed.t), filling.source)
     filling.most = fillers.most
     return filling
 

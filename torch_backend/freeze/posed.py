@@ -26,6 +26,8 @@ class PosedFrame:
     """[3, 3] in pixels of the picture with its overscan."""
     image: FrozenImage
     """The splats' render of it."""
+    exposed_at: float
+    """Normalised time whose exposure it has."""
     own: bool
     """True if it is one of the clip's own frames, seen as its camera saw it."""
     t: int
@@ -81,7 +83,8 @@ def posed_frame(
     own = _is_own(sightings, output, width, height)
     nothing = torch.zeros_like(motion)
     return PosedFrame(
-        output.viewmat, K, image, own, t, frozen, points, depth, motion, w / columns, nothing, motion, nothing
+        output.viewmat, K, image, sightings.scene.time_of_frame(output.exposed_like), own, t, frozen, points, depth,
+        motion, w / columns, nothing, motion, nothing,
     )  # fmt: skip
 
 

@@ -161,6 +161,7 @@ class Sightings:
         """[F, 3] camera centres of the clip's frames, scene units."""
         self._views: OrderedDict[int, PlateView] = OrderedDict()
         self._residuals: OrderedDict[int, Tensor] = OrderedDict()
+        self._displayed: tuple[int, Tensor] | None = None
         self._most: dict[int, float] = {}
 
     def camera(self, frame: int, width: int, height: int) -> tuple[Tensor, Tensor]:
@@ -193,6 +194,12 @@ class Sightings:
                 self._residuals.popitem(last=False)
         self._residuals.move_to_end(frame)
         return self._residuals[frame]
+
+    def displayed(self, frame: int) -> Tensor:
+        """[H, W, 3] float16: plate `frame`, display-referred, uncut; the last one that was asked for is kept."""
+        if self._displayed is None or self._displayed[0] != frame:
+            self._displayed = frame, self.plates.display(frame).half()
+        return self._displayed[1]
 
     def most(self, frame: int) -> float:
         """The largest number in plate `frame`."""
