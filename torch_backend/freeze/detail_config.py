@@ -48,7 +48,7 @@ class DetailConfig:
     """The same, for what hangs together with such a spot."""
     thin: int = 3
     """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
-    torn: float = 0.06
+    torn: float = 0.1
     """Low-passed difference between plate t* and the splats, display-referred, from which on what moves is not shown as
     the splats have it but as that plate does."""
     torn_too: float = 0.03
