@@ -34,23 +34,23 @@ class Rate:
 
 
 MEASURED: dict[str, Rate] = {
-    "import": Rate(2.0, 0.15, 1.0, 400),
-    "solve": Rate(4.0, 4.5, 1.0, 1000),
+    "import": Rate(1.4, 0.11, 1.0, 400),
+    "solve": Rate(2.7, 3.0, 1.0, 1000),
     "train": Rate(4.0, 0.228, 1.0, 1500),
-    "open": Rate(4.5, 0.18, 1.0, 1000),
-    "freeze": Rate(4.1, 0.86, 1.0, 1250),
-    "finish": Rate(5.0, 0.89, 1.0, 700),
-    "bake": Rate(2.3, 1.13, 1.0, 600),
-    "deliver": Rate(2.6, 0.0, 1.0, 500),
+    "open": Rate(8.5, 0.16, 1.0, 1000),
+    "freeze": Rate(3.0, 0.63, 1.0, 1250),
+    "finish": Rate(2.8, 0.5, 1.0, 700),
+    "bake": Rate(1.5, 0.73, 1.0, 600),
+    "deliver": Rate(1.3, 0.0, 1.0, 500),
 }
 """Step -> rate on one core of the processor of docs/farm.md, which says how they were measured."""
-SESSION_SECONDS = 1.3
+SESSION_SECONDS = 0.6
 """Seconds of one core that a session of a host takes besides its tasks: the engine begins it, and enters the job's
 environment, which is set up. Seen with openjd-cli 0.8.0, see docs/farm.md."""
-TASK_SECONDS = 0.25
+TASK_SECONDS = 0.11
 """Of each task in it: what `records` cannot see, for the engine starts the task before, and the system clears up its
 memory after."""
-WATCH_CORES = 0.033
+WATCH_CORES = 0.015
 """Cores that the engine keeps busy while it waits for a task."""
 
 
