@@ -37,7 +37,7 @@ MEASURED: dict[str, Rate] = {
     "import": Rate(1.4, 0.11, 1.0, 400),
     "solve": Rate(2.7, 3.0, 1.0, 1000),
     "train": Rate(4.0, 0.228, 1.0, 1500),
-    "open": Rate(8.5, 0.16, 1.0, 1000),
+    "open": Rate(6.2, 0.3, 1.0, 1000),
     "freeze": Rate(3.0, 0.63, 1.0, 1250),
     "finish": Rate(2.8, 0.5, 1.0, 700),
     "bake": Rate(1.5, 0.73, 1.0, 600),
