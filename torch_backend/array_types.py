@@ -6,7 +6,7 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import interpolate, sparse
+from scipy import sparse
 
 
 class SparseMatrix(Protocol):
@@ -48,6 +48,8 @@ def between_nodes(
 ) -> NDArray[np.float64]:
     """Values [len(y), len(x)] between those of a grid, by a cubic spline: `nodes` are the grid's x and y, ascending,
     four at least, `values` [y, x]."""
+    from scipy import interpolate  # a second of every start, for the lens of an ST map alone
+
     spline = cast(Any, interpolate).RectBivariateSpline(nodes[1], nodes[0], values)
     return np.asarray(spline(y, x), np.float64)
 

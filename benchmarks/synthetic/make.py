@@ -28,7 +28,7 @@ GENERATOR_VERSION = 1
 """Raised when the same seed would give another scene: a folder of another version is refused."""
 ROOT = Path(__file__).resolve().parents[2]
 RENDERER = Path(__file__).with_name("render_bpy.py")
-DEFAULT_BPY = ROOT / ".venv-bpy-5.0"
+USUAL_BPY = ".venv-bpy-5.0"
 _LAST_LINES = 5
 
 Say = Callable[[str], None]
@@ -51,7 +51,8 @@ def default_folder() -> Path:
 
 def find_bpy(given: str | Path | None) -> Path:
     """The Python of a bpy wheel's environment: `given` may be that Python or its environment's folder."""
-    places = [Path(given)] if given else [DEFAULT_BPY, *sorted(ROOT.glob(".venv-bpy-*"), reverse=True)]
+    home = Path(os.environ.get("SPLANNEQUIN_HOME") or ROOT).expanduser()  # where set-up puts environments
+    places = [Path(given)] if given else [home / USUAL_BPY, *sorted(home.glob(".venv-bpy-*"), reverse=True)]
     for place in places:
         for python in (place, place / "bin" / "python", place / "Scripts" / "python.exe"):
             if python.is_file():

@@ -161,7 +161,9 @@ def fill(
     filling.color += carried * filling.share[:, None]
     if fillers.instant is not None:
         told = look_up(fillers.instant.where, small)
-        filling.color = torch.lerp(filling.color, fillers.instant.at(small, larger), told[:, None])
+        on = told > 0.0
+        shown = fillers.instant.at(small[on], larger)
+        filling.color[on] = torch.lerp(filling.color[on], shown, told[on][:, None])
         filling.share = torch.lerp(filling.share, torch.ones_like(told), told)
         filling.source = torch.where(told > 0.5, float(posed.t), filling.source)
     filling.most = fillers.most
