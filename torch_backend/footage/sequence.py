@@ -55,6 +55,8 @@ def find_sequence(path: Path) -> FileSequence:
     if path.exists():
         return _sequence_of_file(path)
     try:
+        if "*" in path.name or "?" in path.name:  # fileseq takes a star for a part of the name
+            raise FileSeqException("a wildcard")
         return FileSequence.findSequenceOnDisk(str(path), strictPadding=False)
     except FileSeqException as error:
         raise footage_error(

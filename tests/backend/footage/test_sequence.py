@@ -82,6 +82,13 @@ def test_folder_file_and_patterns_mean_the_same_sequence(exrs, name):
     assert (source.info.first, source.info.last, source.info.width, source.info.height) == (1001, 1010, 64, 48)
 
 
+@pytest.mark.parametrize("name", ["*.exr", "shot.*.exr", "shot.100?.exr"])
+def test_a_wildcard_is_no_pattern_and_the_sentence_says_what_is(exrs, name):
+    with pytest.raises(JobError, match="No pictures match") as error:
+        open_source(str(exrs / name))
+    assert "# or %04d stands for the frame number" in error.value.hint
+
+
 def test_linear_pictures_are_read_as_the_light_that_they_hold(exrs):
     source = open_source(str(exrs))
     frame = next(iter(source.frames(None, None)))
