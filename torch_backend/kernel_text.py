@@ -2,8 +2,8 @@
 
 A kernel file is a body of C++ for `warp.func_native`, or a part of one. Its head, the lines of `//` before the first
 other line, says what it is and is not compiled; everything after it is, to the letter, because Warp's cache of compiled
-kernels goes by the text. A line `#include "NAME"` stands for such a file of the same folder, without its head. What
-stands between @ signs (`@LOW_PASS@`) is put in by the module that uses the file.
+kernels goes by the text. A line `#include "PATH"` stands for such a file, seen from the folder of the line, without its
+head. What stands between @ signs (`@LOW_PASS@`) is put in by the module that uses the file.
 """
 
 import functools
@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 _HEAD = re.compile(r"(?://.*\n)+")
-_INCLUDE = re.compile(r'^#include "([\w.]+)"\n', re.MULTILINE)
+_INCLUDE = re.compile(r'^#include "([\w./]+)"\n', re.MULTILINE)
 
 
 @functools.cache
@@ -21,4 +21,4 @@ def kernel_text(path: Path) -> str:
     head = _HEAD.match(text)
     if head is None:
         raise ValueError(f"{path}: a kernel file begins with // and what it is")
-    return _INCLUDE.sub(lambda include: kernel_text(path.with_name(include.group(1))), text[head.end() :])
+    return _INCLUDE.sub(lambda include: kernel_text(path.parent / include.group(1)), text[head.end() :])

@@ -41,5 +41,5 @@ def test_every_kernel_file_is_used_and_no_placeholder_is_left():
     sources = [path.read_text(encoding="utf-8") for path in BACKEND.rglob("*.py")]
     sources += [path.read_text(encoding="utf-8") for path in BACKEND.rglob("kernels/**/*.c*")]
     for path in BACKEND.rglob("kernels/**/*.c*"):
-        named = re.compile(rf'"{path.name}"|"{path.stem}"')
+        named = re.compile(rf'["/]{path.name}"|"{path.stem}"')
         assert any(named.search(text) for text in sources), path

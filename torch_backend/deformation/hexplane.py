@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ..torch_types import unflatten
+from . import network, planes_cuda
 from . import planes as compiled
-from . import planes_cuda
 from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_scale
 
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
@@ -158,9 +158,7 @@ class HexPlane(Deformation):
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] scene units (ours detaches them), times [M] or [1] in [0, 1]."""
-        bent = F.silu if self.config.silu else F.relu
-        hidden = bent(self.trunk(self.features_at(means, times)))
-        out = {name: head(bent(self.hidden[name](hidden))) for name, head in self.out.items()}
+        out = dict(zip(self.out, self._network(self.features_at(means, times)), strict=True))
         return Deltas(
             means=out["means"],
             quats=out["quats"],
@@ -169,6 +167,16 @@ class HexPlane(Deformation):
             sh0=out["sh0"][:, None, :],
             shN=unflatten(out["shN"], 1, (-1, 3)) if "shN" in out else None,
         )
+
+    def _network(self, features: Tensor) -> tuple[Tensor, ...]:
+        """What each head says of features [M, features * levels]."""
+        trunk = _layer(self.trunk)
+        heads = [(_layer(self.hidden[name]), _layer(self.out[name])) for name in self.out]
+        if self.config.silu and network.supports(features, trunk, heads):
+            return network.network(features, trunk, heads)
+        bent = F.silu if self.config.silu else F.relu
+        hidden = bent(F.linear(features, *trunk))
+        return tuple(F.linear(bent(F.linear(hidden, *first)), *last) for first, last in heads)
 
     def _by_level(self) -> list[Tensor]:
         """Three planes of space, then three of time, level by level."""
@@ -212,6 +220,11 @@ def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     return layer
 
 
+def _layer(linear: nn.Module) -> network.Layer:
+    assert isinstance(linear, nn.Linear)
+    return network.Layer(linear.weight, linear.bias)
+
+
 def _sample(plane: Tensor, first: Tensor, second: Tensor) -> Tensor:
     """Bilinear samples [M, C] of a plane [1, C, R_second, R_first] at coordinates in [-1, 1]; the rim holds outside."""
     grid = torch.stack([first, second], dim=1)[None, None]
@@ -248,6 +261,7 @@ def _restore(config: HexPlaneConfig, tensors: dict[str, Tensor]) -> HexPlane:
 def _warm_up(config: HexPlaneConfig) -> None:
     if config.features % compiled.LANES == 0:
         compiled.warm_up(config.features)
+        network.warm_up(config.features * len(config.levels), config.width, len(_WIDTHS))
 
 
 HOST = HostSpec("hexplane", HexPlaneConfig, _reference, _create, _restore, _warm_up)

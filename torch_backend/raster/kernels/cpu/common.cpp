@@ -27,11 +27,7 @@ auto first_at = FN(float v, float limit) -> int {
     v = smin(smax(v, 0.f), limit); int t = (int)v; return t + ((float)t < v); };
 auto last_at = FN(float v, float limit) -> int { return v < 0.f ? -1 : (int)smin(v, limit); };
 // 2^p: nearest integer by the rounding of a large addend, degree-5 polynomial for the rest (relative error 2e-7).
-auto exp2v = FN(F p) -> F {
-    F z = p + 12582912.f, f = p - (z - 12582912.f), f2 = f * f;
-    F q = fma(fma(f, (F)1.33389978e-3f, (F)9.61833261e-3f), f2, fma(f, (F)5.55044435e-2f, (F)2.40226522e-1f));
-    q = fma(q, f2, fma(f, (F)6.93147182e-1f, (F)1.f));
-    return __builtin_bit_cast(F, __builtin_bit_cast(I, q) + (__builtin_bit_cast(I, z) << 23)); };
+#include "../../../kernels/exp2.cpp"
 auto expv = FN(F x) -> F { return exp2v(vmin(vmax(x * LOG2E, (F)-125.f), (F)125.f)); };
 auto log2v = FN(F x) -> F {
     I bits = __builtin_bit_cast(I, x), e = (bits - 0x3f3504f3) >> 23;
