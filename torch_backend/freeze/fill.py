@@ -149,8 +149,9 @@ def fill(
         sighting = _doubted(sighting, doubt)
         around = torch.minimum(sighting.visible, look_up(fillers.shown[n], small))
         sighting.visible = torch.lerp(sighting.visible, around, uneasy)
-        sway = _sway(sightings, config, frame, points, sighting) * untold * look_up(fillers.agreed[n], small)
-        weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway))
+        agreed = look_up(fillers.agreed[n], small)
+        sway = _sway(sightings, config, frame, points, sighting) * untold * agreed
+        weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, 1.0 - doubt * (1.0 - agreed)))
         places.append(sighting.pixels * larger)
     believed = torch.stack(weights)
     filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]
@@ -196,12 +197,14 @@ def _weight(
     sighting: Sighting,
     motion: Tensor,
     sway: Tensor,
+    still: Tensor | float = 1.0,
 ) -> Tensor:
-    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*."""
+    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*; what stands still in
+    it by `still` at most."""
     near = _near(sightings, config, posed, frame, sighting)
     if frame == posed.t:
         return near
-    still = (1.0 - motion) * (1.0 - sighting.moving)
+    still = still * (1.0 - motion) * (1.0 - sighting.moving)
     return near * (still + (1.0 - still) * sway)
 
 

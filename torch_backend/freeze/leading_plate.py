@@ -11,7 +11,8 @@ from ..torch_types import norm
 from .bands import bands
 from .detail_config import DetailConfig
 from .frozen import SUPPORT_SECONDS, OutputFrame
-from .posed import PosedFrame, displacements, parallax
+from .held import BothPlates, exposed_alike, held
+from .posed import PosedFrame, displacements, exposed_as, parallax
 from .regions import closed, grown, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import Sighting, Sightings
@@ -129,15 +130,17 @@ def _let_go(
     off, gained = _off(sightings, posed, frame)
     travel = _travel(sightings, config, posed, frame)
     wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
-    contrary = None
+    contrary = told = None
     if truth is not None:
-        contrary = torch.minimum(off, _contrary(sightings, posed, frame, truth))
+        told = _both_plates(sightings, posed, frame, truth)
+        contrary = torch.minimum(off, told.off)
         wrong = wrong | _denied(sightings, config, truth, contrary)
     # What the model lacks at the plate's own time, too, is its fault and no motion.
     wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
     wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
-    if contrary is not None:
+    if contrary is not None and told is not None:
         wrong = sightings.whole(wrong, contrary, config.denied_too)
+        wrong = held(told, off, wrong, sightings.unit, config)
     return closed(wrong, round(config.gap * sightings.unit))
 
 
@@ -185,16 +188,19 @@ def _denied(sightings: Sightings, config: DetailConfig, truth: Sighting, off: Te
     return sightings.whole(spots, off, config.denied_too)
 
 
-def _contrary(sightings: Sightings, posed: PosedFrame, frame: int, truth: Sighting) -> Tensor:
-    """[h, w] low-passed difference of its own plate and plate t*, where that sees the point (`truth`); 0 elsewhere."""
+def _both_plates(sightings: Sightings, posed: PosedFrame, frame: int, truth: Sighting) -> BothPlates:
+    """The frame's own plate, and plate t*, which sees what is seen as `truth` says."""
     h, w = posed.depth.shape
     picture = sightings.view(frame).picture.float()
     inside = _middle(picture, posed.depth)
-    seen = truth.visible[inside][..., None]
-    told = look_up(sightings.view(posed.t).picture.float(), truth.pixels[inside])
-    out = torch.zeros(h, w, device="cpu")
-    out[inside] = sightings.difference(picture * seen, told * seen)
-    return out
+    seen, told = (
+        truth.visible[inside][..., None],
+        look_up(sightings.view(posed.t).picture.float(), truth.pixels[inside]),
+    )
+    told = exposed_alike(picture, told, *exposed_as(sightings, posed))
+    own, instant = torch.zeros(h, w, 3, device="cpu"), torch.zeros(h, w, 3, device="cpu")
+    own[inside], instant[inside] = picture * seen, told * seen
+    return BothPlates(own, instant, truth.visible, sightings.difference(own, instant))
 
 
 def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: Tensor) -> Tensor:

@@ -5,9 +5,11 @@ Pure functions on masks [h, w], bool. Beyond the border nothing counts.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ..torch_types import from_numpy
 from .reproject import narrowed, resized, widened
 
 
@@ -42,3 +44,19 @@ def grown(seeds: Tensor, where: Tensor, reach: int, thin: int = 0) -> Tensor:
         if torch.equal(before, found):  # nothing is left to reach
             break
     return seeds | (where & (resized(found.float(), w, h) > 0.25))
+
+
+def enclosed(mask: Tensor, ground: Tensor, rim: int, share: float) -> Tensor:
+    """Of the mask those connected regions of whose surroundings, `rim` pixels wide, `share` or more is `ground`."""
+    import cv2
+
+    count, found = cv2.connectedComponents(mask.numpy().astype(np.uint8), connectivity=8)
+    labels = from_numpy(np.asarray(found, np.int64))
+    around = widened(labels.float(), rim).long()  # where two regions meet the later one has it
+    around[mask] = 0
+    size, good = (torch.zeros(count, device="cpu") for _ in range(2))
+    size.index_add_(0, around.flatten(), torch.ones(around.numel(), device="cpu"))
+    good.index_add_(0, around.flatten(), ground.flatten().float())
+    keeps = good >= share * size
+    keeps[0] = False
+    return keeps[labels]
