@@ -16,15 +16,15 @@ CONFIG = DetailConfig()
 def wall():
     """Stripes of strong contrast with fine grain: plain paper would show no edge in a wrong place."""
     g = torch.Generator().manual_seed(0)
-    picture = 0.45 + 0.15 * ((torch.arange(W) // 24) % 2)[None, :, None].float().expand(H, W, 3)
+    picture = 0.45 + 0.3 * ((torch.arange(W) // 40) % 2)[None, :, None].float().expand(H, W, 3)
     return blurred(picture + 0.01 * torch.randn(H, W, 3, generator=g), 0.7)
 
 
 def arm():
     """bool [H, W]: let go of already, and [H, W] what hangs together with that."""
     sleeve, hand = torch.zeros(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
-    sleeve[90:130, 60:90] = True
-    hand[70:110, 90:120] = True
+    sleeve[90:130, 56:84] = True
+    hand[70:110, 84:116] = True
     return sleeve, hand
 
 
@@ -49,7 +49,7 @@ def test_a_hand_of_the_walls_colour_goes_with_the_arm_and_nothing_else_does():
     got = found(plates(with_hand(wall(), hand), instant), sleeve)
     assert got[hand].float().mean() > 0.85
     far = torch.ones(H, W, dtype=torch.bool)
-    far[60:120, 80:130] = far[:, :4] = False
+    far[60:120, 74:126] = far[:, :4] = False
     assert not got[far].any()
     assert float((plates(wall(), instant).off > CONFIG.elsewhere).float().mean()) > 0.02, "else edges are no trap"
     assert not found(plates(wall(), instant), sleeve).any()
@@ -73,10 +73,10 @@ def test_a_difference_that_does_not_end_is_none_of_a_thing(hidden):
     seen = torch.ones(H, W)
     if hidden:
         ring = torch.ones(H, W, dtype=torch.bool)
-        ring[74:106, 60:116] = False
+        ring[74:106, 56:112] = False
         seen[ring] = 0.0
     else:
-        hand[:, 90:] = True
+        hand[:, 84:] = True
     both = plates(with_hand(wall(), hand), wall(), seen)
     assert not found(both, sleeve).any()
     assert found(both, sleeve, config=replace(CONFIG, held_share=0.0)).any(), "else something else says no"

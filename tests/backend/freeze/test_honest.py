@@ -16,7 +16,7 @@ from torch_backend.freeze.take import small_share
 
 FRAME, T_STAR = 3, 11
 """The board stands wholly apart in these two."""
-BLIND = {"denied": 9.0, "denied_too": 9.0, "travel": 1e9, "carried": 1e9}
+BLIND = {"denied": 9.0, "denied_too": 9.0, "elsewhere": 9.0, "travel": 1e9, "carried": 1e9}
 """Of `DetailConfig`: what the model and plate t* say is not asked."""
 
 
@@ -139,7 +139,7 @@ def test_plates_that_fill_show_nothing_of_it_either(world):
     try:
         mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14) if frame not in (FRAME, T_STAR)}
         made = make(world, mattes, SightingConfig(contradicted=9.0))
-        believed = make(world, mattes, SightingConfig(contradicted=9.0, unexplained=1e6))
+        believed = make(world, mattes, SightingConfig(contradicted=9.0, unexplained=1e6), agreement=1e6)
     finally:
         world.run.model = before
     assert shows_its_own_board(world, made) < 0.01
