@@ -23,6 +23,7 @@ from torch import Tensor
 
 from ..kernel_text import kernel_text
 from ..native import func_native, initialised_warp, launch_on
+from ..small_tables import small_table
 from ..torch_types import AutogradContext, applied, once_differentiable, split
 
 _KERNELS = Path(__file__).with_name("kernels")
@@ -94,13 +95,6 @@ def supports(planes: Sequence[Tensor]) -> bool:
     )  # fmt: skip
 
 
-@functools.lru_cache(maxsize=64)
-def _on_device(rows: tuple[tuple[float, ...], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A small table on the device. Planes stay where they are for a run, so it is sent once."""
-    values = torch.tensor(rows, dtype=dtype, device="cpu", pin_memory=device.type == "cuda")
-    return values.to(device, non_blocking=True)
-
-
 def _table(planes: Sequence[Tensor]) -> Tensor:
     """[planes, 4] int64: a plane's address, H, W, and how many values the planes before it have."""
     rows: list[tuple[int, ...]] = []
@@ -108,7 +102,7 @@ def _table(planes: Sequence[Tensor]) -> Tensor:
     for plane in planes:
         rows.append((plane.data_ptr(), plane.shape[2], plane.shape[3], before))
         before += plane.numel()
-    return _on_device(tuple(rows), torch.int64, planes[0].device)
+    return small_table(tuple(rows), torch.int64, planes[0].device)  # planes stay where they are for a run
 
 
 def _like(flat: Tensor, planes: Sequence[Tensor]) -> list[Tensor]:
@@ -163,7 +157,7 @@ class _Bend(torch.autograd.Function):
     def forward(ctx: AutogradContext, weights: tuple[tuple[float, ...], ...], *planes: Tensor) -> Tensor:
         terms = planes[0].new_empty(sum(p.numel() for p in planes))
         grads = torch.empty_like(terms) if any(ctx.needs_input_grad) else None
-        scales = _on_device(weights, torch.float32, terms.device)
+        scales = small_table(weights, torch.float32, terms.device)
         inputs = [
             _table(planes).data_ptr(), scales.data_ptr(), terms.data_ptr(), 0 if grads is None else grads.data_ptr(),
             len(planes),

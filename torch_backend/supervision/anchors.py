@@ -17,6 +17,7 @@ from torch.nn import functional as F
 from ..contract import DETECTORS
 from ..deformation import Deformation, Deltas
 from ..gaussians import Gaussians
+from ..small_tables import small_table
 from .support import SEEN_WEIGHT, nearest_supported
 
 
@@ -162,13 +163,19 @@ def support_loss(
             torch.where(has_left, near_left, torch.inf), torch.where(has_right, near_right, torch.inf)
         )
         confidence = torch.exp(-distance / config.support_seconds)
-    total = torch.zeros_like(confidence)
-    held = anchors.moved()
-    for name, value in deltas.moved().items():
-        first, second = held[name].reshape(2, len(rows), -1)
-        gap = value.reshape(len(rows), -1) - torch.lerp(first, second, share[:, None])
-        total = total + _ATTRIBUTE_WEIGHTS[name] * (torch.sqrt(gap.square() + _KNEE**2) - _KNEE).sum(1)
+    held, widths = _columns(anchors)
+    first, second = held.reshape(2, len(rows), -1)
+    gap = _columns(deltas)[0] - torch.lerp(first, second, share[:, None])
+    weights = tuple((_ATTRIBUTE_WEIGHTS[name],) for name, width in widths for _ in range(width))
+    weight = small_table(weights, torch.float32, gap.device)
+    total = ((torch.sqrt(gap.square() + _KNEE**2) - _KNEE) @ weight)[:, 0]
     return config.support_weight * (pairs.weights * confidence * total).sum() / pairs.weights.sum().clamp_min(1.0)
+
+
+def _columns(deltas: Deltas) -> tuple[Tensor, list[tuple[str, int]]]:
+    """([M, C] all numbers of deltas [M] side by side, name and columns of each part): one operator instead of many."""
+    parts = {name: value.flatten(1) if value.dim() > 1 else value[:, None] for name, value in deltas.moved().items()}
+    return torch.cat(list(parts.values()), dim=1), [(name, part.shape[1]) for name, part in parts.items()]
 
 
 def stillness(deltas: Deltas, count: int, error: Tensor, progress: float, config: SupervisionConfig) -> Tensor:
@@ -185,11 +192,13 @@ def stillness(deltas: Deltas, count: int, error: Tensor, progress: float, config
             from any motion, a false one too.
         progress: share of the run that is done.
     """
-    total = deltas.means.new_zeros(len(deltas.means))
-    for name, value in deltas.moved().items():
-        weight = _STILL_WEIGHTS[name]
-        knee = config.still_knee * _STILL_WEIGHTS["means"] / weight
-        total = total + weight * (torch.sqrt(value.reshape(len(value), -1).square().sum(1) + knee**2) - knee)
+    moved, widths = _columns(deltas)
+    names = [name for name, _ in widths]
+    member = tuple(tuple(float(name == of) for name in names) for of, width in widths for _ in range(width))
+    weights = tuple((_STILL_WEIGHTS[name],) for name in names)
+    knees = (tuple(config.still_knee * _STILL_WEIGHTS["means"] / _STILL_WEIGHTS[name] for name in names),)
+    group, weight, knee = (small_table(rows, torch.float32, moved.device) for rows in (member, weights, knees))
+    total = ((torch.sqrt(moved.square() @ group + knee.square()) - knee) @ weight)[:, 0]
     price = config.still_scale * torch.log1p(total / config.still_scale)
     grown = min(max((progress - config.start) / max(config.still_ramp, 1e-6), 0.0), 1.0)
     return config.still_weight * grown * error.detach() * price.sum() / max(1, count)

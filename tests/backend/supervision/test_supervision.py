@@ -155,6 +155,20 @@ def test_stillness_costs_nothing_at_rest_and_less_and_less_beyond():
     assert 0.0 < far < 0.1 * near
 
 
+def test_stillness_is_the_sum_over_attributes_of_what_each_moves_by():
+    g = torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh0": (1, 3), "shN": (8, 3)}
+    drawn = {name: 0.1 * torch.randn(7, *shape, generator=g) for name, shape in shapes.items()}
+    config, cost = SupervisionConfig(), torch.zeros(7, dtype=torch.float64)
+    for name, value in drawn.items():
+        weight = {"means": 5.0, "opacity_logits": 1.0, "sh0": 1.0}.get(name, 0.5)
+        knee = config.still_knee * 5.0 / weight
+        cost += weight * ((value.double().flatten(1) if value.dim() > 1 else value.double()[:, None]).square().sum(1)
+                          + knee**2).sqrt() - weight * knee  # fmt: skip
+    want = 0.05 * config.still_weight * config.still_scale * torch.log1p(cost / config.still_scale).sum() / 20
+    assert price(Deltas(**drawn), 20) == pytest.approx(float(want), rel=1e-5)
+
+
 def test_stillness_is_paid_in_photometric_loss_and_does_not_change_it():
     error = torch.tensor(0.05, requires_grad=True)
     deltas = shifts(0.1)
