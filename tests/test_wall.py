@@ -17,6 +17,7 @@ BLENDER = {"bpy", "bpy_extras", "mathutils", "gpu", "gpu_extras", "bl_ext", "add
 STATIONS = (
     "compiler_folders",
     "native",
+    "small_tables",
     "footage",
     "solve",
     "footage.plates",

@@ -52,14 +52,18 @@ class DetailConfig:
     smeared: float = 0.02
     """Low-passed difference of the frozen render and the own plate, display-referred, that there must be, too: where
     these agree nothing was held, and the plates differ by light."""
+    light: float = 48.0
+    """Sigma in pixels of what plates may differ by because light falls otherwise."""
     misplaced: float = 2.0
     """Pixels by which depth may misplace plate t*: such a difference has to be one from all that it shows within."""
     misplaced_soft: float = 1.0
     """Sigma in pixels under which that is asked: grain is no difference."""
     elsewhere_thin: float = 1.0
     """Half the width in pixels below which it is an edge all the same."""
+    held_least: float = 400.0
+    """Square pixels that such a region has at least,"""
     held_rim: float = 3.0
-    """Pixels around such a region in which it is asked whether the plates agree there,"""
+    """and pixels around it in which it is asked whether the plates agree there,"""
     held_share: float = 0.6
     """in at least this share of them."""
     elsewhere_near: float = 6.0

@@ -17,7 +17,7 @@ from ..scene import resize_intrinsics
 from ..torch_types import from_numpy, norm
 from .bands import look_up_near
 from .detail_config import DetailConfig
-from .posed import PosedFrame, exposed_as
+from .posed import PosedFrame
 from .regions import closed, opened
 from .reproject import blurred, look_up, narrowed, pixel_centres, resized, unproject
 from .sightings import Sightings
@@ -55,7 +55,7 @@ def instant_pixels(
         return None
     points = _smooth_points(config, posed)
     truth = sightings.seen(posed.t, points)
-    gain, offset = exposed_as(sightings, posed)
+    gain, offset = _exposure(sightings, posed)
     told = look_up(sightings.view(posed.t).picture.float(), truth.pixels) * gain + offset
     beside = _angle(points, sightings.centres[sightings.index[posed.t]], posed.centre)
     counts = truth.visible * moves * (beside < config.beside)
@@ -88,3 +88,13 @@ def _smooth_points(config: DetailConfig, posed: PosedFrame) -> Tensor:
     rows, columns = posed.image.alpha.shape
     K = resize_intrinsics(posed.K[None], columns, rows, w, h)[0]
     return unproject(pixel_centres(w, h), from_numpy(depth), posed.viewmat, K)
+
+
+def _exposure(sightings: Sightings, posed: PosedFrame) -> tuple[Tensor, Tensor]:
+    """(gain [3], offset [3]) from the exposure of plate t* to the frame's."""
+    exposure = sightings.run.model.exposure
+    if not exposure.config.on:
+        return torch.ones(3, device="cpu"), torch.zeros(3, device="cpu")
+    theirs, ours = sightings.scene.time_of_frame(posed.t), posed.exposed_at
+    (gain, offset), (our_gain, our_offset) = ([part.detach().cpu() for part in exposure.at(t)] for t in (theirs, ours))
+    return our_gain / gain, our_offset - offset * our_gain / gain

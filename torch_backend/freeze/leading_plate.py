@@ -11,8 +11,8 @@ from ..torch_types import norm
 from .bands import bands
 from .detail_config import DetailConfig
 from .frozen import SUPPORT_SECONDS, OutputFrame
-from .held import BothPlates, exposed_alike, held
-from .posed import PosedFrame, displacements, exposed_as, parallax
+from .held import BothPlates, held
+from .posed import PosedFrame, displacements, parallax
 from .regions import closed, grown, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import Sighting, Sightings
@@ -133,7 +133,7 @@ def _let_go(
     contrary = told = None
     if truth is not None:
         told = _both_plates(sightings, posed, frame, truth)
-        contrary = torch.minimum(off, told.off)
+        contrary = torch.minimum(off, sightings.difference(told.own, told.instant))
         wrong = wrong | _denied(sightings, config, truth, contrary)
     # What the model lacks at the plate's own time, too, is its fault and no motion.
     wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
@@ -193,14 +193,11 @@ def _both_plates(sightings: Sightings, posed: PosedFrame, frame: int, truth: Sig
     h, w = posed.depth.shape
     picture = sightings.view(frame).picture.float()
     inside = _middle(picture, posed.depth)
-    seen, told = (
-        truth.visible[inside][..., None],
-        look_up(sightings.view(posed.t).picture.float(), truth.pixels[inside]),
-    )
-    told = exposed_alike(picture, told, *exposed_as(sightings, posed))
+    seen = truth.visible[inside][..., None]
     own, instant = torch.zeros(h, w, 3, device="cpu"), torch.zeros(h, w, 3, device="cpu")
-    own[inside], instant[inside] = picture * seen, told * seen
-    return BothPlates(own, instant, truth.visible, sightings.difference(own, instant))
+    own[inside] = picture * seen
+    instant[inside] = look_up(sightings.view(posed.t).picture.float(), truth.pixels[inside]) * seen
+    return BothPlates(own, instant, truth.visible)
 
 
 def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: Tensor) -> Tensor:

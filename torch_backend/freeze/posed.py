@@ -108,16 +108,6 @@ def parallax(sightings: Sightings, config: DetailConfig, posed: PosedFrame, fram
     return focal * travel / depth.clamp_min(1e-6) * config.depth_error / sightings.unit
 
 
-def exposed_as(sightings: Sightings, posed: PosedFrame) -> tuple[Tensor, Tensor]:
-    """(gain [3], offset [3]) that expose plate t* as the frame is."""
-    exposure = sightings.run.model.exposure
-    if not exposure.config.on:
-        return torch.ones(3, device="cpu"), torch.zeros(3, device="cpu")
-    theirs, ours = sightings.scene.time_of_frame(posed.t), posed.exposed_at
-    (gain, offset), (our_gain, our_offset) = ([part.detach().cpu() for part in exposure.at(t)] for t in (theirs, ours))
-    return our_gain / gain, our_offset - offset * our_gain / gain
-
-
 def displacements(
     sightings: Sightings, posed: PosedFrame, chosen: list[int], size: tuple[int, int] | None = None
 ) -> tuple[list[Tensor], Tensor]:

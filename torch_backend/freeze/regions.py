@@ -46,17 +46,21 @@ def grown(seeds: Tensor, where: Tensor, reach: int, thin: int = 0) -> Tensor:
     return seeds | (where & (resized(found.float(), w, h) > 0.25))
 
 
-def enclosed(mask: Tensor, ground: Tensor, rim: int, share: float) -> Tensor:
-    """Of the mask those connected regions of whose surroundings, `rim` pixels wide, `share` or more is `ground`."""
+def enclosed(mask: Tensor, ground: Tensor, rim: int, share: float, least: float = 0.0) -> Tensor:
+    """Of the mask those connected regions of whose surroundings, `rim` pixels wide, `share` or more is `ground`.
+
+    Those of fewer than `least` pixels are none.
+    """
     import cv2
 
-    count, found = cv2.connectedComponents(mask.numpy().astype(np.uint8), connectivity=8)
+    count, found, about, _ = cv2.connectedComponentsWithStats(mask.numpy().astype(np.uint8), connectivity=8)
+    areas = from_numpy(np.asarray(about[:, cv2.CC_STAT_AREA], np.float32))
     labels = from_numpy(np.asarray(found, np.int64))
     around = widened(labels.float(), rim).long()  # where two regions meet the later one has it
     around[mask] = 0
     size, good = (torch.zeros(count, device="cpu") for _ in range(2))
     size.index_add_(0, around.flatten(), torch.ones(around.numel(), device="cpu"))
     good.index_add_(0, around.flatten(), ground.flatten().float())
-    keeps = good >= share * size
+    keeps = (good >= share * size) & (areas >= least)
     keeps[0] = False
     return keeps[labels]

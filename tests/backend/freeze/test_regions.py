@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.freeze.regions import grown, opened
+from torch_backend.freeze.regions import enclosed, grown, opened
 from torch_backend.freeze.reproject import narrowed, widened
 
 
@@ -46,3 +46,14 @@ def test_growing_ends_at_its_reach():
     seeds[:, 10:] = False
     columns = grown(seeds, where, 16).any(dim=0).nonzero()
     assert abs(int(columns.max()) - (9 + 16)) <= 2
+
+
+def test_what_is_enclosed_stands_on_its_ground_all_around_and_is_no_speck():
+    mask = torch.zeros(60, 120, dtype=torch.bool)
+    mask[20:40, 10:30] = mask[20:40, 60:80] = mask[50:53, 100:103] = True
+    ground = torch.ones_like(mask)
+    ground[:, 70:90] = False  # half of what surrounds the second one
+    assert (enclosed(mask, ground, 3, 0.9, 20.0) == (mask & (torch.arange(120) < 40))).all()
+    assert (enclosed(mask, ground, 3, 0.4, 20.0) == (mask & (torch.arange(120) < 90))).all()
+    assert (enclosed(mask, ground, 3, 0.4) == mask).all()
+    assert not enclosed(torch.zeros_like(mask), ground, 3, 0.0).any()
