@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ..torch_types import split, unflatten
+from ..torch_types import unflatten
 from . import network, planes_cuda
 from . import planes as compiled
 from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_scale
@@ -176,10 +176,7 @@ class HexPlane(Deformation):
             return network.network(features, trunk, heads)
         bent = F.silu if self.config.silu else F.relu
         hidden = bent(F.linear(features, *trunk))
-        # The heads' first layers are one: on a card a step is bound by how much is launched.
-        first = [torch.cat([layer[k] for layer, _ in heads]) for k in range(2)]
-        parts = split(bent(F.linear(hidden, *first)), [len(layer.bias) for layer, _ in heads], 1)
-        return tuple(F.linear(part, *last) for part, (_, last) in zip(parts, heads, strict=True))
+        return tuple(F.linear(bent(F.linear(hidden, *first)), *last) for first, last in heads)
 
     def _by_level(self) -> list[Tensor]:
         """Three planes of space, then three of time, level by level."""
