@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from .held import HeldConfig
 from .sightings import SightingConfig
 
 
@@ -46,28 +47,6 @@ class DetailConfig:
     """Share of such a difference that must be gone in the render of the plate's own time."""
     denied_too: float = 0.1
     """The same, for what hangs together with such a spot."""
-    elsewhere: float = 0.06
-    """Difference of the own plate and plate t*, exposed alike, from which on they show different things, and what hangs
-    together with what is let go of goes too (`held.py`)."""
-    smeared: float = 0.02
-    """Low-passed difference of the frozen render and the own plate, display-referred, that there must be, too: where
-    these agree nothing was held, and the plates differ by light."""
-    light: float = 48.0
-    """Sigma in pixels of what plates may differ by because light falls otherwise."""
-    misplaced: float = 2.0
-    """Pixels by which depth may misplace plate t*: such a difference has to be one from all that it shows within."""
-    misplaced_soft: float = 1.0
-    """Sigma in pixels under which that is asked: grain is no difference."""
-    elsewhere_thin: float = 1.0
-    """Half the width in pixels below which it is an edge all the same."""
-    held_least: float = 400.0
-    """Square pixels that such a region has at least,"""
-    held_rim: float = 3.0
-    """and pixels around it in which it is asked whether the plates agree there,"""
-    held_share: float = 0.6
-    """in at least this share of them."""
-    elsewhere_near: float = 6.0
-    """How far around such a spot a plain low-passed difference will do, pixels."""
     thin: int = 3
     """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
     torn: float = 0.1
@@ -100,5 +79,7 @@ class DetailConfig:
     believed 1/e in what moves: it may show another state."""
     instant: bool = True
     """Give what plate t* shows and the model lacks a surface of its own (`missing_layer.py`)."""
+    held: HeldConfig = field(default_factory=HeldConfig)
+    """What is held for a while where it was not at t*."""
     sightings: SightingConfig = field(default_factory=SightingConfig)
     """How plates are compared with the model."""

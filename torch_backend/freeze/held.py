@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .detail_config import DetailConfig
 from .regions import enclosed, grown, opened
 from .reproject import blurred, narrowed, resized, widened
 
@@ -21,6 +20,37 @@ _CLIPPED = 0.98
 """Display-referred, from which on a plate may hide anything brighter."""
 _COARSE = 8
 """Light is looked at in so many times fewer pixels a side."""
+
+
+@dataclass(frozen=True)
+class HeldConfig:
+    """When plates show different things. Lengths are in pixels of pictures 640 wide, differences display-referred."""
+
+    apart: float = 0.06
+    """Difference of the plates, in the same light, from which on they show different things."""
+    smeared: float = 0.02
+    """Low-passed difference of the frozen render and the own plate that there must be, too: where these agree nothing
+    was held."""
+    light: float = 48.0
+    """Sigma of what plates may differ by because light falls otherwise."""
+    misplaced: float = 2.0
+    """By how much depth may misplace plate t*: a difference has to be one from all that it shows within."""
+    grain: float = 1.0
+    """Sigma under which that is asked: grain is no difference."""
+    thin: float = 1.0
+    """Half the width below which it is an edge all the same."""
+    near: float = 6.0
+    """How far around such a spot a plain low-passed difference will do,"""
+    low: float = 2.0
+    """and the sigma of that."""
+    reach: float = 64.0
+    """How far from what is let go of it may be, going along it."""
+    least: float = 400.0
+    """Square pixels that a region has at least,"""
+    rim: float = 3.0
+    """and pixels around it in which it is asked whether the plates agree there,"""
+    share: float = 0.6
+    """in at least this share of them."""
 
 
 @dataclass
@@ -35,7 +65,7 @@ class BothPlates:
     """[h, w] in 0..1: how well plate t* sees it."""
 
 
-def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: DetailConfig) -> Tensor:
+def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: HeldConfig) -> Tensor:
     """[h, w] bool: `wrong`, and what hangs together with it where the own plate shows another thing than plate t*.
 
     Args:
@@ -44,14 +74,14 @@ def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: Deta
         unit: pixels of decisions to one in which the configuration counts.
     """
     both = in_the_same_light(both, wrong, config.light * unit)
-    apart = blurred(both.own - both.instant, config.misplaced * unit).abs().amax(dim=-1)
+    apart = blurred(both.own - both.instant, config.low * unit).abs().amax(dim=-1)
     elsewhere = _elsewhere(both, apart, unit, config) & (off > config.smeared)
-    found = grown(wrong, elsewhere, round(config.body * unit)) & ~wrong
+    found = grown(wrong, elsewhere, round(config.reach * unit)) & ~wrong
     if not bool(found.any()):
         return wrong
-    agree = (both.seen > 0.5) & (apart < config.elsewhere)
-    rim, least = max(1, round(config.held_rim * unit)), config.held_least * unit**2
-    return wrong | enclosed(found, agree | wrong, rim, config.held_share, least)
+    agree = (both.seen > 0.5) & (apart < config.apart)
+    rim, least = max(1, round(config.rim * unit)), config.least * unit**2
+    return wrong | enclosed(found, agree | wrong, rim, config.share, least)
 
 
 def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlates:
@@ -73,13 +103,13 @@ def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlat
     return BothPlates(both.own, made, both.seen)
 
 
-def _elsewhere(both: BothPlates, apart: Tensor, unit: float, config: DetailConfig) -> Tensor:
+def _elsewhere(both: BothPlates, apart: Tensor, unit: float, config: HeldConfig) -> Tensor:
     """[h, w] bool: the plates show different things, and not one edge at places that are `misplaced` pixels apart."""
-    soft, reach = config.misplaced_soft * unit, max(1, round(config.misplaced * unit))
+    soft, reach = config.grain * unit, max(1, round(config.misplaced * unit))
     own, instant = blurred(both.own, soft), blurred(both.instant, soft)
     beyond = torch.maximum(_beyond(own, instant, reach), _beyond(instant, own, reach))
-    spots = opened(beyond > config.elsewhere, max(1, round(config.elsewhere_thin * unit)))
-    return spots | (widened(spots, round(config.elsewhere_near * unit)) & (apart > config.elsewhere))
+    spots = opened(beyond > config.apart, max(1, round(config.thin * unit)))
+    return spots | (widened(spots, round(config.near * unit)) & (apart > config.apart))
 
 
 def _beyond(a: Tensor, b: Tensor, reach: int) -> Tensor:

@@ -130,17 +130,16 @@ def _let_go(
     off, gained = _off(sightings, posed, frame)
     travel = _travel(sightings, config, posed, frame)
     wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
-    contrary = told = None
+    both = None if truth is None else _both_plates(sightings, posed, frame, truth)
+    contrary = off if both is None else torch.minimum(off, sightings.difference(both.own, both.instant))
     if truth is not None:
-        told = _both_plates(sightings, posed, frame, truth)
-        contrary = torch.minimum(off, sightings.difference(told.own, told.instant))
         wrong = wrong | _denied(sightings, config, truth, contrary)
     # What the model lacks at the plate's own time, too, is its fault and no motion.
     wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
     wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
-    if contrary is not None and told is not None:
+    if both is not None:
         wrong = sightings.whole(wrong, contrary, config.denied_too)
-        wrong = held(told, off, wrong, sightings.unit, config)
+        wrong = held(both, off, wrong, sightings.unit, config.held)
     return closed(wrong, round(config.gap * sightings.unit))
 
 

@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import torch
 
-from torch_backend.freeze.detail_config import DetailConfig
-from torch_backend.freeze.held import BothPlates, held, in_the_same_light
+from torch_backend.freeze.held import BothPlates, HeldConfig, held, in_the_same_light
 from torch_backend.freeze.reproject import blurred
 
 H, W = 160, 240
-CONFIG = DetailConfig()
+CONFIG = HeldConfig()
 
 
 def wall():
@@ -49,8 +48,8 @@ def test_a_hand_of_the_walls_colour_goes_with_the_arm_and_nothing_else_does():
     far = torch.ones(H, W, dtype=torch.bool)
     far[60:120, 74:126] = far[:, :4] = False
     assert not got[far].any()
-    apart = blurred(wall() - instant, CONFIG.misplaced).abs().amax(-1)
-    assert float((apart > CONFIG.elsewhere).float().mean()) > 0.02, "else edges are no trap"
+    apart = blurred(wall() - instant, CONFIG.low).abs().amax(-1)
+    assert float((apart > CONFIG.apart).float().mean()) > 0.02, "else edges are no trap"
     assert not found(plates(wall(), instant), sleeve).any()
 
 
@@ -73,7 +72,7 @@ def test_a_thing_of_which_plate_t_star_does_not_see_the_rim_may_be_a_wrong_depth
     seen[rim & ~hand] = 0.0
     both = plates(with_hand(wall(), hand), wall(), seen)
     assert not found(both, sleeve).any()
-    assert found(both, sleeve, config=replace(CONFIG, held_share=0.0)).any(), "else something else says no"
+    assert found(both, sleeve, config=replace(CONFIG, share=0.0)).any(), "else something else says no"
 
 
 def test_light_that_falls_otherwise_is_no_thing():
@@ -81,7 +80,7 @@ def test_light_that_falls_otherwise_is_no_thing():
     sleeve, hand = arm()
     ramp = torch.linspace(0.0, 0.2, W)[None, :, None] * torch.tensor([0.6, 0.8, 1.0])
     bright = plates(with_hand(wall(), hand) + ramp, wall())
-    assert float((bright.own - bright.instant).abs().amax(-1)[:, W // 2 :].min()) > CONFIG.elsewhere
+    assert float((bright.own - bright.instant).abs().amax(-1)[:, W // 2 :].min()) > CONFIG.apart
     got = found(bright, sleeve)
     assert got[hand].float().mean() > 0.7
     far = torch.ones(H, W, dtype=torch.bool)

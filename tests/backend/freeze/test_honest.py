@@ -10,13 +10,14 @@ from scipy import ndimage
 from tests.backend.freeze.test_detail import H, W, board_at, build, off, widened
 from torch_backend.deformation import Deformation, Deltas
 from torch_backend.freeze.detail import DetailConfig, Detailer
+from torch_backend.freeze.held import HeldConfig
 from torch_backend.freeze.regions import closed, grown, opened
 from torch_backend.freeze.sightings import SightingConfig
 from torch_backend.freeze.take import small_share
 
 FRAME, T_STAR = 3, 11
 """The board stands wholly apart in these two."""
-BLIND = {"denied": 9.0, "denied_too": 9.0, "elsewhere": 9.0, "travel": 1e9, "carried": 1e9}
+BLIND = {"denied": 9.0, "denied_too": 9.0, "held": HeldConfig(apart=9.0), "travel": 1e9, "carried": 1e9}
 """Of `DetailConfig`: what the model and plate t* say is not asked."""
 
 
