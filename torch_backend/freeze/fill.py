@@ -134,7 +134,7 @@ def fill(
     larger = torch.tensor(
         [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
     )
-    doubt = look_up(posed.doubt, small)
+    doubt, elsewhere = look_up(posed.doubt, small), look_up(posed.held, small)
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
     untold = 1.0 - unknown
@@ -151,7 +151,8 @@ def fill(
         sighting.visible = torch.lerp(sighting.visible, around, uneasy)
         agreed = look_up(fillers.agreed[n], small)
         sway = _sway(sightings, config, frame, points, sighting) * untold * agreed
-        weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, 1.0 - doubt * (1.0 - agreed)))
+        still = 1.0 - elsewhere * (1.0 - agreed)
+        weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, still))
         places.append(sighting.pixels * larger)
     believed = torch.stack(weights)
     filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]

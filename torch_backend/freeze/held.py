@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .regions import enclosed, grown, opened
+from .regions import components, enclosed, grown, opened
 from .reproject import blurred, narrowed, resized, widened
 
 _CLIPPED = 0.98
@@ -51,6 +51,12 @@ class HeldConfig:
     """and pixels around it in which it is asked whether the plates agree there,"""
     share: float = 0.6
     """in at least this share of them."""
+    shift: float = 16.0
+    """By how much plate t* is shifted to see whether it shows the region somewhere near: then depth is wrong there."""
+    step: float = 2.0
+    """Between two such shifts."""
+    left: float = 0.9
+    """Share of the difference that the best shift has to leave."""
 
 
 @dataclass
@@ -66,7 +72,7 @@ class BothPlates:
 
 
 def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: HeldConfig) -> Tensor:
-    """[h, w] bool: `wrong`, and what hangs together with it where the own plate shows another thing than plate t*.
+    """[h, w] bool: what hangs together with `wrong`, and where the own plate shows another thing than plate t*.
 
     Args:
         off: [h, w] low-passed difference of the frozen render and the own plate.
@@ -78,10 +84,15 @@ def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: Held
     elsewhere = _elsewhere(both, apart, unit, config) & (off > config.smeared)
     found = grown(wrong, elsewhere, round(config.reach * unit)) & ~wrong
     if not bool(found.any()):
-        return wrong
+        return found
     agree = (both.seen > 0.5) & (apart < config.apart)
     rim, least = max(1, round(config.rim * unit)), config.least * unit**2
-    return wrong | enclosed(found, agree | wrong, rim, config.share, least)
+    found = enclosed(found, agree | wrong, rim, config.share, least)
+    out = torch.zeros_like(found)
+    for region in components(found):
+        if _left_by_shifts(both, region, unit, config) > config.left:
+            out |= region
+    return out
 
 
 def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlates:
@@ -110,6 +121,26 @@ def _elsewhere(both: BothPlates, apart: Tensor, unit: float, config: HeldConfig)
     beyond = torch.maximum(_beyond(own, instant, reach), _beyond(instant, own, reach))
     spots = opened(beyond > config.apart, max(1, round(config.thin * unit)))
     return spots | (widened(spots, round(config.near * unit)) & (apart > config.apart))
+
+
+def _left_by_shifts(both: BothPlates, region: Tensor, unit: float, config: HeldConfig) -> float:
+    """What is left of the plates' difference in a region, bool [h, w], if plate t* is shifted as suits it best.
+
+    A thing that is not there is nowhere near; what a wrong depth has carried to the wrong place is.
+    """
+    (h, w), step = region.shape, max(1, round(config.step * unit))
+    reach = step * max(1, round(config.shift * unit / step))
+    y, x = (at[:: max(1, step * step)] for at in region.nonzero().unbind(1))
+    soft = config.grain * unit
+    own, instant = blurred(both.own, soft)[y, x], blurred(both.instant, soft)
+    off = own.new_full((), torch.inf)
+    for dy in range(-reach, reach + 1, step):
+        for dx in range(-reach, reach + 1, step):
+            at = (y + dy).clamp(0, h - 1), (x + dx).clamp(0, w - 1)
+            sees = both.seen[at] > 0.5
+            if 2 * int(sees.sum()) > len(y):
+                off = torch.minimum(off, (own - instant[at]).abs().amax(-1)[sees].mean())
+    return float(off / (own - instant[y, x]).abs().amax(-1).mean().clamp_min(1e-6))
 
 
 def _beyond(a: Tensor, b: Tensor, reach: int) -> Tensor:

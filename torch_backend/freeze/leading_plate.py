@@ -44,7 +44,7 @@ def leading_matte(
 
     Also settles `posed.motion`: by the mattes of plate t* where that sees the point, else by the model's;
     `posed.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so;
-    `posed.moved` and `posed.unseen`.
+    `posed.moved`, `posed.unseen` and `posed.held`.
     """
     rows, columns = posed.image.alpha.shape
     lead = sightings.seen(leading, posed.points)
@@ -68,7 +68,8 @@ def leading_matte(
         return within, st, own
     wrong = torch.maximum(posed.motion, lead.moving) > 0.5
     if own:
-        wrong = _let_go(sightings, config, posed, leading, usable, wrong, truth)
+        wrong, found = _let_go(sightings, config, posed, leading, usable, wrong, truth)
+        posed.held = widened(found.float(), round(config.margin * sightings.unit))
     posed.doubt = widened(wrong.float(), round(config.margin * sightings.unit))
     let_go = blurred(posed.doubt, config.feather * sightings.unit)
     matte = 1.0 - let_go
@@ -120,8 +121,8 @@ def _let_go(
     usable: list[int],
     moving: Tensor,
     truth: Sighting | None,
-) -> Tensor:
-    """[h, w] bool: where the frame's own plate shows another instant than t*.
+) -> tuple[Tensor, Tensor]:
+    """([h, w] bool: where the frame's own plate shows another instant than t*, [h, w] bool: what of it `held` found).
 
     Args:
         moving: [h, w] bool, by the mattes.
@@ -139,8 +140,8 @@ def _let_go(
     wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
     if both is not None:
         wrong = sightings.whole(wrong, contrary, config.denied_too)
-        wrong = held(both, off, wrong, sightings.unit, config.held)
-    return closed(wrong, round(config.gap * sightings.unit))
+    found = torch.zeros_like(wrong) if both is None else held(both, off, wrong, sightings.unit, config.held)
+    return closed(wrong | found, round(config.gap * sightings.unit)), found
 
 
 def _off(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:

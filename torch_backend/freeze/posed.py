@@ -48,6 +48,9 @@ class PosedFrame:
     """[h, w] in 0..1: what moves in the clip, at t* or in the frame's own plate; else `motion`."""
     unseen: Tensor
     """[h, w] in 0..1: what moves, and is in no plate near t*: how it looked then nobody knows."""
+    held: Tensor
+    """[h, w] in 0..1: what is held in the frame's own plate where it was not at t*, by these two plates alone: no other
+    fills it that contradicts plate t*, whatever its matte says."""
 
     @property
     def centre(self) -> Tensor:
@@ -84,7 +87,7 @@ def posed_frame(
     nothing = torch.zeros_like(motion)
     return PosedFrame(
         output.viewmat, K, image, sightings.scene.time_of_frame(output.exposed_like), own, t, frozen, points, depth,
-        motion, w / columns, nothing, motion, nothing,
+        motion, w / columns, nothing, motion, nothing, nothing,
     )  # fmt: skip
 
 

@@ -46,6 +46,15 @@ def grown(seeds: Tensor, where: Tensor, reach: int, thin: int = 0) -> Tensor:
     return seeds | (where & (resized(found.float(), w, h) > 0.25))
 
 
+def components(mask: Tensor) -> list[Tensor]:
+    """bool [h, w] each: the connected regions of a mask."""
+    import cv2
+
+    count, found = cv2.connectedComponents(mask.numpy().astype(np.uint8), connectivity=8)
+    labels = from_numpy(np.asarray(found, np.int64))
+    return [labels == n for n in range(1, count)]
+
+
 def enclosed(mask: Tensor, ground: Tensor, rim: int, share: float, least: float = 0.0) -> Tensor:
     """Of the mask those connected regions of whose surroundings, `rim` pixels wide, `share` or more is `ground`.
 

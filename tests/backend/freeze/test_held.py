@@ -32,7 +32,7 @@ def plates(own, instant, seen=None):
 
 
 def found(both, wrong, off=0.03, config=CONFIG):
-    return held(both, torch.full((H, W), off), wrong, 1.0, config) & ~wrong
+    return held(both, torch.full((H, W), off), wrong, 1.0, config)
 
 
 def with_hand(picture, hand, by=0.1):
@@ -99,3 +99,14 @@ def test_what_is_clipped_in_a_plate_may_be_as_bright_as_the_other_says():
     assert abs(float(darker.instant[30, 30, 0]) - 0.3) < 1e-3
     assert float(darker.instant[10, 10, 0]) < 0.85, "0.7 is darker than white in that light"
     assert float(made.instant[44, 44, 0]) == float(instant[44, 44, 0])
+
+
+def test_what_plate_t_star_shows_close_by_is_carried_to_the_wrong_place_and_no_other_thing():
+    """A patch of the own plate stands eleven pixels to the side in plate t*: depth is wrong in it."""
+    sleeve, hand = arm()
+    grain = blurred(torch.rand(H, W, 3, generator=torch.Generator().manual_seed(1)), 2.0) * 2.0 - 0.5
+    own = torch.where(hand[..., None], grain, wall())
+    moved = torch.where(hand[..., None], grain.roll(11, 1), wall())
+    assert not found(plates(own, moved), sleeve).any()
+    assert found(plates(own, moved), sleeve, config=replace(CONFIG, left=0.0)).any(), "else something else says no"
+    assert found(plates(own, wall()), sleeve)[hand].float().mean() > 0.5
