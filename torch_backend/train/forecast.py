@@ -73,8 +73,20 @@ class Stopwatch:
         return (self._clock() - self._since) / self._work if self._steps == STEPS else None
 
 
-def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: float) -> list[tuple[str, float]]:
-    """(preset, seconds) of those that come to less than `preset`, the largest first.
+@dataclass(frozen=True)
+class Alternative:
+    """A preset that takes less."""
+
+    preset: str
+    """Its name."""
+    seconds: float
+    """That it takes."""
+    width: int
+    """Pixels of its training images."""
+
+
+def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: float) -> list[Alternative]:
+    """Those that come to less than `preset`, the largest first.
 
     Args:
         preset: of the run.
@@ -82,7 +94,7 @@ def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: floa
         initial: Gaussians that a run begins with, about.
         each: seconds that a pixel takes.
     """
-    found: list[tuple[str, float]] = []
+    found: list[Alternative] = []
     for name in list(PRESETS)[: list(PRESETS).index(preset)]:
         config = PRESETS[name]()
         width = min(config.width or size[0], size[0])
@@ -93,7 +105,7 @@ def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: floa
         def count(step: int, grown: Densifier = grown, first: int = first, steps: int = steps) -> float:
             return grown.target(first, step / steps)
 
-        found.append((name, each * Outlook(pixels, 0, steps, count).work()))
+        found.append(Alternative(name, each * Outlook(pixels, 0, steps, count).work(), width))
     return found[::-1]
 
 
@@ -104,13 +116,14 @@ def words_for(seconds: float) -> str:
     return f"{round(seconds / 60)} min" if seconds < 5400 else f"{math.floor(seconds / 360 + 0.5) / 10:g} h"
 
 
-def warning_of(seconds: float, resumed: bool, smaller: list[tuple[str, float]]) -> tuple[str, str] | None:
+def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternative]) -> tuple[str, str] | None:
     """(sentence, hint) for a run that will take longer than `LONG_SECONDS`; None for another.
 
     Args:
         seconds: until it is over.
+        width: pixels of its training images.
         resumed: does it go on with what was trained before?
-        smaller: (preset, seconds) of those that take less, the largest first.
+        smaller: those that take less, the largest first.
     """
     if seconds <= LONG_SECONDS:
         return None
@@ -120,7 +133,9 @@ def warning_of(seconds: float, resumed: bool, smaller: list[tuple[str, float]]) 
         sentence = f"The training takes about {long} more on the processor."
     less = "A smaller width or fewer Gaussians take less."
     if smaller:
-        preset, its_seconds = next((row for row in smaller if row[1] <= LONG_SECONDS), smaller[-1])
-        less = f"The preset {preset} would take about {words_for(its_seconds)}."
+        other = next((row for row in smaller if row.seconds <= LONG_SECONDS), smaller[-1])
+        # A clip smaller than a preset's pictures: the longer run only takes more steps, and on such a clip gained none.
+        alike = " on pictures of the same size" if other.width >= width else ""
+        less = f"The preset {other.preset} would take about {words_for(other.seconds)}{alike}."
     kept = "It can be paused at any time and goes on where it stopped."
     return sentence, f"{kept} {less}"

@@ -216,7 +216,7 @@ class Trainer:
             self._foretold = True
             size = self.scene.width, self.scene.height
             smaller = smaller_presets(self.config.preset, size, self.initial, each)
-            told = warning_of(left, resumed, [row for row in smaller if row[1] < left])
+            told = warning_of(left, self.width, resumed, [row for row in smaller if row.seconds < left])
             if told is not None:
                 self.report.warning(*told)
 

@@ -7,6 +7,7 @@ from torch_backend.train import PRESETS, train_shot
 from torch_backend.train.forecast import (
     GAUSSIAN_PIXELS,
     STEPS,
+    Alternative,
     Outlook,
     Stopwatch,
     smaller_presets,
@@ -53,21 +54,29 @@ def test_a_duration_in_words(seconds, words):
 def test_smaller_presets_take_less_and_what_fits_an_hour_is_named():
     each = 1e-6
     rows = smaller_presets("final", (1280, 720), 20_000, each)
-    assert [name for name, _ in rows] == ["standard", "preview"]
-    standard, preview = (seconds for _, seconds in rows)
+    assert [row.preset for row in rows] == ["standard", "preview"]
+    standard, preview = (row.seconds for row in rows)
+    assert [row.width for row in rows] == [960, 320]
     pixels, budget = 960 * 540, PRESETS["standard"]().densify.budget
     low, high = (9000 * each * (pixels + GAUSSIAN_PIXELS * n) for n in (20_000, budget))
     assert low < standard < high and preview < standard / 10
     assert smaller_presets("preview", (1280, 720), 20_000, each) == []
-    sentence, hint = warning_of(9000.0, False, rows)
+    sentence, hint = warning_of(9000.0, 1280, False, rows)
     assert sentence == "The training takes about 2.5 h on the processor."
     assert hint.endswith(f"The preset preview would take about {words_for(preview)}.") and standard > 3600
-    assert warning_of(9000.0, True, [("standard", 3000.0), ("preview", 9.0)]) == (
+    assert warning_of(9000.0, 1280, True, [Alternative("standard", 3000.0, 960), Alternative("preview", 9.0, 320)]) == (
         "The training takes about 2.5 h more on the processor.",
         "It can be paused at any time and goes on where it stopped. The preset standard would take about 50 min.",
     )
-    assert "fewer Gaussians" in warning_of(9000.0, False, [])[1]
-    assert warning_of(3600.0, False, rows) is None
+    assert "fewer Gaussians" in warning_of(9000.0, 1280, False, [])[1]
+    assert warning_of(3600.0, 1280, False, rows) is None
+
+
+def test_a_clip_on_which_a_smaller_preset_trains_on_the_same_pictures_is_told_so():
+    rows = smaller_presets("final", (640, 480), 20_000, 4e-7)
+    assert [row.width for row in rows] == [640, 320]
+    hint = warning_of(9000.0, 640, False, rows)[1]
+    assert hint.endswith(f"standard would take about {words_for(rows[0].seconds)} on pictures of the same size.")
 
 
 def test_a_long_run_says_how_long_it_takes_before_it_has_begun_in_earnest_and_when_it_goes_on(world, quiet):
