@@ -770,6 +770,7 @@ BACKEND: dict[str, str] = {
     "The training takes about {} more on the processor.": "Das Training dauert auf dem Prozessor noch etwa {}.",
     "It can be paused at any time and goes on where it stopped.": "Es kann jederzeit angehalten werden und geht dort weiter, wo es aufhörte.",
     "The preset {} would take about {}.": "Die Voreinstellung {} würde etwa {} dauern.",
+    "The preset {} would take about {} on pictures of the same size.": "Die Voreinstellung {} würde mit gleich großen Bildern etwa {} dauern.",
     "A smaller width or fewer Gaussians take less.": "Eine kleinere Breite oder weniger Gaussians dauern weniger lang.",
     "The graphics card failed its self-test: {}.": "Die Grafikkarte hat ihren Selbsttest nicht bestanden: {}.",
     "Frame {} was not trained on: time stands still at frame {}, the nearest that was.": "Auf Bild {} wurde nicht trainiert: die Zeit steht bei Bild {}, dem nächsten, auf das trainiert wurde.",

@@ -135,7 +135,9 @@ def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternat
     if smaller:
         other = next((row for row in smaller if row.seconds <= LONG_SECONDS), smaller[-1])
         # A clip smaller than a preset's pictures: the longer run only takes more steps, and on such a clip gained none.
-        alike = " on pictures of the same size" if other.width >= width else ""
-        less = f"The preset {other.preset} would take about {words_for(other.seconds)}{alike}."
+        takes = words_for(other.seconds)
+        less = f"The preset {other.preset} would take about {takes}."
+        if other.width >= width:
+            less = f"The preset {other.preset} would take about {takes} on pictures of the same size."
     kept = "It can be paused at any time and goes on where it stopped."
     return sentence, f"{kept} {less}"
