@@ -89,8 +89,9 @@ def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: Held
     rim, least = max(1, round(config.rim * unit)), config.least * unit**2
     found = enclosed(found, agree | wrong, rim, config.share, least)
     out = torch.zeros_like(found)
+    soft = _soft(both, unit, config)
     for region in components(found):
-        if _left_by_shifts(both, region, unit, config) > config.left:
+        if _left_by_shifts(soft, region, unit, config) > config.left:
             out |= region
     return out
 
@@ -116,14 +117,19 @@ def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlat
 
 def _elsewhere(both: BothPlates, apart: Tensor, unit: float, config: HeldConfig) -> Tensor:
     """[h, w] bool: the plates show different things, and not one edge at places that are `misplaced` pixels apart."""
-    soft, reach = config.grain * unit, max(1, round(config.misplaced * unit))
-    own, instant = blurred(both.own, soft), blurred(both.instant, soft)
-    beyond = torch.maximum(_beyond(own, instant, reach), _beyond(instant, own, reach))
+    soft, reach = _soft(both, unit, config), max(1, round(config.misplaced * unit))
+    beyond = torch.maximum(_beyond(soft.own, soft.instant, reach), _beyond(soft.instant, soft.own, reach))
     spots = opened(beyond > config.apart, max(1, round(config.thin * unit)))
     return spots | (widened(spots, round(config.near * unit)) & (apart > config.apart))
 
 
-def _left_by_shifts(both: BothPlates, region: Tensor, unit: float, config: HeldConfig) -> float:
+def _soft(both: BothPlates, unit: float, config: HeldConfig) -> BothPlates:
+    """Both without grain."""
+    sigma = config.grain * unit
+    return BothPlates(blurred(both.own, sigma), blurred(both.instant, sigma), both.seen)
+
+
+def _left_by_shifts(soft: BothPlates, region: Tensor, unit: float, config: HeldConfig) -> float:
     """What is left of the plates' difference in a region, bool [h, w], if plate t* is shifted as suits it best.
 
     A thing that is not there is nowhere near; what a wrong depth has carried to the wrong place is.
@@ -131,13 +137,12 @@ def _left_by_shifts(both: BothPlates, region: Tensor, unit: float, config: HeldC
     (h, w), step = region.shape, max(1, round(config.step * unit))
     reach = step * max(1, round(config.shift * unit / step))
     y, x = (at[:: max(1, step * step)] for at in region.nonzero().unbind(1))
-    soft = config.grain * unit
-    own, instant = blurred(both.own, soft)[y, x], blurred(both.instant, soft)
+    own, instant = soft.own[y, x], soft.instant
     off = own.new_full((), torch.inf)
     for dy in range(-reach, reach + 1, step):
         for dx in range(-reach, reach + 1, step):
             at = (y + dy).clamp(0, h - 1), (x + dx).clamp(0, w - 1)
-            sees = both.seen[at] > 0.5
+            sees = soft.seen[at] > 0.5
             if 2 * int(sees.sum()) > len(y):
                 off = torch.minimum(off, (own - instant[at]).abs().amax(-1)[sees].mean())
     return float(off / (own - instant[y, x]).abs().amax(-1).mean().clamp_min(1e-6))

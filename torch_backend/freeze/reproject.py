@@ -5,9 +5,12 @@ Pure functions on tensors, the same on CPU and GPU. Pixel centres are at +0.5; d
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+
+from ..torch_types import from_numpy
 
 
 def pixel_centres(width: int, height: int, device: torch.device | str = "cpu") -> Tensor:
@@ -79,8 +82,15 @@ def blurred(picture: Tensor, sigma: float) -> Tensor:
     """[H, W] or [H, W, C] under a Gaussian of `sigma` pixels; the border goes on beyond itself."""
     if sigma <= 0:
         return picture
-    flat = (picture[..., None] if picture.ndim == 2 else picture).permute(2, 0, 1)[:, None]
     reach = max(1, round(3 * sigma))
+    if picture.device.type == "cpu" and not picture.requires_grad:  # torch takes 30 times as long
+        import cv2
+
+        taps = cv2.getGaussianKernel(2 * reach + 1, sigma, cv2.CV_32F)
+        values = np.ascontiguousarray(picture.detach().float().numpy())
+        made = cv2.sepFilter2D(values, -1, taps, taps, borderType=cv2.BORDER_REPLICATE)
+        return from_numpy(np.asarray(made, np.float32)).reshape(picture.shape)
+    flat = (picture[..., None] if picture.ndim == 2 else picture).permute(2, 0, 1)[:, None]
     taps = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=flat.device) / sigma).square())
     taps = taps / taps.sum()
     flat = F.conv2d(F.pad(flat, (reach, reach, 0, 0), mode="replicate"), taps.view(1, 1, 1, -1))
