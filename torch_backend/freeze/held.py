@@ -55,7 +55,7 @@ class HeldConfig:
     """By how much plate t* is shifted to see whether it shows the region somewhere near: then depth is wrong there."""
     step: float = 2.0
     """Between two such shifts."""
-    left: float = 0.9
+    left: float = 0.85
     """Share of the difference that the best shift has to leave."""
 
 
@@ -80,8 +80,9 @@ def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: Held
         unit: pixels of decisions to one in which the configuration counts.
     """
     both = in_the_same_light(both, wrong, config.light * unit)
+    soft = BothPlates(blurred(both.own, config.grain * unit), blurred(both.instant, config.grain * unit), both.seen)
     apart = blurred(both.own - both.instant, config.low * unit).abs().amax(dim=-1)
-    elsewhere = _elsewhere(both, apart, unit, config) & (off > config.smeared)
+    elsewhere = _elsewhere(soft, apart, unit, config) & (off > config.smeared)
     found = grown(wrong, elsewhere, round(config.reach * unit)) & ~wrong
     if not bool(found.any()):
         return found
@@ -89,7 +90,6 @@ def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: Held
     rim, least = max(1, round(config.rim * unit)), config.least * unit**2
     found = enclosed(found, agree | wrong, rim, config.share, least)
     out = torch.zeros_like(found)
-    soft = _soft(both, unit, config)
     for region in components(found):
         if _left_by_shifts(soft, region, unit, config) > config.left:
             out |= region
@@ -115,18 +115,12 @@ def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlat
     return BothPlates(both.own, made, both.seen)
 
 
-def _elsewhere(both: BothPlates, apart: Tensor, unit: float, config: HeldConfig) -> Tensor:
+def _elsewhere(soft: BothPlates, apart: Tensor, unit: float, config: HeldConfig) -> Tensor:
     """[h, w] bool: the plates show different things, and not one edge at places that are `misplaced` pixels apart."""
-    soft, reach = _soft(both, unit, config), max(1, round(config.misplaced * unit))
+    reach = max(1, round(config.misplaced * unit))
     beyond = torch.maximum(_beyond(soft.own, soft.instant, reach), _beyond(soft.instant, soft.own, reach))
     spots = opened(beyond > config.apart, max(1, round(config.thin * unit)))
     return spots | (widened(spots, round(config.near * unit)) & (apart > config.apart))
-
-
-def _soft(both: BothPlates, unit: float, config: HeldConfig) -> BothPlates:
-    """Both without grain."""
-    sigma = config.grain * unit
-    return BothPlates(blurred(both.own, sigma), blurred(both.instant, sigma), both.seen)
 
 
 def _left_by_shifts(soft: BothPlates, region: Tensor, unit: float, config: HeldConfig) -> float:
@@ -136,16 +130,22 @@ def _left_by_shifts(soft: BothPlates, region: Tensor, unit: float, config: HeldC
     """
     (h, w), step = region.shape, max(1, round(config.step * unit))
     reach = step * max(1, round(config.shift * unit / step))
-    y, x = (at[:: max(1, step * step)] for at in region.nonzero().unbind(1))
-    own, instant = soft.own[y, x], soft.instant
-    off = own.new_full((), torch.inf)
-    for dy in range(-reach, reach + 1, step):
-        for dx in range(-reach, reach + 1, step):
-            at = (y + dy).clamp(0, h - 1), (x + dx).clamp(0, w - 1)
-            sees = soft.seen[at] > 0.5
-            if 2 * int(sees.sum()) > len(y):
-                off = torch.minimum(off, (own - instant[at]).abs().amax(-1)[sees].mean())
-    return float(off / (own - instant[y, x]).abs().amax(-1).mean().clamp_min(1e-6))
+    y, x = (at[:: step * step] for at in region.nonzero().unbind(1))
+    own = soft.own[y, x]
+
+    def apart(dy: int, dx: int) -> float:
+        """Mean difference where plate t* sees it; infinite if that is less than half of it."""
+        down, right = y + dy, x + dx
+        at = down.clamp(0, h - 1), right.clamp(0, w - 1)
+        sees = (soft.seen[at] > 0.5) & (down == at[0]) & (right == at[1])
+        off = (own - soft.instant[at]).abs().amax(-1)[sees]
+        return float(off.mean()) if 2 * len(off) > len(y) else torch.inf
+
+    unmoved = apart(0, 0)
+    if unmoved == torch.inf:  # not seen: nothing tells it from a wrong depth
+        return 0.0
+    shifts = range(-reach, reach + 1, step)
+    return min(apart(dy, dx) for dy in shifts for dx in shifts) / max(unmoved, 1e-6)
 
 
 def _beyond(a: Tensor, b: Tensor, reach: int) -> Tensor:

@@ -134,10 +134,9 @@ def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternat
     less = "A smaller width or fewer Gaussians take less."
     if smaller:
         other = next((row for row in smaller if row.seconds <= LONG_SECONDS), smaller[-1])
-        # A clip smaller than a preset's pictures: the longer run only takes more steps, and on such a clip gained none.
         takes = words_for(other.seconds)
         less = f"The preset {other.preset} would take about {takes}."
-        if other.width >= width:
+        if other.width >= width:  # then more steps are all that it saves: on one clip of 640 pixels they gained nothing
             less = f"The preset {other.preset} would take about {takes} on pictures of the same size."
     kept = "It can be paused at any time and goes on where it stopped."
     return sentence, f"{kept} {less}"
