@@ -100,28 +100,19 @@ def blurred(picture: Tensor, sigma: float) -> Tensor:
 
 
 def widened(matte: Tensor, by: int) -> Tensor:
-    """[H, W] float or bool, every value spread `by` pixels to all sides: the greatest one around."""
-    return _greatest(_greatest(matte, by, 0), by, 1) if by > 0 else matte
+    """[H, W] float or bool, every value spread `by` pixels to all sides: the greatest one around; beyond the border
+    nothing counts."""
+    if by <= 0:
+        return matte
+    if matte.device.type != "cpu":
+        spread = F.max_pool2d(matte[None, None].float(), 2 * by + 1, 1, by)[0, 0]
+        return spread.to(matte.dtype)
+    import cv2  # 2 to 7 times as fast as maxima of shifted pictures, 25 and more times as fast as pooling
 
-
-def _greatest(matte: Tensor, by: int, along: int) -> Tensor:
-    """[H, W] the greatest of the 2 `by` + 1 values around each in one direction; beyond the border nothing counts.
-
-    Windows twice as wide are made of two: 25 times as fast as `max_pool2d` (640 x 360, two cores), which has one
-    channel to share out.
-    """
-    size, side = matte.shape[along], 2 * by + 1
-    shape = list(matte.shape)
-    shape[along] = size + 2 * by
-    least = False if matte.dtype == torch.bool else -torch.inf
-    out = torch.full(shape, least, dtype=matte.dtype, device=matte.device)
-    out.narrow(along, by, size).copy_(matte)
-    wide = 1
-    while 2 * wide <= side:
-        count = out.shape[along] - wide
-        out = torch.maximum(out.narrow(along, 0, count), out.narrow(along, wide, count))
-        wide *= 2
-    return torch.maximum(out.narrow(along, 0, size), out.narrow(along, side - wide, size))
+    values = np.ascontiguousarray(matte.detach().numpy())
+    values = values.view(np.uint8) if matte.dtype == torch.bool else values
+    window = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * by + 1, 2 * by + 1))
+    return from_numpy(np.asarray(cv2.dilate(values, window), values.dtype)).to(matte.dtype)
 
 
 def narrowed(matte: Tensor, by: int) -> Tensor:
