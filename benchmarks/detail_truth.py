@@ -2,8 +2,11 @@
 
 SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot, with exact
 cameras, and an `auto` run are made in DIR if they are not there. Printed is the mean PSNR of all poses and instants
-that have a truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and what got worse. The
-pose of t* itself does not count: plate t* is its truth. DIR gets truth-NAME.json.
+that have a truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and what got worse; and
+their ST-LPIPS, if its weights are there: a metric of pictures that forgives a shift by two pixels. The pose of t*
+itself does not count: plate t* is its truth. DIR gets truth-NAME.json.
+
+Pictures are judged at the size of the run, or with `--delivered` as an artist gets them: at that of the plates.
 """
 
 from __future__ import annotations
@@ -19,20 +22,22 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import torch
+from torch import Tensor
 
 from benchmarks.bench import RunSpec, hold_out_phase, train_spec
-from benchmarks.sources import Log, load_source
+from benchmarks.detail_clip import DetailClip, over
+from benchmarks.sources import load_source
 from torch_backend.contract import SWITCH, JobError
 from torch_backend.native import default_threads
-from torch_backend.report.evaluate import develop_run, freeze_run, plate_detail
-from torch_backend.report.metrics import WHOLE, psnr_by_region
+from torch_backend.report.metrics import WHOLE, score
 from torch_backend.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
 from torch_backend.report.truth import REGIONS, TruthScene
-from torch_backend.scene import load_scene
 from torch_backend.shot import write_json
 from torch_backend.train import load_run
 
 VARIANTS = (SPLATS, DEVELOPED, WITHHELD, DELIVERED)
+PERCEIVED = "st_lpips"
+"""In a row: the same by ST-LPIPS; less is better."""
 GOALS = {WHOLE: 4.0, "never_seen": 3.0, "moving": 1.5}
 """Region -> dB that delivered frames should gain over splats."""
 WITHHELD_GOAL = 2.0
@@ -52,23 +57,40 @@ def trained(truth: TruthScene, source: str, args: argparse.Namespace) -> str:
 
 
 def judge(
-    truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1, develop: bool = True
+    truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1, develop: bool = True, width: int = 0
 ) -> list[dict[str, Any]]:
-    """PSNR in dB of every pose: [{t_star, pose, variant: {region: dB or None}}]; not developed, that is as splats are.
+    """Every pose of every instant: [{t_star, pose, variant: {region: dB or None}, `PERCEIVED`: the same of it}].
 
-    But for that of t* itself: what is delivered there is plate t*, which is the truth to the byte.
+    Not developed is as splats are. But for the pose of t* itself: what is delivered there is plate t*, which is the
+    truth to the byte. `width`: pixels of the pictures; 0: the plates' own.
     """
-    run, scene = load_run(truth.shot, run_name, torch.device("cpu")), load_scene(truth.shot)
-    detailer, size, rows = plate_detail(truth.shot, run, scene, Log()), (run.width, run.height), []
+    clip, rows = DetailClip(truth.shot, run_name, width, develop), []
+    size = clip.width, clip.height
     for t_star in t_stars:
-        made = develop_run(truth.shot, run, scene, t_star, "nearest", Log()) if develop else None
-        frozen = freeze_run(run, scene, t_star, "nearest", detailer, made)
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
+            told = {name: score(image, target, regions) for name, image in _pictures(clip, pose, t_star).items()}
             row: dict[str, Any] = {"t_star": t_star, "pose": pose}
-            rows.append(row | {v: psnr_by_region(frozen.view(pose, v), target, regions) for v in VARIANTS})
+            row |= {v: {region: of["psnr_db"] for region, of in found.items()} for v, found in told.items()}
+            row[PERCEIVED] = {v: {region: of[PERCEIVED] for region, of in found.items()} for v, found in told.items()}
+            rows.append(row)
         print(f"{truth.name}, t* {t_star}: {gains_text(means(rows)[WHOLE])} dB whole so far", flush=True)
     return rows
+
+
+def _pictures(clip: DetailClip, pose: int, t_star: int) -> dict[str, Tensor]:
+    """A frozen frame in each of `VARIANTS`, [H, W, 3] in 0..1."""
+    field, image = clip.splats(pose, t_star, clip.field(t_star)), clip.splats(pose, t_star)
+    withheld, delivered = (clip.view(pose, t_star, without, image) for without in ((pose,), ()))
+    return {
+        SPLATS: over(field.color, field.alpha), DEVELOPED: delivered.splats, WITHHELD: withheld.picture,
+        DELIVERED: delivered.picture,
+    }  # fmt: skip
+
+
+def perceived(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """As `means`, of ST-LPIPS; empty where its weights are missing."""
+    return means([row[PERCEIVED] for row in rows])
 
 
 def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -99,6 +121,17 @@ def table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     return lines
 
 
+def perceived_table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
+    """Mean ST-LPIPS by scene and region in Markdown; nothing where it was not measured."""
+    lines = [
+        f"| {scene} | {region} | {' -> '.join(f'{of[v]:.4f}' for v in VARIANTS)} |"
+        for scene, regions in found.items()
+        for region, of in regions.items()
+    ]
+    head = ["", "| scene | region | ST-LPIPS, less is better |", "|---|---|---|"]
+    return [*head, *lines] if lines else []
+
+
 def shortfalls(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     """Sentences: regions that got worse, and gains that are less than wanted."""
     sentences = []
@@ -127,10 +160,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--gaussians", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0, help="of the training")
     parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
+    parser.add_argument("--delivered", action="store_true", help="judge at the size of the plates")
     parser.add_argument("--train-only", action="store_true")
     args = parser.parse_args(argv)
     torch.set_num_threads(default_threads())
-    found, results = {}, args.results.absolute()
+    found, seen, results = {}, {}, args.results.absolute()
     try:
         for folder in args.scenes:
             source = f"{args.cameras}:{folder.absolute()}"
@@ -139,8 +173,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"{truth.name}: {truth.shot.run(run)}", flush=True)
             if args.train_only:
                 continue
-            rows = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on")
-            found[truth.name] = means(rows)
+            width = 0 if args.delivered else load_run(truth.shot, run, torch.device("cpu")).width
+            rows = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on", width)
+            found[truth.name], seen[truth.name] = means(rows), perceived(rows)
             name = truth.name.replace(" ", "-")
             facts = {"version": 1, "scene": truth.name, "run": str(truth.shot.run(run))}
             write_json(results / f"truth-{name}.json", {**facts, "mean": found[truth.name], "frames": rows})
@@ -148,7 +183,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"Error: {error}", file=sys.stderr)
         return 1
     if found:
-        print("\n".join(["", *table(found), "", *shortfalls(found)]))
+        print("\n".join(["", *table(found), *perceived_table(seen), "", *shortfalls(found)]))
     return 0
 
 

@@ -49,22 +49,34 @@ class DetailConfig:
     """The same, for what hangs together with such a spot."""
     thin: int = 3
     """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
+    moves: float = 0.25
+    """Share of what is seen that the model has to move for plate t* to stand there in place of the splats."""
+    beside: tuple[float, float] = (10.0, 20.0)
+    """Degrees by which plate t* may see it from another side: up to the first it is believed, from the second on not;
+    from further round it shows what is turned away."""
+    moves_surely: float = 0.8
+    """As `moves`, where the splats have not fallen apart: what stands still is better as other plates have it."""
+    same: float = 0.05
+    """Difference between plate t* and the splats, display-referred, up to which that plate is taken along outlines of
+    depth and where it does not quite see the surface,"""
+    fine: float = 1.0
+    """and the sigma of that."""
+    jump: float = 0.05
+    """Share of itself by which depth jumps at an outline."""
     torn: float = 0.1
-    """Low-passed difference between plate t* and the splats, display-referred, from which on what moves is not shown as
-    the splats have it but as that plate does."""
+    """Low-passed difference between plate t* and the splats, display-referred, from which on these have fallen apart:
+    outlines, too, are as that plate has them then."""
     torn_too: float = 0.03
     """The same, for what hangs together with such a spot."""
-    moves: float = 0.25
-    """Share of what is seen that the model has to move there, too."""
-    beside: float = 15.0
-    """Degrees by which plate t* may see it from another side: from further round it shows what is turned away."""
     rim: int = 2
-    """Pixels along the outline of what plate t* shows in which it does not count."""
+    """Pixels along the outline of what plate t* shows, and along jumps of depth, in which it does not count."""
     medians: int = 3
     """So many times over the median of 5 x 5 pixels' depths is taken there."""
     gap: int = 4
     """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
     sees flickers from pixel to pixel."""
+    unsteady: float = 1.5
+    """Pixels by which displacements around such a gap may differ: by more, two surfaces meet in it."""
     rough: int = 1
     """Pixels of decisions around a place that a plate has to show, too, to fill it where something moves: depth is
     rough there, what it is seen to show changes from pixel to pixel along edges, and single ones would stand out."""

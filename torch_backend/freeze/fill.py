@@ -137,6 +137,7 @@ def fill(
     doubt, elsewhere = look_up(posed.doubt, small), look_up(posed.held, small)
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
+    same_state = torch.zeros(count, device="cpu")
     untold = 1.0 - unknown
     truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
     if truth is not None:  # the better plate t* shows it, the less another time is needed
@@ -150,7 +151,10 @@ def fill(
         around = torch.minimum(sighting.visible, look_up(fillers.shown[n], small))
         sighting.visible = torch.lerp(sighting.visible, around, uneasy)
         agreed = look_up(fillers.agreed[n], small)
-        sway = _sway(sightings, config, frame, points, sighting) * untold * agreed
+        unmoved = _unmoved(sightings, config, frame, points, sighting) * agreed
+        if frame != posed.t:
+            same_state = torch.maximum(same_state, unmoved * _near(sightings, config, posed, frame, sighting))
+        sway = config.sway_trust * unmoved * untold
         still = 1.0 - elsewhere * (1.0 - agreed)
         weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, still))
         places.append(sighting.pixels * larger)
@@ -162,7 +166,8 @@ def fill(
         carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
     filling.color += carried * filling.share[:, None]
     if fillers.instant is not None:
-        told = look_up(fillers.instant.where, small)
+        # A plate near in pose that shows the same, a little swayed, has it at its place: plate t* may be a pixel off.
+        told = look_up(fillers.instant.where, small) * (1.0 - same_state)
         on = told > 0.0
         shown = fillers.instant.at(small[on], larger)
         filling.color[on] = torch.lerp(filling.color[on], shown, told[on][:, None])
@@ -177,12 +182,12 @@ def _doubted(sighting: Sighting, doubt: Tensor) -> Sighting:
     return replace(sighting, moving=torch.maximum(sighting.moving, doubt * (1.0 - sighting.explained)))
 
 
-def _sway(sightings: Sightings, config: DetailConfig, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
-    """[...] how far plate `frame` is believed in what moves: it agrees with the model, which moved it little."""
+def _unmoved(sightings: Sightings, config: DetailConfig, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
+    """[...] in 0..1: what moves is in plate `frame` nearly as at t*: the model agrees, and moved it little."""
     view = sightings.view(frame)
     travel = norm(project(points, view.viewmat, view.K)[0] - sighting.pixels, -1)
     trust = torch.exp(-travel / (config.sway * sightings.unit))
-    return config.sway_trust * sighting.explained * trust
+    return sighting.explained * trust
 
 
 def _near(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, sighting: Sighting) -> Tensor:

@@ -1,8 +1,11 @@
-"""Where the splats of what moves fall apart seen from elsewhere, and plate t* has its pixels.
+"""Plate t*'s own pixels for what moves, where it shows the surface that a frame sees.
 
 What moves is learnt from plate t* alone, so from t*'s camera its splats are right, whatever they look like from a
-metre aside: a face lets the wall through. Their depth holds longer than their colours do. Where plate t* shows the
-same surface, and the splats show another thing, its pixels are taken as they are.
+metre aside: a face has two noses, or lets the wall through. Their depth holds longer than their colours do, and a
+residual (plate t* less the model's render of it) cannot know of colours that fail elsewhere. So within some degrees of
+t*'s camera its pixels are taken as they are, carried by that depth. Along outlines, where depth is a pixel off and
+plate t* shows what is behind, they are taken only where they differ little from the splats, or where a whole region of
+the splats has fallen apart.
 """
 
 from __future__ import annotations
@@ -19,8 +22,12 @@ from .bands import look_up_near
 from .detail_config import DetailConfig
 from .posed import PosedFrame
 from .regions import closed, opened
-from .reproject import blurred, look_up, narrowed, pixel_centres, resized, unproject
+from .reproject import blurred, look_up, narrowed, pixel_centres, resized, unproject, widened
 from .sightings import Sightings
+
+
+_FEW = 0.01
+"""Share of what lies around a gap that has to be seen for anything to be told of it."""
 
 
 @dataclass
@@ -44,30 +51,97 @@ class InstantPixels:
         return shown * self.gain + self.offset
 
 
+@dataclass
+class _Surface:
+    """What a frame sees of what moves, and plate t* of it; [h, w] at the size of decisions."""
+
+    depth: Tensor
+    """Along the frame's axis, without what single pixels' depths are off by."""
+    places: Tensor
+    """[h, w, 2] where plate t* shows it."""
+    moves: Tensor
+    """In 0..1: how much of what is seen the model moves."""
+    told: Tensor
+    """[h, w, 3] what plate t* shows there, exposed as the frame is."""
+    shown: Tensor
+    """[h, w, 3] what the splats do."""
+    counts: Tensor
+    """In 0..1: how well plate t* shows what moves, from near enough; 0 elsewhere."""
+
+
 def instant_pixels(
     sightings: Sightings, config: DetailConfig, posed: PosedFrame, usable: list[int]
 ) -> InstantPixels | None:
-    """Plate t* for what moves and the splats show otherwise; None if it is not needed, or not to be used."""
+    """Plate t* for what moves and it shows from near enough; None if that is nothing, or it is not to be used."""
     h, w = posed.depth.shape
+    moves = resized(posed.image.motion, w, h)
     # Mattes are wide and depth is worst behind their rims: what the model does not move is none of this.
-    moves = (torch.maximum(posed.motion, posed.doubt) > 0.5) & (resized(posed.image.motion, w, h) > config.moves)
-    if posed.t not in usable or not bool(moves.any()):
+    movers = (torch.maximum(posed.motion, posed.doubt) > 0.5) & (moves > config.moves)
+    if posed.t not in usable or not bool(movers.any()):
         return None
-    points = _smooth_points(config, posed)
+    depth = _smooth_depth(config, posed)
+    points = _points(posed, depth)
     truth = sightings.seen(posed.t, points)
-    gain, offset = _exposure(sightings, posed)
-    told = look_up(sightings.view(posed.t).picture.float(), truth.pixels) * gain + offset
-    beside = _angle(points, sightings.centres[sightings.index[posed.t]], posed.centre)
-    counts = truth.visible * moves * (beside < config.beside)
-    off = sightings.difference(told * counts[..., None], resized(posed.image.color, w, h) * counts[..., None])
-    spots = opened(off > config.torn, round(config.thin * sightings.unit))
-    # Along outlines depth is a pixel off, and that plate shows what is behind: there the splats are the better guess.
+    near = _nearness(config, _angle(points, sightings.centres[sightings.index[posed.t]], posed.centre))
+    counts = truth.visible * movers * (near > 0.0)
     seen = narrowed(closed(counts > 0.5, round(config.gap * sightings.unit)), round(config.rim * sightings.unit))
-    torn = sightings.whole(spots, off, config.torn_too) & seen
-    if not bool(torn.any()):
+    if not bool(seen.any()):
         return None
-    where = blurred(torn.float(), config.feather * sightings.unit)
-    return InstantPixels(where, truth.pixels, sightings.displayed(posed.t), gain, offset)
+    places, steady = _bridged(truth.pixels, counts > 0.5, config.gap * sightings.unit, config.unsteady * sightings.unit)
+    seen &= steady
+    gain, offset = _exposure(sightings, posed)
+    told = look_up(sightings.view(posed.t).picture.float(), places) * gain + offset
+    surface = _Surface(depth, places, moves, told, resized(posed.image.color, w, h), counts)
+    taken = (_torn(sightings, config, surface) | _plain(sightings, config, posed, surface)) & seen
+    if not bool(taken.any()):
+        return None
+    where = blurred(taken.float(), config.feather * sightings.unit) * near
+    return InstantPixels(where, places, sightings.displayed(posed.t), gain, offset)
+
+
+def _bridged(places: Tensor, seen: Tensor, sigma: float, unsteady: float) -> tuple[Tensor, Tensor]:
+    """[h, w, 2] where plate t* shows each pixel, and bool [h, w] where that can be told.
+
+    In gaps of what it is `seen` to show depth is rough, and would fetch a pixel from anywhere: there it is as around
+    them, if all around is displaced alike, to `unsteady` pixels. Where it is not, two surfaces meet.
+    """
+    h, w = seen.shape
+    here, counts = pixel_centres(w, h), seen.float()[..., None]
+    moved = (places - here).clamp(-w, w) * counts
+    around = blurred(torch.cat([moved, moved.square().sum(-1, keepdim=True), counts], dim=-1), max(1.0, sigma))
+    mean, square = (around[..., :3] / around[..., 3:].clamp_min(1e-6)).split([2, 1], dim=-1)
+    steady = (square[..., 0] - mean.square().sum(-1) < unsteady**2) & (around[..., 3] > _FEW)
+    return torch.where(counts > 0.0, places, here + mean), seen | steady
+
+
+def _torn(sightings: Sightings, config: DetailConfig, surface: _Surface) -> Tensor:
+    """[h, w] bool: the splats have fallen apart, whole regions of them."""
+    counts = surface.counts[..., None]
+    off = sightings.difference(surface.told * counts, surface.shown * counts)
+    return sightings.whole(opened(off > config.torn, round(config.thin * sightings.unit)), off, config.torn_too)
+
+
+def _plain(sightings: Sightings, config: DetailConfig, posed: PosedFrame, surface: _Surface) -> Tensor:
+    """[h, w] bool: what moves is in plain view of plate t*, or looks there as the splats do."""
+    rim, jump = max(1, round(config.rim * sightings.unit)), config.jump
+    theirs = widened(_edges(sightings.view(posed.t).surface[..., 0], jump), rim).float()
+    outline = widened(_edges(surface.depth, jump), rim) | (look_up(theirs, surface.places) > 0.5)
+    off = blurred(surface.told - surface.shown, config.fine * sightings.unit).abs().amax(-1)
+    plain = ((surface.counts > 0.5) & ~outline) | (off < config.same)
+    return opened(plain & (surface.moves > config.moves_surely), 1)
+
+
+def _edges(depth: Tensor, jump: float) -> Tensor:
+    """[h, w] bool: pixels among whose neighbours depth jumps by a share `jump` of itself."""
+    depth = depth.clamp_max(1e6)
+    least = narrowed(depth, 1)
+    return widened(depth, 1) - least > jump * least
+
+
+def _nearness(config: DetailConfig, beside: Tensor) -> Tensor:
+    """[...] in 0..1: how far plate t* is believed about what it sees from so many degrees aside."""
+    first, last = config.beside
+    return ((last - beside) / max(last - first, 1e-6)).clamp(0.0, 1.0)
 
 
 def _angle(points: Tensor, first: Tensor, second: Tensor) -> Tensor:
@@ -77,17 +151,22 @@ def _angle(points: Tensor, first: Tensor, second: Tensor) -> Tensor:
     return torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
 
 
-def _smooth_points(config: DetailConfig, posed: PosedFrame) -> Tensor:
-    """[h, w, 3] world points that are seen, without what single pixels' depths are off by; edges stay."""
+def _smooth_depth(config: DetailConfig, posed: PosedFrame) -> Tensor:
+    """[h, w] depth of what is seen, without what single pixels' depths are off by; edges stay."""
     import cv2
 
-    h, w = posed.depth.shape
     depth = posed.depth.clamp_max(1e6).numpy()
     for _ in range(config.medians):
         depth = np.asarray(cv2.medianBlur(depth, 5))
+    return from_numpy(depth)
+
+
+def _points(posed: PosedFrame, depth: Tensor) -> Tensor:
+    """[h, w, 3] world points that are seen at a depth [h, w]."""
+    h, w = depth.shape
     rows, columns = posed.image.alpha.shape
     K = resize_intrinsics(posed.K[None], columns, rows, w, h)[0]
-    return unproject(pixel_centres(w, h), from_numpy(depth), posed.viewmat, K)
+    return unproject(pixel_centres(w, h), depth, posed.viewmat, K)
 
 
 def _exposure(sightings: Sightings, posed: PosedFrame) -> tuple[Tensor, Tensor]:

@@ -66,7 +66,7 @@ from .write_beside import WriteBeside
 
 TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
-DETAIL_VERSION = 7
+DETAIL_VERSION = 8
 """The same, of frames made of plates."""
 _FRAME = re.compile(r"-?\d+")
 

@@ -274,27 +274,6 @@ def test_the_board_is_where_it_was_at_t_star_and_has_its_stripes(world, made, fr
     assert result.plate.numpy()[hole].mean() > 0.9
 
 
-def test_splats_that_fall_apart_seen_from_elsewhere_give_way_to_the_plate_of_the_instant(world):
-    """A face lets the wall through from a metre aside; where it is its depth still tells."""
-    output = world.output(3, 8)
-    truth, on = world.truth(output)
-    inner = ~widened(~on, 8)
-
-    def delivered(config, dark):
-        frozen = freeze_at(world.run.model, world.scene.time_of_frame(8), 1.0)
-        image = render_frozen(frozen, output.viewmat, output.K, W, H)
-        image.color[torch.from_numpy(on)] *= dark
-        return Detailer(world.run, world.scene, world.plates(), config).frame(output, frozen, image, W, H)
-
-    config = DetailConfig(depth_error=0.01)
-    whole, torn = delivered(config, 0.5), delivered(replace(config, beside=0.0), 0.5)
-    assert off(torn.color, truth, inner) > 0.15, "what is missed in other plates does not know of it"
-    assert off(whole.color, truth, inner) < 0.2 * off(torn.color, truth, inner)
-    assert (whole.source.numpy()[inner] == 8).all() and whole.plate.numpy()[inner].min() > 0.99
-    good = delivered(config, 1.0)
-    assert off(good.color, truth, ~widened(on, 12)) == off(whole.color, truth, ~widened(on, 12))
-
-
 def test_what_still_is_in_one_plate_only_differs_between_two_instants(world, made):
     early, late = made(6, 2), made(6, 11)
     truths = [world.truth(world.output(6, t)) for t in (2, 11)]

@@ -133,4 +133,9 @@ def test_regions_that_got_worse_are_named():
     assert len(said) == 3 and all(s.startswith("WORSE: room, moving") for s in said)
     row = "| room | whole | 21.00 -> 22.00 -> 23.00 -> 26.00 | +1.00 | +2.00 | +5.00 |"
     assert row in detail_truth.table({"room": mean})
+    rows = [{detail_truth.PERCEIVED: pose(20, 23, 25, None)}, {detail_truth.PERCEIVED: pose(22, 23, 27, None)}]
+    seen = detail_truth.perceived(rows)
+    assert "| room | whole | 21.0000 -> 22.0000 -> 23.0000 -> 26.0000 |" in detail_truth.perceived_table({"room": seen})
+    absent = [{detail_truth.PERCEIVED: {name: {"whole": None} for name in detail_truth.VARIANTS}}]
+    assert detail_truth.perceived_table({"room": detail_truth.perceived(absent)}) == [], "no made-up figure"
     json.dumps(mean)

@@ -1,0 +1,101 @@
+"""Plate t*'s own pixels for what moves: where they stand in place of the splats, and where not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.backend.freeze.test_detail import H, W, build, off, widened
+from torch_backend.freeze.detail import DetailConfig, Detailer
+from torch_backend.freeze.frozen import freeze_at, render_frozen
+from torch_backend.freeze.instant_pixels import _bridged
+from torch_backend.freeze.reproject import pixel_centres
+
+SHARP = DetailConfig(depth_error=0.01)
+"""Surfaces of these worlds are where they are."""
+NEVER = replace(SHARP, beside=(0.0, 0.0))
+"""Plate t* is believed from its own side alone."""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory, quiet):
+    return build(tmp_path_factory.mktemp("board"), quiet())
+
+
+def delivered(world, config, spoilt, pose=3, t_star=8):
+    """(frame, truth [H, W, 3], where the board is): splats of the board are as `spoilt` leaves them, seen from here."""
+    output = world.output(pose, t_star)
+    truth, on = world.truth(output)
+    frozen = freeze_at(world.run.model, world.scene.time_of_frame(t_star), 1.0)
+    image = render_frozen(frozen, output.viewmat, output.K, W, H)
+    where = torch.from_numpy(on)
+    image.color[where] = spoilt(image.color)[where]
+    made = Detailer(world.run, world.scene, world.plates(), config).frame(output, frozen, image, W, H)
+    return made, truth, on
+
+
+def test_splats_that_fall_apart_seen_from_elsewhere_give_way_to_the_plate_of_the_instant(world):
+    """A face lets the wall through from a metre aside; where it is its depth still tells."""
+    (whole, truth, on), (torn, _, _) = (delivered(world, c, lambda color: color * 0.5) for c in (SHARP, NEVER))
+    inner = ~widened(~on, 8)
+    assert off(torn.color, truth, inner) > 0.15, "what is missed in other plates does not know of it"
+    assert off(whole.color, truth, inner) < 0.2 * off(torn.color, truth, inner)
+    assert (whole.source.numpy()[inner] == 8).all() and whole.plate.numpy()[inner].min() > 0.99
+    good, _, _ = delivered(world, SHARP, lambda color: color)
+    assert off(good.color, truth, ~widened(on, 12)) == off(whole.color, truth, ~widened(on, 12))
+
+
+def test_a_second_nose_that_no_low_pass_sees_gives_way_as_well(world):
+    """Splats of a face are double from aside: no more than that, so no region of them has fallen apart."""
+
+    def double(color):
+        return color + 0.06 * torch.sin(torch.arange(W) * 2.0)[None, :, None]
+
+    (whole, truth, on), (residual, _, _) = (delivered(world, c, double) for c in (SHARP, NEVER))
+    inner = ~widened(~on, 8)
+    assert off(residual.color, truth, inner) > 0.03
+    assert off(whole.color, truth, inner) < 0.5 * off(residual.color, truth, inner)
+    assert (whole.source.numpy()[inner] == 8).all()
+
+
+def test_along_outlines_and_from_far_aside_splats_stay(world):
+    """Depth is a pixel off there, and plate t* shows what is behind."""
+
+    def double(color):
+        return color + 0.06 * torch.sin(torch.arange(W) * 2.0)[None, :, None]
+
+    (whole, _, on), (residual, _, _) = (delivered(world, c, double) for c in (SHARP, NEVER))
+    changed = np.abs(whole.color.numpy() - residual.color.numpy()).mean(-1)
+    assert changed[on & widened(~on, 1)].mean() < 0.25 * changed[~widened(~on, 8)].mean()
+    aside, _, _ = delivered(world, replace(SHARP, beside=(1.0, 2.0)), double)
+    assert torch.equal(aside.color, residual.color), "from three degrees aside it is not asked"
+
+
+def test_between_two_sides_it_is_believed_in_part(world):
+    """The board of frame 3 is seen 3.6 degrees from where plate 8 saw it."""
+
+    def dark(color):
+        return color * 0.5
+
+    shares = []
+    for beside in ((0.0, 1.0), (3.0, 4.5), (4.5, 6.0)):
+        made, truth, on = delivered(world, replace(SHARP, beside=beside), dark)
+        shares.append(off(made.color, truth, ~widened(~on, 8)))
+    assert shares[0] > 1.2 * shares[1] > 1.2 * shares[2]
+
+
+def test_a_gap_is_shown_as_around_it_unless_two_surfaces_meet_there():
+    """Where depth is rough it would fetch a pixel from anywhere."""
+    here, seen = pixel_centres(40, 30), torch.ones(30, 40, dtype=torch.bool)
+    seen[12:16, 10:14] = seen[:, 25:28] = False
+    places = here + torch.tensor([5.0, -2.0])
+    places[:, 26:, 0] += 6.0
+    rough = places.clone()
+    rough[~seen] += 30.0 * torch.randn(int((~seen).sum()), 2, generator=torch.Generator().manual_seed(0))
+    found, steady = _bridged(rough, seen, 4.0, 1.5)
+    assert torch.equal(found[seen], rough[seen]) and bool(steady[seen].all())
+    assert bool(steady[12:16, 10:14].all()) and (found - places)[12:16, 10:14].abs().max() < 0.2
+    assert not bool(steady[:, 25:28].any()), "a hand and the wall behind it"
+    nothing, told = _bridged(rough, torch.zeros_like(seen), 4.0, 1.5)
+    assert bool(nothing.isfinite().all()) and not bool(told.any())
