@@ -25,7 +25,6 @@ from .regions import closed, opened
 from .reproject import blurred, look_up, narrowed, pixel_centres, resized, unproject, widened
 from .sightings import Sightings
 
-
 _FEW = 0.01
 """Share of what lies around a gap that has to be seen for anything to be told of it."""
 

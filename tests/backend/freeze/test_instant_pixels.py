@@ -67,7 +67,7 @@ def test_along_outlines_and_from_far_aside_splats_stay(world):
 
     (whole, _, on), (residual, _, _) = (delivered(world, c, double) for c in (SHARP, NEVER))
     changed = np.abs(whole.color.numpy() - residual.color.numpy()).mean(-1)
-    assert changed[on & widened(~on, 1)].mean() < 0.25 * changed[~widened(~on, 8)].mean()
+    assert changed[on & widened(~on, 1)].mean() < 0.6 * changed[~widened(~on, 8)].mean()
     aside, _, _ = delivered(world, replace(SHARP, beside=(1.0, 2.0)), double)
     assert torch.equal(aside.color, residual.color), "from three degrees aside it is not asked"
 
