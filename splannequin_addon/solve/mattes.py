@@ -162,15 +162,4 @@ def _write(path: Path, data: bytes) -> None:
     """Writes beside `path`, fsyncs, renames over it. OSError, also if its folder is a link to elsewhere."""
     if contract.is_link(path.parent):
         raise NotADirectoryError(20, "its folder is a link", str(path))
-    path.parent.mkdir(exist_ok=True)
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    beside.unlink(missing_ok=True)
-    try:
-        with open(beside, "xb") as out:
-            out.write(data)
-            out.flush()
-            os.fsync(out.fileno())
-        os.replace(beside, path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
+    contract.write_atomic(path, data, parents=False)

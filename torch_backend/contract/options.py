@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from .files import is_json_object
+from .files import frame_number, is_json_object
 from .hosts import host_names
 from .option_table import SWITCH, Limit, Option, limits_of, mask_path, option, overscan
 
@@ -304,8 +304,8 @@ class SolveParams:
         "One picture for all frames, a picture of a sequence, or a video",
     )
     """Mask of what alone may move, in white; the camera is not matched on it. Empty: everything may."""
-    overlap: int = option(15, limit=Limit("number of following frames that are matched", 1, 1000))
-    """Each solved frame is matched with this many following ones (and with quadratically spaced ones beyond)."""
+    overlap: int = option(15, limit=Limit("number of following frames that are matched", 1, 31))
+    """Each solved frame is matched with those 1, 2, 4, ... frames after it: so many distances."""
     cameras: str = option(
         "",
         flag="--cameras",
@@ -575,8 +575,13 @@ def check_params(params: object) -> None:
             if value is None or value in limit.also or limit.low <= value <= limit.high:  # NaN is none of them
                 continue
             also = "".join(f", or {value} for {meaning}" for value, meaning in limit.also.items())
-            message = f"The {limit.what} is {value}: it should be {limit.low:.0f} to {limit.high:.0f}{also}."
+            message = f"The {limit.what} is {value}: it should be {_plain(limit.low)} to {_plain(limit.high)}{also}."
             raise ValueError(message)
-    odd = [key for key in getattr(params, "t_star_per_frame", {}) if not key.lstrip("-").isdecimal()]
+    odd = [key for key in getattr(params, "t_star_per_frame", {}) if frame_number(key) is None]
     if odd:
         raise ValueError(f"t* is given for frame {odd[0]!r}: it should be the number of a frame.")
+
+
+def _plain(number: float) -> str:
+    """A limit as one says it: 0.25, 4, 1000000."""
+    return f"{number:.0f}" if float(number).is_integer() else f"{number:g}"

@@ -7,9 +7,11 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import shutil
 import sys
 import time
+import uuid
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any
@@ -59,8 +61,8 @@ def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
         make_folder(path.parent)
     else:
         path.parent.mkdir(exist_ok=True)
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    beside.unlink(missing_ok=True)  # a link that another hand left there would be followed
+    # Not the process's number: two hosts of a farm have the same ones. Nobody can have put a link there, either.
+    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp{path.suffix}")
     try:
         yield beside
         with open(beside, "rb+") as handle:
@@ -69,6 +71,23 @@ def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
+
+
+_HALF = re.compile(r"\..+\.[0-9a-f]+\.tmp(\..+)?")
+_ABANDONED = 3600.0
+
+
+def is_half_written(name: str) -> bool:
+    """True for the name of a file that `atomic_path` has not renamed yet, of this version or an earlier one."""
+    return _HALF.fullmatch(name) is not None
+
+
+def sweep_half_written(folder: Path) -> None:
+    """Removes what killed processes left half written in a folder: nobody has touched it for an hour."""
+    for file in folder.glob(".*.tmp*"):
+        with contextlib.suppress(OSError):  # another sweeper was first, or it is another's: it does no harm
+            if is_half_written(file.name) and time.time() - file.lstat().st_mtime > _ABANDONED:
+                file.unlink()
 
 
 @contextlib.contextmanager

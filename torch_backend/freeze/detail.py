@@ -168,7 +168,7 @@ class Detailer:
         if key not in self._layers:
             folder = Shot(self.scene.folder.parent)
             motion = partial(load_motion, folder)
-            self._layers[key] = instant_layer(self.run, self.scene, None, frozen, t_star, motion=motion)
+            self._layers[key] = instant_layer(self.run, self.scene, frozen, t_star, motion=motion)
             while len(self._layers) > 2:
                 self._layers.popitem(last=False)
         return self._layers[key]

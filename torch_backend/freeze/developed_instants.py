@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..contract import DEVELOPED_FOLDER, JobError, Reporter, frame_file
+from ..contract import DEVELOPED_FOLDER, JobError, Reporter, frame_file, frame_number, sweep_half_written
 from ..gaussians.model import PARAM_NAMES
 from ..scene import Scene
 from ..shot import Shot, content_key, path_error
@@ -27,12 +26,11 @@ from .static_twin import settled
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 3
+VERSION = 4
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
 jumps to another make in the middle of a ramp."""
-_NAME = re.compile(r"-?\d+")
 
 
 class Instants:
@@ -206,7 +204,7 @@ def _make(
 ) -> FrozenGaussians:  # fmt: skip
     moving = motion_mattes(shot)
     frozen = settled(run, scene, frozen, t_star, moving)
-    layer = instant_layer(run, scene, None, frozen, float(t_star), motion=lambda frame: load_motion(shot, frame))
+    layer = instant_layer(run, scene, frozen, float(t_star), motion=lambda frame: load_motion(shot, frame))
     joined = frozen if layer is None else join(frozen, layer)
     return develop(run, scene, joined, t_star, moving, config, check)
 
@@ -226,11 +224,12 @@ def _save(
     # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
     tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
+    sweep_half_written(folder)
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)
     for other in folder.glob("*.safetensors"):
         with contextlib.suppress(OSError):  # known by its key, it does no harm but take room
-            if _NAME.fullmatch(other.stem) and other != path and read_meta(other).get("run") != run.stamp:
+            if frame_number(other.stem) is not None and other != path and read_meta(other).get("run") != run.stamp:
                 other.unlink()
 
 

@@ -15,8 +15,8 @@ from .posed import PosedFrame, displacements, parallax
 from .reproject import blurred, look_up, narrowed, project, resized, unproject, widened
 from .sightings import Sighting, Sightings
 
-WHOLE = 0.999
-"""Matte from which on the leading plate gives the whole pixel."""
+WHOLE = 1.0 - 0.5 / 1024.0
+"""Matte from which on the leading plate gives the whole pixel: it is rounded to 1024 steps, this one to 1."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Depth of a region of a plate that the model does not have (see `instant`).
+"""Depth of a region of a plate that the model does not have (see `missing_layer`).
 
 Nothing tells it alone. What the region hangs on (the arm that a hand belongs to) is nearly as deep, where it can be
 told from what is merely beside it: the same colours and the same flow across the outline. Parallax to the frames

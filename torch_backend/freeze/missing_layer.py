@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -29,22 +28,13 @@ from .ignored import ignore_mattes
 from .instant_depth import DepthConfig, Region, View, inverse_depth, own_motion
 from .instant_track import Track, TrackConfig, swing, tracks
 from .reproject import resized
+from .sightings import matte_of
 
-STILL, UNKNOWN, MOVING = 0, 128, 255
-"""Values of a motion matte (`solve/motion.py`)."""
 _SIZE = 320.0
 """Lengths in pixels in the configuration are those of pictures this wide; others are scaled with the width."""
 
 Motion = Callable[[int], "NDArray[np.uint8] | None"]
 """Motion matte [h, w] of a frame number, None where there is none."""
-
-
-class Shows(Protocol):
-    """Plates by frame number (`footage.plates.Plates` is one)."""
-
-    def display(self, frame: int) -> Tensor:
-        """[H, W, 3] float32 display-referred."""
-        ...
 
 
 @dataclass
@@ -108,7 +98,6 @@ class InstantLayer:
 def instant_layer(
     run: LoadedRun,
     scene: Scene,
-    plates: Shows | None,
     frozen: FrozenGaussians,
     t_star: float,
     config: InstantConfig | None = None,
@@ -117,7 +106,6 @@ def instant_layer(
     """Finds what plate t* shows and a scene frozen at t* does not, and makes Gaussians of it.
 
     Args:
-        plates: display-referred plates of any size; None: the shot's working frames.
         frozen: the scene at t*, on any device.
         t_star: frame number; between two frames the nearer one's plate is looked at.
         motion: motion mattes; without them flow off its epipolar lines alone tells what moves.
@@ -126,7 +114,7 @@ def instant_layer(
     """
     config = config or InstantConfig()
     index = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
-    bench = _Bench(run, scene, plates, index, config, motion)
+    bench = _Bench(run, scene, index, config, motion)
     image = bench.render(frozen)
     things = _small_things(bench, image)
     if not things and not (bench.difference(image) >= config.seed).any():
@@ -164,16 +152,13 @@ def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
 class _Bench:
     """Plate t* and its camera, with its neighbours, at the size at which they are compared."""
 
-    def __init__(
-        self, run: LoadedRun, scene: Scene, plates: Shows | None, index: int, config: InstantConfig,
-        motion: Motion | None,
-    ) -> None:  # fmt: skip
+    def __init__(self, run: LoadedRun, scene: Scene, index: int, config: InstantConfig, motion: Motion | None) -> None:
         self.config, self.exposure, self.index = config, run.model.exposure, index
         self.width = min(run.width, config.width)
         self.height = max(1, round(run.height * self.width / run.width))
         self.unit = self.width / _SIZE
         self.time = float(scene.times[index])
-        self.scene, self._plates, self._motion = scene, plates, motion
+        self.scene, self._motion = scene, motion
         self.Ks = resize_intrinsics(scene.Ks, scene.width, scene.height, self.width, self.height)
         self._views: dict[int, View] = {}
         self.view = self.at(index)
@@ -188,11 +173,8 @@ class _Bench:
         return self._views[index]
 
     def _read(self, index: int) -> View:
-        scene, size = self.scene, (self.width, self.height)
-        if self._plates is None:
-            picture = read_image(scene.image_path(index), *size, scene.display).numpy()
-        else:
-            picture = _resized(self._plates.display(scene.frames[index]).numpy().clip(0.0, 1.0), *size)
+        scene = self.scene
+        picture = read_image(scene.image_path(index), self.width, self.height, scene.display).numpy()
         return self.camera(index, np.ascontiguousarray(picture, np.float32))
 
     def camera(self, index: int, picture: NDArray[np.float32] | None = None) -> View:
@@ -217,12 +199,12 @@ class _Bench:
         return [self.at(i) for i in chosen if i != self.index]
 
     def matte(self, index: int | None = None) -> NDArray[np.float32] | None:
-        """Motion matte of a frame, or of t*, [h, w] in 0..1, if there is one."""
+        """Motion matte of a frame, or of t*, [h, w] in 0..1, if there is one; unknown is `DOUBT`, so still."""
         index = self.index if index is None else index
         found = self._motion(self.scene.frames[index]) if self._motion else None
         if found is None:
             return None
-        return _resized(np.float32(1.0 / MOVING) * found.astype(np.float32), self.width, self.height)
+        return _resized(matte_of(found).numpy(), self.width, self.height)
 
     def render(self, frozen: FrozenGaussians) -> FrozenImage:
         """A frozen scene as camera t* sees it, exposed as plate t* is."""

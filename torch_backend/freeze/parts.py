@@ -16,7 +16,6 @@ from typing import Any
 
 from ..contract import (
     TAKE_FILE,
-    TAKE_PREVIEW_FOLDER,
     TAKE_STATE_FILE,
     ExitCode,
     FreezeParams,
@@ -27,9 +26,8 @@ from ..contract import (
 )
 from ..shot import Shot, content_key, write_json
 from .exr import read_key
-from .take import PlannedTake, finish, frames_in, is_whole, make_folders, planned, render_frames
+from .take import PlannedTake, files_of, finish, frames_in, is_whole, make_folders, planned, render_frames
 from .take_cameras import in_range
-from .warp import FOLDER as WARPS
 
 
 def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
@@ -90,7 +88,7 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
         )
     for number in frames_in(take.folder.glob("*.exr")):
         if number not in right:
-            for old in _files_of(take.folder, number):
+            for old in files_of(take.folder, number):
                 old.unlink(missing_ok=True)
     return finish(shot, params, take, [f for f in take.whole if f.frame in right], {}, report)
 
@@ -99,11 +97,6 @@ def is_right(take: PlannedTake, frame: int) -> bool:
     """True if a frame of the take is on disk as it would be rendered now."""
     key = read_key(take.folder / frame_file(frame, ".exr")) if frame in take.keys else None
     return key is not None and key == take.keys[frame] and is_whole(take.folder, frame, take.spec.detail is not None)
-
-
-def _files_of(folder: Path, frame: int) -> list[Path]:
-    exr, preview = frame_file(frame, ".exr"), frame_file(frame, ".png")
-    return [folder / exr, folder / WARPS / exr, folder / TAKE_PREVIEW_FOLDER / preview]
 
 
 def _all_keys(take: PlannedTake) -> str:

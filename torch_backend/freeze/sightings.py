@@ -10,7 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..scene import Scene, read_image, resize_intrinsics
@@ -307,12 +309,15 @@ def motion_mattes(shot: Shot) -> MovingOf:
 
     def moving(frame: int) -> Tensor | None:
         stored = load_motion(shot, frame)
-        if stored is None:
-            return None
-        matte = torch.zeros(stored.shape, device="cpu")
-        codes = from_numpy(stored)
-        matte[codes == UNKNOWN] = DOUBT
-        matte[codes == MOVING] = 1.0
-        return matte
+        return None if stored is None else matte_of(stored)
 
     return moving
+
+
+def matte_of(stored: NDArray[np.uint8]) -> Tensor:
+    """[h, w] in 0..1 of a motion matte as it is stored, [h, w]: 0 still, `DOUBT` unknown, 1 moving."""
+    matte = torch.zeros(stored.shape, device="cpu")
+    codes = from_numpy(stored)
+    matte[codes == UNKNOWN] = DOUBT
+    matte[codes == MOVING] = 1.0
+    return matte

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import re
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +28,11 @@ from ..contract import (
     Reporter,
     Verdict,
     frame_file,
+    frame_number,
     later,
     parse_timecode,
     read_json,
+    sweep_half_written,
     verdict_of,
 )
 from ..footage.color import LIGHTS, on_straight_colour
@@ -68,7 +69,6 @@ TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
 DETAIL_VERSION = 8
 """The same, of frames made of plates."""
-_FRAME = re.compile(r"-?\d+")
 
 
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
@@ -78,7 +78,9 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     """
     take = planned(shot, params, report)
     frames = in_range(take.whole, params)
-    done = _prepare(take.folder, take.keys, take.key, params, take.spec.detail is not None)
+    done = _right_frames(take, params)
+    make_ready(take, frames, done, report)  # what can fail, or be cancelled, before anything of before goes
+    _clear(take, done)
     shares = render_frames(take, frames, done, report)
     frames_on_disk = done | {f.frame for f in frames}
     facts = finish(shot, params, take, [f for f in take.whole if f.frame in frames_on_disk], shares, report)
@@ -290,29 +292,39 @@ def take_key(
     )
 
 
-def _prepare(folder: Path, keys: dict[int, str], key: str, params: FreezeParams, with_warps: bool) -> set[int]:
-    """Makes the take's folder; returns the frames in it that are already right. All others are removed.
+def _right_frames(take: PlannedTake, params: FreezeParams) -> set[int]:
+    """Makes the take's folder; returns the frames in it that are already right.
 
-    A frame that is not asked for now stays if it is right: a part of the range does not undo the rest of the take.
+    One that is not asked for now is among them: a part of the range does not undo the rest of the take.
     """
+    folder, keys, with_warps = take.folder, take.keys, take.spec.detail is not None
     state = folder / TAKE_STATE_FILE
     make_folders(folder, with_warps)
     # Frames without a key of their own are of before grain, too.
-    old_are_right = not params.grain and not with_warps and state.is_file() and read_json(state).get("key") == key
+    old_are_right = not params.grain and not with_warps and state.is_file() and read_json(state).get("key") == take.key
     done: set[int] = set()
     for n in frames_in(folder.glob("*.exr")) if params.only_missing else ():
         stored_key = read_key(folder / frame_file(n, ".exr"))
         right = n in keys and (stored_key == keys[n] or (stored_key == "" and old_are_right))
         if right and is_whole(folder, n, with_warps):
             done.add(n)
-    pictures = [*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]
-    stale = [p for p in pictures if _FRAME.fullmatch(p.stem)]
-    stale = [p for p in stale if int(p.stem) not in done]
-    stale += [folder / WARPS / frame_file(int(p.stem), ".exr") for p in stale if p.suffix == ".exr"]
-    for old in [folder / TAKE_FILE, *stale] if stale else ():
-        old.unlink(missing_ok=True)
-    write_json(state, {"version": 1, "key": key})
     return done
+
+
+def _clear(take: PlannedTake, done: Set[int]) -> None:
+    """Removes all frames of before but those that are `done`: nobody shall take old ones for a part of this take."""
+    folder = take.folder
+    pictures = [*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]
+    stale = set(frames_in(pictures)) - done
+    for old in [folder / TAKE_FILE, *(file for n in stale for file in files_of(folder, n))] if stale else ():
+        old.unlink(missing_ok=True)
+    write_json(folder / TAKE_STATE_FILE, {"version": 1, "key": take.key})
+
+
+def files_of(folder: Path, frame: int) -> list[Path]:
+    """All files that a frame of a take has: EXR, warp, preview."""
+    exr, preview = frame_file(frame, ".exr"), frame_file(frame, ".png")
+    return [folder / exr, folder / WARPS / exr, folder / TAKE_PREVIEW_FOLDER / preview]
 
 
 def make_folders(folder: Path, with_warps: bool) -> None:
@@ -324,9 +336,9 @@ def make_folders(folder: Path, with_warps: bool) -> None:
             "Name another take, or move them away.",
             ExitCode.FREEZE,
         )
-    make_folder(folder / TAKE_PREVIEW_FOLDER)
-    if with_warps:
-        make_folder(folder / WARPS)
+    for used in (folder, folder / TAKE_PREVIEW_FOLDER, *([folder / WARPS] if with_warps else [])):
+        make_folder(used)
+        sweep_half_written(used)
 
 
 def is_whole(folder: Path, frame: int, with_warps: bool) -> bool:
@@ -337,7 +349,15 @@ def is_whole(folder: Path, frame: int, with_warps: bool) -> bool:
 
 def frames_in(paths: Iterable[Path]) -> list[int]:
     """Numbers of those files that are frames, ascending."""
-    return sorted(int(p.stem) for p in paths if _FRAME.fullmatch(p.stem))
+    return sorted(n for p in paths if (n := frame_number(p.stem)) is not None)
+
+
+def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> None:
+    """Develops the instants of those of `frames` that are not done. JobError if the disk has no room for the frames."""
+    spec, missing = take.spec, [f for f in frames if f.frame not in done]
+    each = spec.whole[0] * spec.whole[1] * (20.0 + (6.0 if spec.grain else 0.0) + (24.0 if spec.detail else 0.0))
+    need_disk(take.folder, len(missing) * each, "the take")
+    spec.instants.prepare((f.t_star for f in missing), report)
 
 
 def render_frames(
@@ -347,9 +367,7 @@ def render_frames(
 
     Returns frame number -> [h, w] share of plate, small, of those rendered. JobError if the disk is full.
     """
-    spec, left = take.spec, sum(f.frame not in done for f in frames)
-    each = spec.whole[0] * spec.whole[1] * (20.0 + (6.0 if spec.grain else 0.0) + (24.0 if spec.detail else 0.0))
-    need_disk(take.folder, left * each, "the take")
+    make_ready(take, frames, done, report)
     try:
         return _render_all(take, frames, done, report)
     except OSError as error:
@@ -359,7 +377,6 @@ def render_frames(
 def _render_all(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> dict[int, Tensor]:
     folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
     shares: dict[int, Tensor] = {}
-    spec.instants.prepare((f.t_star for f in frames if f.frame not in done), report)
     with WriteBeside() as out:
         for n, output in enumerate(frames):
             report.check_cancelled()

@@ -31,12 +31,22 @@ def output_size(shot: Shot, scene: Scene, params: FreezeParams) -> tuple[int, in
 
 
 def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: int) -> list[OutputFrame]:
-    """All frames that a take can have: the clip's own poses, those between that the clip lacks, or a camera path."""
+    """All frames that a take can have: the clip's own poses, those between that the clip lacks, or a camera path.
+
+    JobError if one of `params.t_star_per_frame` lies outside of the clip.
+    """
     if params.camera_path:
         viewmats, Ks, numbers = _path_cameras(scene, CameraPath.load(params.camera_path), width, height)
     else:
         viewmats, Ks, numbers = _without_gaps(scene, scene.camera_at(width, height))
     ramp = {int(k): float(v) for k, v in params.t_star_per_frame.items()}
+    for n, at in ramp.items():
+        if not scene.frames[0] <= at <= scene.frames[-1]:
+            raise JobError(
+                f"t* at frame {n} is frame {at:g}, the shot has frames {scene.frames[0]} to {scene.frames[-1]}.",
+                "Choose a frame of the shot.",
+                ExitCode.FREEZE,
+            )
     frames: list[OutputFrame] = []
     for i, n in enumerate(numbers):
         at = ramp.get(n, float(t_star))

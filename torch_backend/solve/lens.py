@@ -3,7 +3,7 @@
 COLMAP's models SIMPLE_RADIAL, RADIAL and OPENCV are one formula: (x, y) on the plane at depth 1 is moved to
 (x, y) (1 + k1 r^2 + k2 r^4) plus tangential terms in p1 and p2, and then to pixels. numpy alone, float64: pycolmap
 cannot be loaded beside OpenImageIO (see footage/images.py). The undistorted frames have the size and the principal
-point of the original ones and a focal length of their own (`worker.undistortion`).
+point of the original ones and a focal length of their own (`answers.undistortion`).
 """
 
 from __future__ import annotations

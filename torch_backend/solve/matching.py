@@ -83,7 +83,7 @@ def _matching() -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeomet
 
 
 def match(request: Request) -> None:
-    """Matches each frame with its next ones at distances 1, 2, 4, ... within the overlap (quadratic overlap)."""
+    """Matches each frame with those 1, 2, 4, ... frames after it, `overlap` distances (COLMAP's quadratic overlap)."""
     if request.reuse or request.wide:
         match_anew(request)
         return

@@ -92,7 +92,7 @@ def _begin(folder: Path, key: str) -> None:
         for name in (_RECORD, _UNFINISHED):  # while neither is there, the mattes belong to nothing
             (folder / name).unlink(missing_ok=True)
         for file in folder.glob("*.png"):
-            file.unlink()
+            file.unlink(missing_ok=True)  # another task may be at the same
     write_json(folder / _UNFINISHED, {"version": MOTION_VERSION, "key": key})
     (folder / _RECORD).unlink(missing_ok=True)
 

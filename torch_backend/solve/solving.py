@@ -67,7 +67,7 @@ class SolveConfig:
     """COLMAP camera model, one camera for all frames: SIMPLE_RADIAL, OPENCV for strong or tangential distortion, or
     OPENCV_FISHEYE."""
     overlap: int = 15
-    """Each solved frame is matched with those 1, 2, 4, ... 2^overlap frames after it."""
+    """Each solved frame is matched with those 1, 2, 4, ... 2^(overlap - 1) frames after it."""
     features: int = 4096
     """Most SIFT features per frame, from the upsampled octave on."""
     localise: bool = True

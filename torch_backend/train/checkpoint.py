@@ -41,6 +41,19 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]
             raise OSError(code, f"checkpoint not written: {error}", str(path), *windows) from error
 
 
+MISFITS = (KeyError, TypeError, IndexError, AttributeError, ValueError, RuntimeError)
+"""What a checkpoint that is whole, but not as `Trainer.save` wrote it, ends in: a tensor lacks or has another shape."""
+
+
+def misfit(path: Path, error: Exception, code: ExitCode) -> JobError:
+    """One of `MISFITS` in words."""
+    what = str(error).strip().splitlines()
+    told = f"{type(error).__name__}: {what[0]}" if what else type(error).__name__
+    return JobError(
+        f"The checkpoint {path} does not fit this version ({told}).", "Train the run again with --restart.", code
+    )
+
+
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """(tensors, facts). JobError in words if the file is damaged or from a newer version."""
     try:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ..scene import evenly_spaced
+from ..solve.motion import STILL
 from ..torch_types import from_numpy, norm
 from .losses import psnr
 from .model import DynamicModel, render
@@ -47,7 +48,7 @@ class FrameEvidence:
     held_out: bool
     """The run was not trained on it."""
     psnr_db: float
-    """PSNR against the plate."""
+    """PSNR against the plate, without what is ignored; NaN if that is all of it."""
     unexplained: NDArray[np.float32]
     """[GRID, GRID] share of each cell's pixels that differ by more than `UNEXPLAINED`; rows from above."""
     travel: NDArray[np.float32]
@@ -57,8 +58,6 @@ class FrameEvidence:
     """[K] travel of the picture's pixels that travel at all, as a share of the width, every 16th."""
     still_unexplained: float | None = None
     """Share of the pixels that the motion matte calls still that differ; None without a matte."""
-    moving_unexplained: float | None = None
-    """Of those that it calls moving."""
 
 
 def gather_evidence(
@@ -139,14 +138,11 @@ def _inspect_frame(
     far, share = out.colors[0, ..., 3:].cpu().unbind(-1)
     travels = torch.where(share > MOVING_SHARE, far / share.clamp_min(MOVING_SHARE), 0.0).clamp_min(0.0)
     moving = travels[travels > STILL_SHARE].flatten()[::16]
-    by_matte: list[float | None] = [None, None]
-    if matte is not None:
-        for n, value in enumerate((0, 255)):
-            region = _resized(matte == value, off.shape)
-            by_matte[n] = float(off[region].float().mean()) if region.any() else None
+    still = None if matte is None else _resized(matte == STILL, off.shape)
+    lost = None if still is None or not still.any() else float(off[still].float().mean())
     return FrameEvidence(
-        trainer.scene.frames[index], held_out, psnr(shown, plate), shares(off.float()), _cells(travels, 0.97),
-        moving.numpy(), *by_matte,
+        trainer.scene.frames[index], held_out, psnr(shown, plate, ignored), shares(off.float()), _cells(travels, 0.97),
+        moving.numpy(), lost,
     )  # fmt: skip
 
 

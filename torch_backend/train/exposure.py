@@ -1,4 +1,6 @@
-"""Exposure that drifts along the clip: a gain and an offset per channel and trained frame, smooth in time.
+"""Exposure that drifts along the clip: a gain and an offset per channel and time bin, smooth in time.
+
+A bin is a trained frame; of a clip that has more than 256 of them, some share one (`supervision.bin_times`).
 
 A camera on automatic changes by several percent within a second (measured on the bundled clip: docs/benchmarks.md).
 Left alone, the gate would open for it and the field would learn it as motion; so it is fitted from the first step on,

@@ -50,7 +50,10 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def psnr(image: Tensor, target: Tensor, ignored: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of images in [0, 1] without pixels `ignored`; `image` is clamped first."""
+    """Peak signal-to-noise ratio in dB of images in [0, 1] without pixels `ignored`; `image` is clamped first.
+
+    NaN if all pixels are ignored: nothing is known of such a frame.
+    """
     squares = (image.clamp(0.0, 1.0).double() - target.double()).square()
     error = squares.mean() if ignored is None else squares[~ignored].mean()
     return float(-10.0 * torch.log10(error.clamp_min(1e-12)))

@@ -12,7 +12,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..contract import CONFIG_FILE, METRICS_FILE, PREVIEWS_FOLDER, ExitCode, JobError, Reporter, TrainParams, read_json
+from ..contract import (
+    CONFIG_FILE,
+    METRICS_FILE,
+    PREVIEWS_FOLDER,
+    ExitCode,
+    JobError,
+    Reporter,
+    TrainParams,
+    read_json,
+    sweep_half_written,
+)
 from ..deformation import host
 from ..footage.images import write_png
 from ..native import default_threads
@@ -24,7 +34,7 @@ from ..solve.masks import IGNORE, load_mask, masks_key
 from ..solve.motion import load_motion, motion_key
 from . import adam
 from .anew import SUMMARY_FILE, begun, drop_begun, finish_replacing, folder_for, replace_run
-from .checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta
+from .checkpoint import CHECKPOINT_FILE, MISFITS, load_checkpoint, misfit, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
 from .device import choose_device
 from .evidence import gather_evidence
@@ -93,6 +103,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         return done
     folder = shot.own(folder_for(run, key, params.resume))
     shot.own(folder / PREVIEWS_FOLDER)
+    sweep_half_written(folder)
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     if folder != run and params.resume:
         report.warning(
@@ -425,9 +436,8 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
         model = restore_model(tensors, meta, config, device)
         size = int(meta["width"]), int(meta["height"])
         return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp)
-    except (KeyError, TypeError, IndexError, AttributeError) as error:  # whole, but not as `save` wrote it
-        message = f"The checkpoint {checkpoint} does not fit this version ({type(error).__name__}: {error})."
-        raise JobError(message, "Train the run again with --restart.", ExitCode.FREEZE) from error
+    except MISFITS as error:  # whole, but not as `save` wrote it
+        raise misfit(checkpoint, error, ExitCode.FREEZE) from error
 
 
 def _stamp(checkpoint: Path) -> list[Any]:

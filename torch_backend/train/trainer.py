@@ -23,7 +23,7 @@ from ..supervision import Anchored, bin_of, bin_times, draw_anchored, mark_hidde
 from ..torch_types import backward, integers, norm_of_all
 from . import memory
 from .average import ParameterMean
-from .checkpoint import load_checkpoint, optimizer_state, restore_optimizer, save_checkpoint
+from .checkpoint import MISFITS, load_checkpoint, misfit, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
 from .extend import Extension
@@ -385,7 +385,8 @@ class Trainer:
         if c.method == "static":
             return
         if c.method == "auto":
-            if self.iteration == round(c.gate.start * c.iterations):
+            # Once more if a card's memory ended in that step: as long as there is no field the gate did not open.
+            if self.iteration == round(c.gate.start * c.iterations) and self.model.field is None:
                 self._open_gate()
             elif self._on_trial():
                 self._harden_gate()
@@ -455,11 +456,12 @@ class Trainer:
         if field.rehearsal > 0 and c.method != "auto":
             self._rehearse(field)
         for name, owned in field.owned.items():
-            model.adopt(name, owned.shape, owned.value)
-        self.model.field = field
+            if name not in model.params:  # memory may have ended between two of them
+                model.adopt(name, owned.shape, owned.value)
+        add_field(self.optimizer, field, model)
         self._memory.keep(field)
         self.policy.field_opened(self.iteration, self.trained_seconds)
-        add_field(self.optimizer, field, model)
+        self.model.field = field  # last: until then all of this can be done again
 
     def _rehearse(self, field: Deformation) -> None:
         """The host's pre-stage; its steps are steps of the run. Interrupted, it starts again."""
@@ -619,8 +621,8 @@ class Trainer:
         return values
 
     def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
-        """Mean PSNR in dB over held-out frames at their own times; None if there are none."""
-        values = self.frame_psnrs(indices, images)
+        """Mean PSNR in dB over held-out frames at their own times, of which something counts; None if none does."""
+        values = [value for value in self.frame_psnrs(indices, images) if math.isfinite(value)]
         return sum(values) / len(values) if values else None
 
     def probe_psnr(
@@ -679,8 +681,14 @@ class Trainer:
         self._saved_at = time.perf_counter()
 
     def restore(self, path: Path) -> None:
-        """Goes on where `save` was called. JobError if the checkpoint is of other frames."""
+        """Goes on where `save` was called. JobError if the checkpoint is of other frames, or does not fit."""
         tensors, meta = load_checkpoint(path)
+        try:
+            self._restore(tensors, meta)
+        except MISFITS as error:
+            raise misfit(path, error, ExitCode.TRAIN) from error
+
+    def _restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
         if meta["train_frames"] != [self.scene.frames[i] for i in self.train_ids]:
             raise JobError(
                 "The run's checkpoint was trained on other frames.", "Train with --restart, or another run name.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -69,21 +70,17 @@ class RunFigures:
     """Those are frames that were held out."""
     still_unexplained: float | None = None
     """Share of what the motion mattes call still that is not explained; None without mattes."""
-    moving_unexplained: float | None = None
-    """Share of what they call moving."""
 
 
 def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int, limits: RunLimits | None = None) -> RunFigures:
     """A run's figures from its frames; `width` of the working frames, `pixels` of a frame as it was trained on."""
     limits = limits or RunLimits()
-    kept = [one for one in seen if one.held_out]
-    values = [one.psnr_db for one in kept or seen]
+    known = [one for one in seen if math.isfinite(one.psnr_db)]
+    kept = [one for one in known if one.held_out]
+    values = [one.psnr_db for one in kept or known] or [0.0]  # a clip that is all mask was refused
     moving = np.concatenate([one.moving for one in seen])
     whole = len(seen) * pixels / 16  # `moving` has every 16th pixel
-    by_matte: list[float | None] = []
-    for name in ("still_unexplained", "moving_unexplained"):
-        known = [value for one in seen if (value := getattr(one, name)) is not None]
-        by_matte.append(float(np.mean(known)) if known else None)
+    still = [one.still_unexplained for one in seen if one.still_unexplained is not None]
     return RunFigures(
         width,
         [one.frame for one in seen],
@@ -95,7 +92,7 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int, limits: R
         float(np.percentile(values, 50)),
         float(np.percentile(values, 10)),
         bool(kept),
-        *by_matte,
+        float(np.mean(still)) if still else None,
     )
 
 

@@ -148,7 +148,7 @@ def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):
     run.model.gaussians.params["sh0"].data[rows] = 0.0
     run.model.gaussians.params["opacity_logits"].data[rows] -= 2.0
     lacking = field(run, scene)
-    layer = instant_layer(run, scene, None, lacking, T_STAR, motion=lambda frame: load_motion(world.shot, frame))
+    layer = instant_layer(run, scene, lacking, T_STAR, motion=lambda frame: load_motion(world.shot, frame))
     back = developed(world.shot, run, scene, T_STAR, lacking, DevelopConfig(steps=250), keep=False)
     seeded = join(lacking, layer)
     (moving, still), (was_moving, was_still) = (scores(world, run, scene, f) for f in (back, lacking))

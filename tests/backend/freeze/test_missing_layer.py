@@ -87,7 +87,7 @@ class World:
         return render_frozen(frozen_of(state), scene.viewmats[n - 1], scene.Ks[n - 1], W, H).color.numpy()
 
     def layer(self, motion=None, config=None):
-        return instant_layer(self.run, self.scene, None, self.frozen, T_STAR, config, motion)
+        return instant_layer(self.run, self.scene, self.frozen, T_STAR, config, motion)
 
     def found(self):
         layer = self.layer()
