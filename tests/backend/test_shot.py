@@ -2,10 +2,11 @@
 
 import errno
 import json
+import os
 
 import pytest
 
-from torch_backend.contract import ExitCode, JobError
+from torch_backend.contract import ExitCode, JobError, sweep_half_written
 from torch_backend.shot import Shot, atomic_path, checked_name, content_key, need_disk, write_atomic, write_json
 
 
@@ -84,3 +85,24 @@ def test_a_folder_behind_a_link_is_not_the_shots_own(tmp_path):
         shot.own(shot.take("wide") / "preview")
     with pytest.raises(JobError, match="frames is not a folder"):
         shot.own(shot.frames)
+
+
+def test_two_hosts_with_one_process_number_do_not_meet(tmp_path):
+    """Containers of a farm often have small numbers; parts of a job may run twice, also at once."""
+    path = tmp_path / "000001.exr"
+    with atomic_path(path) as first, atomic_path(path) as second:
+        first.write_bytes(b"1")
+        second.write_bytes(b"2")
+    assert path.read_bytes() == b"1" and [p.name for p in tmp_path.iterdir()] == ["000001.exr"]
+
+
+def test_what_killed_writers_leave_is_swept_and_nothing_else(tmp_path):
+    """Of this version and of earlier ones, which named it by the process; a writer at work is younger than an hour."""
+    names = [".checkpoint.4711.tmp.safetensors", f".000001.{'a' * 32}.tmp.exr"]
+    kept = [".mine.tmp.png", "checkpoint.tmp.safetensors", ".notes.tmp", f".young.{'b' * 32}.tmp.exr"]
+    for name in names + kept:
+        (tmp_path / name).write_bytes(b"half")
+        if "young" not in name:
+            os.utime(tmp_path / name, (0, 0))
+    sweep_half_written(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(kept)

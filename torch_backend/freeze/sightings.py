@@ -95,8 +95,6 @@ class Sighting:
     """[...]"""
     visible: Tensor
     """[...] in 0..1: within the picture, and nothing in front."""
-    within: Tensor
-    """[...] in 0..1: within the picture."""
     moving: Tensor
     """[...] in 0..1, of the plate there."""
     explained: Tensor
@@ -227,7 +225,7 @@ class Sightings:
         visible = same_surface(depth, shown, self.config.depth_tolerance) * within
         if view.ignored is not None:
             visible = visible * (1.0 - look_up(view.ignored, pixels)[..., 0])
-        return Sighting(pixels, depth, visible, within, moving, explained)
+        return Sighting(pixels, depth, visible, moving, explained)
 
     def whole(self, moving: Tensor, off: Tensor, least: float = 0.0) -> Tensor:
         """[h, w] bool: `moving`, bool, and the regions that touch it in which plate and model differ, by `off` [h, w].

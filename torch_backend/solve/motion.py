@@ -52,13 +52,13 @@ class MotionResult(TypedDict):
     """Share of them of which nothing is known."""
 
 
-def find_motion(shot: Shot, report: Reporter, config: FlowConfig | None = None) -> MotionResult:
+def find_motion(shot: Shot, report: Reporter) -> MotionResult:
     """Writes the motion matte of every delivered frame, from optical flow against the camera's own motion.
 
     Mattes that are there and belong to these cameras are left alone; a run that was stopped is gone on with. JobError
     if the shot is not solved or a frame is damaged, and Cancelled.
     """
-    config = config or FlowConfig()
+    config = FlowConfig()
     key = _solve_key(shot, config)
     folder = shot.own(shot.motion)
     done = _record(folder / _RECORD)
@@ -134,9 +134,9 @@ def _record(path: Path) -> dict[str, Any]:
     return found if named else {}
 
 
-def is_found(shot: Shot, config: FlowConfig | None = None) -> bool:
+def is_found(shot: Shot) -> bool:
     """True if the shot has mattes of the solve that it has now."""
-    return _record(shot.motion / _RECORD).get("key") == _solve_key(shot, config or FlowConfig())
+    return _record(shot.motion / _RECORD).get("key") == _solve_key(shot, FlowConfig())
 
 
 def motion_key(shot: Shot, with_found: bool = True) -> str:

@@ -55,7 +55,7 @@ def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]
         return torch.device("cuda"), None
     if requested == "cuda":
         sentence, advice = unused or (refusal, "")
-        raise JobError(sentence, f"{advice} {_HINT}".strip(), ExitCode.TRAIN)
+        raise JobError(sentence, f"{advice} {_HINT}".strip(), ExitCode.ENVIRONMENT)
     return torch.device("cpu"), unused
 
 

@@ -197,3 +197,10 @@ def test_json_may_stand_before_the_verb_and_after_it(tmp_path, capsys):
     assert contract.as_json(cli.parser().parse_args(["--json", "status", "s"]))
     assert contract.as_json(cli.parser().parse_args(["status", "s", "--json"]))
     assert not contract.as_json(cli.parser().parse_args(["status", "s"]))
+
+
+def test_limits_are_said_as_they_are():
+    with pytest.raises(ValueError, match=r"is 5.0: it should be 0.25 to 4"):
+        contract.check_params(contract.ImportParams(source="clip.mp4", pixel_aspect=5.0))
+    with pytest.raises(ValueError, match="'--5': it should be the number of a frame"):
+        contract.check_params(contract.FreezeParams(t_star_per_frame={"--5": 3.0}))

@@ -16,11 +16,13 @@ from torch_backend.contract import (
     FreezeParams,
     JobError,
     TrainParams,
+    disk_error,
     later,
 )
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_at, freeze_shot, write_beside
+from torch_backend.freeze import take as take_module
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take_cameras import plan
 from torch_backend.gaussians.ply import read_ply
@@ -220,6 +222,24 @@ def test_cancelled_take_goes_on(trained, quiet):
     assert all((folder / n).stat().st_mtime_ns == t for n, t in done.items())
 
 
+def test_what_ends_before_the_first_frame_leaves_the_take_of_before(trained, quiet, monkeypatch):
+    world, _ = trained
+    ask = dict(take="kept-back", first=103, last=105, detail="off")
+    freeze_shot(world.shot, FreezeParams(**ask, develop="off", t_star=104), quiet())
+    folder = world.shot.take("kept-back")
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(Cancelled):
+        freeze_shot(world.shot, FreezeParams(**ask, t_star=106), quiet(cancel_at=("developing", 0.1)))
+
+    def full(folder, *_):
+        raise disk_error(folder)
+
+    monkeypatch.setattr(take_module, "need_disk", full)
+    with pytest.raises(JobError, match="full"):
+        freeze_shot(world.shot, FreezeParams(**ask, develop="off", t_star=106), quiet())
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
 def test_ramp_changes_the_instant_per_frame(trained, quiet):
     world, _ = trained
     ramp = {str(101 + n): 101.0 + n for n in range(16)}
@@ -273,7 +293,12 @@ def test_frames_that_the_footage_lacks_are_frozen_through_a_camera_between(train
 
 @pytest.mark.parametrize(
     ("params", "word"),
-    [({"t_star": 7}, "frames 101 to 116"), ({"run": "nobody"}, "no trained run"), ({"first": 300}, "No frame lies")],
+    [
+        ({"t_star": 7}, "frames 101 to 116"),
+        ({"t_star_per_frame": {"103": 130.0}}, "at frame 103 is frame 130, the shot has frames 101 to 116"),
+        ({"run": "nobody"}, "no trained run"),
+        ({"first": 300}, "No frame lies"),
+    ],
 )
 def test_wrong_requests_are_sentences(trained, quiet, params, word):
     world, _ = trained

@@ -1,5 +1,7 @@
 """A logo burnt into every frame, and a mask of it: what is behind it is learnt from where other frames see it."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,10 @@ from torch_backend.scene import load_images, load_scene
 from torch_backend.shot import write_json
 from torch_backend.solve.masks import IGNORE, load_mask, write_grey
 from torch_backend.train import config_from_params, train_shot
+from torch_backend.train.evidence import gather_evidence
 from torch_backend.train.ignored import load_ignored
 from torch_backend.train.trainer import Trainer
+from torch_backend.train.verdict import figures_of
 
 LOGO = np.zeros((HEIGHT, WIDTH), bool)
 LOGO[30:40, 6:22] = True
@@ -74,3 +78,25 @@ def test_a_run_is_known_by_what_it_ignores(logo_world, quiet):
     record = read_json(logo_world.shot.solve_record)
     write_json(logo_world.shot.solve_record, {**record, "masks": {IGNORE: {"key": "another"}}})
     assert train_shot(logo_world.shot, params, quiet())["key"] != key
+
+
+def test_ignored_pixels_have_no_share_in_any_figure_and_a_covered_frame_has_none(logo_world, quiet):
+    """What stands in for them is the render itself: counted, it would be perfect."""
+    scene = load_scene(logo_world.shot)
+    config = config_from_params(TrainParams(iterations=300, max_gaussians=300, holdout=0, method="static"))
+    images = load_images(scene, scene.solved, WIDTH, HEIGHT)
+    most = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    most[: 2 * HEIGHT // 3] = True
+    ignored = dict.fromkeys(scene.solved, most)
+    ignored[scene.solved[3]] = torch.ones_like(most)
+    trainer = Trainer(scene, images, scene.solved, config, quiet(), ignored=ignored)
+    seen = gather_evidence(trainer, scene.solved[2:4], images[2:4])
+    plain = {one.frame: one.psnr_db for one in seen}
+    for index in scene.solved[:3]:
+        error = (trainer.render_frame(index).clamp(0.0, 1.0) - images[scene.solved.index(index)])[~most]
+        assert plain[scene.frames[index]] == pytest.approx(-10 * math.log10(float(error.square().mean())), abs=1e-3)
+    assert math.isnan(plain[scene.frames[scene.solved[3]]])
+    assert trainer.heldout_psnr(scene.solved[2:4], images[2:4]) == pytest.approx(plain[scene.frames[2]], abs=1e-3)
+    assert trainer.heldout_psnr(scene.solved[3:4], images[3:4]) is None
+    figures = figures_of(seen, WIDTH, WIDTH * HEIGHT)
+    assert figures.held_out and figures.median_db == pytest.approx(plain[scene.frames[2]])

@@ -3,6 +3,7 @@
 import ast
 import math
 import pathlib
+import sys
 
 import pytest
 import torch
@@ -264,6 +265,40 @@ def test_a_gaussian_too_large_for_its_place_is_dropped(begin):
     d.step(g, trainer.optimizer, len(g), 0.8)
     assert not bool((g.params["means"] == at).all(1).any())
     assert aligned(trainer)
+
+
+def test_a_step_that_memory_did_not_suffice_for_opens_the_gate_once(begin):
+    """`_step_that_fits` asks what is due again, at the same step, once there is room."""
+    trainer = begin("auto", steps=0)
+    while trainer.model.field is None:
+        go_on(trainer, 1)
+    trainer.iteration -= 1
+    field, groups = trainer.model.field, [group.get("name") for group in trainer.optimizer.param_groups]
+    trainer.schedule_events()
+    assert trainer.model.field is field
+    assert [group.get("name") for group in trainer.optimizer.param_groups] == groups
+
+
+def test_a_field_that_memory_did_not_suffice_for_is_made_anew(begin, monkeypatch):
+    module, made = sys.modules[Trainer.__module__], []
+
+    def short(*arguments):
+        made.append(arguments)
+        if len(made) == 1:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return add_field(*arguments)
+
+    add_field = module.add_field
+    monkeypatch.setattr(module, "add_field", short)
+    trainer = begin("control_points", steps=0)
+    while not made:
+        try:
+            go_on(trainer, 1)
+        except torch.OutOfMemoryError:
+            assert trainer.model.field is None
+    go_on(trainer, 2)
+    names = [group.get("name") for group in trainer.optimizer.param_groups]
+    assert trainer.model.field is not None and len(names) == len(set(names)) and len(made) == 2
 
 
 def test_the_table_of_known_failures_names_tests_that_there_are():

@@ -15,7 +15,7 @@ from torch_backend.gaussians import PARAM_NAMES
 from torch_backend.scene import load_images, load_scene
 from torch_backend.shot import Shot
 from torch_backend.train import PRESETS, config_from_params, load_run, train_shot
-from torch_backend.train.checkpoint import load_checkpoint, read_meta, save_checkpoint
+from torch_backend.train.checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta, save_checkpoint
 from torch_backend.train.config import config_from_json, config_to_json
 from torch_backend.train.paper import inside_frustum
 from torch_backend.train.trainer import Trainer
@@ -372,3 +372,24 @@ def test_inside_frustum():
     K = torch.tensor([[10.0, 0, 16.0], [0, 10.0, 8.0], [0, 0, 1]])
     means = torch.tensor([[0.0, 0, 1], [0, 0, -1], [1.59, 0, 1], [1.61, 0, 1], [0, -0.81, 1]])
     assert inside_frustum(means, torch.eye(4), K, 32, 16).tolist() == [True, False, True, False, False]
+
+
+@pytest.mark.parametrize("wrong", ["exposure", "field"])
+def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wrong):
+    """Whole, and of the right version, but a tensor lacks or has another shape: of another build, or edited."""
+    shutil.copytree(world.shot.root, tmp_path / "misfit.splannequin")
+    shot = Shot.open(tmp_path / "misfit.splannequin")
+    asked = TrainParams(run="misfit", iterations=30, max_gaussians=300, method="hexplane")
+    train_shot(shot, asked, quiet())
+    path = shot.run("misfit") / CHECKPOINT_FILE
+    tensors, meta = load_checkpoint(path)
+    if wrong == "exposure":
+        tensors["exposure"] = tensors["exposure"][:-1].clone()
+    else:
+        del tensors[next(name for name in tensors if name.startswith("field."))]
+    save_checkpoint(path, tensors, meta)
+    with pytest.raises(JobError, match="does not fit this version"):
+        load_run(shot, "misfit")
+    (shot.run("misfit") / "summary.json").unlink()
+    with pytest.raises(JobError, match="does not fit this version"):
+        train_shot(shot, asked, quiet())
