@@ -108,8 +108,9 @@ def _bridged(places: Tensor, seen: Tensor, sigma: float, unsteady: float) -> tup
     here, counts = pixel_centres(w, h), seen.float()[..., None]
     moved = (places - here).clamp(-w, w) * counts
     around = blurred(torch.cat([moved, moved.square().sum(-1, keepdim=True), counts], dim=-1), max(1.0, sigma))
-    mean, square = (around[..., :3] / around[..., 3:].clamp_min(1e-6)).split([2, 1], dim=-1)
-    steady = (square[..., 0] - mean.square().sum(-1) < unsteady**2) & (around[..., 3] > _FEW)
+    told = around[..., :3] / around[..., 3:].clamp_min(1e-6)
+    mean, square = told[..., :2], told[..., 2]
+    steady = (square - mean.square().sum(-1) < unsteady**2) & (around[..., 3] > _FEW)
     return torch.where(counts > 0.0, places, here + mean), seen | steady
 
 

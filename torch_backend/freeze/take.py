@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import shutil
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +30,11 @@ from ..contract import (
     Verdict,
     frame_file,
     frame_number,
+    is_half_written,
     later,
     parse_timecode,
     read_json,
+    replace_file,
     sweep_half_written,
     verdict_of,
 )
@@ -69,6 +72,8 @@ TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
 DETAIL_VERSION = 8
 """The same, of frames made of plates."""
+NEXT = ".next"
+"""Folder in a take's folder with the frames of what shall replace it."""
 
 
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
@@ -78,10 +83,14 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     """
     take = planned(shot, params, report)
     frames = in_range(take.whole, params)
-    done = _right_frames(take, params)
+    place = _place(take, params)
+    done = place.right_here | place.right_beside
     make_ready(take, frames, done, report)  # what can fail, or be cancelled, before anything of before goes
-    _clear(take, done)
-    shares = render_frames(take, frames, done, report)
+    if place.beside is None:
+        _clear(take, done)
+    shares = render_frames(dataclasses.replace(take, folder=place.folder), frames, done, report)
+    if place.beside is not None:
+        _take_over(take, place)
     frames_on_disk = done | {f.frame for f in frames}
     facts = finish(shot, params, take, [f for f in take.whole if f.frame in frames_on_disk], shares, report)
     shot.update(t_star=take.t_star)
@@ -187,7 +196,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     width, height = output_size(shot, scene, params)
     whole = plan(scene, params, t_star, width, height)
     folder = shot.own(shot.take(params.take))
-    for inner in (TAKE_PREVIEW_FOLDER, TAKE_REDISTORT.parent, WARPS):
+    for inner in (TAKE_PREVIEW_FOLDER, TAKE_REDISTORT.parent, WARPS, NEXT):
         shot.own(folder / inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
     grain = plate_grain(shot, scene) if params.grain else None
@@ -292,23 +301,57 @@ def take_key(
     )
 
 
-def _right_frames(take: PlannedTake, params: FreezeParams) -> set[int]:
-    """Makes the take's folder; returns the frames in it that are already right.
+@dataclass(frozen=True)
+class _Place:
+    """Where a take's frames are rendered to."""
+
+    folder: Path
+    """The take's own; or `beside`."""
+    beside: Path | None
+    """A folder in it, as long as another take of that name stands there whole: that one stays until this is done."""
+    right_here: set[int]
+    """Frames in the take's own folder that are as they would be rendered now."""
+    right_beside: set[int]
+    """Those in `beside`: it was begun before."""
+
+
+def _place(take: PlannedTake, params: FreezeParams) -> _Place:
+    """Makes the folder that the take is rendered to, and finds the frames that are right.
 
     One that is not asked for now is among them: a part of the range does not undo the rest of the take.
     """
-    folder, keys, with_warps = take.folder, take.keys, take.spec.detail is not None
-    state = folder / TAKE_STATE_FILE
+    folder, with_warps = take.folder, take.spec.detail is not None
     make_folders(folder, with_warps)
+    here, beside = _right_frames(take, folder, params), folder / NEXT
+    there = _right_frames(take, beside, params) if beside.is_dir() else set[int]()
+    for n in set(frames_in([*beside.glob("*.exr"), *(beside / TAKE_PREVIEW_FOLDER).glob("*.png")])) - there:
+        for file in files_of(beside, n):
+            file.unlink(missing_ok=True)
+    stands = (folder / TAKE_FILE).is_file() and bool(set(frames_in(folder.glob("*.exr"))) - here)
+    if not stands:
+        place = _Place(folder, beside, here, there)
+        if beside.is_dir():  # killed while it took over
+            _take_over(take, place)
+        return _Place(folder, None, here | there, set())
+    for used in (beside, beside / TAKE_PREVIEW_FOLDER, *([beside / WARPS] if with_warps else [])):
+        make_folder(used)
+        sweep_half_written(used)
+    return _Place(beside, beside, here, there)
+
+
+def _right_frames(take: PlannedTake, folder: Path, params: FreezeParams) -> set[int]:
+    """The frames in a folder that are as they would be rendered now, and whole; none if all are to be made anew."""
+    keys, with_warps = take.keys, take.spec.detail is not None
+    state = folder / TAKE_STATE_FILE
     # Frames without a key of their own are of before grain, too.
     old_are_right = not params.grain and not with_warps and state.is_file() and read_json(state).get("key") == take.key
-    done: set[int] = set()
+    right: set[int] = set()
     for n in frames_in(folder.glob("*.exr")) if params.only_missing else ():
         stored_key = read_key(folder / frame_file(n, ".exr"))
-        right = n in keys and (stored_key == keys[n] or (stored_key == "" and old_are_right))
-        if right and is_whole(folder, n, with_warps):
-            done.add(n)
-    return done
+        known = n in keys and (stored_key == keys[n] or (stored_key == "" and old_are_right))
+        if known and is_whole(folder, n, with_warps):
+            right.add(n)
+    return right
 
 
 def _clear(take: PlannedTake, done: Set[int]) -> None:
@@ -319,6 +362,18 @@ def _clear(take: PlannedTake, done: Set[int]) -> None:
     for old in [folder / TAKE_FILE, *(file for n in stale for file in files_of(folder, n))] if stale else ():
         old.unlink(missing_ok=True)
     write_json(folder / TAKE_STATE_FILE, {"version": 1, "key": take.key})
+
+
+def _take_over(take: PlannedTake, place: _Place) -> None:
+    """The frames rendered beside a take of before stand in its place. Killed meanwhile, the next freeze goes on."""
+    assert place.beside is not None
+    _clear(take, place.right_here)
+    for file in sorted(place.beside.rglob("*"), key=lambda file: file.parent == place.beside):  # a frame's EXR is last
+        if file.is_file() and not is_half_written(file.name):
+            target = take.folder / file.relative_to(place.beside)
+            make_folder(target.parent)
+            replace_file(file, target)
+    shutil.rmtree(place.beside, ignore_errors=True)
 
 
 def files_of(folder: Path, frame: int) -> list[Path]:
