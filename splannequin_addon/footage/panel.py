@@ -72,7 +72,10 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
         """Shot folder, which frames are solved, consent to set the scene up."""
         props = settings_of(scene_in(context))
         layout.prop(props, "shot_path", text="Folder")
-        for name in ("solve_step", "fps", "colour_space", "matrix", "levels", "layer", "pixel_aspect", "set_up_scene"):
+        for name in ("solve_step", "fps"):
+            layout.prop(props, name)
+        layout.prop(props, "colour_space", text="Space")  # a sidebar of Blender's own width cuts its whole name
+        for name in ("matrix", "levels", "layer", "pixel_aspect", "set_up_scene"):
             layout.prop(props, name)
 
 

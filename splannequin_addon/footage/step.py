@@ -10,6 +10,7 @@ from ..access import settings_of
 from ..process import job_timer, jobs
 from ..process.steps import Step, View
 from ..scene import paths
+from ..shot import selection
 from ..shot.shot_state import ShotState
 from . import arrival, operators, panel, plate
 
@@ -29,12 +30,13 @@ class Import(Step):
     classes = (*operators.CLASSES, *panel.CLASSES)
 
     def params(self, scene: bpy.types.Scene) -> contract.ImportParams:
-        """The clip and its range. JobError without a clip."""
+        """The clip and its range; the shot's own clip where none is chosen. JobError without either."""
         props = settings_of(scene)
-        if not props.clip:
+        clip = paths.absolute(props.clip) if props.clip else _imported_from(scene)
+        if not clip:
             raise contract.JobError("No clip is chosen.", "Choose a video or image sequence.", contract.ExitCode.USAGE)
         span = (props.first, props.last) if props.use_range else (None, None)
-        params = contract.ImportParams(paths.absolute(props.clip), *span, step=props.solve_step, fps=props.fps)
+        params = contract.ImportParams(clip, *span, step=props.solve_step, fps=props.fps)
         params.colour_space, params.layer = props.colour_space.strip(), props.layer.strip()
         params.pixel_aspect, params.matrix, params.levels = round(props.pixel_aspect, 6), props.matrix, props.levels
         return params
@@ -69,6 +71,16 @@ class Import(Step):
         camera = plate.find(scene, shot)
         if camera is not None:
             job_timer.look_through_camera(window, camera)
+
+
+def _imported_from(scene: bpy.types.Scene) -> str:
+    """The clip that the scene's shot was made of: one that was opened by its folder says it; empty without a shot."""
+    folder = selection.shot_folder(scene)
+    try:
+        told = {} if folder is None else contract.read_json(contract.ShotFolder(folder).info_path)
+        return str(told.get("source", ""))
+    except (OSError, ValueError, contract.JobError):  # the import itself says what is wrong with it
+        return ""
 
 
 STEP = Import()

@@ -132,6 +132,8 @@ def reason(scene: bpy.types.Scene) -> str:
     for rank, one in enumerate(suggestions()):
         if one["frame"] == at:
             share, sharp = round(100 * one["seen"]), round(100 * one["sharpness"])
+            if sharp == 100:
+                return f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, and is the sharpest."
             return (
                 f"Suggestion {rank + 1}: frame {one['frame']} saw {share} % of what moves, "
                 f"and is sharper than {sharp} % of the frames."

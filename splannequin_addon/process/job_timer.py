@@ -436,9 +436,18 @@ def forget() -> None:
     _pulses.clear()
 
 
+@persistent
+def _on_undo(*_: object) -> None:
+    """What steps said that they changed in the scene may not be so any more."""
+    for watch in _watches.values():
+        watch.notes.clear()
+
+
 def register() -> None:
-    """Starts the timer (in a window: headless Blender has none) and listens to file loads."""
+    """Starts the timer (in a window: headless Blender has none) and listens to file loads and undo."""
     bpy.app.handlers.load_post.append(_on_load)
+    for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
+        handlers.append(_on_undo)
     if not bpy.app.background:
         bpy.app.timers.register(tick, first_interval=TICK_SECONDS, persistent=True)
 
@@ -448,4 +457,6 @@ def unregister() -> None:
     if bpy.app.timers.is_registered(tick):
         bpy.app.timers.unregister(tick)
     bpy.app.handlers.load_post.remove(_on_load)
+    for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
+        handlers.remove(_on_undo)
     forget()

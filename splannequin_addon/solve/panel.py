@@ -56,7 +56,7 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
         if props.focal_mm > 0.0:
             for name in ("sensor_mm", "refine_focal"):
                 layout.prop(props, name)
-        layout.prop(props, "cameras_from")
+        layout.prop(props, "cameras_from", text="Cameras")
         if props.cameras_from == "SOLVE":
             layout.prop(props, "st_map")
             if props.st_map:

@@ -40,7 +40,7 @@ def run_rows(state: ShotState) -> list[tuple[str, ...]]:
             rows.append((name, f"paused at {share:.0f} %"))
             continue
         psnr = run.get("heldout_psnr_db")
-        moves = f"{100.0 * (run.get('moving_share') or 0.0):.3g}%"
+        moves = f"{100.0 * (run.get('moving_share') or 0.0):.2g}%"
         quality = "-" if psnr is None else f"{psnr:.2f}"
         size = f"{run.get('gaussians', 0) / 1000.0:.3g}k"
         rows.append((name, quality, size, moves, duration(run.get("train_seconds"))))

@@ -106,6 +106,16 @@ def test_another_file_ends_what_blender_itself_was_doing(supervisor, watch, shot
     assert watch.work is None
 
 
+def test_undo_takes_back_what_a_step_said_of_the_scene(supervisor, watch):
+    """The nodes that it tells of are gone."""
+    bpy.ops.ed.undo_push(message="before")
+    bpy.context.scene.frame_end += 1
+    bpy.ops.ed.undo_push(message="a step")
+    watch.notes["bake"] = ["The node group was inserted."]
+    bpy.ops.ed.undo()
+    assert not watch.notes
+
+
 def test_what_pulses_sets_the_pace_and_jobs_keep_theirs(supervisor, watch, monkeypatch):
     looks, pulses = [], []
     monkeypatch.setattr(supervisor, "_jobs_next", 0.0)

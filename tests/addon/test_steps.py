@@ -52,6 +52,13 @@ def test_no_clip_is_said_in_words(scene):
         bpy.ops.splannequin.import_clip()
 
 
+def test_a_shot_opened_by_its_folder_is_imported_again_from_its_own_clip(addon, with_shot, shot, contract):
+    source = str(shot.parent / "clip.mp4")
+    contract.write_json(shot / "shot.json", {**contract.read_json(shot / "shot.json"), "source": source})
+    assert not with_shot.splannequin.clip
+    assert addon("process.steps").STEPS["import"].params(with_shot).source == source
+
+
 def test_no_backend_writes_nothing(addon, scene, clip, tmp_path, monkeypatch):
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))
     scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(tmp_path / "s.splannequin")
