@@ -42,7 +42,7 @@ CONFIG_FILE, METRICS_FILE, SUMMARY_FILE = "config.json", "metrics.jsonl", "summa
 PREVIEWS_FOLDER, NEXT_FOLDER, DEVELOPED_FOLDER = "previews", "next", "developed"
 """In a run's folder: pictures of the training, trainings that will take the run's place, developed instants."""
 TAKE_FILE, TAKE_STATE_FILE = "take.json", "state.json"
-TAKE_PREVIEW_FOLDER, WARP_FOLDER = "preview", "warp"
+TAKE_PREVIEW_FOLDER, WARP_FOLDER, TAKE_NEXT_FOLDER = "preview", "warp", ".next"
 CONTACT_SHEET_FILE, VIDEO_FILE, PLY_FILE = "contact_sheet.png", "video.mp4", "frozen.ply"
 TAKE_REDISTORT = Path("stmap") / "redistort.exr"
 """Of a take with overscan: the way back through the lens."""

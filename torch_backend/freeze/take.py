@@ -19,6 +19,7 @@ from ..contract import (
     NO_DEPTH,
     PLY_FILE,
     TAKE_FILE,
+    TAKE_NEXT_FOLDER,
     TAKE_PREVIEW_FOLDER,
     TAKE_REDISTORT,
     TAKE_STATE_FILE,
@@ -72,8 +73,6 @@ TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
 DETAIL_VERSION = 8
 """The same, of frames made of plates."""
-NEXT = ".next"
-"""Folder in a take's folder with the frames of what shall replace it."""
 
 
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
@@ -196,7 +195,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     width, height = output_size(shot, scene, params)
     whole = plan(scene, params, t_star, width, height)
     folder = shot.own(shot.take(params.take))
-    for inner in (TAKE_PREVIEW_FOLDER, TAKE_REDISTORT.parent, WARPS, NEXT):
+    for inner in (TAKE_PREVIEW_FOLDER, TAKE_REDISTORT.parent, WARPS, TAKE_NEXT_FOLDER):
         shot.own(folder / inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
     grain = plate_grain(shot, scene) if params.grain else None
@@ -322,7 +321,7 @@ def _place(take: PlannedTake, params: FreezeParams) -> _Place:
     """
     folder, with_warps = take.folder, take.spec.detail is not None
     make_folders(folder, with_warps)
-    here, beside = _right_frames(take, folder, params), folder / NEXT
+    here, beside = _right_frames(take, folder, params), folder / TAKE_NEXT_FOLDER
     there = _right_frames(take, beside, params) if beside.is_dir() else set[int]()
     for n in set(frames_in([*beside.glob("*.exr"), *(beside / TAKE_PREVIEW_FOLDER).glob("*.png")])) - there:
         for file in files_of(beside, n):

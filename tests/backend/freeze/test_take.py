@@ -10,6 +10,7 @@ import torch
 
 from torch_backend.contract import (
     NO_DEPTH,
+    TAKE_NEXT_FOLDER,
     CameraFrame,
     CameraPath,
     Cancelled,
@@ -24,7 +25,6 @@ from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_at, freeze_shot, write_beside
 from torch_backend.freeze import take as take_module
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.freeze.take import NEXT
 from torch_backend.freeze.take_cameras import plan
 from torch_backend.gaussians.ply import read_ply
 from torch_backend.scene import load_scene
@@ -249,20 +249,24 @@ def test_a_take_stays_until_the_one_that_replaces_it_is_done(trained, quiet):
     folder = world.shot.take("again")
 
     def contents():
-        return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file() and NEXT not in p.parts}
+        return {
+            p.relative_to(folder): p.read_bytes()
+            for p in folder.rglob("*")
+            if p.is_file() and TAKE_NEXT_FOLDER not in p.parts
+        }
 
     before = contents()
     with pytest.raises(Cancelled):
         freeze_shot(world.shot, FreezeParams(**ask, t_star=106), quiet(cancel_at=("freezing", 0.5)))
     assert contents() == before, "cancelled: the old take is whole"
-    begun = {p.name: p.stat().st_mtime_ns for p in (folder / NEXT).glob("*.exr")}
+    begun = {p.name: p.stat().st_mtime_ns for p in (folder / TAKE_NEXT_FOLDER).glob("*.exr")}
     assert 0 < len(begun) < 6
     other = dict(ask, take="beside")
     freeze_shot(world.shot, FreezeParams(**other, t_star=106), quiet())
     (folder / "take.json").unlink()  # as a kill at the worst moment leaves it: some frames old, some new
     (folder / "000103.exr").unlink()
     facts = freeze_shot(world.shot, FreezeParams(**ask, t_star=106, only_missing=True), quiet())
-    assert facts["t_star_frame"] == 106 and facts["frames"] == 6 and not (folder / NEXT).exists()
+    assert facts["t_star_frame"] == 106 and facts["frames"] == 6 and not (folder / TAKE_NEXT_FOLDER).exists()
     assert all((folder / name).stat().st_mtime_ns == at for name, at in begun.items()), "what was begun is used"
     for number in range(103, 109):
         names = (f"{number:06d}.exr", f"warp/{number:06d}.exr", f"preview/{number:06d}.png")
