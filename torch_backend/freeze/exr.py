@@ -19,7 +19,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 import OpenImageIO as oiio
@@ -244,13 +244,16 @@ def channel_names(spec: oiio.ImageSpec) -> list[str]:
     return list(cast(Any, spec).channelnames)
 
 
-def read_frozen_exr(path: str | Path) -> FrozenFrame:
-    """Reads a file of `write_frozen_exr`; everything float32.
+_Facts = TypeVar("_Facts")
 
-    FileNotFoundError without a file; ValueError if it cannot be read, is not a frozen frame, or is from a newer
-    version.
+
+def read_layers(
+    path: Path, channels: Sequence[str], what: str, metadata: Callable[[oiio.ImageSpec, Path], _Facts]
+) -> tuple[oiio.ImageSpec, list[str], _Facts, NDArray[np.float32]]:
+    """(spec, names of the channels, metadata, pixels [H, W, C] float32) of an EXR of ours with `channels`, at least.
+
+    FileNotFoundError without a file; ValueError if it cannot be read or is not `what`, or as `metadata` raises it.
     """
-    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
     image = oiio.ImageInput.open(str(path))
@@ -259,17 +262,26 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
     try:
         spec = image.spec()
         names = channel_names(spec)
-        missing = [name for name in CHANNELS if name not in names]
+        missing = [name for name in channels if name not in names]
         if missing:
-            raise ValueError(f"{path}: not a frozen frame, it has no channel {', '.join(missing)}")
-        metadata = _metadata(spec, path)
+            raise ValueError(f"{path}: {what}, it has no channel {', '.join(missing)}")
+        facts = metadata(spec, path)
         pixels = image.read_image(oiio.FLOAT)
         if pixels is None:
             raise ValueError(f"{path}: damaged, {image.geterror()}")
     finally:
         image.close()
+    return spec, names, facts, np.asarray(pixels, dtype=np.float32)
+
+
+def read_frozen_exr(path: str | Path) -> FrozenFrame:
+    """Reads a file of `write_frozen_exr`; everything float32.
+
+    FileNotFoundError without a file; ValueError if it cannot be read, is not a frozen frame, or is from a newer
+    version.
+    """
+    spec, names, metadata, pixels = read_layers(Path(path), CHANNELS, "not a frozen frame", _metadata)
     order = [names.index(name) for name in CHANNELS]
-    pixels = np.asarray(pixels, dtype=np.float32)
     forth = light_matrix(metadata.light)
     back = None if forth is None else np.linalg.inv(forth)
     depth, support, motion = (np.ascontiguousarray(pixels[..., i]) for i in order[4:])

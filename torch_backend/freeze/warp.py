@@ -20,7 +20,6 @@ Alpha, ST and Matte of one Image node. Rejected: `forward.u` and `forward.v` (4.
 
 from __future__ import annotations
 
-import errno
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +33,7 @@ from torch import Tensor
 from ..contract import WARP_FOLDER
 from ..footage.color import LIGHTS, in_light, light_matrix
 from ..torch_types import from_numpy
-from .exr import channel_names, check_finite, linear_spec, read_light, set_margin, write_exr
+from .exr import check_finite, linear_spec, read_layers, read_light, set_margin, write_exr
 
 FOLDER = WARP_FOLDER
 """Folder of the warps in a take's."""
@@ -179,25 +178,8 @@ def read_warp(path: str | Path) -> Warp:
 
     FileNotFoundError without a file; ValueError if it cannot be read, is no warp, or is from a newer version.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
-    image = oiio.ImageInput.open(str(path))
-    if image is None:
-        raise ValueError(f"{path}: cannot be read as EXR: {oiio.geterror()}")
-    try:
-        spec = image.spec()
-        names = channel_names(spec)
-        missing = [name for name in CHANNELS if name not in names]
-        if missing:
-            raise ValueError(f"{path}: no warp, it has no channel {', '.join(missing)}")
-        metadata = _metadata(spec, path)
-        pixels = image.read_image(oiio.FLOAT)
-        if pixels is None:
-            raise ValueError(f"{path}: damaged, {image.geterror()}")
-    finally:
-        image.close()
-    found = from_numpy(np.asarray(pixels, dtype=np.float32))
+    spec, names, metadata, pixels = read_layers(Path(path), CHANNELS, "no warp", _metadata)
+    found = from_numpy(pixels)
     fill, alpha, st, matte = (
         found[..., [names.index(name) for name in part]].squeeze(-1)
         for part in (CHANNELS[:3], CHANNELS[3:4], CHANNELS[4:6], CHANNELS[7:])
