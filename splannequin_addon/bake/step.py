@@ -48,8 +48,12 @@ class Bake(Step):
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Bake: whether the freeze is in the scene's compositor."""
-        if state is None or settings_of(scene).take_name not in state.takes:
+        props = settings_of(scene)
+        if state is None or (props.take_name not in state.takes and props.run_name not in state.runs):
             return View(False, False, [], self.needs)
+        if props.take_name not in state.takes:
+            advice = "Freezes the scene's range, puts it before your compositor's output and renders."
+            return View(False, True, [], advice)
         tree = compat.compositor_tree(scene)
         if tree is None or freeze_group.group_node(tree) is None:
             return View(False, True, [], "Put the freeze before your compositor's output and render.")

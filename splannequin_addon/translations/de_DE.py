@@ -67,6 +67,7 @@ MESSAGES: dict[str, str] = {
     "Solve the camera first.": "Zuerst die Kamera lösen.",
     "Train first.": "Zuerst trainieren.",
     "Freeze first.": "Zuerst einfrieren.",
+    "Freezes the scene's range, puts it before your compositor's output and renders.": "Friert den Bereich der Szene ein, setzt ihn vor den Ausgang des Compositors und rendert.",
     "Bake first.": "Zuerst backen.",
     "Choose a clip of people holding still.": "Einen Clip wählen, in dem Menschen stillhalten.",
     "Import the clip.": "Den Clip importieren.",

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 
 import bpy
 import pytest
@@ -23,6 +24,16 @@ def test_a_bake_asks_for_the_scenes_range_and_step_of_the_take(addon, with_shot,
     params = addon("process.steps").STEPS["bake"].params(scene)
     assert (params.first, params.last, params.step) == (1, 250, 3)
     assert addon("process.steps").STEPS["freeze"].params(scene).first is None, "the freeze is about all of the clip"
+
+
+def test_a_bake_freezes_what_is_missing_and_so_needs_a_run_and_no_take(addon, with_shot, shot):
+    bake = addon("process.steps").STEPS["bake"]
+    shutil.rmtree(shot / "takes" / "freeze")
+    view = bake.view(with_shot, addon("shot.inventory").read(shot))
+    assert (view.done, view.ready) == (False, True) and "Freezes the scene's range" in view.advice
+    (shot / "runs" / "main" / "summary.json").unlink()
+    view = bake.view(with_shot, addon("shot.inventory").read(shot))
+    assert not view.ready and view.advice == "Freeze first."
 
 
 def test_a_bake_keeps_the_grain_of_its_take(addon, with_shot, shot):
