@@ -26,8 +26,11 @@ from ..contract import (
 )
 from ..shot import Shot, content_key, write_json
 from .exr import read_key
-from .take import PlannedTake, files_of, finish, frames_in, is_whole, make_folders, planned, render_frames
+from .take import finish
 from .take_cameras import in_range
+from .take_folder import files_of, frames_in, is_whole, make_folders
+from .take_frames import render_frames
+from .take_plan import PlannedTake, planned
 
 
 def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from torch_backend.freeze.detail import DetailConfig, Detailer
 from torch_backend.freeze.held import HeldConfig
 from torch_backend.freeze.regions import closed, grown, opened
 from torch_backend.freeze.sightings import SightingConfig
-from torch_backend.freeze.take import small_share
+from torch_backend.freeze.take_frames import small_share
 
 FRAME, T_STAR = 3, 11
 """The board stands wholly apart in these two."""

@@ -22,8 +22,7 @@ from torch_backend.contract import (
 )
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
-from torch_backend.freeze import freeze_at, freeze_shot, write_beside
-from torch_backend.freeze import take as take_module
+from torch_backend.freeze import freeze_at, freeze_shot, take_frames, write_beside
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take_cameras import plan
 from torch_backend.gaussians.ply import read_ply
@@ -235,7 +234,7 @@ def test_what_ends_before_the_first_frame_leaves_the_take_of_before(trained, qui
     def full(folder, *_):
         raise disk_error(folder)
 
-    monkeypatch.setattr(take_module, "need_disk", full)
+    monkeypatch.setattr(take_frames, "need_disk", full)
     with pytest.raises(JobError, match="full"):
         freeze_shot(world.shot, FreezeParams(**ask, develop="off", t_star=106), quiet())
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
