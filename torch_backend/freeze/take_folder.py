@@ -17,7 +17,6 @@ from ..contract import (
     JobError,
     frame_file,
     frame_number,
-    is_half_written,
     read_json,
     replace_file,
     sweep_half_written,
@@ -95,11 +94,10 @@ def take_over(take: PlannedTake, place: Place) -> None:
     """The frames rendered beside a take of before stand in its place. Killed meanwhile, the next freeze goes on."""
     assert place.beside is not None
     clear(take, place.right_here)
-    for file in sorted(place.beside.rglob("*"), key=lambda file: file.parent == place.beside):  # a frame's EXR is last
-        if file.is_file() and not is_half_written(file.name):
-            target = take.folder / file.relative_to(place.beside)
-            make_folder(target.parent)
-            replace_file(file, target)
+    for n in frames_in(place.beside.glob("*.exr")):
+        for file, target in zip(reversed(files_of(place.beside, n)), reversed(files_of(take.folder, n)), strict=True):
+            if file.is_file():  # the EXR last: a frame that has one has the others
+                replace_file(file, target)
     shutil.rmtree(place.beside, ignore_errors=True)
 
 

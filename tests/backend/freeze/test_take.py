@@ -262,8 +262,10 @@ def test_a_take_stays_until_the_one_that_replaces_it_is_done(trained, quiet):
     assert 0 < len(begun) < 6
     other = dict(ask, take="beside")
     freeze_shot(world.shot, FreezeParams(**other, t_star=106), quiet())
-    (folder / "take.json").unlink()  # as a kill at the worst moment leaves it: some frames old, some new
-    (folder / "000103.exr").unlink()
+    (folder / "take.json").unlink()  # as a kill at the worst moment leaves it: some frames old, some new, one moved
+    first = min(begun)
+    for name in (f"preview/{first[:6]}.png", f"warp/{first}", first):
+        (folder / TAKE_NEXT_FOLDER / name).rename(folder / name)
     facts = freeze_shot(world.shot, FreezeParams(**ask, t_star=106, only_missing=True), quiet())
     assert facts["t_star_frame"] == 106 and facts["frames"] == 6 and not (folder / TAKE_NEXT_FOLDER).exists()
     assert all((folder / name).stat().st_mtime_ns == at for name, at in begun.items()), "what was begun is used"
