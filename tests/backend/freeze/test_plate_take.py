@@ -102,7 +102,7 @@ import os, signal, sys
 sys.path.insert(0, sys.argv[3])
 from tests.backend.conftest import Quiet
 from torch_backend.contract import FreezeParams
-from torch_backend.freeze import freeze_shot, take
+from torch_backend.freeze import freeze_shot, take_frames
 from torch_backend.shot import Shot
 
 def dies(folder, output, *rest):
@@ -110,7 +110,7 @@ def dies(folder, output, *rest):
         os.kill(os.getpid(), signal.SIGKILL)
     return written(folder, output, *rest)
 
-written, take._write_frame = take._write_frame, dies
+written, take_frames._write_frame = take_frames._write_frame, dies
 freeze_shot(Shot.open(sys.argv[1]), FreezeParams(take=sys.argv[2], t_star=105, first=103, last=108), Quiet())
 """
 
