@@ -45,8 +45,10 @@ MISFITS = (KeyError, TypeError, IndexError, AttributeError, ValueError, RuntimeE
 """What a checkpoint that is whole, but not as `Trainer.save` wrote it, ends in: a tensor lacks or has another shape."""
 
 
-def misfit(path: Path, error: Exception, code: ExitCode) -> JobError:
-    """One of `MISFITS` in words."""
+def misfit(path: Path, error: Exception, code: ExitCode) -> Exception:
+    """One of `MISFITS` as a JobError; as it is if a card raised it: then nothing is wrong with the checkpoint."""
+    if isinstance(error, torch.OutOfMemoryError | torch.AcceleratorError):
+        return error
     what = str(error).strip().splitlines()
     told = f"{type(error).__name__}: {what[0]}" if what else type(error).__name__
     return JobError(

@@ -437,7 +437,7 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
         size = int(meta["width"]), int(meta["height"])
         return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp)
     except MISFITS as error:  # whole, but not as `save` wrote it
-        raise misfit(checkpoint, error, ExitCode.FREEZE) from error
+        raise misfit(checkpoint, error, ExitCode.FREEZE) from None
 
 
 def _stamp(checkpoint: Path) -> list[Any]:

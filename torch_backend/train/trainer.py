@@ -458,10 +458,10 @@ class Trainer:
         for name, owned in field.owned.items():
             if name not in model.params:  # memory may have ended between two of them
                 model.adopt(name, owned.shape, owned.value)
-        add_field(self.optimizer, field, model)
         self._memory.keep(field)
+        add_field(self.optimizer, field, model)  # takes no memory: what is before it can be done again
         self.policy.field_opened(self.iteration, self.trained_seconds)
-        self.model.field = field  # last: until then all of this can be done again
+        self.model.field = field
 
     def _rehearse(self, field: Deformation) -> None:
         """The host's pre-stage; its steps are steps of the run. Interrupted, it starts again."""
@@ -686,7 +686,7 @@ class Trainer:
         try:
             self._restore(tensors, meta)
         except MISFITS as error:
-            raise misfit(path, error, ExitCode.TRAIN) from error
+            raise misfit(path, error, ExitCode.TRAIN) from None
 
     def _restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
         if meta["train_frames"] != [self.scene.frames[i] for i in self.train_ids]:

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 import torch_backend.scene
-from torch_backend.contract import Cancelled, JobError, TrainParams
+from torch_backend.contract import Cancelled, ExitCode, JobError, TrainParams
 from torch_backend.gaussians import PARAM_NAMES
 from torch_backend.scene import load_images, load_scene
 from torch_backend.shot import Shot
 from torch_backend.train import PRESETS, config_from_params, load_run, train_shot
-from torch_backend.train.checkpoint import CHECKPOINT_FILE, load_checkpoint, read_meta, save_checkpoint
+from torch_backend.train.checkpoint import CHECKPOINT_FILE, MISFITS, load_checkpoint, misfit, read_meta, save_checkpoint
 from torch_backend.train.config import config_from_json, config_to_json
 from torch_backend.train.paper import inside_frustum
 from torch_backend.train.trainer import Trainer
@@ -393,3 +393,11 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wr
     (shot.run("misfit") / "summary.json").unlink()
     with pytest.raises(JobError, match="does not fit this version"):
         train_shot(shot, asked, quiet())
+
+
+def test_a_card_that_fails_says_nothing_of_the_checkpoint():
+    """It must not be told to train anew what is in order."""
+    for error in (torch.OutOfMemoryError("CUDA out of memory."), torch.AcceleratorError("an illegal memory access")):
+        assert isinstance(error, MISFITS) and misfit(Path("checkpoint"), error, ExitCode.TRAIN) is error
+    told = misfit(Path("checkpoint"), RuntimeError("size mismatch\nfor a"), ExitCode.TRAIN)
+    assert isinstance(told, JobError) and "(RuntimeError: size mismatch)" in str(told)
