@@ -27,6 +27,7 @@ from .contract import (
     need_disk,
     path_error,
     read_json,
+    refuse_foreign,
     replace_file,
     replacing_folder,
     restore_folder,
@@ -92,10 +93,11 @@ class Shot(ShotFolder):
 
     @classmethod
     def create(cls, root: str | Path, name: str = "") -> Shot:
-        """Opens the shot at `root`, or makes an empty one there."""
+        """Opens the shot at `root`, or makes an empty one there. JobError where other files lie there."""
         shot = cls(root)
         if shot.info_path.is_file():
             return cls.open(root)
+        refuse_foreign(shot.root)
         shot.root.mkdir(parents=True, exist_ok=True)
         shot.save(ShotInfo(name=name or shot.root.name.removesuffix(SHOT_SUFFIX)))
         return shot

@@ -41,6 +41,13 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
         row.operator("splannequin.t_star_here", text="", icon="EYEDROPPER")
         shown = scene_in(context).timeline_markers.get(markers.NAME) is not None
         row.operator("splannequin.t_star_marker", text="", icon="MARKER_HLT" if shown else "MARKER", depress=shown)
+        watch = self._watch(context)
+        if props.choose_t_star and watch is not None and watch.state is not None and watch.state.frames:
+            first, last = watch.state.frame_range
+            if not first <= props.t_star <= last:
+                wrap(
+                    layout, context, f"Frame {props.t_star} is outside of the clip: it has {first} to {last}.", "ERROR"
+                )
 
     def _suggested(self, context: bpy.types.Context) -> int | None:
         """The instant that is taken while none is chosen, once it is known: scrubbing asks for it, so does Freeze."""

@@ -21,11 +21,13 @@ from .shot_state import ShotState
 
 
 def create(folder: Path, name: str = "") -> None:
-    """Makes an empty shot folder, or checks the one that is there. ValueError on one from a newer Splannequin."""
+    """Makes an empty shot folder, or checks the one that is there. ValueError on one from a newer Splannequin;
+    JobError where other files lie there."""
     path = ShotFolder(folder).info_path
     if os.path.lexists(path):
         _typed(_Info, path)
         return
+    contract.refuse_foreign(folder)
     folder.mkdir(parents=True, exist_ok=True)
     called = name or folder.name.removesuffix(contract.SHOT_SUFFIX)
     contract.write_json(path, {"version": 1, "name": called, "created": time.time()}, parents=False)

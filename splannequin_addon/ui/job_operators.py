@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
+
 import bpy
 
 from ...torch_backend import contract
@@ -56,6 +59,9 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
         log = steps.STEPS[steps.current(self.step)].log(job) if job is not None else None
         if log is None:
             self.report({"WARNING"}, "There is no log")
+            return {"CANCELLED"}
+        if sys.platform.startswith("linux") and shutil.which("xdg-open") is None:  # Blender would only print that
+            self.report({"WARNING"}, tr(f"No viewer was found (xdg-open is missing). The log is {log}"))
             return {"CANCELLED"}
         bpy.ops.wm.path_open(filepath=str(log))
         return {"FINISHED"}

@@ -233,6 +233,7 @@ from .typed import (
 )
 from .unborn import (
     discard_unborn,
+    refuse_foreign,
 )
 from .verbs import (
     BACKEND,
@@ -431,6 +432,7 @@ __all__ = [
     "read_lines",
     "read_message",
     "read_writer",
+    "refuse_foreign",
     "remove_link",
     "replace_file",
     "replacing_folder",

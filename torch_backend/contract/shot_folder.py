@@ -49,6 +49,12 @@ TAKE_REDISTORT = Path("stmap") / "redistort.exr"
 TAKE_UNDISTORT = Path("stmap") / "undistort.exr"
 """Of a take: from the footage as it was filmed to the plate without the lens, as large as the footage."""
 LIVE_LOG = "live.log"
+FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER = "farm", "trash", "tracking", "paths"
+SHOT_NAMES = frozenset({
+    INFO_FILE, WRITER_FILE, FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER, PAINTED_FOLDER,
+    DRAWN_FOLDER, FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER,
+})  # fmt: skip
+"""All that lies in a shot folder."""
 PICTURE, LAYERS = ".png", ".exr"
 """Suffixes of plates, mattes and previews; of frozen frames."""
 
@@ -162,21 +168,21 @@ class ShotFolder:
     @property
     def farm(self) -> Path:
         """What tasks of a render farm took."""
-        return self.root / "farm"
+        return self.root / FARM_FOLDER
 
     @property
     def trash(self) -> Path:
         """What was removed, until it is deleted."""
-        return self.root / "trash"
+        return self.root / TRASH_FOLDER
 
     @property
     def tracking(self) -> Path:
         """Cameras of Blender's own tracking, as a transforms.json."""
-        return self.root / "tracking" / "transforms.json"
+        return self.root / TRACKING_FOLDER / "transforms.json"
 
     def camera_path(self, take: str) -> Path:
         """Camera that Blender sent for a take."""
-        return self.root / "paths" / f"{take}.json"
+        return self.root / PATHS_FOLDER / f"{take}.json"
 
     def run(self, name: str) -> Path:
         """Folder of a run; ValueError if the name could leave it."""

@@ -1,4 +1,4 @@
-"""What an import that did not end well left of the shot that it was to begin."""
+"""A shot folder before its first import: where one may be made, and what an import that failed left of it."""
 
 from __future__ import annotations
 
@@ -6,16 +6,44 @@ import contextlib
 import shutil
 from pathlib import Path
 
-from .errors import ExitCode
+from .errors import ExitCode, JobError
 from .files import read_json
 from .jobs import LOG_FILE, STATUS_FILE, Status
 from .lock import read_writer
-from .shot_folder import FRAMES_FOLDER, INFO_FILE, JOBS_FOLDER, RUNS_FOLDER, SOLVE_FOLDER, TAKES_FOLDER, ShotFolder
+from .shot_folder import (
+    FRAMES_FOLDER,
+    INFO_FILE,
+    JOBS_FOLDER,
+    RUNS_FOLDER,
+    SHOT_NAMES,
+    SOLVE_FOLDER,
+    TAKES_FOLDER,
+    ShotFolder,
+)
 from .typed import from_dict
 
 _UNBORN = {INFO_FILE, JOBS_FOLDER, FRAMES_FOLDER}
 """What an import that did not end well may leave in a shot folder."""
 _WORK = {SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER}
+
+
+def refuse_foreign(folder: Path) -> None:
+    """JobError if a folder that is to become a shot holds what is no shot's: it is somebody's, not to be filled.
+
+    Hidden files, which file managers leave anywhere, do not count, nor does what an earlier import left.
+    """
+    try:
+        names = sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
+    except OSError:  # not there yet, or to be told by who makes it
+        return
+    foreign = [name for name in names if name not in SHOT_NAMES]
+    if INFO_FILE not in names and foreign:
+        named = foreign[0] if len(foreign) == 1 else f"{foreign[0]} and {len(foreign) - 1} more"
+        raise JobError(
+            f"{folder} is no shot folder, and holds other files ({named}).",
+            "Choose a folder that is empty or not there yet: the shot would lie among them.",
+            ExitCode.USAGE,
+        )
 
 
 def discard_unborn(shot: Path) -> bool:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from torch_backend.contract import discard_unborn
+from torch_backend.contract import JobError, discard_unborn
 from torch_backend.shot import Shot
 
 
@@ -30,3 +30,18 @@ def test_a_shot_with_work_in_it_or_a_file_of_others_stays(shot, file):
 
 def test_a_folder_that_is_not_there_is_nothing_to_take(tmp_path):
     assert not discard_unborn(tmp_path / "none.splannequin")
+
+
+def test_a_folder_of_somebody_elses_is_not_filled(tmp_path):
+    (tmp_path / "scene.blend").write_bytes(b"BLENDER")
+    (tmp_path / "textures").mkdir()
+    with pytest.raises(JobError, match=r"holds other files \(scene\.blend and 1 more\)"):
+        Shot.create(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.blend", "textures"]
+
+
+@pytest.mark.parametrize("left", [[], [".DS_Store"], ["jobs", "frames", ".frames.new"], ["masks", "solve"]])
+def test_a_shot_is_made_where_nothing_of_others_lies(tmp_path, left):
+    for name in left:
+        (tmp_path / name).mkdir()
+    assert Shot.create(tmp_path).info_path.is_file()
