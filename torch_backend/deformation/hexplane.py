@@ -4,7 +4,8 @@ Corrected against the published code: time is mapped to the whole plane, the hea
 layers start at zero so that the field starts as the identity, learning rates do not follow the scene's extent
 (the scene is normalised), smoothness acts along both axes of a spatial plane, the network bends by SiLU (with ReLU the
 whole trunk often dies in the first steps, and the field stands still for good), and sampling coordinates are detached:
-the field says how things move, the image says where they are. `published` brings all of that back.
+the field says how things move, the image says where they are. Axes are stretched where the Gaussians are: background
+behind what moves makes the box large, and people a few nodes wide. `published` brings all of that back.
 
 What stays the trainer's for every host, and so is not the published code's: one image per step (2 to 4), the loss, the
 Gaussians' own rates and their growth, and one optimiser for both stages.
@@ -65,11 +66,15 @@ class HexPlaneConfig(HostConfig):
     """Time planes start at 1 and up to this much above or below (0)."""
     until: float = 1.0
     """Share of the run at which the learning rates have ended."""
+    stretch: float = 2.0
+    """Axes are stretched around the median of the Gaussians: even within so many times their median distance from it,
+    and the coarser the farther beyond (asinh); 0: even throughout, as published."""
     silu: bool = True
     """The network bends by SiLU (off: by ReLU)."""
     published: bool = False
     """Times fed as they are to a sampler of [-1, 1], heads that start as noise, smoothness down the planes only (so
-    never along x), the box of the first points, all harmonics move, and means are pulled through the lookup (on)."""
+    never along x), the box of the first points, even axes, all harmonics move, and means are pulled through the lookup
+    (on)."""
 
     def row_bytes(self) -> int:
         """A level's product and its gradient (by torch's own operators six samples and their products), and a layer
@@ -95,6 +100,7 @@ def _reference(iterations: int) -> HexPlaneConfig:
         time_spread=0.0,
         silu=False,
         until=23_000 / whole,
+        stretch=0.0,
         published=True,
     )
 
@@ -103,10 +109,14 @@ class HexPlane(Deformation):
     """The field. `box` [2, 3] is the part of the scene it resolves; outside it the rim's feature holds.
 
     Made on the CPU, so that a seed means one start on every device; `to` moves it. `harmonics`: how many SH bases
-    beyond the constant one the published field moves.
+    beyond the constant one the published field moves. `around`: [2, 3], the place that axes are stretched around, and
+    the distance from it within which they stay about even, scene units; None: they are even throughout.
     """
 
-    def __init__(self, config: HexPlaneConfig, box: Tensor, generator: torch.Generator, harmonics: int = 0) -> None:
+    def __init__(
+        self, config: HexPlaneConfig, box: Tensor, generator: torch.Generator, harmonics: int = 0,
+        around: Tensor | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         if not bool((box[1] > box[0]).all()):
             bounds = [[float(v) for v in row] for row in box]
@@ -114,6 +124,10 @@ class HexPlane(Deformation):
         self.config = config
         self.box: Tensor
         self.register_buffer("box", box.float().cpu())
+        if around is not None and not (around.shape == (2, 3) and bool((around[1] > 0).all())):
+            raise ValueError(f"around has shape {tuple(around.shape)}: it should be [2, 3], with distances above 0")
+        self.around: Tensor | None
+        self.register_buffer("around", None if around is None else around.float().cpu())
         self.spatial, self.temporal = nn.ParameterList(), nn.ParameterList()
         for level in config.levels:
             nodes = config.resolution * level
@@ -141,7 +155,8 @@ class HexPlane(Deformation):
     def features_at(self, means: Tensor, times: Tensor) -> Tensor:
         """Product of the six planes' samples, levels concatenated: [M, features * levels]."""
         means = means if self.config.published else means.detach()
-        where = 2.0 * (means - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
+        where, (low, high) = self._stretched(means), self._stretched(self.box)
+        where = 2.0 * (where - low) / (high - low) - 1.0
         when = (times if self.config.published else 2.0 * times - 1.0).expand(len(means))
         planes = self._by_level()
         if compiled.supports(planes) and where.dtype == torch.float32:
@@ -155,6 +170,10 @@ class HexPlane(Deformation):
                 product = product * _sample(self.temporal[3 * level + axis], where[:, axis], when)
             parts.append(product)
         return torch.cat(parts, dim=1)
+
+    def _stretched(self, places: Tensor) -> Tensor:
+        """Places [P, 3] along the axes as the planes' nodes lie."""
+        return places if self.around is None else torch.asinh((places - self.around[0]) / self.around[1])
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] scene units (ours detaches them), times [M] or [1] in [0, 1]."""
@@ -247,13 +266,28 @@ def _create(config: HexPlaneConfig, start: Start) -> HexPlane:
     if config.published:
         box = torch.stack([start.points.amin(0), start.points.amax(0)])
         box[1] = torch.maximum(box[1], box[0] + 1e-3)
-    return HexPlane(config, box, start.generator, start.harmonics)
+    return HexPlane(config, box, start.generator, start.harmonics, _around(start.means, config.stretch))
+
+
+def _around(means: Tensor, stretch: float) -> Tensor | None:
+    """[2, 3] what the axes are stretched around for the Gaussians means [M, 3]; None: they are even."""
+    if stretch <= 0 or not len(means):
+        return None
+    middle = means.median(0).values
+    spread = (means - middle).abs().median(0).values
+    return torch.stack([middle, stretch * spread.clamp_min(1e-3)])
 
 
 def _restore(config: HexPlaneConfig, tensors: dict[str, Tensor]) -> HexPlane:
     config = replace(config, time_nodes=tensors["field.temporal.0"].shape[2])
     harmonics = len(tensors["field.out.shN.bias"]) // 3 if "field.out.shN.bias" in tensors else 0
-    field = HexPlane(config, tensors["field.box"], torch.Generator(device="cpu").manual_seed(0), harmonics)
+    field = HexPlane(
+        config,
+        tensors["field.box"],
+        torch.Generator(device="cpu").manual_seed(0),
+        harmonics,
+        tensors.get("field.around"),
+    )
     field.load_state(tensors)
     return field
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torch_backend.deformation import HexPlane, HexPlaneConfig, Start, host, host_config
+from torch_backend.deformation import HexPlane, HexPlaneConfig, Start, field_box, host, host_config
 
 BOX = torch.tensor([[-1.0, -2.0, 0.5], [1.0, 2.0, 3.0]])
 
@@ -48,6 +48,34 @@ def test_ends_of_time_hit_the_end_nodes():
     base = module.features_at(x, torch.tensor([1.0 / 4])) / 1.0
     assert torch.allclose(module.features_at(x, torch.tensor([0.0])), torch.zeros_like(base), atol=1e-6)
     assert torch.allclose(module.features_at(x, torch.tensor([1.0])), 64.0 * base, rtol=1e-4)
+
+
+def test_stretched_axes_are_fine_where_the_gaussians_are():
+    """People 0.3 wide in a box of 40: even axes of 8 nodes give them an eighth of one, these ten times as many."""
+    g = torch.Generator().manual_seed(4)
+    people, background = 0.3 * torch.randn(60, 3, generator=g), 20.0 * torch.randn(30, 3, generator=g)
+    means = torch.cat([people, background])
+    start = Start(means, field_box(means), means, 10, 0, torch.Generator().manual_seed(0))
+    nodes = {}
+    for stretch in (0.0, 2.0):
+        made = host("hexplane").create(HexPlaneConfig(features=4, resolution=8, time_nodes=5, stretch=stretch), start)
+        with torch.no_grad():  # the first plane counts nodes along x, all others are 1
+            for n, plane in enumerate((*made.spatial, *made.temporal)):
+                plane.copy_(torch.arange(8.0).expand_as(plane) if n == 0 else torch.ones_like(plane))
+        at = made.features_at(people, torch.tensor([0.5]))[:, 0]
+        nodes[stretch] = float((at.max() - at.min()).detach())
+        again = host("hexplane").restore(made.config, made.state())
+        assert torch.equal(again.features_at(means, torch.tensor([0.2])), made.features_at(means, torch.tensor([0.2])))
+    assert nodes[2.0] > 10.0 * nodes[0.0]
+
+
+def test_a_run_of_before_keeps_even_axes():
+    made = stir(field())
+    again = host("hexplane").restore(HexPlaneConfig(features=4, resolution=8, width=16), made.state())
+    assert again.around is None
+    assert torch.equal(
+        again.features_at(points(), torch.tensor([0.4])), made.features_at(points(), torch.tensor([0.4]))
+    )
 
 
 def test_gradients_match_finite_differences_at_float64():
