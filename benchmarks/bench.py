@@ -27,7 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main
 
 from benchmarks.sources import Log, child_environ, end_with_parent, load_source, make_scenes
 from benchmarks.synthetic.make import default_folder
-from benchmarks.synthetic.sizes import SIZES
+from benchmarks.synthetic.sizes import HARD, KINDS, LIMITS, SIZES
 from torch_backend.contract import METHODS, SUPERVISIONS, ExitCode, JobError, TrainParams, from_dict, read_json
 from torch_backend.job import new_job, run_job
 from torch_backend.native import default_threads
@@ -446,11 +446,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     quick = {"max_gaussians": args.max_gaussians or QUICK_GAUSSIANS} if args.quick else {}
     sources = [f"truth:{Path(p).absolute()}" for p in args.truth] + [f"shot:{Path(p).absolute()}" for p in args.shot]
     try:
-        if not sources or args.size or args.quick or args.limits or args.hard:
+        kinds = (*(LIMITS if args.limits else ()), *(HARD if args.hard else ()), *args.kinds)
+        if not sources or args.size or args.quick or kinds:
             cameras = ("exact", "solved") if args.cameras == "both" else (args.cameras,)
             size = args.size or ("quick" if args.quick else "medium")
             folder = Path(args.scenes).absolute()
-            sources += make_scenes(size, args.tuning, cameras, folder, args.bpy, args.limits, args.hard)
+            sources += make_scenes(size, args.tuning, cameras, folder, args.bpy, kinds or ("plain",))
         runs, notes = plan(
             sources,
             results,
@@ -495,6 +496,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cameras", choices=("exact", "solved", "both"), default="exact", help="of synthetic scenes")
     parser.add_argument("--scenes", default=str(default_folder()), metavar="DIR", help="of synthetic scenes")
     parser.add_argument("--tuning", action="store_true", help="scenes to tune on instead of those to report on")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=[], metavar="KIND", help="these scenes alone")
     parser.add_argument("--limits", action="store_true", help="the four scenes that break an assumption, alone")
     parser.add_argument("--hard", action="store_true", help="the scenes with what a freeze loses in view, alone")
     parser.add_argument("--truth", action="append", default=[], metavar="FOLDER", help="scene with rendered truth")

@@ -23,7 +23,7 @@ from torch import Tensor
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, solved_shot
-from benchmarks.synthetic.sizes import HARD, LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
+from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import read_json
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key
@@ -116,17 +116,15 @@ def make_scenes(
     cameras: Sequence[str],
     folder: Path,
     bpy: str | None = None,
-    limits: bool = False,
-    hard: bool = False,
+    kinds: Sequence[str] = ("plain",),
 ) -> list[str]:
     """Sources of the synthetic scenes of a size, rendered first where they are not there (a child process).
 
-    With `limits` those of the first seed that break an assumption of the method, with `hard` those that have a thing in
-    view that a freeze loses, instead of the plain ones. `bpy` is a Python with Blender's module, found beside the
-    repository if it is not given. RuntimeError with the child's own last words if a scene cannot be made.
+    `kinds`: of `synthetic.sizes.KINDS`; of those that break an assumption of the method the first seed alone. `bpy` is
+    a Python with Blender's module, found beside the repository if it is not given. RuntimeError with the child's own
+    last words if a scene cannot be made.
     """
-    seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: 1 if limits else SIZES[size].scenes]
-    kinds = (LIMITS if limits else ()) + (HARD if hard else ()) or ("plain",)
+    seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: 1 if {*kinds} & {*LIMITS} else SIZES[size].scenes]
     command = [sys.executable, "-P", "-m", "benchmarks.sources", "--size", size, "--out", str(folder)]
     command += [*(["--bpy", bpy] if bpy else []), "--seeds", *map(str, seeds), "--kinds", *kinds]
     with subprocess.Popen(
