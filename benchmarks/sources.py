@@ -132,9 +132,14 @@ def make_scenes(
     ) as child:
         errors = child.stderr.read() if child.stderr else ""
     if child.returncode:
-        last = errors.strip().splitlines()[-1:] or ["no output"]
-        raise RuntimeError(f"the synthetic scenes could not be made: {last[0]}")
+        raise RuntimeError(f"the synthetic scenes could not be made: {last_words(errors)}")
     return [f"{c}:{folder / size / scene_name(seed, kind)}" for c in cameras for kind in kinds for seed in seeds]
+
+
+def last_words(errors: str) -> str:
+    """The last line that a failed child wrote, but for what image libraries say of themselves as Python ends."""
+    told = [line for line in errors.strip().splitlines() if "nanobind" not in line and not line.startswith(" - ")]
+    return told[-1] if told else "no output"
 
 
 def child_environ(**extra: str) -> dict[str, str]:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks.bench import ABLATIONS, HOLDOUT, RunSpec, cores, override, plan, run_plan
-from benchmarks.sources import ROOT
+from benchmarks.sources import ROOT, last_words
 from torch_backend.contract import METHODS, read_json
 from torch_backend.deformation import host_config, hosts
 from torch_backend.report.evaluate import last_third_step_ms
@@ -244,3 +244,9 @@ def test_a_real_clip_is_judged_where_nothing_moves_far_from_the_instant(scene):
     before = kept.stat().st_mtime_ns
     again = RealScene(scene[1].shot, instants=3)
     assert bool((again.regions(116, 109, 32, 24)["rigid"] == mask).all()) and kept.stat().st_mtime_ns == before
+
+
+def test_what_a_failed_child_said_is_not_lost_behind_what_libraries_say_at_the_end():
+    errors = "starting\nanny is missing: install it.\nnanobind: leaked 3 instances!\n - leaked type x\nSee https://nanobind.y\n"
+    assert last_words(errors) == "anny is missing: install it."
+    assert last_words("\n") == "no output"
