@@ -73,6 +73,16 @@ def test_a_folder_of_no_shot_is_refused(scene, tmp_path):
         bpy.ops.splannequin.solve_camera()
 
 
+def test_an_artists_own_folder_is_not_filled(scene, clip, tmp_path):
+    mine = tmp_path / "project"
+    mine.mkdir()
+    (mine / "scene.blend").write_bytes(b"BLENDER")
+    scene.splannequin.clip, scene.splannequin.shot_path = str(clip), str(mine)
+    with pytest.raises(RuntimeError, match=r"holds other files \(scene\.blend\)\. Choose a folder that is empty"):
+        bpy.ops.splannequin.import_clip()
+    assert [p.name for p in mine.iterdir()] == ["scene.blend"]
+
+
 def test_the_shot_folder_stands_beside_the_clip(addon, scene, tmp_path):
     scene.splannequin.clip = str(tmp_path / "a clip.mov")
     assert addon("shot.selection").shot_folder(scene) == tmp_path / "a clip.splannequin"
