@@ -158,9 +158,10 @@ def test_a_failed_import_leaves_no_empty_shot(tmp_path):
     wrong.write_text("no video")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
-    for folder in ("s.splannequin", "mine"):
-        done = run("import", tmp_path / folder, wrong)
-        assert done.returncode == ExitCode.FOOTAGE and "text.mp4" in done.stdout
+    done = run("import", tmp_path / "s.splannequin", wrong)
+    assert done.returncode == ExitCode.FOOTAGE and "text.mp4" in done.stdout
+    done = run("import", tmp_path / "mine", wrong)
+    assert done.returncode == ExitCode.USAGE and "holds other files (notes.txt)" in done.stderr
     assert run("freeze", wrong, "--output", tmp_path / "out").returncode == ExitCode.FOOTAGE
     assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
     assert [p.name for p in (tmp_path / "mine").iterdir()] == ["notes.txt"]

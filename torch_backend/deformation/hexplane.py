@@ -266,13 +266,15 @@ def _create(config: HexPlaneConfig, start: Start) -> HexPlane:
     if config.published:
         box = torch.stack([start.points.amin(0), start.points.amax(0)])
         box[1] = torch.maximum(box[1], box[0] + 1e-3)
-    return HexPlane(config, box, start.generator, start.harmonics, _around(start.means, config.stretch))
+    return HexPlane(config, box, start.generator, start.harmonics, _around(start.means, box, config.stretch))
 
 
-def _around(means: Tensor, stretch: float) -> Tensor | None:
-    """[2, 3] what the axes are stretched around for the Gaussians means [M, 3]; None: they are even."""
-    if stretch <= 0 or not len(means):
+def _around(means: Tensor, box: Tensor, stretch: float) -> Tensor | None:
+    """[2, 3] what the axes are stretched around for the Gaussians means [M, 3] in `box`; None: they are even."""
+    if stretch <= 0:
         return None
+    if not len(means):
+        means = box
     middle = means.median(0).values
     spread = (means - middle).abs().median(0).values
     return torch.stack([middle, stretch * spread.clamp_min(1e-3)])
@@ -280,13 +282,14 @@ def _around(means: Tensor, stretch: float) -> Tensor | None:
 
 def _restore(config: HexPlaneConfig, tensors: dict[str, Tensor]) -> HexPlane:
     config = replace(config, time_nodes=tensors["field.temporal.0"].shape[2])
+    around = tensors["field.around"] if config.stretch > 0 else None
     harmonics = len(tensors["field.out.shN.bias"]) // 3 if "field.out.shN.bias" in tensors else 0
     field = HexPlane(
         config,
         tensors["field.box"],
         torch.Generator(device="cpu").manual_seed(0),
         harmonics,
-        tensors.get("field.around"),
+        around,
     )
     field.load_state(tensors)
     return field

@@ -219,6 +219,8 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
         values["gate"] = {k: v for k, v in values["gate"].items() if k not in ("rounds", "threshold", "floor")}
         if values.get("host") == "hexplane":
             values["field"] = {**values["field"], "silu": False}
+    if values.get("host") == "hexplane":  # the axes of earlier runs are even
+        values["field"] = {"stretch": 0.0, **values["field"]}
     try:
         nested["field"] = host(values["host"]).settings
         for name, cls in nested.items():
