@@ -144,4 +144,5 @@ def test_plates_bring_their_own_grain(trained, quiet):
     plates = read_frozen_exr(world.shot.take("plates") / "000112.exr")
     assert np.max(facts["grain"]["deviation_8bit"]) > 0
     assert plates.detail.plate.min() < 0.9 and (plates.detail.plate == 1.0).mean() > 0.5
-    assert not plates.grain[plates.detail.plate == 1.0].any()
+    own = plates.grain[plates.detail.plate == 1.0]  # half precision: a matte of 0.9999 is read as 1
+    assert np.abs(own).max() < 1e-4 < np.abs(plates.grain).max()
