@@ -446,7 +446,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     quick = {"max_gaussians": args.max_gaussians or QUICK_GAUSSIANS} if args.quick else {}
     sources = [f"truth:{Path(p).absolute()}" for p in args.truth] + [f"shot:{Path(p).absolute()}" for p in args.shot]
     try:
-        kinds = (*(LIMITS if args.limits else ()), *(HARD if args.hard else ()), *args.kinds)
+        kinds = tuple(dict.fromkeys((*(LIMITS if args.limits else ()), *(HARD if args.hard else ()), *args.kinds)))
         if not sources or args.size or args.quick or kinds:
             cameras = ("exact", "solved") if args.cameras == "both" else (args.cameras,)
             size = args.size or ("quick" if args.quick else "medium")
