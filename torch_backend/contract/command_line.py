@@ -110,7 +110,8 @@ def requested_params(args: argparse.Namespace, unset: Mapping[str, Any] | None =
     kinds = VERBS[name].jobs
     if freezes_a_shot(args):
         _refuse_what_a_clip_wants(args)
-        kinds = {"freeze": FreezeParams}
+        said = {name: getattr(args, name) for name in _RANGE if name in getattr(args, "said", {})}
+        return {"freeze": FreezeParams(**{**_values(args, name, FreezeParams, unset or {}), **said})}
     return {kind: cls(**_values(args, name, cls, unset or {})) for kind, cls in kinds.items()}
 
 
@@ -161,17 +162,27 @@ def freezes_a_shot(args: argparse.Namespace) -> bool:
     return args.command == "freeze" and "://" not in args.clip and is_shot(args.clip)
 
 
+_RANGE = ("first", "last", "step")
+"""Of a clip, the frames that are read; of a shot, those that are frozen."""
+
+
 def _refuse_what_a_clip_wants(args: argparse.Namespace) -> None:
     """JobError if `freeze SHOT` was told what only the steps before it can heed."""
-    known = {spec.dest for _, spec in options_for("freeze", FreezeParams)}
-    lost = [flag for dest, flag in getattr(args, "said", {}).items() if dest not in known]
+    known = {*_RANGE, *(spec.dest for _, spec in options_for("freeze", FreezeParams))}
+    lost = {dest: flag for dest, flag in getattr(args, "said", {}).items() if dest not in known}
     if lost:
-        verb = "is" if len(lost) == 1 else "are"
+        verb, it = ("is", "it") if len(lost) == 1 else ("are", "them")
+        steps = [name for name in ("import", "solve", "train") if lost.keys() & _dests_of(name)]
         raise JobError(
-            f"{_listed(lost)} {verb} for a clip, and {args.clip} is a shot folder, which is frozen alone.",
-            "Leave it out: the verb of its own step has it.",
+            f"{_listed([*lost.values()])} {verb} for a clip, and {args.clip} is a shot folder, which is frozen alone.",
+            f"Leave {it} out" + (f", or say {it} to {_listed([f'`{name}`' for name in steps])}." if steps else "."),
             ExitCode.USAGE,
         )
+
+
+def _dests_of(name: str) -> set[str]:
+    """Where a verb keeps what its jobs are told."""
+    return {spec.dest for cls in VERBS[name].jobs.values() for _, spec in options_for(name, cls)}
 
 
 def trains_anew(args: argparse.Namespace) -> bool:

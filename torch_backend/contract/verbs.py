@@ -301,7 +301,16 @@ VERBS: dict[str, Verb] = {
         "frozen frames of a shot; of a clip, all that is missing first: import, solve, train",
         WholeWords,
         PARAMS,
-        shown={"source": INPUT},
+        shown={
+            "source": INPUT,
+            "first": ("N", "first frame number of the clip; of a shot folder, first frame that is frozen"),
+            "last": ("N", "last frame number, inclusive; of a shot folder, last frame that is frozen"),
+            "step": (
+                "N",
+                "solve and train on every n-th frame; all frames are delivered whatever it is. Of a shot folder, "
+                "freeze every n-th frame from the first",
+            ),
+        },
     ),
     "take": Verb("`freeze SHOT`", ShotWords, {"freeze": FreezeParams}, (BACKEND,), now="freeze"),
     "bake": Verb("a take through the compositor: DIR/composited and DIR/shot.blend", BakeWords, sides=(BLENDER,)),

@@ -128,6 +128,8 @@ class HexPlane(Deformation):
             raise ValueError(f"around has shape {tuple(around.shape)}: it should be [2, 3], with distances above 0")
         self.around: Tensor | None
         self.register_buffer("around", None if around is None else around.float().cpu())
+        self._rim: Tensor
+        self.register_buffer("_rim", self._stretched(self.box), persistent=False)
         self.spatial, self.temporal = nn.ParameterList(), nn.ParameterList()
         for level in config.levels:
             nodes = config.resolution * level
@@ -155,8 +157,8 @@ class HexPlane(Deformation):
     def features_at(self, means: Tensor, times: Tensor) -> Tensor:
         """Product of the six planes' samples, levels concatenated: [M, features * levels]."""
         means = means if self.config.published else means.detach()
-        where, (low, high) = self._stretched(means), self._stretched(self.box)
-        where = 2.0 * (where - low) / (high - low) - 1.0
+        low, high = self._rim
+        where = 2.0 * (self._stretched(means) - low) / (high - low) - 1.0
         when = (times if self.config.published else 2.0 * times - 1.0).expand(len(means))
         planes = self._by_level()
         if compiled.supports(planes) and where.dtype == torch.float32:
@@ -174,6 +176,11 @@ class HexPlane(Deformation):
     def _stretched(self, places: Tensor) -> Tensor:
         """Places [P, 3] along the axes as the planes' nodes lie."""
         return places if self.around is None else torch.asinh((places - self.around[0]) / self.around[1])
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """As `Deformation.load_state`."""
+        super().load_state(tensors)
+        self._rim.copy_(self._stretched(self.box))
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
         """Deltas of M Gaussians; means [M, 3] scene units (ours detaches them), times [M] or [1] in [0, 1]."""

@@ -143,24 +143,31 @@ def test_freeze_of_a_shot_asks_for_the_freeze_alone_and_of_a_clip_for_everything
         assert ask("freeze", shot, "--t-star", 3, "--run", "other") == {
             "freeze": contract.FreezeParams(run="other", t_star=3, only_missing=True)
         }
+    ranged = ask("freeze", "gone.splannequin", "--first", 3, "--last=9", "--step", 2)
+    assert ranged == {"freeze": contract.FreezeParams(first=3, last=9, step=2, only_missing=True)}
     for clip in ("a.mp4", tmp_path / "pictures", "rtsp://host/a.splannequin"):
         assert tuple(ask("freeze", clip)) == ("import", "solve", "train", "freeze")
 
 
 @pytest.mark.parametrize(
-    ("words", "named"),
+    ("words", "named", "instead"),
     [
-        (("--first", "3"), "--first is for a clip"),
-        (("--preset=preview", "--iter", "5", "--seed", "1"), "--preset, --iterations and --seed are for a clip"),
-        (("--output", "output"), "--output is for a clip"),
-        (("--restart",), "--restart is for a clip"),
+        (("--fps", "24"), "--fps is for a clip", "Leave it out, or say it to `import`."),
+        (
+            ("--preset=preview", "--iter", "5", "--camera-model", "OPENCV"),
+            "--preset, --iterations and --camera-model are for a clip",
+            "Leave them out, or say them to `solve` and `train`.",
+        ),
+        (("--output", "output"), "--output is for a clip", "Leave it out."),
+        (("--restart",), "--restart is for a clip", "Leave it out, or say it to `train`."),
     ],
 )
-def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, capsys):
+def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, instead, capsys):
     """Also where the value is the default, and where the option is abbreviated."""
     assert cli.main(["freeze", "s.splannequin", *words]) == contract.ExitCode.USAGE
     said = capsys.readouterr().err
     assert named in said and "s.splannequin is a shot folder" in said and said.count("\n") == 1
+    assert said.rstrip().endswith(instead)
 
 
 @pytest.mark.parametrize(
