@@ -204,6 +204,17 @@ def test_wrong_choices_are_named():
         config_from_params(TrainParams(iterations=3))
 
 
+def test_the_gate_of_a_long_run_opens_after_3000_steps_and_what_hangs_on_it_with_it():
+    """Ghosts of movers that a longer static stage makes are never put right (docs/benchmarks.md)."""
+    long, short = (config_from_params(TrainParams(preset=preset)) for preset in ("final", "standard"))
+    assert [round(at * long.iterations) for at in (long.gate.start, long.supervision.start)] == [3000, 3000]
+    trials = [round(c.iterations * (c.gate.harden - c.gate.start)) for c in (long, short)]
+    assert trials == [3500, 1050], "a trial is as long as it was"
+    assert [round(at * short.iterations) for at in (short.gate.start, short.supervision.start)] == [3000, 3000]
+    paper = config_from_params(TrainParams(preset="final", method="hexplane", supervision="paper"))
+    assert round(paper.supervision.start * paper.iterations) == 10_000, "the paper's numbers are the paper's"
+
+
 def test_config_round_trip():
     for host in ("hexplane", "mlp", "control_points"):
         for host_config in ("default", "reference"):
