@@ -193,12 +193,15 @@ fit one view each, far behind it, and no field puts them right (docs/benchmarks.
 
 
 def _gate_for(config: TrainConfig) -> None:
-    """Opens the gate of a long run sooner; the trial is as long as it was, and anchors and price begin with it."""
+    """Opens the gate of a long run sooner; the trial is as long as it was, anchors and price begin with it, and
+    harmonics before it, as they do in a short run: else what changes with the view is taken for motion."""
     if config.method != "auto":
         return
     gate, anchors = config.gate, config.supervision
-    sooner = max(0.0, gate.start - _MOST_STATIC / max(1, config.iterations))
-    gate.start, gate.harden, anchors.start = gate.start - sooner, gate.harden - sooner, anchors.start - sooner
+    start = min(gate.start, _MOST_STATIC / max(1, config.iterations))
+    sooner = gate.start - start
+    config.sh_every *= start / gate.start
+    gate.start, gate.harden, anchors.start = start, gate.harden - sooner, anchors.start - sooner
 
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:

@@ -211,6 +211,7 @@ def test_the_gate_of_a_long_run_opens_after_3000_steps_and_what_hangs_on_it_with
     trials = [round(c.iterations * (c.gate.harden - c.gate.start)) for c in (long, short)]
     assert trials == [3500, 1050], "a trial is as long as it was"
     assert [round(at * short.iterations) for at in (short.gate.start, short.supervision.start)] == [3000, 3000]
+    assert [round(c.sh_every * c.iterations) for c in (long, short)] == [1350, 1350], "view is learnt before time"
     paper = config_from_params(TrainParams(preset="final", method="hexplane", supervision="paper"))
     assert round(paper.supervision.start * paper.iterations) == 10_000, "the paper's numbers are the paper's"
 
