@@ -194,7 +194,7 @@ TRAINING: list[tuple[str, list[str], str]] = [
     (
         "Divergence without NaN",
         [
-            _S + "test_a_field_that_throws_gaussians_out_of_the_scene_is_put_back",
+            _S + "test_a_field_that_throws_gaussians_out_of_their_place_is_put_back",
             _S + "test_a_hasty_step_of_one_attribute_is_trained_away",
             _S + "test_whole_runs_of_every_host_stay_finite_and_alike",
         ],

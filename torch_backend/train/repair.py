@@ -10,7 +10,7 @@ seen again in any loss (docs/numerics.md). So
 - a number of the field becomes what it was when the field was last seen in order; where that is not known, the median
   of its tensor: 0 among weights, the neutral 1 in planes of time, a usual radius among radii;
 - a number of the exposure or the poses becomes 0, which is no correction;
-- a field that throws the Gaussians out of the scene goes back to what it was as a whole, at half the learning rates:
+- a field that throws what it moves out of its place goes back to what it was as a whole, at half the learning rates:
   whoever is out of the picture gets no gradient to come back by;
 - Adam's moments start at 0 wherever a number was mended, and wherever they are not finite themselves.
 
@@ -30,6 +30,7 @@ from ..deformation import Deformation
 from ..deformation.protocol import Owned
 from ..gaussians import PARAM_NAMES, Densifier
 from ..raster.constants import QUAT_MIN
+from ..torch_types import norm
 from .adam import all_finite
 from .model import DynamicModel
 
@@ -37,7 +38,11 @@ _FEW = 0.01
 """Share of the Gaussians up to which a gradient that is not finite is their own fault, and not the frame's or field's.
 """
 _THROWN = 0.1
-"""Share of the moving Gaussians that a field in order may shift by more than the scene's extent."""
+"""Share of the moving Gaussians that a field in order may throw at any instant..."""
+_FAR = 2.0
+"""...by more than so many times their median distance from their middle, which holds where whoever moves has been. In
+a healthy run of a preview the upper tenth moves by at most 0.04 of it; one that came apart threw them up to 500 times
+as far, at some instants, and the scene's extent, in which far background counts, was no bound (docs/benchmarks.md)."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
@@ -51,39 +56,57 @@ def unstable(step: int) -> JobError:
 
 
 class FieldMemory:
-    """A field's parameters as they were when it was last seen in order, on its device.
+    """A field's parameters as they were when it was last seen in order, and the time before, on its device.
 
-    Only good for as long as the field has the same nodes and box: `keep` it anew when they change.
+    Between two looks it heeds every step: a field that comes apart does so at some instants first, and a look sees the
+    last step's instant alone. Only good for as long as the field has the same nodes and box: `keep` it anew when they
+    change.
     """
 
     def __init__(self) -> None:
-        self._kept: dict[str, Tensor] = {}
+        self._kept: list[dict[str, Tensor]] = []  # the newest last
+        self._reach: Tensor | None = None
+        self._worst: Tensor | None = None
 
     @torch.no_grad()
-    def keep(self, field: Deformation | None) -> None:
-        """Copies the parameters of a field that is in order."""
+    def keep(self, field: Deformation | None, means: Tensor) -> None:
+        """Copies the parameters of a field that is in order, and takes measure of what it moves, means [M, 3]."""
         named = {} if field is None else dict(field.named_parameters())
-        if {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in self._kept.items()}:
-            self._kept = {name: torch.empty_like(p) for name, p in named.items()}
+        if self._kept and {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in self._kept[-1].items()}:
+            self._kept = []
+        kept = self._kept.pop(0) if len(self._kept) > 1 else {n: torch.empty_like(p) for n, p in named.items()}
         for name, p in named.items():
-            self._kept[name].copy_(p)
+            kept[name].copy_(p)
+        self._kept.append(kept)
+        self._worst = None
+        self._reach = _FAR * norm(means - means.median(0).values, 1).median() if len(means) else None
+
+    @torch.no_grad()
+    def heed(self, shift: Tensor) -> None:
+        """A step's `shift` [M, 3] of the means it moves, scene units; what is not finite is for `repair`."""
+        if self._reach is not None and len(shift):
+            thrown = (shift.abs().amax(1) > self._reach).float().mean()
+            self._worst = thrown if self._worst is None else torch.maximum(self._worst, thrown)
 
     def of(self, name: str, p: Tensor) -> Tensor | None:
         """What parameter `name` was; None if not known."""
-        kept = self._kept.get(name)
+        kept = self._kept[-1].get(name) if self._kept else None
         return kept if kept is not None and kept.shape == p.shape else None
 
     @torch.no_grad()
-    def put_back(self, field: Deformation, shift: Tensor, extent: float, optimizer: torch.optim.Optimizer) -> str:
-        """Puts the field back if its last `shift` of means [M, 3] threw a tenth farther than the scene's `extent`.
+    def put_back(self, field: Deformation, optimizer: torch.optim.Optimizer) -> str:
+        """Puts the field back if at some step since the last look it threw too much of what it moves too far.
 
-        Halves the learning rates of what the field owns. Returns what was done, in words.
+        It goes back to the look before the last: what was kept last may have begun to come apart. Halves the learning
+        rates of what the field owns. Returns what was done, in words.
         """
-        named = dict(field.named_parameters())
-        before = {name: kept for name, p in named.items() if (kept := self.of(name, p)) is not None}
-        thrown = ~(shift.abs().amax(1) <= extent)
-        if not len(thrown) or before.keys() != named.keys() or not bool(thrown.float().mean() > _THROWN):
+        worst, self._worst = self._worst, None
+        if worst is None or not self._kept or not bool(worst > _THROWN):
             return ""
+        named, before = dict(field.named_parameters()), self._kept[0]
+        if {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in before.items()}:
+            return ""
+        self._kept = [before]
         for name, p in named.items():
             p.copy_(before[name])
             optimizer.state.pop(p, None)
@@ -91,8 +114,8 @@ class FieldMemory:
         for group in optimizer.param_groups:
             if any(id(p) in owned for p in group["params"]):
                 group["lr_start"], group["lr_end"] = 0.5 * group["lr_start"], 0.5 * group["lr_end"]
-        count = _counted(int(thrown.sum()), "Gaussian")
-        return f"put the field back to what it was, at half the learning rates ({count} thrown out of the scene)"
+        share = f"{100.0 * float(worst):.0f} % of what moves"
+        return f"put the field back to what it was, at half the learning rates ({share} was thrown out of its place)"
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ from ..raster import RasterOutput
 from ..raster.cuda import forget_demands
 from ..scene import Scene
 from ..supervision import Anchored, bin_of, bin_times, draw_anchored, mark_hidden, mark_seen, stillness, support_loss
-from ..torch_types import backward, integers, norm_of_all
+from ..torch_types import backward, integers
 from . import memory
 from .average import ParameterMean
 from .checkpoint import MISFITS, load_checkpoint, misfit, optimizer_state, restore_optimizer, save_checkpoint
@@ -109,9 +109,7 @@ class Trainer:
         self.unusable: set[int] = set()
         self.order: list[int] = []
         self._recent: deque[int] = deque(maxlen=2 * _INSPECT_EVERY)
-        self._memory, self._shift = FieldMemory(), torch.zeros(0, 3, device=self.device)
-        low, high = field_box(scene.points)
-        self._extent = float(norm_of_all(high - low))
+        self._memory = FieldMemory()
         self.poses = Poses(self.times, config.poses, self.device)
         self._refined = False
         self.optimizer = optimizer_of(self.model, self.poses, config)
@@ -243,7 +241,6 @@ class Trainer:
         model = self.model.gaussians
         before = len(model)
         self.optimizer.zero_grad(set_to_none=True)
-        self._shift = self._shift[:0]
         if len(self.densifier.seen) != before:  # it ended between a round of growth and its end
             self.densifier.reset(before)
         forget_demands()
@@ -281,7 +278,8 @@ class Trainer:
         rows = self.model.open_rows()
         pairs = self._pairs_to_anchor(rows)
         deltas, anchored = self._deltas(rows, frame, pairs)
-        self._shift = self._shift[:0] if deltas is None else deltas.means.detach()
+        if deltas is not None:
+            self._memory.heed(deltas.means.detach())
         if deltas is not None and self.progress < self.config.field.detached:
             deltas = deltas.detached()
         state = self.model.moved(rows, deltas)
@@ -440,7 +438,6 @@ class Trainer:
             return
         if harden(self):
             self.policy.gate_hardened(self.iteration)
-            self._shift = self._shift[:0]
 
     def _create_field(self) -> None:
         self.inspect_nonfinite()  # and every bound of the field
@@ -458,7 +455,7 @@ class Trainer:
         for name, owned in field.owned.items():
             if name not in model.params:  # memory may have ended between two of them
                 model.adopt(name, owned.shape, owned.value)
-        self._memory.keep(field)
+        self._memory.keep(field, means)
         add_field(self.optimizer, field, model)  # takes no memory: what is before it can be done again
         self.policy.field_opened(self.iteration, self.trained_seconds)
         self.model.field = field
@@ -552,7 +549,7 @@ class Trainer:
         """
         done = repair(self.model, self.optimizer, self.densifier, self._memory, self.iteration)
         if self.model.field is not None and not done:
-            done = self._memory.put_back(self.model.field, self._shift, self._extent, self.optimizer)
+            done = self._memory.put_back(self.model.field, self.optimizer)
         bad = [] if done or not (skipped or gradients) else self._bad_images()
         if bad:
             self.unusable.update(bad)
@@ -568,7 +565,7 @@ class Trainer:
         elif skipped:
             self.report.warning(skipped)
         elif not gradients:
-            self._memory.keep(self.model.field)
+            self._memory.keep(self.model.field, self.model.gaussians.params["means"].detach()[self.model.open_rows()])
 
     def _bad_images(self) -> list[int]:
         """Of the frames trained on lately, those whose image is not finite."""
