@@ -8,13 +8,15 @@ from typing import Any
 import torch
 from torch import nn
 
-from ..deformation import Deformation
+from ..deformation import Deformation, GateConfig
 from ..gaussians import Gaussians, sh_bases
 from .adam import FusedAdam
 from .config import TrainConfig
 from .model import DynamicModel
 from .poses import Poses
 
+_USUAL = GateConfig().start
+"""Share of the run at which a field joins, unless the run is long."""
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 
 
@@ -42,10 +44,20 @@ def optimizer_of(model: DynamicModel, poses: Poses, config: TrainConfig) -> Fuse
     return FusedAdam(groups, eps=1e-15)
 
 
-def add_field(optimizer: FusedAdam, field: Deformation, model: Gaussians) -> None:
-    """Adds a field's parameters, and those of its own that each Gaussian has."""
+def add_field(optimizer: FusedAdam, field: Deformation, model: Gaussians, config: TrainConfig, share: float) -> None:
+    """Adds a field's parameters, at a `share` of its rates, and those of its own that each Gaussian has.
+
+    Rates fall over the run, and a host's are good from a third of it on: a field that joins sooner starts at what they
+    are by then. At twice that it may come apart (docs/benchmarks.md, "Stability").
+    """
+    joins = config.gate.start if config.method == "auto" else _USUAL
     for group in field.parameter_groups():
-        optimizer.add_param_group({**group, "lr_start": group["lr"]})
+        start, end = share * group["lr"], share * group["lr_end"]
+        since, until = group.get("since", 0.0), group.get("until", 1.0)
+        if joins < _USUAL < until and since < _USUAL:
+            start *= (end / start) ** ((_USUAL - since) / (until - since))
+            since = joins
+        optimizer.add_param_group({**group, "lr": start, "lr_start": start, "lr_end": end, "since": since})
     for name, owned in field.owned.items():
         rates = {"lr": owned.lr, "lr_start": owned.lr, "lr_end": owned.lr_end}
         optimizer.add_param_group({"params": [model.params[name]], "name": name, "rows": True, **rates})

@@ -67,6 +67,8 @@ class FieldMemory:
         self._kept: list[dict[str, Tensor]] = []  # the newest last
         self._reach: Tensor | None = None
         self._worst: Tensor | None = None
+        self.rates = 1.0
+        """Share of the learning rates it began with that a field has after it was put back."""
 
     @torch.no_grad()
     def keep(self, field: Deformation | None, means: Tensor) -> None:
@@ -106,7 +108,7 @@ class FieldMemory:
         named, before = dict(field.named_parameters()), self._kept[0]
         if {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in before.items()}:
             return ""
-        self._kept = [before]
+        self._kept, self.rates = [before], 0.5 * self.rates
         for name, p in named.items():
             p.copy_(before[name])
             optimizer.state.pop(p, None)

@@ -456,7 +456,8 @@ class Trainer:
             if name not in model.params:  # memory may have ended between two of them
                 model.adopt(name, owned.shape, owned.value)
         self._memory.keep(field, means)
-        add_field(self.optimizer, field, model)  # takes no memory: what is before it can be done again
+        # Takes no memory: what is before it can be done again.
+        add_field(self.optimizer, field, model, c, self._memory.rates)
         self.policy.field_opened(self.iteration, self.trained_seconds)
         self.model.field = field
 
@@ -670,6 +671,7 @@ class Trainer:
             "needs": self.policy.state(),
             "trained_seconds": self.trained_seconds,
             "sh_degree": self.model.sh_degree,
+            "field_rates": self._memory.rates,
             "train_frames": [self.scene.frames[i] for i in self.train_ids],
             "width": self.width,
             "height": self.height,
@@ -694,7 +696,8 @@ class Trainer:
         self.model = restore_model(tensors, meta, self.config, self.device)
         self.optimizer = optimizer_of(self.model, self.poses, self.config)
         if self.model.field is not None:
-            add_field(self.optimizer, self.model.field, self.model.gaussians)
+            self._memory.rates = float(meta.get("field_rates", 1.0))
+            add_field(self.optimizer, self.model.field, self.model.gaussians, self.config, self._memory.rates)
         if self.config.poses.on:
             self.poses.values.data.copy_(tensors["poses"])
         restore_optimizer(self._named(), self.optimizer, tensors)

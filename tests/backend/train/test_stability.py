@@ -1,6 +1,7 @@
 """What is not finite, or thrown out of all proportion, is dropped or mended and named; the run goes on."""
 
 import ast
+import dataclasses
 import math
 import pathlib
 import sys
@@ -10,13 +11,18 @@ import torch
 
 from benchmarks.known_failures import TRAINING
 from benchmarks.stability import METHODS, configuration, table, train_once
-from torch_backend.contract import JobError
+from torch_backend.contract import JobError, TrainParams
+from torch_backend.deformation.hexplane import HexPlane
 from torch_backend.scene import load_images, load_scene
+from torch_backend.train import config_from_params
+from torch_backend.train.adam import FusedAdam
+from torch_backend.train.optimizer import add_field, schedule_rates
 from torch_backend.train.repair import repair
 from torch_backend.train.trainer import Trainer
 
 HOSTS = METHODS[:-1]
 NAN = math.nan
+RATES = ("lr", "lr_start", "lr_end")
 
 
 @pytest.fixture
@@ -239,6 +245,39 @@ def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(b
     trainer._memory.heed(torch.zeros_like(means))
     trainer.inspect_nonfinite()
     assert len(warnings(trainer)) == said
+
+
+def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin, tmp_path):
+    trainer = begin("hexplane", 30)
+    trainer._memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
+    trainer.inspect_nonfinite()
+    trainer.save(tmp_path / "checkpoint.safetensors")
+    resumed = begin("hexplane", 0)
+    resumed.restore(tmp_path / "checkpoint.safetensors")
+    rates = [[group[key] for key in ("lr_start", "lr_end")] for group in trainer.optimizer.param_groups]
+    assert [[group[key] for key in ("lr_start", "lr_end")] for group in resumed.optimizer.param_groups] == rates
+    lr = trainer.config.field.lr_grid
+    assert [0.5 * lr, 0.5 * lr * trainer.config.field.lr_end] in rates
+
+
+def test_a_field_that_joins_sooner_starts_at_the_rates_of_a_third_of_the_run():
+    rates = {}
+    for preset in ("standard", "final"):
+        config = config_from_params(TrainParams(preset=preset))
+        settings = dataclasses.replace(config.field, time_nodes=8)
+        box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        field = HexPlane(settings, box, torch.Generator().manual_seed(0))
+        optimizer = FusedAdam(
+            [{"params": [torch.nn.Parameter(torch.zeros(1))], **dict.fromkeys(RATES, 1.0)}], eps=1e-15
+        )
+        add_field(optimizer, field, None, config, 1.0)
+        rates[preset] = []
+        for progress in (config.gate.start, 1.0):
+            schedule_rates(optimizer, progress)
+            rates[preset] += [group["lr"] for group in optimizer.param_groups[1:]]
+    assert rates["final"] == pytest.approx(rates["standard"])
+    third = 0.1 ** (1 / 3)
+    assert rates["final"] == pytest.approx([3e-2 * third, 1e-3 * third, 3e-3, 1e-4])
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh0", "shN"])
