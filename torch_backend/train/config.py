@@ -193,15 +193,17 @@ moves as ghosts that fit one view each, far behind it, and no field puts them ri
 
 
 def _gate_for(config: TrainConfig) -> None:
-    """Opens the gate sooner than published; the trial is as long as it was, anchors and price begin with it, and
-    harmonics before it: else what changes with the view is taken for motion."""
+    """Opens the gate sooner than published; the trial is as long as it was, and anchors and price begin with it.
+
+    So do harmonics in a long run: else what changes with the view is taken for motion. In a short one each degree needs
+    its steps, or none seems worth its while.
+    """
     if config.method != "auto" or config.host_config == "reference":
         return
-    gate, anchors = config.gate, config.supervision
-    start = min(_STATIC, _MOST_STATIC / max(1, config.iterations))
-    sooner = gate.start - start
-    config.sh_every *= start / gate.start
-    gate.start, gate.harden, anchors.start = start, gate.harden - sooner, anchors.start - sooner
+    gate, anchors, steps = config.gate, config.supervision, max(1, config.iterations)
+    sooner = gate.start - min(_STATIC, _MOST_STATIC / steps)
+    gate.start, gate.harden, anchors.start = gate.start - sooner, gate.harden - sooner, anchors.start - sooner
+    config.sh_every *= min(1.0, 3.0 * _MOST_STATIC / steps)
 
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:
