@@ -69,7 +69,7 @@ def test_the_first_steps_of_our_own_runs_are_coarse(begin, method, small):
 def test_growth_waits_for_whole_pictures():
     for preset in PRESETS:
         ours = config_from_params(TrainParams(preset=preset))
-        assert ours.densify.start < ours.coarse <= ours.gate.harden + 1e-9 < ours.densify.stop
+        assert ours.densify.start == ours.coarse <= ours.gate.harden < ours.densify.stop
         published = config_from_params(TrainParams(preset=preset, method="hexplane"))
         assert (published.coarse, published.densify.start, published.densify.stop) == (0.0, 0.06, 0.5)
 
