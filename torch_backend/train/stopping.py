@@ -152,6 +152,8 @@ class RunSchedule:
     """Training steps, if nothing ends the run before."""
     densify_every: int
     """Steps between two rounds of densification."""
+    densify_start: float
+    """Share at which growth begins."""
     densify_stop: float
     """Share at which growth ends of itself."""
     give_up: float
@@ -328,7 +330,10 @@ class StoppingPolicy:
         self.measured.append((probe.iteration, probe.gaussian_count, value))
         # While a field is on trial probes fall and rise by it: one measured 3 steps after it had opened ended growth.
         if fine and not self.joined and self.growing and not self.facts.on_trial:
-            gain = self.facts.growth_gain_db = growth_gain(self.measured, round(_SPAN * self.schedule.iterations))
+            # The first round makes many at once, and probes fall until they have settled.
+            settled = s.densify_start * s.iterations + s.densify_every
+            grown = [row for row in self.measured if row[0] > settled]
+            gain = self.facts.growth_gain_db = growth_gain(grown, round(_SPAN * s.iterations))
             if gain is not None and gain < self.config.growth_gain:
                 self.growth_ended = probe.iteration
         hardened = (s.give_up * s.iterations if self.facts.hardened is None else self.facts.hardened) / s.iterations

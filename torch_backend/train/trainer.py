@@ -101,14 +101,10 @@ class Trainer:
         self.initial = len(gaussians)
         gate, densify = config.gate, config.densify
         schedule = RunSchedule(
-            config.iterations,
-            densify.every,
-            densify.stop,
-            gate.give_up,
-            config.sh_every,
-            config.lr_end,
-            config.coarse if self._coarse is not self._whole else 0.0,
-        )
+            iterations=config.iterations, densify_every=densify.every, densify_start=densify.start,
+            densify_stop=densify.stop, give_up=gate.give_up, sh_every=config.sh_every, rates_end=config.lr_end,
+            coarse=config.coarse if self._coarse is not self._whole else 0.0,
+        )  # fmt: skip
         self.policy = StoppingPolicy(config.needs, len(train) if config.decides else 0, schedule)
         self.extensions: list[Extension] = []
         self.iteration = 0
