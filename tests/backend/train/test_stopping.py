@@ -181,7 +181,7 @@ def test_a_degree_that_gains_too_little_is_dropped_for_good(long_world, quiet, t
 
 
 def test_growth_ends_when_it_gains_too_little(long_world, quiet, tmp_path):
-    changes = {"init__seeds": 0, "densify__budget": 3000, "densify__start": 0.06, "iterations": 200}
+    changes = {"init__seeds": 0, "densify__budget": 3000, "densify__start": 0.06, "iterations": 200, "method": "static"}
     free = finish(trainer_of(long_world, quiet, needs__growth_gain=-1e9, **changes), tmp_path)
     assert free.policy.growth_ended is None
     assert len(free.model.gaussians) > 1000
