@@ -74,12 +74,13 @@ class FieldMemory:
     def keep(self, field: Deformation | None, means: Tensor) -> None:
         """Copies the parameters of a field that is in order, and takes measure of what it moves, means [M, 3]."""
         named = {} if field is None else dict(field.named_parameters())
-        if self._kept and {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in self._kept[-1].items()}:
-            self._kept = []
-        kept = self._kept.pop(0) if len(self._kept) > 1 else {n: torch.empty_like(p) for n, p in named.items()}
-        for name, p in named.items():
-            kept[name].copy_(p)
-        self._kept.append(kept)
+        if not self._kept or {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in self._kept[-1].items()}:
+            # Both at once: what a card holds later does not grow by them.
+            self._kept = [{name: p.detach().clone() for name, p in named.items()} for _ in range(2)]
+        else:
+            self._kept.append(self._kept.pop(0))
+            for name, p in named.items():
+                self._kept[-1][name].copy_(p)
         self._worst = None
         self._reach = _FAR * norm(means - means.median(0).values, 1).median() if len(means) else None
 
@@ -108,9 +109,10 @@ class FieldMemory:
         named, before = dict(field.named_parameters()), self._kept[0]
         if {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in before.items()}:
             return ""
-        self._kept, self.rates = [before], 0.5 * self.rates
+        self.rates *= 0.5
         for name, p in named.items():
             p.copy_(before[name])
+            self._kept[1][name].copy_(p)
             optimizer.state.pop(p, None)
         owned = {id(p) for p in named.values()}
         for group in optimizer.param_groups:
