@@ -39,10 +39,11 @@ _FEW = 0.01
 """
 _THROWN = 0.1
 """Share of the moving Gaussians that a field in order may throw at any instant..."""
-_FAR = 2.0
-"""...by more than so many times their median distance from their middle, which holds where whoever moves has been. In
-a healthy run of a preview the upper tenth moves by at most 0.04 of it; one that came apart threw them up to 500 times
-as far, at some instants, and the scene's extent, in which far background counts, was no bound (docs/benchmarks.md)."""
+_FAR, _LEAST_FAR = 6.0, 1.0
+"""...by more than so many times their median distance from their middle, and scene units, or than the scene's extent:
+somebody may walk as far as what moves reaches, and an apple swing by many times its own size. In a healthy run of a
+preview the upper tenth moves by at most 0.05 of that distance; one that came apart threw it hundreds of times as far
+at some instants, and that extent, in which far background counts, was no bound (docs/benchmarks.md)."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
@@ -63,7 +64,9 @@ class FieldMemory:
     change.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, extent: float) -> None:
+        self.extent = extent
+        """Of the scene, in its units: farther than this is always out of place."""
         self._kept: list[dict[str, Tensor]] = []  # the newest last
         self._reach: Tensor | None = None
         self._worst: Tensor | None = None
@@ -82,7 +85,10 @@ class FieldMemory:
             for name, p in named.items():
                 self._kept[-1][name].copy_(p)
         self._worst = None
-        self._reach = _FAR * norm(means - means.median(0).values, 1).median() if len(means) else None
+        self._reach = None
+        if len(means):
+            around = norm(means - means.median(0).values, 1).median()
+            self._reach = (_FAR * around).clamp(min(_LEAST_FAR, self.extent), self.extent)
 
     @torch.no_grad()
     def heed(self, shift: Tensor) -> None:

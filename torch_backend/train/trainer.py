@@ -20,7 +20,7 @@ from ..raster import RasterOutput
 from ..raster.cuda import forget_demands
 from ..scene import Scene
 from ..supervision import Anchored, bin_of, bin_times, draw_anchored, mark_hidden, mark_seen, stillness, support_loss
-from ..torch_types import backward, integers
+from ..torch_types import backward, integers, norm_of_all
 from . import memory
 from .average import ParameterMean
 from .checkpoint import MISFITS, load_checkpoint, misfit, optimizer_state, restore_optimizer, save_checkpoint
@@ -109,7 +109,8 @@ class Trainer:
         self.unusable: set[int] = set()
         self.order: list[int] = []
         self._recent: deque[int] = deque(maxlen=2 * _INSPECT_EVERY)
-        self._memory = FieldMemory()
+        low, high = field_box(scene.points)
+        self._memory = FieldMemory(float(norm_of_all(high - low)))
         self.poses = Poses(self.times, config.poses, self.device)
         self._refined = False
         self.optimizer = optimizer_of(self.model, self.poses, config)
