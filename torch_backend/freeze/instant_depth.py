@@ -50,6 +50,14 @@ class DepthConfig:
     """Or at most this times that of what is hidden, whichever is nearer."""
     steps: int = 64
     """Inverse depths that are tried."""
+    field_alpha: float = 0.3
+    """Alpha of what the field moves, by itself, from which on the field has something at a pixel."""
+    field_share: float = 0.4
+    """A region is as deep as what the field has there if that fills at least this share of it."""
+    field_jump: float = 0.25
+    """What lies off its median by more than this share of inverse depth is something else."""
+    field_reach: float = 2.0
+    """Standard deviation of the mean of the field's depth that is taken."""
 
 
 @dataclass
@@ -169,6 +177,35 @@ def inverse_depth(
     found = float(np.median(inverse[region]))
     own = own_motion(view, others, region, config, unit)
     return inverse, Region(int(region.sum()), box, 1.0 / found, 1.0 / max(hidden, 1e-10), attached, own)
+
+
+def as_field(
+    inverse: NDArray[np.float32], region: NDArray[np.bool_], config: DepthConfig, unit: float
+) -> NDArray[np.float32] | None:
+    """Inverse depth [h, w] of a region (and around it), just in front of what the field has there; None if that is too
+    little.
+
+    A field that has half a hand, or a pale one, has learnt from all frames around t* where the hand is. With a depth
+    guessed anew the other half would stand elsewhere, and the two come apart from the side.
+
+    Args:
+        inverse: [h, w] of what the field moves there, before all that stands still; 0 where it has nothing.
+        region: [h, w] what the model lacks.
+        unit: pixels per pixel of a picture 320 wide.
+    """
+    import cv2
+
+    there = region & (inverse > 0.0)
+    if there.sum() < max(1.0, config.field_share * region.sum()):
+        return None
+    middle = float(np.median(inverse[there]))
+    apart = np.abs(np.log(np.maximum(inverse, 1e-9) / middle))
+    weight = ((inverse > 0.0) & (apart < np.log1p(config.field_jump))).astype(np.float32)
+    sigma, alone = config.field_reach * unit, 1e-3
+    held = np.asarray(cv2.GaussianBlur(weight, (0, 0), sigma), np.float32)
+    pulled = np.asarray(cv2.GaussianBlur(inverse * weight, (0, 0), sigma), np.float32)
+    told = (1.0 + config.front) * (pulled + alone * middle) / (held + alone)
+    return np.asarray(told, np.float32)
 
 
 def _ring(

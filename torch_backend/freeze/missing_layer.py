@@ -2,7 +2,8 @@
 so that it stands where it stood from every pose, as a layer of small Gaussians in front of the frozen scene.
 
 Whole regions are looked for, on a low-passed residual: a model trained at 320 px is soft everywhere, and softness is
-not disagreement. Depth is told by what a region hangs on (the arm), by the frames around t*, and by what it hides.
+not disagreement. Depth is told by what a region hangs on (the arm), by the frames around t*, and by what it hides;
+where the field has the hand itself, if paler or softer than the plate, it is as deep as that.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from ..train.exposure import Exposure
 from ..train.model import gathered
 from .frozen import FrozenGaussians, FrozenImage, render_frozen
 from .ignored import ignore_mattes
-from .instant_depth import DepthConfig, Region, View, inverse_depth, own_motion
+from .instant_depth import DepthConfig, Region, View, as_field, inverse_depth, own_motion
 from .instant_track import Track, TrackConfig, swing, tracks
 from .reproject import resized
 from .sightings import matte_of
@@ -287,6 +288,7 @@ def _shell(
     covers: list[tuple[NDArray[np.float32], Track | None]]
     covers = [(_cover(bench, image, r), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
     covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
+    fields = _fields_inverse(bench, frozen) if covers else cover
     for soft, thing in covers:
         if soft.max() < 0.5:
             continue
@@ -298,6 +300,9 @@ def _shell(
         if swings is not None:
             depths = np.full_like(depths, 1.0 / swings.depth)
             facts = replace(facts, depth=swings.depth, deviation=swings.deviation)
+        elif (told := as_field(fields, soft >= 0.5, bench.config.depth, bench.unit)) is not None:
+            depths = told
+            facts = replace(facts, depth=1.0 / float(np.median(told[soft >= 0.5])))
         stronger = soft > cover
         inverse[stronger], cover[stronger] = depths[stronger], soft[stronger]
         facts_of_regions.append(facts)
@@ -305,6 +310,17 @@ def _shell(
     rows, columns = np.nonzero(cover > 0.1)
     means = view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
     return _gaussians(bench, frozen, means, rows, columns, inverse, cover, colors), cover, facts_of_regions
+
+
+def _fields_inverse(bench: _Bench, frozen: FrozenGaussians) -> NDArray[np.float32]:
+    """Inverse depth [h, w] of what the field moves before all that stands still, however faint; 0 where nothing."""
+    moves = frozen.motion > 0.5
+    if not bool(moves.any()):
+        return np.zeros((bench.height, bench.width), np.float32)
+    movers, still = bench.render(fade(frozen, moves.float())), bench.render(fade(frozen, (~moves).float()))
+    c, depth = bench.config.depth, movers.depth.numpy()
+    there = (movers.alpha.numpy() > c.field_alpha) & (depth * (1.0 + c.front) < still.depth.numpy())
+    return np.where(there, 1.0 / np.maximum(depth, 1e-6), 0.0).astype(np.float32)
 
 
 def _small_things(bench: _Bench, image: FrozenImage) -> list[Track]:

@@ -9,6 +9,7 @@ import torch
 
 from torch_backend.footage.images import write_png
 from torch_backend.freeze.frozen import FrozenGaussians, freeze_at, render_frozen
+from torch_backend.freeze.instant_depth import DepthConfig, as_field
 from torch_backend.freeze.missing_layer import InstantConfig, instant_layer, join, low_difference
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
@@ -252,6 +253,38 @@ def test_a_logo_on_the_picture_is_no_thing_in_the_scene(tmp_path):
         return picture
 
     assert world(tmp_path, wall(), lambda n: wall(), drawn).layer() is None
+
+
+def pale(state, opacity):
+    return {**state, "opacity_logits": torch.full_like(state["opacity_logits"], opacity)}
+
+
+def test_a_hand_that_the_field_has_but_too_pale_is_as_deep_as_the_field_has_it(tmp_path):
+    deep = 1.3 * ARM  # behind what it seems to hang on
+    behind = {"start": (-0.36, 0.0), "drift": (0.02, 0.06), "z": deep}
+    static, faint = together(wall(), arm()), pale(hand(T_STAR, **behind), -2.2)
+    motion = torch.cat([torch.zeros(len(static["means"])), torch.ones(len(faint["means"]))])
+    known = together(static, faint)
+    made = world(tmp_path, known, lambda n: together(static, hand(n, **behind)), motion=motion)
+    layer = made.found()
+    depths = layer.state["means"][:, 2].numpy()
+    assert abs(np.median(depths) / deep - 1) < 0.05
+    truth_state = together(static, hand(T_STAR, **behind))
+    for n in (1, FRAMES):
+        truth, without = made.image(truth_state, n), made.image(known, n)
+        changed = np.abs(truth - without).max(-1) > 0.1
+        off = np.square(made.image(join(made.frozen, layer).state, n) - truth)[changed].mean()
+        assert off < 0.25 * np.square(without - truth)[changed].mean()
+
+
+def test_a_trace_of_what_the_field_moves_tells_no_depth():
+    inverse, region = np.zeros((40, 40), np.float32), np.zeros((40, 40), bool)
+    region[10:30, 10:30] = True
+    inverse[10:16, 10:30] = 0.2
+    assert as_field(inverse, region, DepthConfig(), 1.0) is None
+    inverse[10:20, 10:30], inverse[18:20, 10:30] = 0.25, 1.0  # and a stray in front
+    told = as_field(inverse, region, DepthConfig(), 1.0)
+    assert told is not None and np.allclose(told[region], 0.25 * (1.0 + DepthConfig().front), rtol=1e-3)
 
 
 def test_moving_gaussians_before_what_plate_t_star_shows_are_faded(tmp_path):
