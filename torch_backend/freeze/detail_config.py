@@ -45,7 +45,7 @@ class DetailConfig:
     believed where plate t* agrees with the render: something held still that was elsewhere."""
     own_time: float = 0.3
     """Share of such a difference that must be gone in the render of the plate's own time."""
-    denied_too: float = 0.1
+    denied_too: float = 0.08
     """The same, for what hangs together with such a spot."""
     thin: int = 3
     """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
