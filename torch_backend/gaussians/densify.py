@@ -31,9 +31,6 @@ class DensifyConfig:
     """Share of the run at which growth begins."""
     stop: float = 0.5
     """Share of the run at which growth ends; pruning goes on."""
-    sooner: float = 0.0
-    """Share of the run by which growth begins and ends sooner in a run that starts with fewer Gaussians than its coarse
-    pictures have pixels: those can still say what to split."""
     every: int = 100
     """Iterations between two rounds."""
     prune_opacity: float = 0.01

@@ -192,9 +192,8 @@ def _rates_for(config: TrainConfig) -> None:
 _STATIC, _MOST_STATIC = 0.2, 3000
 """Share of a run with a gate that stays static, and its most steps. In 10,000 of them, 350,000 Gaussians paint what
 moves as ghosts that fit one view each, far behind it, and no field puts them right (docs/benchmarks.md)."""
-_GROWS, _SPARSE_GROWS_SOONER = (0.0, 0.35), 0.1
-"""Growth begins and ends so much of the run after pictures are whole: coarse ones do not say what to split, unless
-there are fewer Gaussians than they have pixels."""
+_GROWS = (0.0, 0.35)
+"""Growth begins and ends so much of the run after pictures are whole: coarse ones do not say what to split."""
 
 
 def _stages_for(config: TrainConfig) -> None:
@@ -211,7 +210,6 @@ def _stages_for(config: TrainConfig) -> None:
     sooner = gate.start - min(_STATIC, _MOST_STATIC / steps)
     config.coarse = min(config.coarse, gate.harden - sooner)
     config.densify.start, config.densify.stop = (config.coarse + share for share in _GROWS)
-    config.densify.sooner = min(_SPARSE_GROWS_SOONER, config.densify.start)
     if config.method == "auto":
         gate.start, gate.harden, anchors.start = gate.start - sooner, gate.harden - sooner, anchors.start - sooner
         config.sh_every *= min(1.0, 3.0 * _MOST_STATIC / steps)

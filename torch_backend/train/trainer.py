@@ -92,14 +92,14 @@ class Trainer:
         centres = bin_times(scene.times[train])
         self._bins = [bin_of(centres, time) for time in self.times]
         self.centres = centres.to(self.device)
-        self.most, self.pieces, self.initial = most, pieces, 0
+        self.most, self.pieces = most, pieces
         budget = self._densify_config().budget
         count = len(self.centres)
         gaussians = initialise(scene, images, train, count, config.init, self.generator, budget, self.ignored)
         gaussians = gaussians.to(self.device)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure), pieces)
         self.initial = len(gaussians)
-        gate, densify = config.gate, self._densify_config()
+        gate, densify = config.gate, config.densify
         schedule = RunSchedule(
             iterations=config.iterations, densify_every=densify.every, densify_start=densify.start,
             densify_stop=densify.stop, give_up=gate.give_up, sh_every=config.sh_every, rates_end=config.lr_end,
@@ -229,12 +229,8 @@ class Trainer:
         return size.width * size.height
 
     def _densify_config(self) -> DensifyConfig:
-        """As configured, but for what fits and what the run begins with; the configuration itself stays as it was asked
-        for: it is the run's key."""
-        config, coarse = self.config.densify, self._coarse
-        if coarse is not self._whole and self.initial < coarse.width * coarse.height:
-            start, stop = config.start - config.sooner, config.stop - config.sooner
-            config = dataclasses.replace(config, start=start, stop=stop)
+        """As configured, but for what fits; the configuration itself stays as it was asked for: it is the run's key."""
+        config = self.config.densify
         return config if self.most is None else dataclasses.replace(config, budget=min(config.budget, self.most))
 
     def _step_that_fits(self) -> Tensor | None:
@@ -396,7 +392,7 @@ class Trainer:
         if c.poses.on and not self._refined and self.progress >= c.poses.until:
             self._freeze_poses()
         due = self.iteration > 0 and self.iteration % c.densify.every == 0
-        if due and self.densifier.config.start <= self.progress < 0.9:
+        if due and c.densify.start <= self.progress < 0.9:
             self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress, self.policy.growing)
         if c.method == "static":
             return

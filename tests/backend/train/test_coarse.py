@@ -74,18 +74,6 @@ def test_growth_waits_for_whole_pictures():
         assert (published.coarse, published.densify.start, published.densify.stop) == (0.0, 0.06, 0.5)
 
 
-def test_fewer_gaussians_than_coarse_pixels_grow_on_coarse_pictures(begin, scene):
-    few = begin()
-    copies = -(-2000 // len(scene.points))
-    scene.points, scene.colors = scene.points.repeat(copies, 1), scene.colors.repeat(copies, 1)
-    dense = begin(densify=config_from_params(TrainParams(iterations=40, max_gaussians=4000)).densify)
-    assert few.initial < 48 * 36 < dense.initial
-    starts = [(run.densifier.config.start, run.densifier.config.stop) for run in (few, dense)]
-    assert starts == [pytest.approx((0.2, 0.55)), pytest.approx((0.3, 0.65))]
-    assert few.policy.schedule.densify_start == few.densifier.config.start
-    assert begin(method="hexplane").densifier.config.start == 0.06, "as published"
-
-
 def test_a_resumed_run_goes_on_at_its_size(begin, tmp_path):
     """To the bit, from the middle of the coarse part and beyond its end."""
     straight = begin()
