@@ -15,6 +15,7 @@ time was left. `--dry-run` carries the same code out on the processor, at tiny s
 import argparse
 import itertools
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -402,8 +403,8 @@ def _resumed(stage: Stage) -> dict[str, Any]:
     """A run saved before a round of growth, and gone on with on each device."""
     most, width = (1200, 64) if stage.dry else (60_000, 640)
     trainer = _trainer(stage, 600, most, width)
-    every = trainer.config.densify.every
-    for _ in range(every):
+    growth = trainer.config.densify
+    for _ in range(growth.every * max(1, math.ceil(growth.start * trainer.config.iterations / growth.every))):
         _step(trainer)
     path = stage.results / "gpu-scratch.safetensors"
     trainer.save(path)

@@ -44,6 +44,7 @@ def new_trainer(world: Any, quiet: type, method: str, supervision: str, poses: b
     config = config_from_params(asked)
     config.poses.on, config.densify.every, config.init.seeds = poses, 5, 0
     config.gate.start, config.field.start, config.supervision.support_samples = 0.2, 0.2, 64
+    config.densify.start = min(config.densify.start, 0.2)
     if method in ("mlp", "control_points"):
         config.field.noise = 0.1  # published: times are blurred
     images = load_images(scene, scene.solved, 32, 24).to("cuda")
