@@ -288,7 +288,7 @@ def _shell(
     covers: list[tuple[NDArray[np.float32], Track | None]]
     covers = [(_cover(bench, image, r), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
     covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
-    fields = _fields_inverse(bench, frozen) if covers else cover
+    fields = _fields_inverse(bench, frozen) if covers else inverse
     for soft, thing in covers:
         if soft.max() < 0.5:
             continue
