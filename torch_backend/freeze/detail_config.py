@@ -68,6 +68,16 @@ class DetailConfig:
     outlines, too, are as that plate has them then."""
     torn_too: float = 0.03
     """The same, for what hangs together with such a spot."""
+    ghost: float = 0.06
+    """Low-passed difference between plate t* and the splats, display-referred, from which on these show a ghost on what
+    stands still behind what is let go of,"""
+    ghost_too: float = 0.03
+    """and from which on what hangs together with such a spot is of it."""
+    ghost_of: tuple[float, float] = (0.8, 0.9)
+    """Shares of the difference between plate t* and the leading plate that those are at most: a ghost is a part of what
+    that plate shows there."""
+    sliver: int = 2
+    """Half the width in pixels below which of a ghost nothing is mended: along outlines bits would stand."""
     rim: int = 2
     """Pixels along the outline of what plate t* shows, and along jumps of depth, in which it does not count."""
     medians: int = 3

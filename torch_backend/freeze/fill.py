@@ -71,7 +71,7 @@ def fillers_of(
     agreed = _agreed(sightings, config, posed, chosen, moved)
     residuals = [sightings.residual(frame) for frame in chosen]
     most = max(sightings.scene.display.most, *(sightings.most(frame) for frame in chosen))
-    instant = instant_pixels(sightings, config, posed, usable)
+    instant = instant_pixels(sightings, config, posed, leading, usable)
     return Fillers(chosen, moved, unknown, shown, agreed, residuals, most, instant)
 
 

@@ -49,8 +49,11 @@ class HeldConfig:
     """Square pixels that a region has at least,"""
     rim: float = 3.0
     """and pixels around it in which it is asked whether the plates agree there,"""
-    share: float = 0.6
+    share: float = 0.5
     """in at least this share of them."""
+    hole: float = 0.4
+    """Share of the pixels around a hole that were found, for what it holds to go with them: the middle of a hand that
+    has the colour of the wall."""
     shift: float = 16.0
     """By how much plate t* is shifted to see whether it shows the region somewhere near: then depth is wrong there."""
     step: float = 2.0
@@ -102,17 +105,29 @@ def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlat
     What is let go of (`wrong`, bool [h, w]) or clipped says nothing of it; and what is clipped in one plate may be as
     bright as the other says.
     """
+    made = both.instant + light_between(both, wrong, sigma) * both.seen[..., None]
+    made = torch.where(both.instant > _CLIPPED, torch.maximum(made, both.own), made)
+    made = torch.where(both.own > _CLIPPED, torch.minimum(made, both.own), made)
+    return BothPlates(both.own, made, both.seen)
+
+
+def light_between(both: BothPlates, wrong: Tensor, sigma: float) -> Tensor:
+    """[h, w, 3] by how much the own plate is brighter, smoothly; see `in_the_same_light`."""
     h, w = wrong.shape
     clipped = torch.maximum(both.own, both.instant).amax(dim=-1) > _CLIPPED
     counts = ((both.seen > 0.5) & ~wrong & ~clipped).float()[..., None]
     size = (w + _COARSE - 1) // _COARSE, (h + _COARSE - 1) // _COARSE
     told = torch.cat([(both.own - both.instant) * counts, counts], dim=-1)
     light = blurred(resized(told, *size), sigma / _COARSE)
-    light = resized(light[..., :3] / light[..., 3:].clamp_min(1e-3), w, h)
-    made = both.instant + light * both.seen[..., None]
-    made = torch.where(both.instant > _CLIPPED, torch.maximum(made, both.own), made)
-    made = torch.where(both.own > _CLIPPED, torch.minimum(made, both.own), made)
-    return BothPlates(both.own, made, both.seen)
+    return resized(light[..., :3] / light[..., 3:].clamp_min(1e-3), w, h)
+
+
+def with_holes(wrong: Tensor, found: Tensor, unit: float, config: HeldConfig) -> tuple[Tensor, Tensor]:
+    """(what is let go of, what of it was `found`), bool [h, w] both, with the holes that what was found surrounds."""
+    if not bool(found.any()):
+        return wrong, found
+    holes = enclosed(~wrong, found, max(1, round(config.rim * unit)), config.hole)
+    return wrong | holes, found | holes
 
 
 def _elsewhere(soft: BothPlates, apart: Tensor, unit: float, config: HeldConfig) -> Tensor:

@@ -11,7 +11,7 @@ from ..torch_types import norm
 from .bands import bands
 from .detail_config import DetailConfig
 from .frozen import SUPPORT_SECONDS, OutputFrame
-from .held import BothPlates, held
+from .held import BothPlates, held, with_holes
 from .posed import PosedFrame, displacements, parallax
 from .regions import closed, grown, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
@@ -141,7 +141,8 @@ def _let_go(
     if both is not None:
         wrong = sightings.whole(wrong, contrary, config.denied_too)
     found = torch.zeros_like(wrong) if both is None else held(both, off, wrong, sightings.unit, config.held)
-    return closed(wrong | found, round(config.gap * sightings.unit)), found
+    wrong = closed(wrong | found, round(config.gap * sightings.unit))
+    return with_holes(wrong, found, sightings.unit, config.held)
 
 
 def _off(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:

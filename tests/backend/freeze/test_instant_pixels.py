@@ -9,7 +9,7 @@ import torch
 from tests.backend.freeze.test_detail import H, W, build, off, widened
 from torch_backend.freeze.detail import DetailConfig, Detailer
 from torch_backend.freeze.frozen import freeze_at, render_frozen
-from torch_backend.freeze.instant_pixels import _bridged
+from torch_backend.freeze.instant_view import bridged
 from torch_backend.freeze.reproject import pixel_centres
 
 SHARP = DetailConfig(depth_error=0.01)
@@ -93,9 +93,9 @@ def test_a_gap_is_shown_as_around_it_unless_two_surfaces_meet_there():
     places[:, 26:, 0] += 6.0
     rough = places.clone()
     rough[~seen] += 30.0 * torch.randn(int((~seen).sum()), 2, generator=torch.Generator().manual_seed(0))
-    found, steady = _bridged(rough, seen, 4.0, 1.5)
+    found, steady = bridged(rough, seen, 4.0, 1.5)
     assert torch.equal(found[seen], rough[seen]) and bool(steady[seen].all())
     assert bool(steady[12:16, 10:14].all()) and (found - places)[12:16, 10:14].abs().max() < 0.2
     assert not bool(steady[:, 25:28].any()), "a hand and the wall behind it"
-    nothing, told = _bridged(rough, torch.zeros_like(seen), 4.0, 1.5)
+    nothing, told = bridged(rough, torch.zeros_like(seen), 4.0, 1.5)
     assert bool(nothing.isfinite().all()) and not bool(told.any())

@@ -1,0 +1,114 @@
+"""What plate t* shows of the surfaces that a frame sees, whatever the splats make of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..scene import resize_intrinsics
+from ..torch_types import from_numpy, norm
+from .detail_config import DetailConfig
+from .posed import PosedFrame
+from .reproject import blurred, look_up, pixel_centres, unproject
+from .sightings import Sighting, Sightings
+
+_FEW = 0.01
+"""Share of what lies around a gap that has to be seen for anything to be told of it."""
+
+
+@dataclass
+class InstantView:
+    """Plate t* as a frame sees it; [h, w] at the size of decisions."""
+
+    depth: Tensor
+    """Along the frame's axis, without what single pixels' depths are off by."""
+    points: Tensor
+    """[h, w, 3] world points at that depth."""
+    sighting: Sighting
+    """How plate t* shows them."""
+    near: Tensor
+    """In 0..1: how far it is believed, by the angle between the two views."""
+    picture: Tensor
+    """[h, w, 3] plate t* itself, display-referred, as it was exposed."""
+    gain: Tensor
+    """[3] by which its colours are multiplied, and"""
+    offset: Tensor
+    """[3] that is added, to expose them as the frame is."""
+
+    def told(self, places: Tensor) -> Tensor:
+        """[..., 3] what it shows at its pixels [..., 2], exposed as the frame is."""
+        return look_up(self.picture, places) * self.gain + self.offset
+
+    def shows(self, where: Tensor) -> Tensor:
+        """[h, w] in 0..1: how well it shows what is `where`, bool [h, w], from near enough; 0 elsewhere."""
+        return self.sighting.visible * where * (self.near > 0.0)
+
+
+def instant_view(sightings: Sightings, config: DetailConfig, posed: PosedFrame) -> InstantView:
+    """Plate t* for a frame; which has to be one of those that may be used."""
+    depth = _smooth_depth(config, posed)
+    points = _points(posed, depth)
+    angle = _angle(points, sightings.centres[sightings.index[posed.t]], posed.centre)
+    sighting = sightings.seen(posed.t, points)
+    picture = sightings.view(posed.t).picture.float()
+    return InstantView(depth, points, sighting, _nearness(config, angle), picture, *exposed(sightings, posed, posed.t))
+
+
+def bridged(places: Tensor, seen: Tensor, sigma: float, unsteady: float) -> tuple[Tensor, Tensor]:
+    """[h, w, 2] where plate t* shows each pixel, and bool [h, w] where that can be told.
+
+    In gaps of what it is `seen` to show depth is rough, and would fetch a pixel from anywhere: there it is as around
+    them, if all around is displaced alike, to `unsteady` pixels. Where it is not, two surfaces meet.
+    """
+    h, w = seen.shape
+    here, counts = pixel_centres(w, h), seen.float()[..., None]
+    moved = (places - here).clamp(-w, w) * counts
+    around = blurred(torch.cat([moved, moved.square().sum(-1, keepdim=True), counts], dim=-1), max(1.0, sigma))
+    told = around[..., :3] / around[..., 3:].clamp_min(1e-6)
+    mean, square = told[..., :2], told[..., 2]
+    steady = (square - mean.square().sum(-1) < unsteady**2) & (around[..., 3] > _FEW)
+    return torch.where(counts > 0.0, places, here + mean), seen | steady
+
+
+def _nearness(config: DetailConfig, beside: Tensor) -> Tensor:
+    """[...] in 0..1: how far plate t* is believed about what it sees from so many degrees aside."""
+    first, last = config.beside
+    return ((last - beside) / max(last - first, 1e-6)).clamp(0.0, 1.0)
+
+
+def _angle(points: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    """[...] degrees between the directions from which two places [3] see points [..., 3]."""
+    a, b = points - first, points - second
+    cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
+    return torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
+
+
+def _smooth_depth(config: DetailConfig, posed: PosedFrame) -> Tensor:
+    """[h, w] depth of what is seen, without what single pixels' depths are off by; edges stay."""
+    import cv2
+
+    depth = posed.depth.clamp_max(1e6).numpy()
+    for _ in range(config.medians):
+        depth = np.asarray(cv2.medianBlur(depth, 5))
+    return from_numpy(depth)
+
+
+def _points(posed: PosedFrame, depth: Tensor) -> Tensor:
+    """[h, w, 3] world points that are seen at a depth [h, w]."""
+    h, w = depth.shape
+    rows, columns = posed.image.alpha.shape
+    K = resize_intrinsics(posed.K[None], columns, rows, w, h)[0]
+    return unproject(pixel_centres(w, h), depth, posed.viewmat, K)
+
+
+def exposed(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:
+    """(gain [3], offset [3]) from the exposure of a plate to that of the frame that is made."""
+    exposure = sightings.run.model.exposure
+    if not exposure.config.on:
+        return torch.ones(3, device="cpu"), torch.zeros(3, device="cpu")
+    theirs, ours = sightings.scene.time_of_frame(frame), posed.exposed_at
+    (gain, offset), (our_gain, our_offset) = ([part.detach().cpu() for part in exposure.at(t)] for t in (theirs, ours))
+    return our_gain / gain, our_offset - offset * our_gain / gain
