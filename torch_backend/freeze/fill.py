@@ -167,7 +167,9 @@ def fill(
     filling.color += carried * filling.share[:, None]
     if fillers.instant is not None:
         # A plate near in pose that shows the same, a little swayed, has it at its place: plate t* may be a pixel off.
-        told = look_up(fillers.instant.where, small) * (1.0 - same_state)
+        # What it adds is what the model missed of it, so it rids nothing of a ghost.
+        haunted = look_up(fillers.instant.haunted, small)
+        told = look_up(fillers.instant.where, small) * (1.0 - same_state * (1.0 - haunted))
         on = told > 0.0
         shown = fillers.instant.at(small[on], larger)
         filling.color[on] = torch.lerp(filling.color[on], shown, told[on][:, None])

@@ -60,13 +60,10 @@ def ghosts(
     if not bool(clear.any()):
         return None
     places, steady = bridged(view.sighting.pixels, counts > 0.5, gap, config.unsteady * unit)
-    light = _light(config, view, shown, let_go, unit)
+    lead, light = _beside_it(sightings, config, posed, leading, view, let_go)
     counted = counts[..., None]
     told = (view.told(places) + light) * counted
-    off = sightings.difference(told, shown * counted)
-    gain, offset = exposed(sightings, posed, leading)
-    lead = look_up(sightings.view(leading).picture.float(), sightings.seen(leading, view.points).pixels)
-    most = sightings.difference(told, (lead * gain + offset) * counted)
+    off, most = (sightings.difference(told, other * counted) for other in (shown, lead))
     some, more = config.ghost_of
     spots = opened((off > config.ghost) & (off < some * most), round(config.thin * unit))
     found = sightings.whole(spots, torch.where(off < more * most, off, 0.0), config.ghost_too) | (posed.held > 0.5)
@@ -76,12 +73,20 @@ def ghosts(
     return Ghosts(where, places, light) if bool(where.any()) else None
 
 
-def _light(config: DetailConfig, view: InstantView, shown: Tensor, let_go: Tensor, unit: float) -> Tensor:
-    """[h, w, 3] by how much the splats are brighter than plate t* around what is let go of, smoothly."""
-    sees = view.sighting.visible * (view.near > 0.0)
+def _beside_it(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, leading: int, view: InstantView, let_go: Tensor
+) -> tuple[Tensor, Tensor]:
+    """([h, w, 3] what the leading plate shows, [h, w, 3] by how much that is brighter than plate t*, smoothly).
+
+    Where it is believed the frame is that plate: no seam is to be seen where plate t* begins.
+    """
+    gain, offset = exposed(sightings, posed, leading)
+    sighting = sightings.seen(leading, view.points)
+    lead = look_up(sightings.view(leading).picture.float(), sighting.pixels) * gain + offset
+    sees = torch.minimum(view.sighting.visible * (view.near > 0.0), sighting.visible)
     told = view.told(view.sighting.pixels)
-    both = BothPlates(shown * sees[..., None], told * sees[..., None], sees)
-    return light_between(both, let_go, config.held.light * unit)
+    both = BothPlates(lead * sees[..., None], told * sees[..., None], sees)
+    return lead, light_between(both, let_go, config.held.light * sightings.unit)
 
 
 def _behind_rims(sightings: Sightings, config: DetailConfig, posed: PosedFrame, places: Tensor) -> Tensor:

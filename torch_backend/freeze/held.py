@@ -49,7 +49,7 @@ class HeldConfig:
     """Square pixels that a region has at least,"""
     rim: float = 3.0
     """and pixels around it in which it is asked whether the plates agree there,"""
-    share: float = 0.5
+    share: float = 0.4
     """in at least this share of them."""
     hole: float = 0.4
     """Share of the pixels around a hole that were found, for what it holds to go with them: the middle of a hand that
@@ -89,7 +89,8 @@ def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: Held
     found = grown(wrong, elsewhere, round(config.reach * unit)) & ~wrong
     if not bool(found.any()):
         return found
-    agree = (both.seen > 0.5) & (apart < config.apart)
+    around = blurred(both.seen, config.low * unit)  # beside what plate t* does not see both are 0, and agree in nothing
+    agree = (both.seen > 0.5) & (apart < config.apart * around)
     rim, least = max(1, round(config.rim * unit)), config.least * unit**2
     found = enclosed(found, agree | wrong, rim, config.share, least)
     out = torch.zeros_like(found)
@@ -126,7 +127,10 @@ def with_holes(wrong: Tensor, found: Tensor, unit: float, config: HeldConfig) ->
     """(what is let go of, what of it was `found`), bool [h, w] both, with the holes that what was found surrounds."""
     if not bool(found.any()):
         return wrong, found
-    holes = enclosed(~wrong, found, max(1, round(config.rim * unit)), config.hole)
+    holes = torch.zeros_like(found)
+    for region in components(enclosed(~wrong, found, max(1, round(config.rim * unit)), config.hole)):
+        if not bool(torch.cat([region[0], region[-1], region[:, 0], region[:, -1]]).any()):  # all around is no hole
+            holes |= region
     return wrong | holes, found | holes
 
 

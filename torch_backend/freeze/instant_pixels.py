@@ -30,7 +30,9 @@ class InstantPixels:
     """Plate t* as it fills a frame."""
 
     where: Tensor
-    """[h, w] in 0..1: how much of what it shows stands in place of the splats, at the size of decisions."""
+    """[h, w] in 0..1: how much of what it shows stands in place of the splats, at the size of decisions,"""
+    haunted: Tensor
+    """[h, w] in 0..1: and how much of that in place of a ghost."""
     places: Tensor
     """[h, w, 2] where it shows each, in pixels of the size of decisions."""
     plate: Tensor
@@ -81,16 +83,16 @@ def instant_pixels(
     movers = let_go & (moves > config.moves)
     taken, places = _of_movers(sightings, config, posed, view, shown, moves, view.shows(movers))
     behind = ghosts(sightings, config, posed, leading, view, shown, let_go, view.shows(let_go & ~movers))
-    light = torch.zeros_like(shown)
+    light, haunted = torch.zeros_like(shown), torch.zeros_like(view.depth)
     if behind is not None:
         near = (widened(behind.where, _feather(config, sightings)) > 0.5) & ~taken
         places = torch.where(near[..., None], behind.places, places)
         light = torch.where(near[..., None], behind.light, light)
-        taken = taken | behind.where
+        taken, haunted = taken | behind.where, near.float()
     if not bool(taken.any()):
         return None
     where = blurred(taken.float(), config.feather * sightings.unit) * view.near
-    return InstantPixels(where, places, sightings.displayed(posed.t), view.gain, view.offset, light)
+    return InstantPixels(where, haunted, places, sightings.displayed(posed.t), view.gain, view.offset, light)
 
 
 def _feather(config: DetailConfig, sightings: Sightings) -> int:

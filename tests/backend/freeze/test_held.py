@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from torch_backend.freeze.held import BothPlates, HeldConfig, held, in_the_same_light
+from torch_backend.freeze.held import BothPlates, HeldConfig, held, in_the_same_light, with_holes
 from torch_backend.freeze.reproject import blurred
 
 H, W = 160, 240
@@ -110,3 +110,18 @@ def test_what_plate_t_star_shows_close_by_is_carried_to_the_wrong_place_and_no_o
     assert not found(plates(own, moved), sleeve).any()
     assert found(plates(own, moved), sleeve, config=replace(CONFIG, left=0.0)).any(), "else something else says no"
     assert found(plates(own, wall()), sleeve)[hand].float().mean() > 0.5
+
+
+def test_the_middle_of_a_hand_that_has_the_walls_colour_goes_with_its_rim():
+    """A window that an arm surrounds is let go of only if it is what was found that surrounds it."""
+    _, hand = arm()
+    palm, window = torch.zeros_like(hand), torch.zeros_like(hand)
+    palm[80:96, 94:106] = True
+    window[20:40, 20:40] = True
+    rim, wrong = hand & ~palm, torch.zeros_like(hand)
+    wrong[10:50, 10:50] = True
+    wrong &= ~window
+    let_go, of_it = with_holes(wrong | rim, rim, 1.0, CONFIG)
+    assert torch.equal(of_it, hand) and torch.equal(let_go, wrong | hand)
+    nothing = torch.zeros_like(rim)
+    assert with_holes(wrong, nothing, 1.0, CONFIG)[0] is wrong
