@@ -4,23 +4,24 @@ A hand that was held before a monitor for a second is in the splats as a smear, 
 the frame is. The own plate is let go of there, since it shows the hand; other plates add what the model missed of
 *them*, and know nothing of the smear either. Plate t* shows the monitor: where splats differ from it, as a region, and
 towards what the leading plate shows, they are haunted, and its pixels stand in their place. What shines differs
-from plate t* as well, but as much as the leading plate does.
+from plate t* as well, but as much as the leading plate does. Light falls otherwise in the two plates, which is made
+good as around it: where the leading plate is believed the frame is that plate, and no seam may show.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from .detail_config import DetailConfig
-from .held import BothPlates, light_between
+from .held import BothPlates, left_by_shifts, light_between
 from .instant_view import InstantView, bridged, exposed
 from .posed import PosedFrame
-from .regions import closed, opened
-from .reproject import look_up, narrowed
-from .sightings import Sightings
+from .regions import closed, components, opened
+from .reproject import blurred, look_up, narrowed
+from .sightings import Sighting, Sightings
 
 
 @dataclass
@@ -60,33 +61,42 @@ def ghosts(
     if not bool(clear.any()):
         return None
     places, steady = bridged(view.sighting.pixels, counts > 0.5, gap, config.unsteady * unit)
-    lead, light = _beside_it(sightings, config, posed, leading, view, let_go)
+    both, sighting = _both(sightings, posed, leading, view)
+    alike = replace(both, seen=torch.minimum(both.seen, sighting.visible))
+    light = light_between(alike, let_go, config.held.light * unit)
     counted = counts[..., None]
     told = (view.told(places) + light) * counted
-    off, most = (sightings.difference(told, other * counted) for other in (shown, lead))
+    off, most = (sightings.difference(told, other * counted) for other in (shown, both.own))
     some, more = config.ghost_of
     spots = opened((off > config.ghost) & (off < some * most), round(config.thin * unit))
     found = sightings.whole(spots, torch.where(off < more * most, off, 0.0), config.ghost_too) | (posed.held > 0.5)
-    where = opened(
-        found & clear & steady & ~_behind_rims(sightings, config, posed, places), round(config.sliver * unit)
-    )
+    found &= clear & steady & ~_behind_rims(sightings, config, posed, places)
+    known = torch.maximum(sighting.moving, posed.held)
+    where = _passed(config, both, light, known, opened(found, round(config.sliver * unit)), unit)
     return Ghosts(where, places, light) if bool(where.any()) else None
 
 
-def _beside_it(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, leading: int, view: InstantView, let_go: Tensor
-) -> tuple[Tensor, Tensor]:
-    """([h, w, 3] what the leading plate shows, [h, w, 3] by how much that is brighter than plate t*, smoothly).
-
-    Where it is believed the frame is that plate: no seam is to be seen where plate t* begins.
-    """
+def _both(sightings: Sightings, posed: PosedFrame, leading: int, view: InstantView) -> tuple[BothPlates, Sighting]:
+    """(the leading plate and plate t*, exposed as the frame is, and how the first shows what the frame sees)."""
     gain, offset = exposed(sightings, posed, leading)
     sighting = sightings.seen(leading, view.points)
     lead = look_up(sightings.view(leading).picture.float(), sighting.pixels) * gain + offset
-    sees = torch.minimum(view.sighting.visible * (view.near > 0.0), sighting.visible)
-    told = view.told(view.sighting.pixels)
-    both = BothPlates(lead * sees[..., None], told * sees[..., None], sees)
-    return lead, light_between(both, let_go, config.held.light * sightings.unit)
+    sees = view.sighting.visible * (view.near > 0.0)
+    return BothPlates(lead, view.told(view.sighting.pixels) * sees[..., None], sees), sighting
+
+
+def _passed(config: DetailConfig, both: BothPlates, light: Tensor, known: Tensor, where: Tensor, unit: float) -> Tensor:
+    """[h, w] bool: the regions of `where` in which the leading plate shows something that was elsewhere at t*.
+
+    That is `known`, [h, w] in 0..1, by mattes or by what is held, or plate t* shows its like nowhere near.
+    """
+    grain = config.held.grain * unit
+    own, instant = (blurred(of, grain) for of in (both.own, both.instant + light * both.seen[..., None]))
+    soft, out = BothPlates(own, instant, both.seen), torch.zeros_like(where)
+    for region in components(where):
+        if float(known[region].mean()) > 0.5 or left_by_shifts(soft, region, unit, config.held) > config.held.left:
+            out |= region
+    return out
 
 
 def _behind_rims(sightings: Sightings, config: DetailConfig, posed: PosedFrame, places: Tensor) -> Tensor:

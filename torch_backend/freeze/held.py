@@ -95,7 +95,7 @@ def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: Held
     found = enclosed(found, agree | wrong, rim, config.share, least)
     out = torch.zeros_like(found)
     for region in components(found):
-        if _left_by_shifts(soft, region, unit, config) > config.left:
+        if left_by_shifts(soft, region, unit, config) > config.left:
             out |= region
     return out
 
@@ -142,7 +142,7 @@ def _elsewhere(soft: BothPlates, apart: Tensor, unit: float, config: HeldConfig)
     return spots | (widened(spots, round(config.near * unit)) & (apart > config.apart))
 
 
-def _left_by_shifts(soft: BothPlates, region: Tensor, unit: float, config: HeldConfig) -> float:
+def left_by_shifts(soft: BothPlates, region: Tensor, unit: float, config: HeldConfig) -> float:
     """What is left of the plates' difference in a region, bool [h, w], if plate t* is shifted as suits it best.
 
     A thing that is not there is nowhere near; what a wrong depth has carried to the wrong place is.
