@@ -60,29 +60,34 @@ def ghosts(
     clear = narrowed(closed(counts > 0.5, round(gap)), rim)
     if not bool(clear.any()):
         return None
-    places, steady = bridged(view.sighting.pixels, counts > 0.5, gap, config.unsteady * unit)
-    both, sighting = _both(sightings, posed, leading, view)
+    told = view.told(view.sighting.pixels)
+    both, sighting = _both(sightings, posed, leading, view, told)
     alike = replace(both, seen=torch.minimum(both.seen, sighting.visible))
     light = light_between(alike, let_go, config.held.light * unit)
     counted = counts[..., None]
-    told = (view.told(places) + light) * counted
-    off, most = (sightings.difference(told, other * counted) for other in (shown, both.own))
+    instant = (told + light) * counted
+    off, most = (sightings.difference(instant, other * counted) for other in (shown, both.own))
     some, more = config.ghost_of
     spots = opened((off > config.ghost) & (off < some * most), round(config.thin * unit))
     found = sightings.whole(spots, torch.where(off < more * most, off, 0.0), config.ghost_too) | (posed.held > 0.5)
+    if not bool((found & clear).any()):
+        return None
+    places, steady = bridged(view.sighting.pixels, counts > 0.5, gap, config.unsteady * unit)
     found &= clear & steady & ~_behind_rims(sightings, config, posed, places)
     known = torch.maximum(sighting.moving, posed.held)
     where = _passed(config, both, light, known, opened(found, round(config.sliver * unit)), unit)
     return Ghosts(where, places, light) if bool(where.any()) else None
 
 
-def _both(sightings: Sightings, posed: PosedFrame, leading: int, view: InstantView) -> tuple[BothPlates, Sighting]:
-    """(the leading plate and plate t*, exposed as the frame is, and how the first shows what the frame sees)."""
+def _both(
+    sightings: Sightings, posed: PosedFrame, leading: int, view: InstantView, told: Tensor
+) -> tuple[BothPlates, Sighting]:
+    """(the leading plate and plate t*, which tells `told`, and how the first shows what the frame sees)."""
     gain, offset = exposed(sightings, posed, leading)
     sighting = sightings.seen(leading, view.points)
     lead = look_up(sightings.view(leading).picture.float(), sighting.pixels) * gain + offset
     sees = view.sighting.visible * (view.near > 0.0)
-    return BothPlates(lead, view.told(view.sighting.pixels) * sees[..., None], sees), sighting
+    return BothPlates(lead, told * sees[..., None], sees), sighting
 
 
 def _passed(config: DetailConfig, both: BothPlates, light: Tensor, known: Tensor, where: Tensor, unit: float) -> Tensor:
