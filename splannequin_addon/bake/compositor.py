@@ -197,11 +197,11 @@ def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Ite
     ]
     if warp and any(take.plate_size):
         wanted.append(_warp_picture(take))
-    if plate is not None:
-        wanted.append(original_plate.to_read(take, _shot_of(take), plate))
     for path, name, encoding in wanted:
         sequences.read(path, name, encoding, take.first, take.last)
         yield
+    if plate is not None:
+        yield from original_plate.read_ahead(take, _shot_of(take), plate)
 
 
 def _warp_picture(take: Take) -> tuple[Path, str, sequences.Encoding]:

@@ -6,6 +6,7 @@ working frames stand in, and a sentence says why.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,18 +97,24 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
         return Plate(image, None, said, size, working_light.has_shoulder(contract.ShotFolder(shot)))
     st = None
     if footage.map is not None:
-        st = sequences.load_numbers(footage.map, f"Undistort {take.folder.name}")
+        st = sequences.load_numbers(footage.map, _map_name(take))
     width, height = footage.size
     without = ", without its lens by the take's ST map" if st is not None else ""
     return Plate(image, st, [f"The plate is {footage.file.name} itself, {width} x {height}{without}."], footage.size)
 
 
-def to_read(take: Take, shot: Path, stand_in: Path) -> tuple[Path, str, sequences.Encoding]:
-    """File, name and encoding of the picture that `plate_of` will have read."""
+def read_ahead(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
+    """Has Blender read the pictures that `plate_of` will need, one a turn."""
     footage, _ = footage_of(take, shot)
     if footage is None or not compat.knows_colour(footage.probe):
-        return stand_in, working_name(stand_in), "srgb"
-    return footage.file, _name(footage), footage.probe
+        sequences.read(stand_in, working_name(stand_in), "srgb", take.first, take.last)
+        yield
+        return
+    sequences.read(footage.file, _name(footage), footage.probe, take.first, take.last, opaque=True)
+    yield
+    if footage.map is not None:
+        sequences.read_numbers(footage.map, _map_name(take))
+        yield
 
 
 def working_name(plate: Path) -> str:
@@ -119,15 +126,18 @@ def _name(footage: Footage) -> str:
     return f"Plate {footage.file.stem}"
 
 
+def _map_name(take: Take) -> str:
+    return f"Undistort {take.folder.name}"
+
+
 def _image(footage: Footage, frames: tuple[int, int]) -> tuple[bpy.types.Image | None, str]:
     """The footage as a data-block, or None and why Blender does not show it as it is."""
     try:
-        image = sequences.load_sequence(footage.file, _name(footage), footage.probe)
+        image = sequences.load_sequence(footage.file, _name(footage), footage.probe, opaque=True)
     except ValueError:
         return None, f"Blender's colour configuration has no space like {footage.space}"
     except RuntimeError:
         return None, f"Blender cannot read {footage.file.name}"
-    image.alpha_mode = "NONE"  # a plate is opaque; its colour is taken as it stands in the file
     size = sequences.shown_size(image, *frames)
     if size == footage.size:
         return image, ""

@@ -16,7 +16,8 @@ from .ownership import TAG
 Encoding = str | tuple[float, ...]
 """How a file's numbers are meant, as `compat.colour_space` has it."""
 _ahead: set[str] = set()
-"""Files that `read_ahead` has just had read: the next `load_sequence` takes them as they are."""
+"""Files that `read` and `read_numbers` have just had read: the next time that they are loaded they are taken as they
+are."""
 
 
 def forget_ahead() -> None:
@@ -24,11 +25,18 @@ def forget_ahead() -> None:
     _ahead.clear()
 
 
-def read(path: Path, name: str, encoding: Encoding, first: int, last: int) -> None:
+def read(path: Path, name: str, encoding: Encoding, first: int, last: int, opaque: bool = False) -> None:
     """Has a picture of a sequence read, whose frames go from `first` to `last`: a node does it for the frame that it
-    shows."""
+    shows. `opaque`: see `load_sequence`."""
     _ahead.discard(os.path.abspath(path))
-    shown_size(load_sequence(path, name, encoding), first, last)
+    shown_size(load_sequence(path, name, encoding, opaque), first, last)
+    _ahead.add(os.path.abspath(path))
+
+
+def read_numbers(path: Path, name: str) -> None:
+    """Has a picture of numbers read, as `read` does."""
+    _ahead.discard(os.path.abspath(path))
+    size_of(load_numbers(path, name))
     _ahead.add(os.path.abspath(path))
 
 
@@ -45,8 +53,10 @@ def shown_size(image: bpy.types.Image, first: int, last: int) -> tuple[int, int]
         bpy.data.node_groups.remove(reader)
 
 
-def load_sequence(path: Path, name: str, encoding: Encoding) -> bpy.types.Image:
+def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = False) -> bpy.types.Image:
     """An image sequence or a video as a data-block, reused by path.
+
+    `opaque`: its colours are taken as they stand in the file, whatever its alpha is.
 
     ValueError if the colour configuration has no such encoding, RuntimeError if Blender cannot read the file.
     """
@@ -54,6 +64,7 @@ def load_sequence(path: Path, name: str, encoding: Encoding) -> bpy.types.Image:
     for image in bpy.data.images:
         if image.get(TAG) and os.path.abspath(bpy.path.abspath(image.filepath)) == wanted:
             compat.set_image_colour(image, encoding)  # another import may have made it of other light
+            _make_opaque(image, opaque)
             if wanted not in _ahead:
                 image.reload()
             _ahead.discard(wanted)
@@ -65,8 +76,15 @@ def load_sequence(path: Path, name: str, encoding: Encoding) -> bpy.types.Image:
         image.source = "SEQUENCE"
     image[TAG] = True
     compat.set_image_colour(image, encoding)
+    _make_opaque(image, opaque)
     image.filepath = paths.blend_path(path)
     return image
+
+
+def _make_opaque(image: bpy.types.Image, opaque: bool) -> None:
+    """Each setting, of the same value too, has Blender read the picture again."""
+    if opaque and image.alpha_mode != "NONE":
+        image.alpha_mode = "NONE"
 
 
 def load_numbers(path: Path, name: str) -> bpy.types.Image:
@@ -74,7 +92,9 @@ def load_numbers(path: Path, name: str) -> bpy.types.Image:
     wanted = os.path.abspath(path)
     for known in bpy.data.images:
         if known.get(TAG) and os.path.abspath(bpy.path.abspath(known.filepath)) == wanted:
-            known.reload()
+            if wanted not in _ahead:
+                known.reload()
+            _ahead.discard(wanted)
             return known
     image = bpy.data.images.load(wanted)
     image.name = name

@@ -149,6 +149,21 @@ def test_what_is_read_ahead_is_the_footage(addon, scene, footage):
     assert [i.name for i in bpy.data.images if i.name.startswith("Plate")] == ["Plate 000005"]
 
 
+def test_the_map_of_the_lens_is_read_ahead_and_again_if_it_has_changed(addon, scene, footage, tmp_path):
+    """Reading one holds Blender's window, so each has a turn of its own; the first bake here never came in."""
+    bake, shot = addon("bake.insertion"), footage(map="stmap/undistort.exr")
+    for frame in (5, 6):
+        st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(frame))
+        assert len(list(bake.read_ahead(scene, shot, "detail"))) == 3
+    read = next(image for image in bpy.data.images if image.name.startswith("Plate"))
+    assert read.alpha_mode == "NONE", "to be set while it is inserted it would be read once more"
+    bake.insert(scene, shot, "detail")
+    assert not addon("scene.sequences")._ahead, "they are taken as they were read"
+    node_of(addon, scene).inputs["Mix"].default_value = 0.0
+    found, expected = render(scene, tmp_path, 6), made.moved(made.plate(6), 6)
+    assert float((np.abs(found - expected) / np.maximum(np.abs(expected), 0.05)).max()) < 2e-3
+
+
 def test_a_video_shows_frame_n_at_frame_n(addon, scene, footage, tmp_path):
     """Its n-th picture, as bright as its luma says."""
     size = levels.WIDTH, levels.HEIGHT
