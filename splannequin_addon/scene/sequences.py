@@ -82,7 +82,7 @@ def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = Fals
 
 
 def _make_opaque(image: bpy.types.Image, opaque: bool) -> None:
-    """Each setting, of the same value too, has Blender read the picture again."""
+    """Sets it once and at first: a change has Blender read the picture again."""
     if opaque and image.alpha_mode != "NONE":
         image.alpha_mode = "NONE"
 
