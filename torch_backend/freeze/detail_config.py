@@ -54,15 +54,20 @@ class DetailConfig:
     beside: tuple[float, float] = (10.0, 20.0)
     """Degrees by which plate t* may see it from another side: up to the first it is believed, from the second on not;
     from further round it shows what is turned away."""
-    moves_surely: float = 0.8
+    returns: float = 2.0
+    """Pixels from which what plate t* has at the place of a point is seen by the frame, at most: then it shows that
+    point, though their depths differ."""
+    moves_surely: float = 0.5
     """As `moves`, where the splats have not fallen apart: what stands still is better as other plates have it."""
     same: float = 0.05
     """Difference between plate t* and the splats, display-referred, up to which that plate is taken along outlines of
     depth and where it does not quite see the surface,"""
     fine: float = 1.0
     """and the sigma of that."""
+    outline: float = 0.1
+    """Share of itself by which depth jumps there: an arm that comes towards the camera is rough by half of that."""
     jump: float = 0.05
-    """Share of itself by which depth jumps at an outline."""
+    """The same, for what stands still behind what moves."""
     torn: float = 0.1
     """Low-passed difference between plate t* and the splats, display-referred, from which on these have fallen apart:
     outlines, too, are as that plate has them then."""

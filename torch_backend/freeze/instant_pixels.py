@@ -18,7 +18,7 @@ from torch import Tensor
 from .bands import look_up_near
 from .detail_config import DetailConfig
 from .ghosts import ghosts
-from .instant_view import InstantView, bridged, instant_view
+from .instant_view import InstantView, bridged, instant_view, smooth_depth
 from .posed import PosedFrame
 from .regions import closed, opened
 from .reproject import blurred, look_up, narrowed, resized, widened
@@ -129,8 +129,9 @@ def _torn(sightings: Sightings, config: DetailConfig, surface: _Surface) -> Tens
 
 def _plain(sightings: Sightings, config: DetailConfig, posed: PosedFrame, surface: _Surface) -> Tensor:
     """[h, w] bool: what moves is in plain view of plate t*, or looks there as the splats do."""
-    rim, jump = max(1, round(config.rim * sightings.unit)), config.jump
-    theirs = widened(_edges(sightings.view(posed.t).surface[..., 0], jump), rim).float()
+    rim, jump = max(1, round(config.rim * sightings.unit)), config.outline
+    theirs = smooth_depth(config, sightings.view(posed.t).surface[..., 0])
+    theirs = widened(_edges(theirs, jump), rim).float()
     outline = widened(_edges(surface.depth, jump), rim) | (look_up(theirs, surface.places) > 0.5)
     off = blurred(surface.told - surface.shown, config.fine * sightings.unit).abs().amax(-1)
     plain = ((surface.counts > 0.5) & ~outline) | (off < config.same)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from ..scene import resize_intrinsics
 from ..torch_types import from_numpy, norm
 from .detail_config import DetailConfig
 from .posed import PosedFrame
-from .reproject import blurred, look_up, pixel_centres, unproject
+from .reproject import blurred, inside, look_up, pixel_centres, project, unproject
 from .sightings import Sighting, Sightings
 
 _FEW = 0.01
@@ -49,10 +49,12 @@ class InstantView:
 
 def instant_view(sightings: Sightings, config: DetailConfig, posed: PosedFrame) -> InstantView:
     """Plate t* for a frame; which has to be one of those that may be used."""
-    depth = _smooth_depth(config, posed)
+    depth = smooth_depth(config, posed.depth)
     points = _points(posed, depth)
     angle = _angle(points, sightings.centres[sightings.index[posed.t]], posed.centre)
     sighting = sightings.seen(posed.t, points)
+    visible = torch.maximum(sighting.visible, _returns(sightings, config, posed, sighting))
+    sighting = replace(sighting, visible=visible)
     picture = sightings.view(posed.t).picture.float()
     return InstantView(depth, points, sighting, _nearness(config, angle), picture, *exposed(sightings, posed, posed.t))
 
@@ -73,6 +75,19 @@ def bridged(places: Tensor, seen: Tensor, sigma: float, unsteady: float) -> tupl
     return torch.where(counts > 0.0, places, here + mean), seen | steady
 
 
+def _returns(sightings: Sightings, config: DetailConfig, posed: PosedFrame, sighting: Sighting) -> Tensor:
+    """[h, w] in 0..1: what plate t* has at its places is seen by the frame where these were asked for, or so near that
+    nobody sees it. Of an arm that comes towards the camera depth is rough by more than a surface may be, and no pixel
+    of it is far from its place."""
+    view, (h, w) = sightings.view(posed.t), sighting.depth.shape
+    depth = look_up(view.surface[..., 0].clamp_max(1e6), sighting.pixels, "nearest")
+    points = unproject(sighting.pixels, depth, view.viewmat, view.K)
+    back = project(points, posed.viewmat, _camera(posed, w, h))[0] - pixel_centres(w, h)
+    off = norm(back, -1) / sightings.unit
+    returns = (2.0 - off / config.returns).clamp(0.0, 1.0) * inside(sighting.pixels, *sightings.size)
+    return returns if view.ignored is None else returns * (1.0 - look_up(view.ignored, sighting.pixels)[..., 0])
+
+
 def _nearness(config: DetailConfig, beside: Tensor) -> Tensor:
     """[...] in 0..1: how far plate t* is believed about what it sees from so many degrees aside."""
     first, last = config.beside
@@ -86,11 +101,11 @@ def _angle(points: Tensor, first: Tensor, second: Tensor) -> Tensor:
     return torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
 
 
-def _smooth_depth(config: DetailConfig, posed: PosedFrame) -> Tensor:
-    """[h, w] depth of what is seen, without what single pixels' depths are off by; edges stay."""
+def smooth_depth(config: DetailConfig, depth: Tensor) -> Tensor:
+    """[h, w] a depth [h, w] without what single pixels of it are off by; edges stay."""
     import cv2
 
-    depth = posed.depth.clamp_max(1e6).numpy()
+    depth = np.ascontiguousarray(depth.clamp_max(1e6).numpy())
     for _ in range(config.medians):
         depth = np.asarray(cv2.medianBlur(depth, 5))
     return from_numpy(depth)
@@ -99,9 +114,13 @@ def _smooth_depth(config: DetailConfig, posed: PosedFrame) -> Tensor:
 def _points(posed: PosedFrame, depth: Tensor) -> Tensor:
     """[h, w, 3] world points that are seen at a depth [h, w]."""
     h, w = depth.shape
+    return unproject(pixel_centres(w, h), depth, posed.viewmat, _camera(posed, w, h))
+
+
+def _camera(posed: PosedFrame, w: int, h: int) -> Tensor:
+    """[3, 3] the frame's camera in pixels of decisions."""
     rows, columns = posed.image.alpha.shape
-    K = resize_intrinsics(posed.K[None], columns, rows, w, h)[0]
-    return unproject(pixel_centres(w, h), depth, posed.viewmat, K)
+    return resize_intrinsics(posed.K[None], columns, rows, w, h)[0]
 
 
 def exposed(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:

@@ -23,14 +23,17 @@ def world(tmp_path_factory, quiet):
     return build(tmp_path_factory.mktemp("board"), quiet())
 
 
-def delivered(world, config, spoilt, pose=3, t_star=8):
-    """(frame, truth [H, W, 3], where the board is): splats of the board are as `spoilt` leaves them, seen from here."""
+def delivered(world, config, spoilt, pose=3, t_star=8, rough=None):
+    """(frame, truth [H, W, 3], where the board is): splats of the board are as `spoilt` leaves them, seen from here,
+    and as deep as `rough` does."""
     output = world.output(pose, t_star)
     truth, on = world.truth(output)
     frozen = freeze_at(world.run.model, world.scene.time_of_frame(t_star), 1.0)
     image = render_frozen(frozen, output.viewmat, output.K, W, H)
     where = torch.from_numpy(on)
     image.color[where] = spoilt(image.color)[where]
+    if rough is not None:
+        image.depth[where] = rough(image.depth)[where]
     made = Detailer(world.run, world.scene, world.plates(), config).frame(output, frozen, image, W, H)
     return made, truth, on
 
@@ -57,6 +60,28 @@ def test_a_second_nose_that_no_low_pass_sees_gives_way_as_well(world):
     assert off(residual.color, truth, inner) > 0.03
     assert off(whole.color, truth, inner) < 0.5 * off(residual.color, truth, inner)
     assert (whole.source.numpy()[inner] == 8).all()
+
+
+def test_a_depth_that_is_rough_holds_as_far_as_it_fetches_pixels_from_their_places(world):
+    """An arm that comes towards the camera: by depth alone nearly none of it would be what plate t* shows."""
+
+    def rough(depth):
+        return depth * (1.0 + 0.07 * torch.sin(torch.arange(H) * 0.2)[:, None])
+
+    def dark(color):
+        return color * 0.5
+
+    asked = {pixels: delivered(world, replace(SHARP, returns=pixels), dark, rough=rough) for pixels in (1e-3, 2.0)}
+    (strict, truth, on), (whole, _, _) = asked.values()
+    inner = ~widened(~on, 8)
+    assert off(whole.color, truth, inner) < 0.5 * off(strict.color, truth, inner)
+    assert (whole.source.numpy()[inner] == 8).mean() > 0.95
+
+    def deep(depth):  # the wall behind the board
+        return depth * 1.5
+
+    far = [delivered(world, replace(SHARP, returns=pixels), dark, rough=deep)[0].color for pixels in (1e-3, 2.0)]
+    assert torch.equal(*far), "what lies so far behind is another thing"
 
 
 def test_along_outlines_and_from_far_aside_splats_stay(world):
