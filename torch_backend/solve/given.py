@@ -79,46 +79,26 @@ def take_over(
         JobError: the worker broke off, or not one point agrees with the cameras.
     """
     given, matched = taken.solve, taken.matched
-    listed = frames["frames"]
     size = (frames["width"], frames["height"])
     used = sorted({camera.lens for camera in matched.cameras.values()})
     lenses = [given.lenses[n].scaled(*size) for n in used]
-    names = {f["frame"]: Path(f["file"]).name for f in listed}
+    names = {f["frame"]: Path(f["file"]).name for f in frames["frames"]}
     poses = {
         names[n]: {"pose": camera.pose.tolist(), "source": "registered", "lens": used.index(camera.lens)}
         for n, camera in matched.cameras.items()
     }
-    points = foreign.own_points(given, matched, size)
-    centres = np.array([camera_centre(camera.pose) for camera in matched.cameras.values()])
-    own = points is not None and _enough(points, centres)
-    registered = [f["frame"] for f in listed if f["solve"] and f["frame"] in matched.cameras]
-    request = {
-        "images": str(shot.raw),
-        "solved": [names[n] for n in registered],
-        "others": [],
-        "camera_model": "PINHOLE",
-        "neighbours": 0,
-        "threads": max(1, min(os.cpu_count() or 1, 16)),
-        **options,
-        "known": {
-            "lenses": [vars(lens) for lens in lenses],
-            "images": {name: {"lens": p["lens"], "pose": p["pose"]} for name, p in poses.items()},
-            "triangulate": not own,
-        },
+    registered = [f["frame"] for f in frames["frames"] if f["solve"] and f["frame"] in matched.cameras]
+    points = _own_points(taken, size)
+    known = {
+        "lenses": [vars(lens) for lens in lenses],
+        "images": {name: {"lens": p["lens"], "pose": p["pose"]} for name, p in poses.items()},
+        "triangulate": points is None,
     }
-    write_json(scratch / REQUEST_FILE, request)
+    write_json(scratch / REQUEST_FILE, _request(shot, [names[n] for n in registered], known, options))
     answer = run_worker(scratch / REQUEST_FILE, shot.colmap_log, report)["result"]
     (scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
-    if own and points is not None:
-        angle = float(points.pop("angle"))
-        save_arrays(scratch / POINTS_FILE, points)
-        _write_model(scratch / "model", lenses, poses, points)
-        known = points["error"][points["error"] > 0]
-        answer = {
-            "points": len(points["xyz"]),
-            "reprojection_error_px": float(known.mean()),
-            "triangulation_angle_deg": angle,
-        }
+    if points is not None:
+        answer = _keep_own(points, scratch, lenses, poses)
     if not answer["points"]:  # the worker left nothing to read
         refuse_misfit(answer, 0)
     fx, fy, _, _, *bend = lenses[0].params
@@ -129,6 +109,42 @@ def take_over(
         "camera_model": lenses[0].model,
         "focal_px": 0.5 * (fx + fy),
         "distortion": bend,
+    }
+
+
+def _own_points(taken: Taken, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
+    """The file's own points for pictures of `size` (w, h) as `foreign.own_points`, if enough to train from."""
+    points = foreign.own_points(taken.solve, taken.matched, size)
+    centres = np.array([camera_centre(camera.pose) for camera in taken.matched.cameras.values()])
+    return points if points is not None and _enough(points, centres) else None
+
+
+def _request(shot: Shot, solved: list[str], known: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """What the worker is asked: `solved` are names of pictures, `known` is what the cameras' file says of them."""
+    return {
+        "images": str(shot.raw),
+        "solved": solved,
+        "others": [],
+        "camera_model": "PINHOLE",
+        "neighbours": 0,
+        "threads": max(1, min(os.cpu_count() or 1, 16)),
+        **options,
+        "known": known,
+    }
+
+
+def _keep_own(
+    points: dict[str, NDArray[Any]], scratch: Path, lenses: list[foreign.Lens], poses: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """Writes the file's own points and a model of them into `scratch`; the answer that the worker gives of its own."""
+    angle = float(points.pop("angle"))
+    save_arrays(scratch / POINTS_FILE, points)
+    _write_model(scratch / "model", lenses, poses, points)
+    known = points["error"][points["error"] > 0]
+    return {
+        "points": len(points["xyz"]),
+        "reprojection_error_px": float(known.mean()),
+        "triangulation_angle_deg": angle,
     }
 
 
