@@ -310,7 +310,7 @@ MESSAGES: dict[str, str] = {
     "Without a folder it goes to {}.": "Ohne Ordner kommt es nach {}.",
     "Scaled": "Skaliert",
     "Its scale was set from a known distance": "Sein Maßstab wurde nach einer bekannten Strecke gesetzt",
-    "320 pixels wide, 2400 steps: to see whether the shot holds, minutes on a laptop": "320 Pixel breit, 2400 Schritte: um zu sehen, ob der Shot hält, Minuten auf einem Laptop",
+    "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop": "320 Pixel breit, 2000 Schritte: um zu sehen, ob der Shot hält, Minuten auf einem Laptop",
     "960 pixels wide, 9000 steps: for most shots": "960 Pixel breit, 9000 Schritte: für die meisten Shots",
     "As wide as the working frames, 30000 steps, most Gaussians: takes longest. On a graphics card as wide as the source, up to 1920 pixels, with up to a million Gaussians": "So breit wie die Arbeitsbilder, 30000 Schritte, die meisten Gaussians: dauert am längsten. Auf einer Grafikkarte so breit wie die Quelle, bis 1920 Pixel, mit bis zu einer Million Gaussians",
     "processor": "Prozessor",

@@ -30,21 +30,19 @@ def test_without_a_timed_run_nothing_is_promised(costs, addon, contract):
     assert told is None and rows[-1].width == 0, "nothing is known of the clip"
 
 
-def test_a_preset_that_was_run_takes_as_long_again_and_others_by_pixels_and_steps(costs, contract):
-    steps = contract.PRESET_STEPS
+def test_a_preset_that_was_run_takes_as_long_again_and_others_by_pixels_and_steps(costs):
     rows, told = costs({"main": run(iterations=1000, train_seconds=100.0)})
     assert told["run"] == "main"
-    assert (rows["preview"].seconds, rows["preview"].measured) == (pytest.approx(0.1 * steps["preview"]), True)
-    assert (rows["standard"].seconds, rows["standard"].measured) == (pytest.approx(0.1 * steps["standard"] * 9), False)
-    assert rows["final"].seconds == pytest.approx(0.1 * steps["final"] * 16)
+    assert (rows["preview"].seconds, rows["preview"].measured) == (200.0, True)
+    assert (rows["standard"].seconds, rows["standard"].measured) == (pytest.approx(200.0 * 4.5 * 9), False)
+    assert rows["final"].seconds == 200.0 * 15 * 16
 
 
-def test_a_static_run_does_not_tell_how_long_one_with_motion_takes(costs, contract):
-    steps = contract.PRESET_STEPS["preview"]
+def test_a_static_run_does_not_tell_how_long_one_with_motion_takes(costs):
     runs = {"main": run(iterations=1000, train_seconds=100.0, method="auto")}
-    runs["still"] = run(run="still", iterations=steps, train_seconds=40.0, method="static")
+    runs["still"] = run(run="still", iterations=2000, train_seconds=40.0, method="static")
     rows, told = costs(runs)
-    assert told["run"] == "main" and rows["preview"].seconds == pytest.approx(0.1 * steps)
+    assert told["run"] == "main" and rows["preview"].seconds == 200.0
     rows, told = costs({"still": runs["still"]})
     assert told["run"] == "still" and rows["preview"].seconds == 40.0, "better than nothing"
 

@@ -12,7 +12,7 @@ from .option_table import SWITCH, Limit, Option, limits_of, mask_path, option, o
 
 LAST_FRAME = 1_048_574
 """Blender's last frame number: no scene reaches further."""
-PRESET_STEPS = {"preview": 2400, "standard": 9000, "final": 30_000}
+PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
 PRESET_WIDTHS = {"preview": 320, "standard": 960, "final": 0}
 """Width in pixels of each preset's training images, never above the working frames'; 0: theirs."""
@@ -342,7 +342,7 @@ class TrainParams:
         label="Preset",
         tip="How much to spend on training",
         items={
-            "preview": ("Preview", "320 pixels wide, 2400 steps: to see whether the shot holds, minutes on a laptop"),
+            "preview": ("Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
             "standard": ("Standard", "960 pixels wide, 9000 steps: for most shots"),
             "final": (
                 "Final",

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ..contract import PRESET_STEPS, PRESET_WIDTHS, TrainParams
+from ..contract import PRESET_STEPS, PRESET_WIDTHS
 from ..freeze.develop import DevelopConfig
-from ..train import config_from_params
 from .shots import FarmShot
 
 STEPS = ("import", "solve", "train", "open", "freeze", "finish", "bake", "deliver")
@@ -99,10 +98,7 @@ def take_size(shot: FarmShot) -> tuple[int, int]:
 def _training(shot: FarmShot) -> float:
     asked: dict[str, Any] = shot.requests["train"]
     steps = asked["iterations"] or PRESET_STEPS[asked["preset"]]
-    names = ("preset", "method", "host_config", "iterations")
-    coarse = config_from_params(TrainParams(**{name: asked[name] for name in names})).coarse
-    pixels = (1.0 - 0.75 * coarse) * _trained_width(shot) ** 2 * _shape(shot)
-    return steps * (pixels / 1e6 + PER_STEP)
+    return steps * (_trained_width(shot) ** 2 * _shape(shot) / 1e6 + PER_STEP)
 
 
 def _trained_width(shot: FarmShot) -> int:

@@ -27,7 +27,7 @@ class TrainConfig:
 
     preset: str = "preview"
     """Preset these numbers come from."""
-    iterations: int = 2400
+    iterations: int = 2000
     """Training steps of one image each."""
     width: int = 320
     """Width in pixels of the training images, never above the working frames', or the source's with `plates`; 0:
@@ -66,8 +66,11 @@ class TrainConfig:
     """Learning rate of the other harmonics (3DGS: 2.5e-3 / 20)."""
     lr_end: float = 0.2
     """Share of its start that each of these rates, but that of means, has at the end."""
-    coarse: float = 0.3
-    """Share of the run, its beginning, that is trained on pictures of half the width; 0: none, as published."""
+    soft_movers: float = 0.5
+    """Share of the run, its beginning, in which what the motion mattes call moving is learnt from softened pictures
+    (`softened.py`); 0: none, as published."""
+    soft_block: float = 8.0
+    """Side of a pixel of these, in pixels of pictures 640 wide."""
     average: float = 0.04
     """Share of the run, its end, whose steps' mean the run keeps (`average.py`); 0: the last step."""
     opacity_weight: float = 2e-3
@@ -168,7 +171,9 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
     config.host_config = params.host_config
     if params.host_config == "reference":
         config.supervision.pulls = "all"
-    _stages_for(config)
+    _gate_for(config)
+    if not config.decides:
+        config.soft_movers = 0.0
     config.field = host_config(config.host, config.host_config, config.iterations)
     if params.holdout >= 0:
         config.holdout = params.holdout
@@ -192,27 +197,18 @@ def _rates_for(config: TrainConfig) -> None:
 _STATIC, _MOST_STATIC = 0.2, 3000
 """Share of a run with a gate that stays static, and its most steps. In 10,000 of them, 350,000 Gaussians paint what
 moves as ghosts that fit one view each, far behind it, and no field puts them right (docs/benchmarks.md)."""
-_GROWS = (0.0, 0.35)
-"""Growth begins and ends so much of the run after pictures are whole: coarse ones do not say what to split."""
 
 
-def _stages_for(config: TrainConfig) -> None:
-    """When a run of our own numbers goes from coarse to fine, and from static to moving.
-
-    The gate opens sooner than published; the trial is as long as it was, and anchors and price begin with it. So do
+def _gate_for(config: TrainConfig) -> None:
+    """Opens the gate sooner than published; the trial is as long as it was, anchors and price begin with it. So do
     harmonics in a long run: else what changes with the view is taken for motion. In a short one each degree needs its
-    steps, or none seems worth its while.
-    """
-    if not config.decides:
-        config.coarse = 0.0
+    steps, or none seems worth its while."""
+    if config.method != "auto" or config.host_config == "reference":
         return
     gate, anchors, steps = config.gate, config.supervision, max(1, config.iterations)
     sooner = gate.start - min(_STATIC, _MOST_STATIC / steps)
-    config.coarse = min(config.coarse, gate.harden - sooner)
-    config.densify.start, config.densify.stop = (config.coarse + share for share in _GROWS)
-    if config.method == "auto":
-        gate.start, gate.harden, anchors.start = gate.start - sooner, gate.harden - sooner, anchors.start - sooner
-        config.sh_every *= min(1.0, 3.0 * _MOST_STATIC / steps)
+    config.sh_every *= min(1.0, 3.0 * _MOST_STATIC / steps)
+    gate.start, gate.harden, anchors.start = gate.start - sooner, gate.harden - sooner, anchors.start - sooner
 
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:
@@ -240,9 +236,10 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
         "poses": {},
         "lr_end": 0.1,
         "average": 0.0,
-        "coarse": 0.0,
+        "soft_movers": 0.0,
         **data,
-    }  # earlier runs decided nothing, kept their last step and had no coarse pictures; a finished one is only read
+    }  # earlier runs decided nothing, kept their last step and softened nothing; a finished one is only read
+    values.pop("coarse", None)  # builds of a day began on coarse pictures
     if "hexplane" in values:  # written before there were other hosts
         values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))
     if "rounds" in values.get("gate", {}):  # written before the gate opened on trial, and HexPlane bent by SiLU

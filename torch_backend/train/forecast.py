@@ -29,8 +29,8 @@ _SAMPLES = 256
 class Outlook:
     """Steps of a run that are still to be taken."""
 
-    pixels: Callable[[int], float]
-    """Of the image that a step is taken on, after so many steps."""
+    pixels: int
+    """Of a training image."""
     begin: int
     """Steps that are done."""
     end: int
@@ -43,10 +43,10 @@ class Outlook:
         steps = max(0, self.end - self.begin)
         parts = min(steps, _SAMPLES)
         at = (self.begin + int((n + 0.5) * steps / parts) for n in range(parts))
-        return sum(step_work(self.pixels(step), self.gaussians(step)) for step in at) * steps / max(1, parts)
+        return sum(step_work(self.pixels, self.gaussians(step)) for step in at) * steps / max(1, parts)
 
 
-def step_work(pixels: float, gaussians: float) -> float:
+def step_work(pixels: int, gaussians: float) -> float:
     """What a step comes to, in pixels."""
     return pixels + GAUSSIAN_PIXELS * gaussians
 
@@ -98,15 +98,12 @@ def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: floa
     for name in list(PRESETS)[: list(PRESETS).index(preset)]:
         config = PRESETS[name]()
         width = min(config.width or size[0], size[0])
-        whole = width * max(1, round(size[1] * width / size[0]))
+        pixels = width * max(1, round(size[1] * width / size[0]))
         grown = Densifier(config.densify, 0)
         first, steps = min(initial, config.densify.budget), config.iterations
 
         def count(step: int, grown: Densifier = grown, first: int = first, steps: int = steps) -> float:
             return grown.target(first, step / steps)
-
-        def pixels(step: int, whole: int = whole, until: float = config.coarse * steps) -> float:
-            return whole / 4 if step < until else whole
 
         found.append(Alternative(name, each * Outlook(pixels, 0, steps, count).work(), width))
     return found[::-1]

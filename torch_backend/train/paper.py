@@ -25,11 +25,7 @@ class RenderedRun(RunView, Protocol):
         ...
 
     def image_of(self, frame: int) -> Tensor:
-        """[H, W, 3] float32, that frame as it is trained on now, on the device."""
-        ...
-
-    def ignored_of(self, frame: int) -> Tensor | None:
-        """bool [H, W] which pixels of that picture teach nothing; None: all do."""
+        """[H, W, 3] float32, that frame, on the device."""
         ...
 
 
@@ -53,7 +49,8 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
     other_state["means"].retain_grad()
     other_out = run.render_trained(other_state, other)
     exposed = model.exposure.apply(other_out.colors[0], run.times[other])
-    loss = photometric(exposed, run.image_of(other), run.config.dssim, run.ignored_of(other))
+    ignored = run.ignored_at(run.train_ids[other])
+    loss = photometric(exposed, run.image_of(other), run.config.dssim, ignored)
     backward(loss, retain_graph=True)
     other_supervised = _supervised(run, other, rows, other_state, other_out)
     every = supervision.pulls == "all"

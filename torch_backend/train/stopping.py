@@ -152,8 +152,6 @@ class RunSchedule:
     """Training steps, if nothing ends the run before."""
     densify_every: int
     """Steps between two rounds of densification."""
-    densify_start: float
-    """Share at which growth begins."""
     densify_stop: float
     """Share at which growth ends of itself."""
     give_up: float
@@ -162,8 +160,6 @@ class RunSchedule:
     """The SH degree rises by one every this share; 0: it is the highest from the start."""
     rates_end: float
     """Share of the harmonics' learning rate that is left at the end."""
-    coarse: float = 0.0
-    """Share until which the run is trained, and measured, on coarse pictures."""
 
 
 @dataclass(frozen=True)
@@ -323,19 +319,13 @@ class StoppingPolicy:
         value = probe.probe_psnr(self.probes)
         if value is None:
             return
-        s = self.schedule
-        fine = probe.progress >= s.coarse
-        if fine and s.coarse:  # what was measured on coarse pictures is of another kind
-            self.measured = [row for row in self.measured if row[0] >= s.coarse * s.iterations]
         self.measured.append((probe.iteration, probe.gaussian_count, value))
         # While a field is on trial probes fall and rise by it: one measured 3 steps after it had opened ended growth.
-        if fine and not self.joined and self.growing and not self.facts.on_trial:
-            # The first round makes many at once, and probes fall until they have settled.
-            settled = s.densify_start * s.iterations + s.densify_every
-            grown = [row for row in self.measured if row[0] > settled]
-            gain = self.facts.growth_gain_db = growth_gain(grown, round(_SPAN * s.iterations))
+        if not self.joined and self.growing and not self.facts.on_trial:
+            gain = self.facts.growth_gain_db = growth_gain(self.measured, round(_SPAN * self.schedule.iterations))
             if gain is not None and gain < self.config.growth_gain:
                 self.growth_ended = probe.iteration
+        s = self.schedule
         hardened = (s.give_up * s.iterations if self.facts.hardened is None else self.facts.hardened) / s.iterations
         over = probe.progress > max(hardened, s.densify_stop if self.growing else 0.0)
         gain = newest_gain(self.measured, probe.iteration - round(self.config.stop_window * s.iterations))

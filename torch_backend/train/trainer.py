@@ -24,7 +24,6 @@ from ..torch_types import backward, integers, norm_of_all
 from . import memory
 from .average import ParameterMean
 from .checkpoint import MISFITS, load_checkpoint, misfit, optimizer_state, restore_optimizer, save_checkpoint
-from .coarse import PictureSize, picture_sizes
 from .config import TrainConfig, config_to_json
 from .exposure import Exposure
 from .extend import Extension
@@ -37,6 +36,7 @@ from .paper import paper_step
 from .poses import Poses, corrected
 from .repair import FieldMemory, drop_offenders, repair, unstable
 from .residual import correlation_of_movers
+from .softened import SoftenedMovers
 from .stopping import RunSchedule, StoppingPolicy
 
 _MAX_BAD_STEPS = 20
@@ -82,9 +82,9 @@ class Trainer:
         self.movers = movers if config.decides else None
         self.ignored = ignored or {}
         self.height, self.width = images.shape[1:3]
+        self.softened = SoftenedMovers(self.movers, self.width, config.soft_movers, config.soft_block)
         self.viewmats = scene.viewmats.to(self.device)
-        self._whole, self._coarse = picture_sizes(scene, self.width, self.height, self.device)
-        self.Ks = self._whole.Ks
+        self.Ks = scene.camera_at(self.width, self.height).to(self.device)
         self.times = [float(scene.times[i]) for i in train]
         self._time_tensor = torch.tensor(self.times, device=self.device)
         self.seconds = float(scene.seconds[train[-1]] - scene.seconds[train[0]])
@@ -101,10 +101,8 @@ class Trainer:
         self.initial = len(gaussians)
         gate, densify = config.gate, config.densify
         schedule = RunSchedule(
-            iterations=config.iterations, densify_every=densify.every, densify_start=densify.start,
-            densify_stop=densify.stop, give_up=gate.give_up, sh_every=config.sh_every, rates_end=config.lr_end,
-            coarse=config.coarse if self._coarse is not self._whole else 0.0,
-        )  # fmt: skip
+            config.iterations, densify.every, densify.stop, gate.give_up, config.sh_every, config.lr_end
+        )
         self.policy = StoppingPolicy(config.needs, len(train) if config.decides else 0, schedule)
         self.extensions: list[Extension] = []
         self.iteration = 0
@@ -204,8 +202,8 @@ class Trainer:
     def _foretell(self, watch: Stopwatch, resumed: bool) -> None:
         """After a step on the processor: how long the run will still take, once some were timed; the first time a
         long one says so in words."""
-        now = len(self.model.gaussians)
-        each = watch.step(step_work(self._pixels(self.iteration - 1), now))
+        pixels, now = self.width * self.height, len(self.model.gaussians)
+        each = watch.step(step_work(pixels, now))
         if each is None:
             return
         grows = self.policy.growing and not self.extensions
@@ -213,7 +211,7 @@ class Trainer:
         def count(step: int) -> float:
             return max(now, self.densifier.target(self.initial, step / self.config.iterations)) if grows else now
 
-        left = each * Outlook(self._pixels, self.iteration, self.end, count).work()
+        left = each * Outlook(pixels, self.iteration, self.end, count).work()
         self.report.metric(FORECAST, {"of": "training", "seconds_left": round(left, 1)})
         if not self._foretold:
             self._foretold = True
@@ -222,11 +220,6 @@ class Trainer:
             told = warning_of(left, self.width, resumed, [row for row in smaller if row.seconds < left])
             if told is not None:
                 self.report.warning(*told)
-
-    def _pixels(self, step: int) -> float:
-        """Of the picture that a step is taken on."""
-        size = self._pictures_at(step / self.config.iterations)
-        return size.width * size.height
 
     def _densify_config(self) -> DensifyConfig:
         """As configured, but for what fits; the configuration itself stays as it was asked for: it is the run's key."""
@@ -302,7 +295,8 @@ class Trainer:
         if paper:
             state["means"].retain_grad()
         exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
-        loss = photometric(exposed, self.image_of(frame), self.config.dssim, self.ignored_of(frame))
+        ignored = self.ignored_at(self.train_ids[frame])
+        loss = self.softened.loss(exposed, self.image_of(frame), self.config.dssim, ignored, frame, self.progress)
         total = loss + self._regularisers(rows)
         if deltas is not None and supervision.preset == "support":
             price = stillness(deltas, len(self.model.gaussians), loss, self.progress, supervision)
@@ -331,7 +325,7 @@ class Trainer:
         """After a step, applied or not (0-dim bool): what it tells the densifier and the support bitmap."""
         if out.weight_sum is None:
             raise RuntimeError("the frame was rendered without contributions")
-        radii, weight = out.radii[0], self.pictures.area * out.weight_sum[0]
+        radii, weight = out.radii[0], out.weight_sum[0]
         if self.device.type != "cpu":
             skipped = ~applied
             self._bad = torch.stack([self._bad[0] + skipped, (self._bad[1] + 1) * skipped])
@@ -340,7 +334,7 @@ class Trainer:
         mark_seen(self.model.gaussians, self._bins[frame], weight)
         if out.depth_median is not None:  # at steps that mark who was hidden
             index = self.train_ids[frame]
-            view = (self.viewmats[index], self.pictures.Ks[index], out.depth_median[0])
+            view = (self.viewmats[index], self.Ks[index], out.depth_median[0])
             mark_hidden(self.model.gaussians, rows, self._bins[frame], state, *view)
 
     def _deltas(self, rows: Tensor, frame: int, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
@@ -364,12 +358,8 @@ class Trainer:
         return split_deltas(self.model.ask(field, where, times, own), len(rows))
 
     def image_of(self, frame: int) -> Tensor:
-        """[H, W, 3] float32, the trained frame at position `frame` as it is trained on now, on the device."""
-        return self.pictures.of(self.images[frame].to(self.device, torch.float32, non_blocking=True))
-
-    def ignored_of(self, frame: int) -> Tensor | None:
-        """bool [H, W] which pixels of that picture teach nothing; None: all do."""
-        return self.pictures.any_of(self.ignored_at(self.train_ids[frame]))
+        """[H, W, 3] float32, the trained frame at position `frame`, on the device."""
+        return self.images[frame].to(self.device, torch.float32, non_blocking=True)
 
     def ignored_at(self, index: int) -> Tensor | None:
         """bool [H, W] which pixels of frame `index` of the scene teach nothing, on the device; None: all do."""
@@ -482,7 +472,8 @@ class Trainer:
         def loss(state: dict[str, Tensor], frame: int) -> Tensor:
             self.report.check_cancelled()
             out = self.render_trained(state, frame, sh_degree=0, with_contributions=False)
-            return photometric(out.colors[0], self.image_of(frame), self.config.dssim, self.ignored_of(frame))
+            ignored = self.ignored_at(self.train_ids[frame])
+            return photometric(out.colors[0], self.image_of(frame), self.config.dssim, ignored)
 
         points, colors = (t.to(self.device) for t in (self.scene.points, self.scene.colors))
         field.rehearse(Rehearsal(points, colors, self.times, steps, loss, self.generator))
@@ -501,18 +492,10 @@ class Trainer:
         options.setdefault("background", self.background)
         options.setdefault("with_contributions", True)
         options.setdefault("with_depth", False)
-        degree, size = options.pop("sh_degree", self.model.sh_degree), self.pictures
+        degree = options.pop("sh_degree", self.model.sh_degree)
         return render(
-            state, degree, self._viewmat(index, frame), size.Ks[index], size.width, size.height, **options
+            state, degree, self._viewmat(index, frame), self.Ks[index], self.width, self.height, **options
         )  # fmt: skip
-
-    @property
-    def pictures(self) -> PictureSize:
-        """Those that are trained on now."""
-        return self._pictures_at(self.progress)
-
-    def _pictures_at(self, progress: float) -> PictureSize:
-        return self._coarse if progress < self.config.coarse and not self.extensions else self._whole
 
     def _next_frame(self) -> int:
         if not self.order:
@@ -612,36 +595,31 @@ class Trainer:
     @torch.no_grad()
     def render_frame(
         self, index: int, *, sh_degree: int | None = None, exposure: bool = True, field: bool = True,
-        viewmats: Tensor | None = None, size: PictureSize | None = None,
+        viewmats: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """Frame `index` of the scene at its own time, [H, W, 3], not clamped.
 
-        With another SH degree, without exposure or field, from other cameras [F, 4, 4] than the run's, or of another
-        size.
+        With another SH degree, without exposure or field, or from other cameras [F, 4, 4] than the run's.
         """
-        size = size or self._whole
         model, time = self.model, float(self.scene.times[index])
         state = model.state_at(time) if field else model.moved(model.open_rows(), None)
         viewmat = self._viewmat(index) if viewmats is None else viewmats[index]
         out = render(
-            state, model.sh_degree if sh_degree is None else sh_degree, viewmat, size.Ks[index], size.width,
-            size.height, background=self.background, with_depth=False, with_contributions=False,
+            state, model.sh_degree if sh_degree is None else sh_degree, viewmat, self.Ks[index], self.width,
+            self.height, background=self.background, with_depth=False, with_contributions=False,
         )  # fmt: skip
         return model.exposure.apply(out.colors[0], time) if exposure else out.colors[0]
 
-    def frame_psnrs(
-        self, indices: list[int], images: Tensor | list[Tensor], size: PictureSize | None = None, **options: Any
-    ) -> list[float]:
+    def frame_psnrs(self, indices: list[int], images: Tensor | list[Tensor], **options: Any) -> list[float]:
         """PSNR in dB of each frame `indices` of the scene at its own time against images [I, H, W, 3].
 
-        At their size, or at another one; `options` go to `render_frame`.
+        `options` go to `render_frame`.
         """
         values: list[float] = []
-        size = size or self._whole
         for n, i in enumerate(indices):
             self.report.check_cancelled()
-            image = size.of(images[n].to(self.device, torch.float32))
-            values.append(psnr(self.render_frame(i, size=size, **options), image, size.any_of(self.ignored_at(i))))
+            image = images[n].to(self.device, torch.float32)
+            values.append(psnr(self.render_frame(i, **options), image, self.ignored_at(i)))
         return values
 
     def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
@@ -652,11 +630,11 @@ class Trainer:
     def probe_psnr(
         self, frames: list[int], *, exposure: bool = True, field: bool = True, **options: Any
     ) -> float | None:  # fmt: skip
-        """As `stopping.Probe` says, on pictures as they are trained on now; `options` go to `render_frame`."""
+        """As `stopping.Probe` says; `options` go to `render_frame`."""
         if not (exposure or self.config.exposure.on) or not (field or self.model.field is not None) or not frames:
             return None
         indices, options = [self.train_ids[n] for n in frames], {**options, "exposure": exposure, "field": field}
-        values = self.frame_psnrs(indices, [self.images[n] for n in frames], self.pictures, **options)
+        values = self.frame_psnrs(indices, [self.images[n] for n in frames], **options)
         value = sum(values) / len(values)
         return value if math.isfinite(value) else None
 

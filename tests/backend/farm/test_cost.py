@@ -53,17 +53,15 @@ def test_a_part_is_longer_where_a_take_would_have_more_than_a_template_may(shot,
 
 
 def test_a_training_costs_its_steps_and_pixels_and_an_instant_too(shot, requests):
-    """The first 0.3 of a training is on pictures of half the width."""
     (one,) = shots_of(shot, requests)
     amounts = {step.kind: step.amounts[0] for step in steps_of(one, 10, False) if 0 in step.amounts}
-    assert amounts["train"] == pytest.approx(2400 * ((0.7 + 0.3 / 4) * 320 * 180 / 1e6 + PER_STEP))
+    assert amounts["train"] == pytest.approx(2000 * (320 * 180 / 1e6 + PER_STEP))
     assert amounts["open"] == pytest.approx(300 * 640 * 360 / 1e6)
     assert amounts["solve"] == pytest.approx(20 * (640 * 360 / 1e6 + PER_SOLVED))
     one.requests["train"].update(iterations=100, width=64)
     one.requests["freeze"]["develop"] = "off"
     amounts = {step.kind: step.amounts[0] for step in steps_of(one, 10, False) if 0 in step.amounts}
-    assert amounts["train"] == pytest.approx(100 * ((0.7 + 0.3 / 4) * 64 * 36 / 1e6 + PER_STEP))
-    assert amounts["open"] == 0.0
+    assert amounts["train"] == pytest.approx(100 * (64 * 36 / 1e6 + PER_STEP)) and amounts["open"] == 0.0
 
 
 def test_what_a_job_costs(shot, requests):

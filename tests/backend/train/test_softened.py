@@ -1,0 +1,99 @@
+"""What moves is learnt from softened pictures: the loss against its definition, and who asks for it."""
+
+import pytest
+import torch
+
+from torch_backend.contract import TrainParams
+from torch_backend.train.config import config_from_json, config_from_params, config_to_json
+from torch_backend.train.losses import photometric
+from torch_backend.train.softened import SoftenedMovers
+
+H, W = 90, 162
+"""No multiples of a block."""
+
+
+@pytest.fixture
+def pictures():
+    g = torch.Generator().manual_seed(0)
+    image, target = (torch.rand(H, W, 3, generator=g, dtype=torch.float64) for _ in range(2))
+    movers = torch.zeros(2, H, W, dtype=torch.bool)
+    movers[0, 40:60, 100:130] = True
+    return image.requires_grad_(), target, movers
+
+
+def soft(picture, block):
+    """Means of blocks, one by one."""
+    rows, columns = range(0, H, block), range(0, W, block)
+    means = [[picture[y : y + block, x : x + block].mean(dim=(0, 1)) for x in columns] for y in rows]
+    return torch.stack([torch.stack(row) for row in means])
+
+
+def test_it_is_the_loss_of_what_stands_still_and_the_loss_of_soft_movers(pictures):
+    image, target, movers = pictures
+    made = SoftenedMovers(movers, W, until=0.5, block=16.0)
+    assert made.block == 4 and made.margin == 1
+    around = torch.zeros(H, W, dtype=torch.bool)
+    around[39:61, 99:131] = True
+    blocks = torch.zeros(23, 41, dtype=torch.bool)
+    blocks[9:16, 24:33] = True
+    expected = photometric(image, target, 0.2, around) + photometric(soft(image, 4), soft(target, 4), 0.2, ~blocks)
+    assert made.loss(image, target, 0.2, None, 0, 0.49).item() == pytest.approx(float(expected.detach()), abs=1e-12)
+
+
+def test_only_the_mean_of_what_moves_counts(pictures):
+    """Its details may be anywhere within a pixel of the soft picture; those of what stands still may not."""
+    image, target, movers = pictures
+    with torch.no_grad():
+        image.copy_(target)
+        swapped = image.clone()
+        swapped[48:52, 108:112] = image[48:52, 108:112].flip(0, 1)
+        still = image.clone()
+        still[8:12, 8:12] = image[8:12, 8:12].flip(0, 1)
+    made = SoftenedMovers(movers, W, until=0.5, block=16.0)
+    assert float(made.loss(swapped, target, 0.2, None, 0, 0.0)) < 1e-9
+    assert float(made.loss(still, target, 0.2, None, 0, 0.0)) > 1e-4
+    assert float(made.loss(swapped, target, 0.2, None, 0, 0.5)) > 1e-4, "later its details count"
+
+
+def test_a_hand_that_is_far_from_where_it_should_be_is_pulled_there(pictures):
+    """A bar of 2 px that lies 2.5 px beside its place: in whole pictures it is as wrong wherever it goes."""
+    _, _, movers = pictures
+    movers[0, :, 60:140] = True
+    across = torch.arange(W, dtype=torch.float64) + 0.5
+
+    def bar(at):
+        return torch.sigmoid(6.0 * (1.0 - (across - at).abs()))[None, :, None].expand(H, W, 3)
+
+    def pull(made):
+        at = torch.tensor(99.5, dtype=torch.float64, requires_grad=True)
+        made.loss(bar(at), bar(102.0), 0.0, None, 0, 0.0).backward()
+        return float(at.grad)
+
+    whole, softened = (pull(SoftenedMovers(m, W, until=0.5, block=16.0)) for m in (None, movers))
+    assert softened < -1e-4 and abs(whole) < 0.1 * abs(softened)
+
+
+def test_frames_without_movers_and_runs_without_mattes_are_as_published(pictures):
+    image, target, movers = pictures
+    expected = float(photometric(image, target, 0.2))
+    assert float(SoftenedMovers(movers, W, 0.5, 16.0).loss(image, target, 0.2, None, 1, 0.0)) == expected
+    assert float(SoftenedMovers(None, W, 0.5, 16.0).loss(image, target, 0.2, None, 0, 0.0)) == expected
+    assert float(SoftenedMovers(movers, W, 0.5, 3.0).loss(image, target, 0.2, None, 0, 0.0)) == expected, "one pixel"
+
+
+def test_ignored_pixels_teach_nothing(pictures):
+    image, target, movers = pictures
+    ignored = torch.zeros(H, W, dtype=torch.bool)
+    ignored[:, 90:] = True
+    SoftenedMovers(movers, W, 0.5, 16.0).loss(image, target, 0.2, ignored, 0, 0.0).backward()
+    assert float(image.grad[:, 90:].abs().max()) == 0.0 and float(image.grad[:, :80].abs().max()) > 0.0
+
+
+def test_published_settings_soften_nothing_and_runs_of_before_neither():
+    ours = config_from_params(TrainParams())
+    assert ours.soft_movers > 0.0
+    for published in (TrainParams(host_config="reference"), TrainParams(method="hexplane", host_config="reference")):
+        assert config_from_params(published).soft_movers == 0.0
+    stored = config_to_json(ours)
+    del stored["soft_movers"]
+    assert config_from_json({**stored, "coarse": 0.3}).soft_movers == 0.0

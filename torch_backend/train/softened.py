@@ -1,0 +1,63 @@
+"""What moves is learnt from softened pictures first.
+
+A hand that is farther from where the field has it than Gaussians are wide has nothing that pulls it there, and stays
+where it is most of the time. In pictures of large pixels it overlaps with itself. What stands still is learnt from
+whole pictures all the while: from a run that began on coarse ones altogether it lost 0.2 to 0.9 dB
+(docs/benchmarks.md, "Developed instants").
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.nn import functional as F
+
+from .losses import photometric
+
+_LENGTHS_OF = 640.0
+_MARGIN = 4.0
+"""Pixels of pictures 640 wide around what moves that are softened with it."""
+
+
+class SoftenedMovers:
+    """The photometric loss of a run, in which what moves is soft for a while."""
+
+    def __init__(self, movers: Tensor | None, width: int, until: float, block: float) -> None:
+        """
+        Args:
+            movers: bool [I, H, W], what moves in each trained frame; None: nobody knows, and nothing is softened.
+            width: W.
+            until: share of the run, its beginning, that is softened.
+            block: pixels of pictures 640 wide along the side of a softened one.
+        """
+        self.block, self.margin = round(block * width / _LENGTHS_OF), max(1, round(_MARGIN * width / _LENGTHS_OF))
+        self.until = until if self.block > 1 else 0.0
+        self.movers = movers
+        self._any = [] if movers is None else movers.flatten(1).any(dim=1).tolist()
+
+    def loss(
+        self, image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None, frame: int, progress: float
+    ) -> Tensor:
+        """As `photometric`, 0-dim.
+
+        Args:
+            image, target: [H, W, 3].
+            dssim: weight of structure.
+            ignored: bool [H, W] pixels that teach nothing; None: all do.
+            frame: position among the trained frames.
+            progress: share of the run that is done.
+        """
+        if self.movers is None or progress >= self.until or not self._any[frame]:
+            return photometric(image, target, dssim, ignored)
+        moves = self.movers[frame].to(image.device)[None, None].float()
+        moves = F.max_pool2d(moves, 2 * self.margin + 1, 1, self.margin)[0, 0] > 0.0
+        taught = moves if ignored is None else moves & ~ignored
+        sharp = photometric(image, target, dssim, moves if ignored is None else moves | ignored)
+        return sharp + photometric(self._soft(image), self._soft(target), dssim, ~self._touched(taught))
+
+    def _soft(self, image: Tensor) -> Tensor:
+        """[h, w, 3] means of the blocks of [H, W, 3]; those at the far borders may be smaller."""
+        return F.avg_pool2d(image.permute(2, 0, 1)[None], self.block, ceil_mode=True)[0].permute(1, 2, 0).contiguous()
+
+    def _touched(self, mask: Tensor) -> Tensor:
+        """bool [h, w]: blocks in which a pixel of the mask lies."""
+        return F.max_pool2d(mask[None, None].float(), self.block, ceil_mode=True)[0, 0] > 0.0
