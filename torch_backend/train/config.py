@@ -66,9 +66,9 @@ class TrainConfig:
     """Learning rate of the other harmonics (3DGS: 2.5e-3 / 20)."""
     lr_end: float = 0.2
     """Share of its start that each of these rates, but that of means, has at the end."""
-    soft_movers: float = 0.5
-    """Share of the run, its beginning, in which what the motion mattes call moving is learnt from softened pictures
-    (`softened.py`); 0: none, as published."""
+    soft_movers: float = 0.2
+    """Share of the run, from the opening of the gate on, in which what the motion mattes call moving is learnt from
+    softened pictures (`softened.py`); 0: none, as published."""
     soft_block: float = 8.0
     """Side of a pixel of these, in pixels of pictures 640 wide."""
     average: float = 0.04
@@ -172,7 +172,7 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
     if params.host_config == "reference":
         config.supervision.pulls = "all"
     _gate_for(config)
-    if not config.decides:
+    if config.method != "auto" or not config.decides:
         config.soft_movers = 0.0
     config.field = host_config(config.host, config.host_config, config.iterations)
     if params.holdout >= 0:

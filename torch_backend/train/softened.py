@@ -1,9 +1,9 @@
-"""What moves is learnt from softened pictures first.
+"""What moves is learnt from softened pictures while its field is young.
 
 A hand that is farther from where the field has it than Gaussians are wide has nothing that pulls it there, and stays
 where it is most of the time. In pictures of large pixels it overlaps with itself. What stands still is learnt from
-whole pictures all the while: from a run that began on coarse ones altogether it lost 0.2 to 0.9 dB
-(docs/benchmarks.md, "Developed instants").
+whole pictures all the while, and so is everything before there is a field: a run that began on coarse pictures
+altogether lost 0.2 to 0.9 dB of what stands still (docs/benchmarks.md, "Developed instants").
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ _MARGIN = 4.0
 class SoftenedMovers:
     """The photometric loss of a run, in which what moves is soft for a while."""
 
-    def __init__(self, movers: Tensor | None, width: int, until: float, block: float) -> None:
+    def __init__(self, movers: Tensor | None, width: int, span: tuple[float, float], block: float) -> None:
         """
         Args:
             movers: bool [I, H, W], what moves in each trained frame; None: nobody knows, and nothing is softened.
             width: W.
-            until: share of the run, its beginning, that is softened.
+            span: from when to when it is softened, in shares of the run.
             block: pixels of pictures 640 wide along the side of a softened one.
         """
         self.block, self.margin = round(block * width / _LENGTHS_OF), max(1, round(_MARGIN * width / _LENGTHS_OF))
-        self.until = until if self.block > 1 else 0.0
+        self.span = span if self.block > 1 else (0.0, 0.0)
         self.movers = movers
         self._any = [] if movers is None else movers.flatten(1).any(dim=1).tolist()
 
@@ -46,7 +46,7 @@ class SoftenedMovers:
             frame: position among the trained frames.
             progress: share of the run that is done.
         """
-        if self.movers is None or progress >= self.until or not self._any[frame]:
+        if self.movers is None or not self.span[0] <= progress < self.span[1] or not self._any[frame]:
             return photometric(image, target, dssim, ignored)
         moves = self.movers[frame].to(image.device)[None, None].float()
         moves = F.max_pool2d(moves, 2 * self.margin + 1, 1, self.margin)[0, 0] > 0.0

@@ -82,7 +82,8 @@ class Trainer:
         self.movers = movers if config.decides else None
         self.ignored = ignored or {}
         self.height, self.width = images.shape[1:3]
-        self.softened = SoftenedMovers(self.movers, self.width, config.soft_movers, config.soft_block)
+        opens = config.gate.start
+        self.softened = SoftenedMovers(self.movers, self.width, (opens, opens + config.soft_movers), config.soft_block)
         self.viewmats = scene.viewmats.to(self.device)
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
         self.times = [float(scene.times[i]) for i in train]

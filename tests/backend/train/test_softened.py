@@ -30,7 +30,7 @@ def soft(picture, block):
 
 def test_it_is_the_loss_of_what_stands_still_and_the_loss_of_soft_movers(pictures):
     image, target, movers = pictures
-    made = SoftenedMovers(movers, W, until=0.5, block=16.0)
+    made = SoftenedMovers(movers, W, span=(0.2, 0.5), block=16.0)
     assert made.block == 4 and made.margin == 1
     around = torch.zeros(H, W, dtype=torch.bool)
     around[39:61, 99:131] = True
@@ -49,10 +49,11 @@ def test_only_the_mean_of_what_moves_counts(pictures):
         swapped[48:52, 108:112] = image[48:52, 108:112].flip(0, 1)
         still = image.clone()
         still[8:12, 8:12] = image[8:12, 8:12].flip(0, 1)
-    made = SoftenedMovers(movers, W, until=0.5, block=16.0)
-    assert float(made.loss(swapped, target, 0.2, None, 0, 0.0)) < 1e-9
-    assert float(made.loss(still, target, 0.2, None, 0, 0.0)) > 1e-4
-    assert float(made.loss(swapped, target, 0.2, None, 0, 0.5)) > 1e-4, "later its details count"
+    made = SoftenedMovers(movers, W, span=(0.2, 0.5), block=16.0)
+    assert float(made.loss(swapped, target, 0.2, None, 0, 0.2)) < 1e-9
+    assert float(made.loss(still, target, 0.2, None, 0, 0.2)) > 1e-4
+    for progress in (0.19, 0.5):
+        assert float(made.loss(swapped, target, 0.2, None, 0, progress)) > 1e-4, "before and later its details count"
 
 
 def test_a_hand_that_is_far_from_where_it_should_be_is_pulled_there(pictures):
@@ -66,33 +67,39 @@ def test_a_hand_that_is_far_from_where_it_should_be_is_pulled_there(pictures):
 
     def pull(made):
         at = torch.tensor(99.5, dtype=torch.float64, requires_grad=True)
-        made.loss(bar(at), bar(102.0), 0.0, None, 0, 0.0).backward()
+        made.loss(bar(at), bar(102.0), 0.0, None, 0, 0.2).backward()
         return float(at.grad)
 
-    whole, softened = (pull(SoftenedMovers(m, W, until=0.5, block=16.0)) for m in (None, movers))
+    whole, softened = (pull(SoftenedMovers(m, W, span=(0.2, 0.5), block=16.0)) for m in (None, movers))
     assert softened < -1e-4 and abs(whole) < 0.1 * abs(softened)
 
 
 def test_frames_without_movers_and_runs_without_mattes_are_as_published(pictures):
     image, target, movers = pictures
     expected = float(photometric(image, target, 0.2))
-    assert float(SoftenedMovers(movers, W, 0.5, 16.0).loss(image, target, 0.2, None, 1, 0.0)) == expected
-    assert float(SoftenedMovers(None, W, 0.5, 16.0).loss(image, target, 0.2, None, 0, 0.0)) == expected
-    assert float(SoftenedMovers(movers, W, 0.5, 3.0).loss(image, target, 0.2, None, 0, 0.0)) == expected, "one pixel"
+    assert float(SoftenedMovers(movers, W, (0.2, 0.5), 16.0).loss(image, target, 0.2, None, 1, 0.2)) == expected
+    assert float(SoftenedMovers(None, W, (0.2, 0.5), 16.0).loss(image, target, 0.2, None, 0, 0.2)) == expected
+    assert float(SoftenedMovers(movers, W, (0.2, 0.5), 3.0).loss(image, target, 0.2, None, 0, 0.2)) == expected, (
+        "one pixel"
+    )
 
 
 def test_ignored_pixels_teach_nothing(pictures):
     image, target, movers = pictures
     ignored = torch.zeros(H, W, dtype=torch.bool)
     ignored[:, 90:] = True
-    SoftenedMovers(movers, W, 0.5, 16.0).loss(image, target, 0.2, ignored, 0, 0.0).backward()
+    SoftenedMovers(movers, W, (0.2, 0.5), 16.0).loss(image, target, 0.2, ignored, 0, 0.2).backward()
     assert float(image.grad[:, 90:].abs().max()) == 0.0 and float(image.grad[:, :80].abs().max()) > 0.0
 
 
 def test_published_settings_soften_nothing_and_runs_of_before_neither():
     ours = config_from_params(TrainParams())
     assert ours.soft_movers > 0.0
-    for published in (TrainParams(host_config="reference"), TrainParams(method="hexplane", host_config="reference")):
+    for published in (
+        TrainParams(host_config="reference"),
+        TrainParams(method="hexplane"),
+        TrainParams(method="static"),
+    ):
         assert config_from_params(published).soft_movers == 0.0
     stored = config_to_json(ours)
     del stored["soft_movers"]
