@@ -32,8 +32,19 @@ from torch_backend.solve.motion import load_motion
 from torch_backend.train import load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 
+from ..conftest import build_world, paint_motion
+
 SHORT = DevelopConfig(steps=3)
 T_STAR = 105
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, quiet):
+    """As everywhere, but of few steps: developing is for a run that is not as sharp as its pictures yet."""
+    world = build_world(tmp_path_factory.mktemp("young"))
+    paint_motion(world)
+    summary = train_shot(world.shot, TrainParams(iterations=250, holdout=8, max_gaussians=1500), quiet())
+    return world, summary
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +148,9 @@ def test_a_developed_instant_is_nearer_to_the_truth(trained, made):
     world, _ = trained
     run, scene, frozen, now = made
     (moving, still), (was_moving, was_still) = (scores(world, run, scene, f) for f in (now, frozen))
-    assert still > was_still + 0.3 and moving > was_moving - 0.3  # 0.46 and 1.55 by two seeds of the training
+    assert (
+        still > was_still + 0.3 and moving > was_moving - 0.3
+    )  # 3.3 and more, 0.5 and more by three seeds of the training
 
 
 def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):

@@ -28,7 +28,7 @@ def test_it_learns_and_reports(trained):
     rows = [json.loads(line) for line in (world.shot.run("main") / "metrics.jsonl").read_text().splitlines()]
     assert [r["iteration"] for r in rows] == list(range(90, 901, 90))
     assert rows[-1]["heldout_psnr_db"] > rows[0]["heldout_psnr_db"]
-    assert all(r["moving_share"] == 0 for r in rows if r["iteration"] < 300)
+    assert all(r["moving_share"] == 0 for r in rows if r["iteration"] < 180)
 
 
 def test_the_gate_opens_for_the_patch_that_moves(trained):
@@ -204,13 +204,13 @@ def test_wrong_choices_are_named():
         config_from_params(TrainParams(iterations=3))
 
 
-def test_the_gate_opens_after_a_third_of_the_run_at_most_3000_steps_and_what_hangs_on_it_with_it():
+def test_the_gate_opens_after_a_fifth_of_the_run_at_most_3000_steps_and_what_hangs_on_it_with_it():
     """Ghosts of movers that a longer static stage makes are never put right (docs/benchmarks.md)."""
     preview, standard, final = (config_from_params(TrainParams(preset=preset)) for preset in PRESETS)
-    opened, degrees = [667, 3000, 3000], [300, 1350, 1350]
+    opened, degrees = [400, 1800, 3000], [300, 1350, 1350]
     for c, steps, degree in zip((preview, standard, final), opened, degrees, strict=True):
         assert [round(at * c.iterations) for at in (c.gate.start, c.supervision.start)] == [steps, steps]
-        assert round(c.sh_every * c.iterations) == degree, "view is learnt before time"
+        assert round(c.sh_every * c.iterations) == degree, "in a long run view is learnt before time"
         assert c.gate.harden - c.gate.start == pytest.approx(0.45 - 1 / 3), "a trial is as long as it was"
     for published in ({"method": "hexplane", "supervision": "paper"}, {"host_config": "reference"}):
         config = config_from_params(TrainParams(preset="final", **published))
