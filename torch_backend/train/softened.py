@@ -48,7 +48,7 @@ class SoftenedMovers:
         """
         if self.movers is None or not self.span[0] <= progress < self.span[1] or not self._any[frame]:
             return photometric(image, target, dssim, ignored)
-        moves = self.movers[frame].to(image.device)[None, None].float()
+        moves = self.movers[frame].to(image.device, non_blocking=True)[None, None].float()
         moves = F.max_pool2d(moves, 2 * self.margin + 1, 1, self.margin)[0, 0] > 0.0
         taught = moves if ignored is None else moves & ~ignored
         sharp = photometric(image, target, dssim, moves if ignored is None else moves | ignored)
