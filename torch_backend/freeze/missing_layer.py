@@ -68,7 +68,10 @@ class InstantConfig:
     """A moving Gaussian is a ghost if at least this share of what is seen of it lies where plate t* shows what is
     behind it."""
     gain: float = 0.1
-    """Layer and fading are kept if they lower the low-passed difference where they act by at least this share."""
+    """Layer and fading are kept if they lower the low-passed difference where they act by at least this share,"""
+    detail: float = 0.3
+    """or the difference of single pixels by this share, and the low-passed one at all: a hand that the field has but
+    blurred is where plate t* has it, and has no fingers."""
     stuck: float = 0.5
     """Detail that correlates this well with that at the same pixels of other frames is on the picture (a logo)."""
     depth: DepthConfig = field(default_factory=DepthConfig)
@@ -452,13 +455,20 @@ def _shares(bench: _Bench, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> 
 
 
 def _helps(bench: _Bench, after: FrozenImage, before: FrozenImage, where: NDArray[np.bool_]) -> bool:
-    """True if the low-passed difference falls enough where something was done, and does not rise around it."""
+    """True if the difference, low-passed or of single pixels, falls enough where something was done, and does not rise
+    around it."""
     import cv2
 
     c = bench.config
     around = cv2.dilate(where.astype(np.uint8), _disc(2.0 * c.blur * bench.unit)) > 0
     old, new = bench.difference(before), bench.difference(after)
-    return bool(new[where].mean() <= (1.0 - c.gain) * old[where].mean() and new[around].mean() <= old[around].mean())
+    if new[where].mean() <= (1.0 - c.gain) * old[where].mean() and new[around].mean() <= old[around].mean():
+        return True
+    fine, finer = (np.abs(image.color.numpy() - bench.view.picture).max(axis=-1) for image in (before, after))
+    sharper = (
+        finer[where].mean() <= (1.0 - c.detail) * fine[where].mean() and finer[around].mean() <= fine[around].mean()
+    )
+    return bool(sharper and new[where].mean() <= old[where].mean())
 
 
 def _large(mask: NDArray[np.bool_], seeds: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from torch_backend.footage.images import write_png
 from torch_backend.freeze.frozen import FrozenGaussians, freeze_at, render_frozen
 from torch_backend.freeze.instant_depth import DepthConfig, as_field
-from torch_backend.freeze.missing_layer import InstantConfig, instant_layer, join, low_difference
+from torch_backend.freeze.missing_layer import InstantConfig, _Bench, _helps, instant_layer, join, low_difference
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
 from torch_backend.scene import Scene
@@ -317,3 +318,26 @@ def test_the_layer_is_exposed_once_like_the_rest(tmp_path):
 
 def test_small_things_are_left_alone(waving):
     assert waving.layer(config=InstantConfig(least=5000.0)) is None
+
+
+def test_a_hand_that_the_field_has_without_fingers_is_given_those_of_the_plate():
+    """Low-passed, a blurred hand is as right as a sharp one can be."""
+    plate = np.full((60, 80, 3), 0.2, np.float32)
+    where = np.zeros((60, 80), bool)
+    where[20:40, 30:50] = True
+    plate[20:40, 30:50] += np.where(np.arange(20) % 4 < 2, 0.6, 0.2)[None, :, None].astype(np.float32)
+    bench = object.__new__(_Bench)
+    bench.config, bench.unit, bench._ignored, bench.view = InstantConfig(), 1.0, None, SimpleNamespace(picture=plate)
+    bench.width, bench.height = 80, 60
+
+    def image(color):
+        return SimpleNamespace(color=torch.from_numpy(color.astype(np.float32)))
+
+    blurred = plate.copy()
+    blurred[where] = 0.6 + 0.021  # the mean of fingers and of what is between them, a little too bright
+    sharp, pale = plate + 0.02 * where[..., None], plate + 0.05 * where[..., None]
+    assert _helps(bench, image(sharp), image(blurred), where)
+    assert not _helps(bench, image(blurred), image(blurred), where), "nothing gained"
+    assert not _helps(bench, image(pale), image(blurred), where), "sharp, and farther from the plate's colour"
+    bench.config = InstantConfig(detail=1.1)
+    assert not _helps(bench, image(sharp), image(blurred), where), "by its low-pass alone it would be left away"
