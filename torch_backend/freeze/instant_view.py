@@ -105,10 +105,10 @@ def smooth_depth(config: DetailConfig, depth: Tensor) -> Tensor:
     """[h, w] a depth [h, w] without what single pixels of it are off by; edges stay."""
     import cv2
 
-    depth = np.ascontiguousarray(depth.clamp_max(1e6).numpy())
+    smooth = np.ascontiguousarray(depth.clamp_max(1e6).numpy())
     for _ in range(config.medians):
-        depth = np.asarray(cv2.medianBlur(depth, 5))
-    return from_numpy(depth)
+        smooth = np.asarray(cv2.medianBlur(smooth, 5))
+    return from_numpy(smooth)
 
 
 def _points(posed: PosedFrame, depth: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..torch_types import integers
 from .losses import photometric
 
 _LENGTHS_OF = 640.0
@@ -32,7 +33,7 @@ class SoftenedMovers:
         self.block, self.margin = round(block * width / _LENGTHS_OF), max(1, round(_MARGIN * width / _LENGTHS_OF))
         self.span = span if self.block > 1 else (0.0, 0.0)
         self.movers = movers
-        self._any = [] if movers is None else movers.flatten(1).any(dim=1).tolist()
+        self._any = [] if movers is None else integers(movers.flatten(1).any(dim=1).long())
 
     def loss(
         self, image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None, frame: int, progress: float

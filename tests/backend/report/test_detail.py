@@ -1,5 +1,6 @@
 """The benchmarks of plate detail on a trained shot whose moving patch is known."""
 
+import itertools
 import json
 import shutil
 
@@ -29,7 +30,9 @@ def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tm
     for freeze in found["freezes"]:
         mean = freeze["mean"]
         still = [mean[variant]["still_db"] for variant in VARIANTS]
-        assert still == sorted(still) and still[3] > max(45, still[2] + 3)
+        better = itertools.pairwise(still)
+        assert all(after > before - 0.01 for before, after in better), "at 53 dB one may be as good as the next"
+        assert still[3] > max(45, still[2] + 3)
         assert mean["delivered"]["best_90_db"] > mean["splats"]["best_90_db"]
         assert all(0.1 < row["still_share"] < 0.95 for row in freeze["frames"])
     assert found["instants_differ_255"] < 1.0 and found["motion_from"] == clip.motion_from
