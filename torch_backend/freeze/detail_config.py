@@ -65,8 +65,8 @@ class DetailConfig:
     fine: float = 1.0
     """and the sigma of that."""
     outline: float = 0.1
-    """Share of itself by which depth jumps at an outline of what moves: an arm that comes towards the camera is rough by
-    half of that."""
+    """Share of itself by which depth jumps at an outline of what moves: an arm that comes towards the camera is rough
+    by half of that."""
     jump: float = 0.05
     """The same, for what stands still behind what moves."""
     torn: float = 0.1
