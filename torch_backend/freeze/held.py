@@ -54,12 +54,24 @@ class HeldConfig:
     hole: float = 0.4
     """Share of the pixels around a hole that were found, for what it holds to go with them: the middle of a hand that
     has the colour of the wall."""
+    island: float = 2000.0
+    """Square pixels up to which a hole in what is let go of goes with it, whatever surrounds it,"""
+    unlike: float = 0.045
+    """if the frozen render and the own plate differ in it by as much in the mean, low-passed: what an arm and a head
+    leave between them is their rims."""
     shift: float = 16.0
     """By how much plate t* is shifted to see whether it shows the region somewhere near: then depth is wrong there."""
     step: float = 2.0
     """Between two such shifts."""
     left: float = 0.85
     """Share of the difference that the best shift has to leave."""
+    surely: float = 0.1
+    """Mean low-passed difference of the frozen render and the own plate in a region, from which on it is asked whether
+    the render bears plate t* out: then nothing else is, for no wrong depth does that,"""
+    borne_out: float = 0.45
+    """as it does if it differs from that plate by at most this share of it,"""
+    least_borne_out: float = 200.0
+    """and the region has as many square pixels."""
 
 
 @dataclass
@@ -74,11 +86,12 @@ class BothPlates:
     """[h, w] in 0..1: how well plate t* sees it."""
 
 
-def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: HeldConfig) -> Tensor:
+def held(both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, unit: float, config: HeldConfig) -> Tensor:
     """[h, w] bool: what hangs together with `wrong`, and where the own plate shows another thing than plate t*.
 
     Args:
-        off: [h, w] low-passed difference of the frozen render and the own plate.
+        render: [h, w, 3] the frozen render, display-referred.
+        off: [h, w] low-passed difference of it and the own plate.
         wrong: [h, w] bool, where the own plate is let go of.
         unit: pixels of decisions to one in which the configuration counts.
     """
@@ -92,9 +105,8 @@ def held(both: BothPlates, off: Tensor, wrong: Tensor, unit: float, config: Held
     around = blurred(both.seen, config.low * unit)  # beside what plate t* does not see both are 0, and agree in nothing
     agree = (both.seen > 0.5) & (apart < config.apart * around)
     rim, least = max(1, round(config.rim * unit)), config.least * unit**2
-    found = enclosed(found, agree | wrong, rim, config.share, least)
-    out = torch.zeros_like(found)
-    for region in components(found):
+    out = _borne_out(both, render, found, unit, config)
+    for region in components(enclosed(found & ~out, agree | wrong, rim, config.share, least)):
         if left_by_shifts(soft, region, unit, config) > config.left:
             out |= region
     return out
@@ -123,15 +135,44 @@ def light_between(both: BothPlates, wrong: Tensor, sigma: float) -> Tensor:
     return resized(light[..., :3] / light[..., 3:].clamp_min(1e-3), w, h)
 
 
-def with_holes(wrong: Tensor, found: Tensor, unit: float, config: HeldConfig) -> tuple[Tensor, Tensor]:
-    """(what is let go of, what of it was `found`), bool [h, w] both, with the holes that what was found surrounds."""
-    if not bool(found.any()):
-        return wrong, found
-    holes = torch.zeros_like(found)
-    for region in components(enclosed(~wrong, found, max(1, round(config.rim * unit)), config.hole)):
-        if not bool(torch.cat([region[0], region[-1], region[:, 0], region[:, -1]]).any()):  # all around is no hole
+def with_holes(wrong: Tensor, found: Tensor, off: Tensor, unit: float, config: HeldConfig) -> tuple[Tensor, Tensor]:
+    """(what is let go of, what of it was `found`), bool [h, w] both, with its holes that belong to it.
+
+    Those are the ones that what was found surrounds, and small ones in which render and own plate differ, by `off`
+    [h, w].
+    """
+    surrounded = torch.zeros_like(found)
+    if bool(found.any()):
+        surrounded = enclosed(~wrong, found, max(1, round(config.rim * unit)), config.hole)
+    holes, islands = torch.zeros_like(found), torch.zeros_like(found)
+    for region in components(~wrong):
+        if bool(torch.cat([region[0], region[-1], region[:, 0], region[:, -1]]).any()):  # all around is no hole
+            continue
+        if bool((surrounded & region).any()):
             holes |= region
-    return wrong | holes, found | holes
+        elif float(region.sum()) <= config.island * unit**2 and float(off[region].mean()) > config.unlike:
+            islands |= region
+    return wrong | holes | islands, found | holes
+
+
+def _borne_out(both: BothPlates, render: Tensor, found: Tensor, unit: float, config: HeldConfig) -> Tensor:
+    """[h, w] bool: regions of `found` in which the frozen render shows what plate t* does, and the own plate does not.
+
+    A fist before a face of its colour is a shift of that face, too; the splats, which other plates have made, know.
+    """
+    out, anything = torch.zeros_like(found), torch.ones_like(found)
+    regions = components(enclosed(found, anything, 1, 0.0, config.least_borne_out * unit**2))
+    if not regions:
+        return out
+    shown = render * both.seen[..., None]
+    from_own, from_instant = (
+        blurred(shown - plate, config.low * unit).abs().amax(dim=-1) for plate in (both.own, both.instant)
+    )
+    for region in regions:
+        own, instant = float(from_own[region].mean()), float(from_instant[region].mean())
+        if own > config.surely and instant < config.borne_out * own:
+            out |= region
+    return out
 
 
 def _elsewhere(soft: BothPlates, apart: Tensor, unit: float, config: HeldConfig) -> Tensor:

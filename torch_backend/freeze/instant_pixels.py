@@ -15,13 +15,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..torch_types import norm
 from .bands import look_up_near
 from .detail_config import DetailConfig
 from .ghosts import ghosts
-from .instant_view import InstantView, bridged, instant_view, smooth_depth
+from .instant_view import InstantView, bridged, continued, instant_view, smooth_depth
 from .posed import PosedFrame
 from .regions import closed, opened
-from .reproject import blurred, look_up, narrowed, resized, widened
+from .reproject import blurred, look_up, narrowed, pixel_centres, resized, widened
 from .sightings import Sightings
 
 
@@ -43,10 +44,17 @@ class InstantPixels:
     """[3] that is added, to expose them as the frame is."""
     light: Tensor
     """[h, w, 3] that is added: light that falls otherwise; 0 for what moves."""
+    together: float
+    """Pixels of decisions by which neighbours of one surface are displaced differently at most."""
 
     def at(self, pixels: Tensor, larger: Tensor) -> Tensor:
         """[P, 3] its colours at the frame's pixels [P, 2] of decisions; it has `larger` [2] times as many pixels."""
-        shown = look_up_near(self.plate, look_up(self.places, pixels) * larger, "bicubic")
+        h, w = self.places.shape[:2]
+        moved = self.places - pixel_centres(w, h)
+        smooth, nearest = look_up(moved, pixels), look_up(moved, pixels, "nearest")
+        apart = norm(smooth - nearest, -1) > self.together  # between two surfaces the mean is at neither
+        places = pixels + torch.where(apart[:, None], nearest, smooth)
+        shown = look_up_near(self.plate, places * larger, "bicubic")
         return shown * self.gain + self.offset + look_up(self.light, pixels)
 
 
@@ -92,7 +100,8 @@ def instant_pixels(
     if not bool(taken.any()):
         return None
     where = blurred(taken.float(), config.feather * sightings.unit) * view.near
-    return InstantPixels(where, haunted, places, sightings.displayed(posed.t), view.gain, view.offset, light)
+    plate, together = sightings.displayed(posed.t), config.unsteady * sightings.unit
+    return InstantPixels(where, haunted, places, plate, view.gain, view.offset, light, together)
 
 
 def _feather(config: DetailConfig, sightings: Sightings) -> int:
@@ -117,7 +126,8 @@ def _of_movers(
     places, steady = bridged(view.sighting.pixels, counts > 0.5, gap, unsteady)
     surface = _Surface(view.depth, places, moves, view.told(places), shown, counts)
     taken = _torn(sightings, config, surface) | _plain(sightings, config, posed, surface)
-    return taken & seen & steady, places
+    taken = taken & seen & steady
+    return taken, continued(places, taken, _feather(config, sightings))
 
 
 def _torn(sightings: Sightings, config: DetailConfig, surface: _Surface) -> Tensor:

@@ -75,6 +75,28 @@ def bridged(places: Tensor, seen: Tensor, sigma: float, unsteady: float) -> tupl
     return torch.where(counts > 0.0, places, here + mean), seen | steady
 
 
+def continued(places: Tensor, taken: Tensor, reach: int) -> Tensor:
+    """[h, w, 2] where plate t* shows each pixel, carried on by `reach` pixels beyond what is `taken`, bool [h, w].
+
+    A border is soft, and what it fades out into may lie behind: pixels of plate t* from there would be specks. It goes
+    on as the nearest pixel that is taken; between two of them in the mean it would be at neither.
+    """
+    import cv2
+
+    if not bool(taken.any()):
+        return places
+    h, w = taken.shape
+    away, labels = cv2.distanceTransformWithLabels(
+        (~taken).numpy().astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest, told = from_numpy(np.asarray(labels, np.int64)), taken.flatten()
+    moved = (places - pixel_centres(w, h)).flatten(0, 1)[told]
+    by_label = torch.zeros(int(nearest.max()) + 1, 2, device="cpu")
+    by_label[nearest.flatten()[told]] = moved
+    on = (from_numpy(np.asarray(away, np.float32)) <= reach) & ~taken
+    return torch.where(on[..., None], pixel_centres(w, h) + by_label[nearest], places)
+
+
 def _returns(sightings: Sightings, config: DetailConfig, posed: PosedFrame, sighting: Sighting) -> Tensor:
     """[h, w] in 0..1: what plate t* has at its places is seen by the frame where these were asked for, or so near that
     nobody sees it. Of an arm that comes towards the camera depth is rough by more than a surface may be, and no pixel

@@ -138,11 +138,16 @@ def _let_go(
     # What the model lacks at the plate's own time, too, is its fault and no motion.
     wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
     wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
-    if both is not None:
+    if truth is not None:
         wrong = sightings.whole(wrong, contrary, config.denied_too)
-    found = torch.zeros_like(wrong) if both is None else held(both, off, wrong, sightings.unit, config.held)
+        # What plate t* does not see cannot contradict: a rim of light along the arm, before what a head hides at t*.
+        wrong = sightings.whole(wrong, torch.where(truth.visible < 0.5, off, 0.0))
+    found = torch.zeros_like(wrong)
+    if both is not None:
+        h, w = wrong.shape
+        found = held(both, resized(posed.image.color, w, h), off, wrong, sightings.unit, config.held)
     wrong = closed(wrong | found, round(config.gap * sightings.unit))
-    return with_holes(wrong, found, sightings.unit, config.held)
+    return with_holes(wrong, found, off, sightings.unit, config.held)
 
 
 def _off(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,8 @@ import torch
 from tests.backend.freeze.test_detail import H, W, build, off, widened
 from torch_backend.freeze.detail import DetailConfig, Detailer
 from torch_backend.freeze.frozen import freeze_at, render_frozen
-from torch_backend.freeze.instant_view import bridged
+from torch_backend.freeze.instant_pixels import InstantPixels
+from torch_backend.freeze.instant_view import bridged, continued
 from torch_backend.freeze.reproject import pixel_centres
 
 SHARP = DetailConfig(depth_error=0.01)
@@ -124,3 +125,36 @@ def test_a_gap_is_shown_as_around_it_unless_two_surfaces_meet_there():
     assert not bool(steady[:, 25:28].any()), "a hand and the wall behind it"
     nothing, told = bridged(rough, torch.zeros_like(seen), 4.0, 1.5)
     assert bool(nothing.isfinite().all()) and not bool(told.any())
+
+
+def test_a_soft_border_goes_on_as_the_nearest_pixel_that_is_taken():
+    """A hand and a sleeve, displaced to different sides, and between them a wall that plate t* shows elsewhere."""
+    here, taken = pixel_centres(40, 30), torch.zeros(30, 40, dtype=torch.bool)
+    taken[5:25, 5:15] = taken[5:25, 20:35] = True
+    ways = torch.tensor([[3.0, 1.0], [-4.0, 2.0], [25.0, 0.0]])
+    places = here + ways[2]
+    places[:, 5:15], places[:, 20:35] = here[:, 5:15] + ways[0], here[:, 20:35] + ways[1]
+    places[~taken] = (here + ways[2])[~taken]
+    moved = continued(places, taken, 4) - here
+    torch.testing.assert_close(moved[10, 1:17], ways[0].expand(16, 2))
+    torch.testing.assert_close(moved[10, 18:39], ways[1].expand(21, 2))
+    torch.testing.assert_close(moved[10, 0], ways[2])
+    nothing = torch.zeros_like(taken)
+    assert continued(places, nothing, 4) is places
+
+
+def test_between_two_surfaces_a_plate_larger_than_decisions_is_read_at_either_and_not_between():
+    """Left half comes from the red end of plate t*, right half from the blue end; green lies between the two."""
+    plate = torch.zeros(80, 160, 3)
+    plate[:, :50, 0] = plate[:, 50:110, 1] = plate[:, 110:, 2] = 1.0
+    here = pixel_centres(40, 20)
+    places = here.clone()
+    places[:, :20, 0], places[:, 20:, 0] = 0.4 * here[:, :20, 0], 40.0 - 0.4 * (40.0 - here[:, 20:, 0])
+    none = torch.zeros(20, 40)
+    made = InstantPixels(
+        none, none, places, plate.half(), torch.ones(3), torch.zeros(3), torch.zeros(20, 40, 3), 1.5
+    )  # fmt: skip
+    fine = pixel_centres(160, 80).reshape(-1, 2) / 4.0
+    row = made.at(fine, torch.tensor([4.0, 4.0])).reshape(80, 160, 3)[40]
+    assert row[:78, 0].min() > 0.9 and row[82:, 2].min() > 0.9
+    assert row[:, 1].max() < 0.1
