@@ -217,11 +217,19 @@ class _Bench:
 
     def difference(self, image: FrozenImage) -> NDArray[np.float32]:
         """Low-passed difference [h, w] between plate and render, beyond what misplaced edges explain."""
-        c, shown = self.config, image.color.numpy()
-        plate = (
+        shown = image.color.numpy()
+        return low_difference(self._plate(shown), shown, self.config.blur * self.unit, self.config.shift * self.unit)
+
+    def single(self, image: FrozenImage) -> NDArray[np.float32]:
+        """Difference [h, w] of single pixels, the greatest of the channels."""
+        shown = image.color.numpy()
+        return np.abs(shown - self._plate(shown)).max(axis=-1)
+
+    def _plate(self, shown: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[h, w, 3] plate t*, where it counts; elsewhere what is `shown`."""
+        return (
             self.view.picture if self._ignored is None else np.where(self._ignored[..., None], shown, self.view.picture)
         )
-        return low_difference(plate, shown, c.blur * self.unit, c.shift * self.unit)
 
 
 def low_difference(
@@ -464,11 +472,9 @@ def _helps(bench: _Bench, after: FrozenImage, before: FrozenImage, where: NDArra
     old, new = bench.difference(before), bench.difference(after)
     if new[where].mean() <= (1.0 - c.gain) * old[where].mean() and new[around].mean() <= old[around].mean():
         return True
-    fine, finer = (np.abs(image.color.numpy() - bench.view.picture).max(axis=-1) for image in (before, after))
-    sharper = (
-        finer[where].mean() <= (1.0 - c.detail) * fine[where].mean() and finer[around].mean() <= fine[around].mean()
-    )
-    return bool(sharper and new[where].mean() <= old[where].mean())
+    fine, finer = bench.single(before), bench.single(after)
+    sharper = finer[where].mean() <= (1.0 - c.detail) * fine[where].mean()
+    return bool(sharper and finer[around].mean() <= fine[around].mean() and new[where].mean() <= old[where].mean())
 
 
 def _large(mask: NDArray[np.bool_], seeds: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
