@@ -47,6 +47,9 @@ class DetailConfig:
     """Share of such a difference that must be gone in the render of the plate's own time."""
     denied_too: float = 0.08
     """The same, for what hangs together with such a spot."""
+    beyond: float = 100.0
+    """Square pixels from which on what the render alone says, where plate t* does not see, is let go of: along borders
+    of the picture and of what plate t* sees bits differ that are none."""
     thin: int = 3
     """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
     moves: float = 0.25

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .regions import components, enclosed, grown, opened
+from .regions import components, enclosed, grown, larger, opened
 from .reproject import blurred, narrowed, resized, widened
 
 _CLIPPED = 0.98
@@ -160,8 +160,7 @@ def _borne_out(both: BothPlates, render: Tensor, found: Tensor, unit: float, con
 
     A fist before a face of its colour is a shift of that face, too; the splats, which other plates have made, know.
     """
-    out, anything = torch.zeros_like(found), torch.ones_like(found)
-    regions = components(enclosed(found, anything, 1, 0.0, config.least_borne_out * unit**2))
+    out, regions = torch.zeros_like(found), components(larger(found, config.least_borne_out * unit**2))
     if not regions:
         return out
     shown = render * both.seen[..., None]

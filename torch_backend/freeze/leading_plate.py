@@ -13,7 +13,7 @@ from .detail_config import DetailConfig
 from .frozen import SUPPORT_SECONDS, OutputFrame
 from .held import BothPlates, held, with_holes
 from .posed import PosedFrame, displacements, parallax
-from .regions import closed, grown, opened
+from .regions import closed, grown, larger, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sightings import Sighting, Sightings
 from .warp import snap
@@ -140,8 +140,9 @@ def _let_go(
     wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
     if truth is not None:
         wrong = sightings.whole(wrong, contrary, config.denied_too)
-        # What plate t* does not see cannot contradict: a rim of light along the arm, before what a head hides at t*.
-        wrong = sightings.whole(wrong, torch.where(truth.visible < 0.5, off, 0.0))
+        # Of what plate t* does not see the frozen render alone knows: an elbow that was further back.
+        beyond = sightings.whole(wrong, torch.where(truth.visible < 0.5, off, 0.0)) & ~wrong
+        wrong = wrong | larger(beyond, config.beyond * sightings.unit**2)
     found = torch.zeros_like(wrong)
     if both is not None:
         h, w = wrong.shape

@@ -55,6 +55,16 @@ def components(mask: Tensor) -> list[Tensor]:
     return [labels == n for n in range(1, count)]
 
 
+def larger(mask: Tensor, least: float) -> Tensor:
+    """Of the mask those connected regions that have `least` pixels or more."""
+    import cv2
+
+    _, found, about, _ = cv2.connectedComponentsWithStats(mask.numpy().astype(np.uint8), connectivity=8)
+    keeps = np.asarray(about[:, cv2.CC_STAT_AREA]) >= least
+    keeps[0] = False
+    return from_numpy(keeps)[from_numpy(np.asarray(found, np.int64))]
+
+
 def enclosed(mask: Tensor, ground: Tensor, rim: int, share: float, least: float = 0.0) -> Tensor:
     """Of the mask those connected regions of whose surroundings, `rim` pixels wide, `share` or more is `ground`.
 

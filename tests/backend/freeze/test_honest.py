@@ -37,8 +37,11 @@ def narrowed(mask, by):
     return ndimage.binary_erosion(mask, np.ones((2 * by + 1,) * 2))
 
 
-def make(world, mattes, sightings=None, **config):
-    """The frame at T_STAR; `mattes` frame -> bool [H, W], of those that are not as they should be."""
+def make(world, mattes, sightings=None, masked=None, **config):
+    """The frame at T_STAR; `mattes` frame -> bool [H, W], of those that are not as they should be.
+
+    `masked`: bool [H, W], what plate t* is not to show; None: nothing.
+    """
 
     def moving(frame):
         on = mattes.get(frame)
@@ -46,6 +49,9 @@ def make(world, mattes, sightings=None, **config):
 
     settings = DetailConfig(depth_error=0.01, sightings=sightings or SightingConfig(), **config)
     detailer = Detailer(world.run, world.scene, world.plates(), settings, moving)
+    if masked is not None:
+        at_t = torch.from_numpy(masked).float()
+        detailer.seen.ignored = lambda frame: at_t if frame == T_STAR else None
     return world.make(world.output(FRAME, T_STAR), detailer)
 
 
@@ -88,6 +94,22 @@ def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
         world.run.model = before
     assert shows_its_own_board(world, made) < 0.01
     assert shows_its_own_board(world, alone) > 0.9, "else there is nothing to mend"
+
+
+def test_where_plate_t_star_does_not_see_the_render_says_what_goes_with_what_moves(world):
+    """The model leaves the board where it was at t*, whose plate is masked where it had been; mattes end short."""
+    before, (_, on) = world.run.model, world.seen_at(FRAME)
+    short = narrowed(on, 9)
+    mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14)} | {FRAME: short}
+    hidden = widened(on, 30) & ~widened(world.seen_at(T_STAR)[1], 4)
+    world.run.model = replace(before, field=Stays())
+    try:
+        made, alone = (make(world, mattes, masked=hidden, beyond=least) for least in (100.0, 1e9))
+    finally:
+        world.run.model = before
+    rim = on & hidden & ~widened(short, 4)
+    assert rim.sum() > 300 and made.matte.numpy()[rim].mean() < 0.05
+    assert alone.matte.numpy()[rim].mean() > 0.5, "else something else says so"
 
 
 def test_what_the_model_moves_goes_with_what_moves_beside_it(world):

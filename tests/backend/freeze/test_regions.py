@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.freeze.regions import enclosed, grown, opened
+from torch_backend.freeze.regions import enclosed, grown, larger, opened
 from torch_backend.freeze.reproject import narrowed, widened
 
 
@@ -57,3 +57,12 @@ def test_what_is_enclosed_stands_on_its_ground_all_around_and_is_no_speck():
     assert (enclosed(mask, ground, 3, 0.4, 20.0) == (mask & (torch.arange(120) < 90))).all()
     assert (enclosed(mask, ground, 3, 0.4) == mask).all()
     assert not enclosed(torch.zeros_like(mask), ground, 3, 0.0).any()
+
+
+def test_regions_of_too_few_pixels_are_dropped_whole():
+    mask = torch.zeros(20, 30, dtype=torch.bool)
+    mask[2:6, 2:7] = mask[10:13, 10:16] = True
+    mask[6, 7] = True  # hangs on the first by its corner
+    kept = larger(mask, 19.0)
+    assert torch.equal(kept, mask & (torch.arange(20)[:, None] < 8))
+    assert torch.equal(larger(mask, 18.0), mask) and not larger(mask, 22.0).any()
