@@ -8,9 +8,7 @@ where the field has the hand itself, if paler or softer than the plate, it is as
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,66 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians.model import SH_C0
-from ..scene import Scene, evenly_spaced, read_image, resize_intrinsics
-from ..shot import Shot
+from ..scene import Scene
 from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.exposure import Exposure
 from ..train.model import gathered
-from .frozen import FrozenGaussians, FrozenImage, render_frozen
-from .ignored import ignore_mattes
-from .instant_depth import DepthConfig, Region, View, as_field, inverse_depth, own_motion
-from .instant_track import Track, TrackConfig, swing, tracks
-from .reproject import resized
-from .sightings import matte_of
-
-_SIZE = 320.0
-"""Lengths in pixels in the configuration are those of pictures this wide; others are scaled with the width."""
-
-Motion = Callable[[int], "NDArray[np.uint8] | None"]
-"""Motion matte [h, w] of a frame number, None where there is none."""
-
-
-@dataclass
-class InstantConfig:
-    """What counts as missing, and what stands in for it. Lengths are in pixels of pictures 320 wide."""
-
-    width: int = 640
-    """Plates are compared, and the layer is made, at the trained size, but no wider than this."""
-    blur: float = 3.0
-    """Standard deviation of the low-pass before plate and render are compared."""
-    shift: float = 1.0
-    """The render may be this far from where the plate has an edge: a difference it explains is none."""
-    seed: float = 0.12
-    """A region has a low-passed difference of at least this somewhere (display-referred)."""
-    grow: float = 0.06
-    """And of at least this everywhere."""
-    least: float = 30.0
-    """Square pixels; smaller regions are left alone."""
-    moving: float = 0.5
-    """Least share of a region that the motion matte calls moving, if there is one."""
-    own_motion: float = 0.12
-    """Least distance of a region's flow from its epipolar lines, per frame; twice that where there is no matte."""
-    solid: float = 0.14
-    """Difference at a pixel from which on it is wholly the layer's; below half of it, the model's."""
-    sigma: float = 0.6
-    """Standard deviation of a Gaussian in pixels of the layer: no holes at twice the size, and not softer than that."""
-    opacity: float = 0.97
-    """Of a Gaussian inside a region."""
-    fade: float = 0.5
-    """A moving Gaussian is a ghost if at least this share of what is seen of it lies where plate t* shows what is
-    behind it."""
-    gain: float = 0.1
-    """Layer and fading are kept if they lower the low-passed difference where they act by at least this share,"""
-    detail: float = 0.3
-    """or the difference of single pixels by this share, and the low-passed one at all: a hand that the field has but
-    blurred is where plate t* has it, and has no fingers."""
-    stuck: float = 0.5
-    """Detail that correlates this well with that at the same pixels of other frames is on the picture (a logo)."""
-    depth: DepthConfig = field(default_factory=DepthConfig)
-    """How depth is told."""
-    track: TrackConfig = field(default_factory=TrackConfig)
-    """How small things are followed."""
+from .frozen import FrozenGaussians, FrozenImage
+from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed
+from .instant_depth import Region, as_field, inverse_depth, own_motion
+from .instant_track import Track, swing, tracks
 
 
 @dataclass
@@ -118,7 +65,7 @@ def instant_layer(
     """
     config = config or InstantConfig()
     index = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
-    bench = _Bench(run, scene, index, config, motion)
+    bench = InstantBench(run, scene, index, config, motion)
     image = bench.render(frozen)
     things = _small_things(bench, image)
     if not things and not (bench.difference(image) >= config.seed).any():
@@ -153,101 +100,7 @@ def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
     return replace(frozen, state=state)
 
 
-class _Bench:
-    """Plate t* and its camera, with its neighbours, at the size at which they are compared."""
-
-    def __init__(self, run: LoadedRun, scene: Scene, index: int, config: InstantConfig, motion: Motion | None) -> None:
-        self.config, self.exposure, self.index = config, run.model.exposure, index
-        self.width = min(run.width, config.width)
-        self.height = max(1, round(run.height * self.width / run.width))
-        self.unit = self.width / _SIZE
-        self.time = float(scene.times[index])
-        self.scene, self._motion = scene, motion
-        self.Ks = resize_intrinsics(scene.Ks, scene.width, scene.height, self.width, self.height)
-        self._views: dict[int, View] = {}
-        self.view = self.at(index)
-        mask = ignore_mattes(Shot(scene.folder.parent))(scene.frames[index])
-        self._ignored = None if mask is None else resized(mask, self.width, self.height).numpy() > 0.0
-        """[h, w] bool what of plate t* is no part of the scene: nothing is missing there."""
-
-    def at(self, index: int) -> View:
-        """Delivered frame `index`: its plate and camera. Kept."""
-        if index not in self._views:
-            self._views[index] = self._read(index)
-        return self._views[index]
-
-    def _read(self, index: int) -> View:
-        scene = self.scene
-        picture = read_image(scene.image_path(index), self.width, self.height, scene.display).numpy()
-        return self.camera(index, np.ascontiguousarray(picture, np.float32))
-
-    def camera(self, index: int, picture: NDArray[np.float32] | None = None) -> View:
-        """Its camera, with a picture or none."""
-        viewmat, K = self.scene.viewmats[index].double().numpy(), self.Ks[index].double().numpy()
-        return View(index, np.zeros((0, 0, 3), np.float32) if picture is None else picture, viewmat, K)
-
-    def frame(self, index: int) -> tuple[View, NDArray[np.bool_]] | None:
-        """A plate with its camera, and what moves there [h, w]; None if that is not known. Not kept."""
-        matte = self.matte(index) if 0 <= index < len(self.scene.frames) else None
-        return None if matte is None else (self._views.get(index) or self._read(index), matte > 0.5)
-
-    def neighbours(self) -> list[View]:
-        """Frames around t*, on both sides where there are any."""
-        steps = self.config.depth.neighbours
-        found = [self.index + sign * step for step in steps for sign in (-1, 1)]
-        return [self.at(i) for i in found if 0 <= i < len(self.scene.frames)]
-
-    def spread(self, count: int) -> list[View]:
-        """Up to `count` frames, evenly over the clip, without t*."""
-        chosen = evenly_spaced(len(self.scene.frames), count)
-        return [self.at(i) for i in chosen if i != self.index]
-
-    def matte(self, index: int | None = None) -> NDArray[np.float32] | None:
-        """Motion matte of a frame, or of t*, [h, w] in 0..1, if there is one; unknown is `DOUBT`, so still."""
-        index = self.index if index is None else index
-        found = self._motion(self.scene.frames[index]) if self._motion else None
-        if found is None:
-            return None
-        return _resized(matte_of(found).numpy(), self.width, self.height)
-
-    def render(self, frozen: FrozenGaussians) -> FrozenImage:
-        """A frozen scene as camera t* sees it, exposed as plate t* is."""
-        camera = self.scene.viewmats[self.index], self.Ks[self.index]
-        return render_frozen(frozen, *camera, self.width, self.height, self.exposure, self.time)
-
-    def difference(self, image: FrozenImage) -> NDArray[np.float32]:
-        """Low-passed difference [h, w] between plate and render, beyond what misplaced edges explain."""
-        shown = image.color.numpy()
-        return low_difference(self._plate(shown), shown, self.config.blur * self.unit, self.config.shift * self.unit)
-
-    def single(self, image: FrozenImage) -> NDArray[np.float32]:
-        """Difference [h, w] of single pixels, the greatest of the channels."""
-        shown = image.color.numpy()
-        return np.abs(shown - self._plate(shown)).max(axis=-1)
-
-    def _plate(self, shown: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[h, w, 3] plate t*, where it counts; elsewhere what is `shown`."""
-        return (
-            self.view.picture if self._ignored is None else np.where(self._ignored[..., None], shown, self.view.picture)
-        )
-
-
-def low_difference(
-    plate: NDArray[np.float32], shown: NDArray[np.float32], blur: float, shift: float
-) -> NDArray[np.float32]:
-    """Difference between two pictures [h, w, 3] after a low-pass, [h, w], the greatest of the channels.
-
-    A picture that is off by s pixels differs, to first order, by s times the gradient: the difference that `shift`
-    pixels explain is subtracted, so that an edge out of place is none. `blur` is a standard deviation in pixels.
-    """
-    low = _blurred(plate - shown, blur)
-    smooth = _blurred(plate, blur)
-    down, right = np.gradient(smooth, axis=(0, 1))
-    explained = shift * np.hypot(down, right)
-    return np.maximum(np.abs(low) - explained, 0.0).max(-1)
-
-
-def _regions(bench: _Bench, image: FrozenImage) -> list[NDArray[np.bool_]]:
+def _regions(bench: InstantBench, image: FrozenImage) -> list[NDArray[np.bool_]]:
     """Masks [h, w] of the regions in which plate t* shows something that moves and the render does not."""
     import cv2
 
@@ -262,7 +115,7 @@ def _regions(bench: _Bench, image: FrozenImage) -> list[NDArray[np.bool_]]:
     return [region for region in found if _moves(bench, region) and not _stuck(bench, region, image)]
 
 
-def _moves(bench: _Bench, region: NDArray[np.bool_]) -> bool:
+def _moves(bench: InstantBench, region: NDArray[np.bool_]) -> bool:
     """True if what plate t* shows in a region moves. What is merely modelled badly stays on its epipolar lines."""
     c, matte = bench.config, bench.matte()
     share = 1.0 if matte is None else float(matte[region].mean())
@@ -272,7 +125,7 @@ def _moves(bench: _Bench, region: NDArray[np.bool_]) -> bool:
     return share >= c.moving and own >= (1.0 if matte is not None else 2.0) * c.own_motion * bench.unit
 
 
-def _stuck(bench: _Bench, region: NDArray[np.bool_], image: FrozenImage) -> bool:
+def _stuck(bench: InstantBench, region: NDArray[np.bool_], image: FrozenImage) -> bool:
     """True if a region shows the same detail in frames all over the clip, while the world behind it goes by: a logo."""
     view, unit = bench.view, bench.unit
     inverse = 1.0 / float(np.median(image.depth.numpy()[region]))
@@ -280,13 +133,17 @@ def _stuck(bench: _Bench, region: NDArray[np.bool_], image: FrozenImage) -> bool
     for other in bench.spread(7):
         travel = np.linalg.norm(view.project(other, inverse) - view.grid(), axis=-1)
         if np.median(travel[region]) > 3.0 * unit:
-            a, b = ((v.picture - _blurred(v.picture, 2.0 * unit))[region].ravel() for v in (view, other))
+            a, b = ((v.picture - low_passed(v.picture, 2.0 * unit))[region].ravel() for v in (view, other))
             alike.append(float((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9)))
     return bool(alike) and float(np.median(alike)) > bench.config.stuck
 
 
 def _shell(
-    bench: _Bench, frozen: FrozenGaussians, image: FrozenImage, regions: list[NDArray[np.bool_]], things: list[Track]
+    bench: InstantBench,
+    frozen: FrozenGaussians,
+    image: FrozenImage,
+    regions: list[NDArray[np.bool_]],
+    things: list[Track],
 ) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
     """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
     view, cover = bench.view, np.zeros((bench.height, bench.width), np.float32)
@@ -323,7 +180,7 @@ def _shell(
     return _gaussians(bench, frozen, means, rows, columns, inverse, cover, colors), cover, facts_of_regions
 
 
-def _fields_inverse(bench: _Bench, frozen: FrozenGaussians) -> NDArray[np.float32]:
+def _fields_inverse(bench: InstantBench, frozen: FrozenGaussians) -> NDArray[np.float32]:
     """Inverse depth [h, w] of what the field moves before all that stands still, however faint; 0 where nothing."""
     moves = frozen.motion > 0.5
     if not bool(moves.any()):
@@ -334,13 +191,13 @@ def _fields_inverse(bench: _Bench, frozen: FrozenGaussians) -> NDArray[np.float3
     return np.where(there, 1.0 / np.maximum(depth, 1e-6), 0.0).astype(np.float32)
 
 
-def _small_things(bench: _Bench, image: FrozenImage) -> list[Track]:
+def _small_things(bench: InstantBench, image: FrozenImage) -> list[Track]:
     """Small things that move at t* and that the render does not show, however little a low-pass leaves of them."""
     c = bench.config
     return tracks(bench.frame, bench.index, image.color.numpy(), c.track, bench.unit)
 
 
-def _thing_cover(bench: _Bench, image: FrozenImage, thing: Track) -> NDArray[np.float32]:
+def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArray[np.float32]:
     """How much of each pixel [h, w] a small thing covers: how far it is on the way from what is behind to its colour.
 
     Its colours differ, so what is farther from what is behind than a third of that way is wholly its own inside.
@@ -350,12 +207,12 @@ def _thing_cover(bench: _Bench, image: FrozenImage, thing: Track) -> NDArray[np.
     plate, behind = bench.view.picture, image.color.numpy()
     way = thing.color - behind
     share = ((plate - behind) * way).sum(-1) / np.maximum(np.square(way).sum(-1), 1e-4)
-    near = cv2.dilate(thing.pixels.astype(np.uint8), _disc(1.0)) > 0
+    near = cv2.dilate(thing.pixels.astype(np.uint8), disc(1.0)) > 0
     return np.where(near, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)
 
 
 def _gaussians(
-    bench: _Bench, frozen: FrozenGaussians, means: NDArray[np.float64], rows: NDArray[np.intp],
+    bench: InstantBench, frozen: FrozenGaussians, means: NDArray[np.float64], rows: NDArray[np.intp],
     columns: NDArray[np.intp], inverse: NDArray[np.float32], cover: NDArray[np.float32], colors: NDArray[np.float32],
 ) -> dict[str, Tensor]:  # fmt: skip
     """Gaussians [M] at `means`, coloured by the pixels (rows, columns) of plate t*, one pixel apart on the screen."""
@@ -387,9 +244,9 @@ def _matted(
     """
     import cv2
 
-    inside = np.asarray(cv2.erode((cover > 0.9).astype(np.float32), _disc(1.0 * unit)), np.float32)
-    weight = _blurred(inside, 1.5 * unit)
-    own = _blurred(picture * inside[..., None], 1.5 * unit) / np.maximum(weight, 1e-6)[..., None]
+    inside = np.asarray(cv2.erode((cover > 0.9).astype(np.float32), disc(1.0 * unit)), np.float32)
+    weight = low_passed(inside, 1.5 * unit)
+    own = low_passed(picture * inside[..., None], 1.5 * unit) / np.maximum(weight, 1e-6)[..., None]
     way, length = own - behind, np.square(own - behind).sum(-1)
     share = np.clip(((picture - behind) * way).sum(-1) / np.maximum(length, 1e-6), 0.0, 1.0)
     rim = (cover > 0.0) & (inside < 0.5) & (weight > 0.02) & (length > 0.15**2)
@@ -406,7 +263,7 @@ def _unexposed(color: Tensor, exposure: Exposure, time: float) -> Tensor:
     return (color - offset.cpu()) / gain.cpu()
 
 
-def _cover(bench: _Bench, image: FrozenImage, region: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _cover(bench: InstantBench, image: FrozenImage, region: NDArray[np.bool_]) -> NDArray[np.float32]:
     """How much of each pixel [h, w] around a region is what the model lacks, 0..1.
 
     The low-passed region has the shape of a blot. Inside, the model stands for what is hidden, so what differs from
@@ -416,17 +273,17 @@ def _cover(bench: _Bench, image: FrozenImage, region: NDArray[np.bool_]) -> NDAr
 
     c, unit = bench.config, bench.unit
     shown, plate = image.color.numpy(), bench.view.picture
-    down, right = np.gradient(_blurred(shown, 0.7 * unit), axis=(0, 1))
-    off = np.abs(_blurred(plate - shown, 0.7 * unit)) - 0.5 * c.shift * unit * np.hypot(down, right)
+    down, right = np.gradient(low_passed(shown, 0.7 * unit), axis=(0, 1))
+    off = np.abs(low_passed(plate - shown, 0.7 * unit)) - 0.5 * c.shift * unit * np.hypot(down, right)
     ramp = np.clip(2.0 * off.max(-1) / c.solid - 1.0, 0.0, 1.0).astype(np.float32)
-    near = cv2.dilate(region.astype(np.uint8), _disc(2.0 * unit)) > 0
+    near = cv2.dilate(region.astype(np.uint8), disc(2.0 * unit)) > 0
     ramp = np.where(near, ramp, 0.0).astype(np.float32)
-    closed = cv2.morphologyEx(ramp, cv2.MORPH_CLOSE, _disc(2.5 * unit))
-    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, _disc(1.0 * unit))
+    closed = cv2.morphologyEx(ramp, cv2.MORPH_CLOSE, disc(2.5 * unit))
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc(1.0 * unit))
     return np.where(near, opened, 0.0).astype(np.float32)
 
 
-def _ghosts(bench: _Bench, frozen: FrozenGaussians, image: FrozenImage) -> tuple[Tensor, NDArray[np.bool_]]:
+def _ghosts(bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage) -> tuple[Tensor, NDArray[np.bool_]]:
     """(kept [N], mask [h, w]): moving Gaussians that stand before what plate t* shows, judged on that plate.
 
     A ghost is seen where the render without all that moves is nearer to the plate, by a low-pass, than with it.
@@ -452,7 +309,7 @@ def _ghosts(bench: _Bench, frozen: FrozenGaussians, image: FrozenImage) -> tuple
     return kept, ghost
 
 
-def _shares(bench: _Bench, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+def _shares(bench: InstantBench, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
     """What camera t* sees of each Gaussian, [N] each: inside a mask [h, w], and at all. Sums of alpha T over pixels."""
     device, scene, i = frozen.support.device, bench.scene, bench.index
     where = from_numpy(mask).to(device, torch.float32)
@@ -462,13 +319,13 @@ def _shares(bench: _Bench, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> 
     return inside, whole
 
 
-def _helps(bench: _Bench, after: FrozenImage, before: FrozenImage, where: NDArray[np.bool_]) -> bool:
+def _helps(bench: InstantBench, after: FrozenImage, before: FrozenImage, where: NDArray[np.bool_]) -> bool:
     """True if the difference, low-passed or of single pixels, falls enough where something was done, and does not rise
     around it."""
     import cv2
 
     c = bench.config
-    around = cv2.dilate(where.astype(np.uint8), _disc(2.0 * c.blur * bench.unit)) > 0
+    around = cv2.dilate(where.astype(np.uint8), disc(2.0 * c.blur * bench.unit)) > 0
     old, new = bench.difference(before), bench.difference(after)
     if new[where].mean() <= (1.0 - c.gain) * old[where].mean() and new[around].mean() <= old[around].mean():
         return True
@@ -487,28 +344,3 @@ def _large(mask: NDArray[np.bool_], seeds: NDArray[np.bool_], least: float) -> N
     good = (sizes >= least) & seeded
     good[0] = False
     return good[np.asarray(labels, np.int32)]
-
-
-def _blurred(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """A Gaussian low-pass of [h, w] or [h, w, C]; sigma in pixels."""
-    import cv2
-
-    return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32)
-
-
-def _disc(radius: float) -> NDArray[np.uint8]:
-    """A disc of a radius in pixels, at least 1."""
-    import cv2
-
-    side = 2 * max(1, math.ceil(radius)) + 1
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)).astype(np.uint8)
-
-
-def _resized(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """[H, W] or [H, W, C] at another size: averaged where it shrinks."""
-    import cv2
-
-    if values.shape[:2] == (height, width):
-        return values
-    kind = cv2.INTER_AREA if width <= values.shape[1] else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(values, (width, height), interpolation=kind), np.float32)

@@ -10,8 +10,9 @@ import torch
 
 from torch_backend.footage.images import write_png
 from torch_backend.freeze.frozen import FrozenGaussians, freeze_at, render_frozen
+from torch_backend.freeze.instant_bench import InstantBench, InstantConfig, low_difference
 from torch_backend.freeze.instant_depth import DepthConfig, as_field
-from torch_backend.freeze.missing_layer import InstantConfig, _Bench, _helps, instant_layer, join, low_difference
+from torch_backend.freeze.missing_layer import _helps, instant_layer, join
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
 from torch_backend.scene import Scene
@@ -326,7 +327,7 @@ def test_a_hand_that_the_field_has_without_fingers_is_given_those_of_the_plate()
     where = np.zeros((60, 80), bool)
     where[20:40, 30:50] = True
     plate[20:40, 30:50] += np.where(np.arange(20) % 4 < 2, 0.6, 0.2)[None, :, None].astype(np.float32)
-    bench = object.__new__(_Bench)
+    bench = object.__new__(InstantBench)
     bench.config, bench.unit, bench._ignored, bench.view = InstantConfig(), 1.0, None, SimpleNamespace(picture=plate)
     bench.width, bench.height = 80, 60
 

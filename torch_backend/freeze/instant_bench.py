@@ -1,0 +1,187 @@
+"""Plate t* beside what a frozen scene shows of it: where what `missing_layer.py` finds is looked for and judged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import Scene, evenly_spaced, read_image, resize_intrinsics
+from ..shot import Shot
+from ..train import LoadedRun
+from .frozen import FrozenGaussians, FrozenImage, render_frozen
+from .ignored import ignore_mattes
+from .instant_depth import DepthConfig, View
+from .instant_track import TrackConfig
+from .reproject import resized
+from .sightings import matte_of
+
+_SIZE = 320.0
+"""Lengths in pixels in the configuration are those of pictures this wide; others are scaled with the width."""
+
+Motion = Callable[[int], "NDArray[np.uint8] | None"]
+"""Motion matte [h, w] of a frame number, None where there is none."""
+
+
+@dataclass
+class InstantConfig:
+    """What counts as missing, and what stands in for it. Lengths are in pixels of pictures 320 wide."""
+
+    width: int = 640
+    """Plates are compared, and the layer is made, at the trained size, but no wider than this."""
+    blur: float = 3.0
+    """Standard deviation of the low-pass before plate and render are compared."""
+    shift: float = 1.0
+    """The render may be this far from where the plate has an edge: a difference it explains is none."""
+    seed: float = 0.12
+    """A region has a low-passed difference of at least this somewhere (display-referred)."""
+    grow: float = 0.06
+    """And of at least this everywhere."""
+    least: float = 30.0
+    """Square pixels; smaller regions are left alone."""
+    moving: float = 0.5
+    """Least share of a region that the motion matte calls moving, if there is one."""
+    own_motion: float = 0.12
+    """Least distance of a region's flow from its epipolar lines, per frame; twice that where there is no matte."""
+    solid: float = 0.14
+    """Difference at a pixel from which on it is wholly the layer's; below half of it, the model's."""
+    sigma: float = 0.6
+    """Standard deviation of a Gaussian in pixels of the layer: no holes at twice the size, and not softer than that."""
+    opacity: float = 0.97
+    """Of a Gaussian inside a region."""
+    fade: float = 0.5
+    """A moving Gaussian is a ghost if at least this share of what is seen of it lies where plate t* shows what is
+    behind it."""
+    gain: float = 0.1
+    """Layer and fading are kept if they lower the low-passed difference where they act by at least this share,"""
+    detail: float = 0.3
+    """or the difference of single pixels by this share, and the low-passed one at all: a hand that the field has but
+    blurred is where plate t* has it, and has no fingers."""
+    stuck: float = 0.5
+    """Detail that correlates this well with that at the same pixels of other frames is on the picture (a logo)."""
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    """How depth is told."""
+    track: TrackConfig = field(default_factory=TrackConfig)
+    """How small things are followed."""
+
+
+class InstantBench:
+    """Plate t* and its camera, with its neighbours, at the size at which they are compared."""
+
+    def __init__(self, run: LoadedRun, scene: Scene, index: int, config: InstantConfig, motion: Motion | None) -> None:
+        self.config, self.exposure, self.index = config, run.model.exposure, index
+        self.width = min(run.width, config.width)
+        self.height = max(1, round(run.height * self.width / run.width))
+        self.unit = self.width / _SIZE
+        self.time = float(scene.times[index])
+        self.scene, self._motion = scene, motion
+        self.Ks = resize_intrinsics(scene.Ks, scene.width, scene.height, self.width, self.height)
+        self._views: dict[int, View] = {}
+        self.view = self.at(index)
+        mask = ignore_mattes(Shot(scene.folder.parent))(scene.frames[index])
+        self._ignored = None if mask is None else resized(mask, self.width, self.height).numpy() > 0.0
+        """[h, w] bool what of plate t* is no part of the scene: nothing is missing there."""
+
+    def at(self, index: int) -> View:
+        """Delivered frame `index`: its plate and camera. Kept."""
+        if index not in self._views:
+            self._views[index] = self._read(index)
+        return self._views[index]
+
+    def _read(self, index: int) -> View:
+        scene = self.scene
+        picture = read_image(scene.image_path(index), self.width, self.height, scene.display).numpy()
+        return self.camera(index, np.ascontiguousarray(picture, np.float32))
+
+    def camera(self, index: int, picture: NDArray[np.float32] | None = None) -> View:
+        """Its camera, with a picture or none."""
+        viewmat, K = self.scene.viewmats[index].double().numpy(), self.Ks[index].double().numpy()
+        return View(index, np.zeros((0, 0, 3), np.float32) if picture is None else picture, viewmat, K)
+
+    def frame(self, index: int) -> tuple[View, NDArray[np.bool_]] | None:
+        """A plate with its camera, and what moves there [h, w]; None if that is not known. Not kept."""
+        matte = self.matte(index) if 0 <= index < len(self.scene.frames) else None
+        return None if matte is None else (self._views.get(index) or self._read(index), matte > 0.5)
+
+    def neighbours(self) -> list[View]:
+        """Frames around t*, on both sides where there are any."""
+        steps = self.config.depth.neighbours
+        found = [self.index + sign * step for step in steps for sign in (-1, 1)]
+        return [self.at(i) for i in found if 0 <= i < len(self.scene.frames)]
+
+    def spread(self, count: int) -> list[View]:
+        """Up to `count` frames, evenly over the clip, without t*."""
+        chosen = evenly_spaced(len(self.scene.frames), count)
+        return [self.at(i) for i in chosen if i != self.index]
+
+    def matte(self, index: int | None = None) -> NDArray[np.float32] | None:
+        """Motion matte of a frame, or of t*, [h, w] in 0..1, if there is one; unknown is `DOUBT`, so still."""
+        index = self.index if index is None else index
+        found = self._motion(self.scene.frames[index]) if self._motion else None
+        if found is None:
+            return None
+        return resized_array(matte_of(found).numpy(), self.width, self.height)
+
+    def render(self, frozen: FrozenGaussians) -> FrozenImage:
+        """A frozen scene as camera t* sees it, exposed as plate t* is."""
+        camera = self.scene.viewmats[self.index], self.Ks[self.index]
+        return render_frozen(frozen, *camera, self.width, self.height, self.exposure, self.time)
+
+    def difference(self, image: FrozenImage) -> NDArray[np.float32]:
+        """Low-passed difference [h, w] between plate and render, beyond what misplaced edges explain."""
+        shown = image.color.numpy()
+        return low_difference(self._plate(shown), shown, self.config.blur * self.unit, self.config.shift * self.unit)
+
+    def single(self, image: FrozenImage) -> NDArray[np.float32]:
+        """Difference [h, w] of single pixels, the greatest of the channels."""
+        shown = image.color.numpy()
+        return np.abs(shown - self._plate(shown)).max(axis=-1)
+
+    def _plate(self, shown: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[h, w, 3] plate t*, where it counts; elsewhere what is `shown`."""
+        return (
+            self.view.picture if self._ignored is None else np.where(self._ignored[..., None], shown, self.view.picture)
+        )
+
+
+def low_difference(
+    plate: NDArray[np.float32], shown: NDArray[np.float32], blur: float, shift: float
+) -> NDArray[np.float32]:
+    """Difference between two pictures [h, w, 3] after a low-pass, [h, w], the greatest of the channels.
+
+    A picture that is off by s pixels differs, to first order, by s times the gradient: the difference that `shift`
+    pixels explain is subtracted, so that an edge out of place is none. `blur` is a standard deviation in pixels.
+    """
+    low = low_passed(plate - shown, blur)
+    smooth = low_passed(plate, blur)
+    down, right = np.gradient(smooth, axis=(0, 1))
+    explained = shift * np.hypot(down, right)
+    return np.maximum(np.abs(low) - explained, 0.0).max(-1)
+
+
+def low_passed(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """A Gaussian low-pass of [h, w] or [h, w, C]; sigma in pixels."""
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32)
+
+
+def disc(radius: float) -> NDArray[np.uint8]:
+    """A disc of a radius in pixels, at least 1."""
+    import cv2
+
+    side = 2 * max(1, math.ceil(radius)) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)).astype(np.uint8)
+
+
+def resized_array(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """[H, W] or [H, W, C] at another size: averaged where it shrinks."""
+    import cv2
+
+    if values.shape[:2] == (height, width):
+        return values
+    kind = cv2.INTER_AREA if width <= values.shape[1] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(values, (width, height), interpolation=kind), np.float32)
