@@ -35,6 +35,11 @@ class SoftenedMovers:
         self.movers = movers
         self._any = [] if movers is None else integers(movers.flatten(1).any(dim=1).long())
 
+    @property
+    def until(self) -> float:
+        """Share of the run at which the last softened picture was learnt from; 0: none is."""
+        return 0.0 if not any(self._any) else self.span[1]
+
     def loss(
         self, image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None, frame: int, progress: float
     ) -> Tensor:

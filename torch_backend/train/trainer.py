@@ -102,8 +102,9 @@ class Trainer:
         self.initial = len(gaussians)
         gate, densify = config.gate, config.densify
         schedule = RunSchedule(
-            config.iterations, densify.every, densify.stop, gate.give_up, config.sh_every, config.lr_end
-        )
+            config.iterations, densify.every, densify.stop, gate.give_up, config.sh_every, config.lr_end,
+            self.softened.until,
+        )  # fmt: skip
         self.policy = StoppingPolicy(config.needs, len(train) if config.decides else 0, schedule)
         self.extensions: list[Extension] = []
         self.iteration = 0

@@ -79,6 +79,8 @@ def test_frames_without_movers_and_runs_without_mattes_are_as_published(pictures
     expected = float(photometric(image, target, 0.2))
     assert float(SoftenedMovers(movers, W, (0.2, 0.5), 16.0).loss(image, target, 0.2, None, 1, 0.2)) == expected
     assert float(SoftenedMovers(None, W, (0.2, 0.5), 16.0).loss(image, target, 0.2, None, 0, 0.2)) == expected
+    last = [SoftenedMovers(m, W, (0.2, 0.5), 16.0).until for m in (movers, torch.zeros_like(movers), None)]
+    assert last == [0.5, 0.0, 0.0]
     one = SoftenedMovers(movers, W, (0.2, 0.5), block=3.0)
     assert float(one.loss(image, target, 0.2, None, 0, 0.2)) == expected, "one pixel"
 

@@ -292,6 +292,16 @@ def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     assert on.iteration == 100
 
 
+@pytest.mark.parametrize(("softened", "stopped"), [(0.0, 30), (0.5, 70)])
+def test_no_end_is_looked_for_while_pictures_are_soft_nor_across_their_end(softened, stopped):
+    """Sharp probes gain nothing from softened pictures, so what they say spans whole pictures alone."""
+    policy = StoppingPolicy(StoppingConfig(join=1.0), 60, RunSchedule(100, 10, 0.6, 0.7, 0.15, 0.2, softened))
+    policy.growth_ended, policy.facts.hardened = 10, 20
+    for step in range(1, 101):
+        list(policy.decide(Numbers(step)))
+    assert policy.stopped == stopped
+
+
 def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
     changes = {"init__seeds": 0, "needs__growth_gain": 0.5, "needs__stop_gain": 0.5}
     whole = finish(trainer_of(long_world, quiet, **changes), tmp_path)
