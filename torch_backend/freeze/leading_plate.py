@@ -128,7 +128,9 @@ def _let_go(
         moving: [h, w] bool, by the mattes.
         truth: how plate t* sees what is seen; None if it may not be used.
     """
-    off, gained = _off(sightings, posed, frame)
+    h, w = moving.shape
+    render = resized(posed.image.color, w, h)
+    off, gained = _off(sightings, posed, frame, render)
     travel = _travel(sightings, config, posed, frame)
     wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
     both = None if truth is None else _both_plates(sightings, posed, frame, truth)
@@ -145,20 +147,19 @@ def _let_go(
         wrong = wrong | larger(beyond, config.beyond * sightings.unit**2)
     found = torch.zeros_like(wrong)
     if both is not None:
-        h, w = wrong.shape
-        found = held(both, resized(posed.image.color, w, h), off, wrong, sightings.unit, config.held)
+        found = held(both, render, off, wrong, sightings.unit, config.held)
     wrong = closed(wrong | found, round(config.gap * sightings.unit))
     return with_holes(wrong, found, off, sightings.unit, config.held)
 
 
-def _off(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:
-    """([h, w] low-passed difference of the frozen render and its own plate, [h, w] by how much that is more than
-    the difference of the model at the plate's own time); 0 beyond the plate."""
+def _off(sightings: Sightings, posed: PosedFrame, frame: int, render: Tensor) -> tuple[Tensor, Tensor]:
+    """([h, w] low-passed difference of the frozen `render` [h, w, 3] and its own plate, [h, w] by how much that is more
+    than the difference of the model at the plate's own time); 0 beyond the plate."""
     h, w = posed.depth.shape
     view = sightings.view(frame)
     inside = _middle(view.missed, posed.depth)
     off, gained = torch.zeros(h, w, device="cpu"), torch.zeros(h, w, device="cpu")
-    off[inside] = sightings.difference(view.picture.float(), resized(posed.image.color, w, h)[inside])
+    off[inside] = sightings.difference(view.picture.float(), render[inside])
     gained[inside] = off[inside] - view.missed.float()
     return off, gained
 
