@@ -44,9 +44,13 @@ class HeldConfig:
     low: float = 2.0
     """and the sigma of that."""
     reach: float = 64.0
-    """How far from what is let go of it may be, going along it."""
+    """How far from what is let go of it may be, going along it,"""
+    gap: float = 4.0
+    """and over gaps of twice this: between forearm and fingers a wrist may look like the wall."""
     least: float = 400.0
     """Square pixels that a region has at least,"""
+    least_beside: float = 100.0
+    """or no farther than such gaps from one that was found: a hand and its arm,"""
     rim: float = 3.0
     """and pixels around it in which it is asked whether the plates agree there,"""
     share: float = 0.4
@@ -99,17 +103,21 @@ def held(both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, unit: flo
     soft = BothPlates(blurred(both.own, config.grain * unit), blurred(both.instant, config.grain * unit), both.seen)
     apart = blurred(both.own - both.instant, config.low * unit).abs().amax(dim=-1)
     elsewhere = _elsewhere(soft, apart, unit, config) & (off > config.smeared)
-    found = grown(wrong, elsewhere, round(config.reach * unit)) & ~wrong
+    gap, reach = round(config.gap * unit), round(config.reach * unit)
+    hanging = grown(wrong, elsewhere, reach) & ~wrong
+    found = grown(widened(wrong, gap), widened(elsewhere, gap), reach) & elsewhere & ~wrong
     if not bool(found.any()):
         return found
     around = blurred(both.seen, config.low * unit)  # beside what plate t* does not see both are 0, and agree in nothing
     agree = (both.seen > 0.5) & (apart < config.apart * around)
-    rim, least = max(1, round(config.rim * unit)), config.least * unit**2
-    out = _borne_out(both, render, found, unit, config)
-    for region in components(enclosed(found & ~out, agree | wrong, rim, config.share, least)):
-        if left_by_shifts(soft, region, unit, config) > config.left:
+    rim, least, least_beside = max(1, round(config.rim * unit)), config.least * unit**2, config.least_beside * unit**2
+    borne_out, out = _borne_out(both, render, hanging, unit, config), torch.zeros_like(found)
+    regions = components(enclosed(found & ~borne_out, agree | wrong, rim, config.share, least_beside))
+    for region in sorted(regions, key=lambda each: int(each.sum()), reverse=True):
+        enough = int(region.sum()) >= least or bool((widened(region, 2 * gap) & out).any())
+        if enough and left_by_shifts(soft, region, unit, config) > config.left:
             out |= region
-    return out
+    return out | borne_out
 
 
 def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlates:

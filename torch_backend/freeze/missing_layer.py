@@ -200,7 +200,8 @@ def _small_things(bench: InstantBench, image: FrozenImage) -> list[Track]:
 def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArray[np.float32]:
     """How much of each pixel [h, w] a small thing covers: how far it is on the way from what is behind to its colour.
 
-    Its colours differ, so what is farther from what is behind than a third of that way is wholly its own inside.
+    Its colours differ, so what is farther from what is behind than a third of that way is wholly its own inside. A line
+    is no part of it: the outline of a leg that the render has a pixel aside is that of the floor, too.
     """
     import cv2
 
@@ -208,7 +209,8 @@ def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArr
     way = thing.color - behind
     share = ((plate - behind) * way).sum(-1) / np.maximum(np.square(way).sum(-1), 1e-4)
     near = cv2.dilate(thing.pixels.astype(np.uint8), disc(1.0)) > 0
-    return np.where(near, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)
+    covered = np.where(near, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)
+    return np.asarray(cv2.morphologyEx(covered, cv2.MORPH_OPEN, disc(1.0 * bench.unit)), np.float32)
 
 
 def _gaussians(

@@ -61,6 +61,15 @@ def test_what_touches_nothing_that_was_let_go_of_stays():
     assert not found(plates(with_hand(wall(), hand), wall()), nothing).any()
 
 
+def test_a_hand_beyond_a_wrist_that_looks_like_the_wall_goes_with_its_arm():
+    """The same hand a few pixels from the sleeve, and farther."""
+    sleeve, hand = arm()
+    beyond, elsewhere = hand.roll(5, 1), hand.roll(24, 1)
+    assert found(plates(with_hand(wall(), beyond), wall()), sleeve)[beyond].float().mean() > 0.7
+    assert not found(plates(with_hand(wall(), beyond), wall()), sleeve, config=replace(CONFIG, gap=0.0)).any()
+    assert not found(plates(with_hand(wall(), elsewhere), wall()), sleeve).any()
+
+
 def test_where_the_render_is_its_own_plate_light_differs_and_nothing_was_held():
     sleeve, hand = arm()
     assert not found(plates(with_hand(wall(), hand), wall()), sleeve, off=0.01).any()

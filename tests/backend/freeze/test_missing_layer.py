@@ -12,7 +12,8 @@ from torch_backend.footage.images import write_png
 from torch_backend.freeze.frozen import FrozenGaussians, freeze_at, render_frozen
 from torch_backend.freeze.instant_bench import InstantBench, InstantConfig, low_difference
 from torch_backend.freeze.instant_depth import DepthConfig, as_field
-from torch_backend.freeze.missing_layer import _helps, instant_layer, join
+from torch_backend.freeze.instant_track import Track
+from torch_backend.freeze.missing_layer import _helps, _thing_cover, instant_layer, join
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
 from torch_backend.scene import Scene
@@ -319,6 +320,20 @@ def test_the_layer_is_exposed_once_like_the_rest(tmp_path):
 
 def test_small_things_are_left_alone(waving):
     assert waving.layer(config=InstantConfig(least=5000.0)) is None
+
+
+def test_an_outline_a_pixel_aside_is_no_part_of_a_small_thing():
+    """A leg that is known, but for a line of floor along it, and an apple that is not: both lie in what moves."""
+    shown, plate = np.full((40, 60, 3), 0.7, np.float32), np.full((40, 60, 3), 0.7, np.float32)
+    plate[5:35, 10:12] = plate[18:23, 40:45] = 0.1
+    moves = np.zeros((40, 60), bool)
+    moves[5:35, 10:24] = moves[17:24, 39:46] = True
+    bench = object.__new__(InstantBench)
+    bench.unit, bench.view = 1.0, SimpleNamespace(picture=plate)
+    thing = Track(moves, np.full(3, 0.1, np.float32), {})
+    cover = _thing_cover(bench, SimpleNamespace(color=torch.from_numpy(shown)), thing)
+    assert cover[18:23, 40:45].mean() > 0.8
+    assert not cover[:, :30].any()
 
 
 def test_a_hand_that_the_field_has_without_fingers_is_given_those_of_the_plate():
