@@ -47,38 +47,40 @@ def load_movers(mattes: Mattes, scene: Scene, indices: list[int], width: int, he
     return movers if found else None
 
 
+@torch.no_grad()
 def moving_frames(run: RunView, share: float) -> Tensor:
     """int [N]: in how many trained frames each Gaussian lies in what moves, by what it paints there.
 
     It counts where it is really seen, in front of what it stands before: at least `share` of its alpha * T over the
-    frame's pixels falls on movers. The static model is asked; frames that are kept back or unusable are not.
+    frame's pixels falls on movers. Each frame is asked at its own time; those kept back or unusable are not.
     """
     if run.movers is None:
         raise ValueError("the shot has no motion mattes")
     model, height, width = run.model, run.height, run.width
-    state = model.gaussians.params
     counts = torch.zeros(len(model.gaussians), dtype=torch.long, device=model.device)
     for n, index in enumerate(run.train_ids):
         movers = run.movers[n]
         if n in run.excluded_frames or not bool(movers.any()):
             continue
         run.report.check_cancelled()
-        mask = movers.to(model.device, torch.float32)
+        mask, state = movers.to(model.device, torch.float32), model.state_at(run.times[n])
         camera = run.viewmats[index], run.Ks[index], width, height
         on_movers, painted_weight = gathered(state, *camera, torch.stack([mask, torch.ones_like(mask)], -1)).unbind(1)
         counts += (painted_weight > SEEN_WEIGHT) & (on_movers > share * painted_weight)
     return counts
 
 
+def _paints_movers(run: RunView) -> Tensor:
+    """bool [N]: who paints what moves in several frames, and in a good share of those in which it was seen."""
+    gate: GateConfig = run.config.gate
+    moving = moving_frames(run, gate.moving_share)
+    return (moving >= gate.moving_often * run.model.gaussians.support.sum(1)) & (moving >= gate.moving_frames)
+
+
 def on_trial(run: RunView) -> Tensor:
     """bool [N]: who the gate opens on trial: all that is painted, or of it what moves in several frames and often."""
-    gate: GateConfig = run.config.gate
     candidates = painted(run.model.gaussians)
-    if run.movers is None:
-        return candidates
-    moving = moving_frames(run, gate.moving_share)
-    often = moving >= gate.moving_often * run.model.gaussians.support.sum(1)
-    return candidates & often & (moving >= gate.moving_frames)
+    return candidates if run.movers is None else candidates & _paints_movers(run)
 
 
 @torch.no_grad()
@@ -92,12 +94,31 @@ def harden(run: RunView) -> bool:
     stays = stays_open(model.gaussians, rows, change, config, noise)
     if not bool(stays.any()) and run.progress < config.give_up:
         return False
-    closed, moved = rows[~stays], model.moved(rows, mean)
+    _close(model, rows, ~stays, mean)
+    return True
+
+
+@torch.no_grad()
+def close_strays(run: RunView) -> None:
+    """Closes who paints no movers any more; its mean change stays.
+
+    What is split while it is open leaves open children, of which many paint what stands still beside a mover.
+    """
+    model = run.model
+    rows = model.open_rows()
+    if run.movers is None or not len(rows):
+        return
+    _, mean = _changes(model, rows, torch.zeros(len(rows), device=model.device), run.config.gate)
+    _close(model, rows, ~_paints_movers(run)[rows], mean)
+
+
+def _close(model: DynamicModel, rows: Tensor, strays: Tensor, mean: Deltas) -> None:
+    """Closes those of `rows` [M] that are `strays`, bool [M], as they are with their `mean` change."""
+    closed, moved = rows[strays], model.moved(rows, mean)
     for name, param in model.gaussians.params.items():
         if name in moved:
             param.data[closed] = moved[name][closed]
     model.gaussians.open[closed] = False
-    return True
 
 
 @torch.no_grad()

@@ -30,7 +30,7 @@ from .extend import Extension
 from .forecast import Outlook, Stopwatch, smaller_presets, step_work, warning_of
 from .losses import photometric, psnr
 from .model import DynamicModel, render, restore_model
-from .movers import harden, on_trial
+from .movers import close_strays, harden, on_trial
 from .optimizer import add_field, limit_harmonics, optimizer_of, schedule_rates
 from .paper import paper_step
 from .poses import Poses, corrected
@@ -394,6 +394,9 @@ class Trainer:
                 self._open_gate()
             elif self._on_trial():
                 self._harden_gate()
+            elif self.iteration == round(c.densify.stop * c.iterations) and self.policy.facts.hardened is not None:
+                self.inspect_nonfinite()
+                close_strays(self)
         elif self.model.field is None and self.progress >= c.field.start:
             self.model.gaussians.open[:] = True
             self._create_field()
@@ -438,11 +441,12 @@ class Trainer:
         )
 
     def _harden_gate(self) -> None:
-        """Closes for good what did not move. While nothing moves at all, the trial goes on."""
+        """Closes for good what did not move or only stands beside it. While nothing moves at all, the trial goes on."""
         self.inspect_nonfinite()  # one NaN would spoil the neighbours' verdicts
         if self.model.field is None or not len(self.model.open_rows()):
             return
         if harden(self):
+            close_strays(self)
             self.policy.gate_hardened(self.iteration)
 
     def _create_field(self) -> None:

@@ -10,7 +10,7 @@ from torch_backend.scene import load_images, load_scene
 from torch_backend.solve.motion import MOVING, PAINTED, STILL, UNKNOWN, load_motion, write_matte
 from torch_backend.train import config_from_params, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint
-from torch_backend.train.movers import load_movers, moving_frames, on_trial
+from torch_backend.train.movers import load_movers, mean_of, moving_frames, on_trial
 from torch_backend.train.trainer import Trainer
 
 
@@ -90,6 +90,25 @@ def test_what_lies_in_movers_goes_on_trial_and_nothing_else(painted_world, quiet
     assert few.any() and not on_trial(trainer).any(), "what something passes stands still most of the time"
     trainer.movers = None
     assert on_trial(trainer).float().mean() > 0.8, "without mattes all that is painted is tried"
+
+
+def test_when_growth_ends_who_is_open_and_paints_no_mover_closes(painted_world, quiet):
+    """Children of what is open are open: some are put beside the patch here, with a change of their own."""
+    trainer = trainer_of(painted_world, quiet, 140)
+    model, config = trainer.model, trainer.config
+    movers = model.gaussians.open.clone()
+    assert trainer.policy.facts.hardened is not None and movers.any()
+    beside = (centred_on_movers(trainer, 4) == 0) & model.gaussians.support.any(1) & ~movers
+    strays = torch.nonzero(beside).flatten()[:20]
+    model.gaussians.open[strays] = True
+    mean = mean_of(model, strays)
+    trainer.config.densify.every = 1000  # no round of growth at that step
+    trainer.iteration = round(config.densify.stop * config.iterations)
+    trainer.schedule_events()
+    assert len(strays) == 20 and not model.gaussians.open[strays].any()
+    assert float(model.gaussians.open[movers].float().mean()) > 0.8
+    for name, value in mean.items():
+        torch.testing.assert_close(model.gaussians.params[name][strays], value, msg=name)
 
 
 def test_where_the_mattes_say_that_nothing_moves_nothing_opens(tmp_path, quiet):
