@@ -72,7 +72,7 @@ def gather_evidence(
         mattes: the shot's motion mattes, if there are any.
     """
     images = {i: held_out[n] for n, i in enumerate(test)}
-    images |= {i: trainer.images[n] for n, i in enumerate(trainer.train_ids) if n not in trainer.unusable}
+    images |= {i: trainer.images[n] for n, i in enumerate(trainer.train_ids) if n not in trainer.soundness.unusable}
     every = sorted(images)
     picked = evenly_spaced(len(every), MOST)
     places = seen_places(trainer.model)

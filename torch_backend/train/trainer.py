@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,21 +33,17 @@ from .movers import close_strays, harden, on_trial
 from .optimizer import add_field, limit_harmonics, optimizer_of, schedule_rates
 from .paper import paper_step
 from .poses import Poses, corrected
-from .repair import FieldMemory, drop_offenders, repair, unstable
 from .residual import correlation_of_movers
 from .softened import SoftenedMovers
+from .soundness import INSPECT_EVERY, Soundness
 from .stopping import RunSchedule, StoppingPolicy
-
-_MAX_BAD_STEPS = 20
-_INSPECT_EVERY = 10
-"""Steps between two looks at what a GPU counted, and between two reports of progress."""
 
 
 class Trainer:
     """Optimises one run on one device; images [I, H, W, 3] float16 display-referred, on the device or in host memory.
 
     Random numbers are drawn on the CPU whatever the device is: a run is the same experiment everywhere, and its
-    checkpoint goes on anywhere. On a GPU a step reads nothing back; `run` looks every `_INSPECT_EVERY` steps.
+    checkpoint goes on anywhere. On a GPU a step reads nothing back; `run` looks every `INSPECT_EVERY` steps.
 
     Args:
         scene: normalised scene, on the CPU.
@@ -109,19 +104,15 @@ class Trainer:
         self.extensions: list[Extension] = []
         self.iteration = 0
         self.trained_seconds = 0.0
-        self.bad_steps = 0
-        self.unusable: set[int] = set()
         self.order: list[int] = []
-        self._recent: deque[int] = deque(maxlen=2 * _INSPECT_EVERY)
         low, high = field_box(scene.points)
-        self._memory = FieldMemory(float(norm_of_all(high - low)))
+        self.soundness = Soundness(float(norm_of_all(high - low)), self.device)
         self.poses = Poses(self.times, config.poses, self.device)
         self._refined = False
         self.optimizer = optimizer_of(self.model, self.poses, config)
         self.mean = ParameterMean()
         self.densifier = Densifier(self._densify_config(), len(gaussians), self.device)
         self._foretold = False
-        self._bad = torch.zeros(2, dtype=torch.int32, device=self.device)
         self._saved_at = time.perf_counter()
 
     # ------------------------------------------------------------------ the run
@@ -133,7 +124,7 @@ class Trainer:
     @property
     def excluded_frames(self) -> set[int]:
         """Positions of the trained frames that are not trained on now: kept back as probes, or unusable."""
-        return self.unusable | self.policy.held
+        return self.soundness.unusable | self.policy.held
 
     @property
     def gaussian_count(self) -> int:
@@ -188,7 +179,7 @@ class Trainer:
                     evaluate(self)
                     if watch is not None:
                         watch.begin()
-                if self.iteration % _INSPECT_EVERY == 0 or self.iteration == self.end:
+                if self.iteration % INSPECT_EVERY == 0 or self.iteration == self.end:
                     self.inspect_nonfinite()
                     text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {float(loss):.4f}"
                     self.report.progress("training", self.iteration - begin, self.end - begin, text)
@@ -284,7 +275,7 @@ class Trainer:
         pairs = self._pairs_to_anchor(rows)
         deltas, anchored = self._deltas(rows, frame, pairs)
         if deltas is not None:
-            self._memory.heed(deltas.means.detach())
+            self.soundness.memory.heed(deltas.means.detach())
         if deltas is not None and self.progress < self.config.field.detached:
             deltas = deltas.detached()
         state = self.model.moved(rows, deltas)
@@ -311,15 +302,15 @@ class Trainer:
         backward(total)
         if paper:
             other = paper_step(self, frame, rows, state, out)
-            self._recent.extend([] if other is None else [other])
+            self.soundness.trains_on(*([] if other is None else [other]))
         self.optimizer.step(guard=[total])
         if self._refines_poses():
             self.poses.fix_gauge(self.excluded_frames)
         applied = self.optimizer.applied
         if self.device.type == "cpu" and not bool(applied):
-            self._skip_step(frame)
+            self.soundness.skipped(self, frame)
             return loss.detach()
-        self.bad_steps = 0
+        self.soundness.count(applied)
         self._observe(frame, rows, state, out, applied)
         return loss.detach()
 
@@ -329,8 +320,6 @@ class Trainer:
             raise RuntimeError("the frame was rendered without contributions")
         radii, weight = out.radii[0], out.weight_sum[0]
         if self.device.type != "cpu":
-            skipped = ~applied
-            self._bad = torch.stack([self._bad[0] + skipped, (self._bad[1] + 1) * skipped])
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
         mark_seen(self.model.gaussians, self._bins[frame], weight)
@@ -465,9 +454,9 @@ class Trainer:
         for name, owned in field.owned.items():
             if name not in model.params:  # memory may have ended between two of them
                 model.adopt(name, owned.shape, owned.value)
-        self._memory.keep(field, means)
+        self.soundness.memory.keep(field, means)
         # Takes no memory: what is before it can be done again.
-        add_field(self.optimizer, field, model, c, self._memory.rates)
+        add_field(self.optimizer, field, model, c, self.soundness.memory.rates)
         self.policy.field_opened(self.iteration, self.trained_seconds)
         self.model.field = field
 
@@ -508,7 +497,7 @@ class Trainer:
             drawn = integers(torch.randperm(len(self.train_ids), generator=self.generator, device="cpu"))
             out = self.excluded_frames
             self.order = [frame for frame in drawn if frame not in out]
-        self._recent.append(self.order[-1])
+        self.soundness.trains_on(self.order[-1])
         return self.order.pop()
 
     def _regularisers(self, rows: Tensor) -> Tensor:
@@ -535,53 +524,9 @@ class Trainer:
         loss = support_loss(self.model.gaussians, field, pairs, deltas, self.centres, self.seconds, s)
         return s.support_every * loss
 
-    def _skip_step(self, frame: int) -> None:
-        """After a step that was left out on the CPU: repairs; a run that keeps failing ends in words."""
-        self.bad_steps += 1
-        if self.bad_steps >= _MAX_BAD_STEPS:
-            raise unstable(self.iteration)
-        number = self.scene.frames[self.train_ids[frame]]
-        text = f"Step {self.iteration} on frame {number} was skipped: its loss or gradient is not finite."
-        self._recover(text if self.bad_steps == 1 else "", gradients=True)
-
     def inspect_nonfinite(self) -> None:
-        """Repairs what is not finite; reads a GPU's counts of steps left out: since the last look, and in a row."""
-        count, in_a_row = (0, 0) if self.device.type == "cpu" else integers(self._bad)
-        self._bad[0] = 0
-        if in_a_row >= _MAX_BAD_STEPS:
-            raise unstable(self.iteration)
-        text = f"{count} of the steps up to {self.iteration} were skipped: their loss or gradient is not finite."
-        self._recover(text if count else "", gradients=in_a_row > 0)
-
-    def _recover(self, skipped: str, gradients: bool) -> None:
-        """Finds what is not finite and drops or mends it; `skipped` says which steps were left out, if any.
-
-        gradients: the parameters hold those of a step that was left out.
-        """
-        done = repair(self.model, self.optimizer, self.densifier, self._memory, self.iteration)
-        if self.model.field is not None and not done:
-            done = self._memory.put_back(self.model.field, self.optimizer)
-        bad = [] if done or not (skipped or gradients) else self._bad_images()
-        if bad:
-            self.unusable.update(bad)
-            self.order = [frame for frame in self.order if frame not in self.unusable]
-            if len(self.unusable) == len(self.train_ids):
-                raise unstable(self.iteration)
-            names = ", ".join(str(self.scene.frames[self.train_ids[frame]]) for frame in bad)
-            done = f"left frame {names} out from now on (its image is not finite)"
-        elif gradients and not done:
-            done = drop_offenders(self.model, self.optimizer, self.densifier)
-        if done:
-            self.report.warning(f"{skipped or f'Step {self.iteration}.'} Repaired: {done}. Training goes on.")
-        elif skipped:
-            self.report.warning(skipped)
-        elif not gradients:
-            self._memory.keep(self.model.field, self.model.gaussians.params["means"].detach()[self.model.open_rows()])
-
-    def _bad_images(self) -> list[int]:
-        """Of the frames trained on lately, those whose image is not finite."""
-        frames = sorted({*self._recent} - self.unusable)
-        return [frame for frame in frames if not bool(torch.isfinite(self.image_of(frame)).all())]
+        """Repairs what is not finite, and says so; JobError if the run keeps failing."""
+        self.soundness.inspect(self)
 
     # ------------------------------------------------------------------ optimiser
 
@@ -681,7 +626,7 @@ class Trainer:
             "needs": self.policy.state(),
             "trained_seconds": self.trained_seconds,
             "sh_degree": self.model.sh_degree,
-            "field_rates": self._memory.rates,
+            "field_rates": self.soundness.memory.rates,
             "train_frames": [self.scene.frames[i] for i in self.train_ids],
             "width": self.width,
             "height": self.height,
@@ -706,8 +651,8 @@ class Trainer:
         self.model = restore_model(tensors, meta, self.config, self.device)
         self.optimizer = optimizer_of(self.model, self.poses, self.config)
         if self.model.field is not None:
-            self._memory.rates = float(meta.get("field_rates", 1.0))
-            add_field(self.optimizer, self.model.field, self.model.gaussians, self.config, self._memory.rates)
+            rates = self.soundness.memory.rates = float(meta.get("field_rates", 1.0))
+            add_field(self.optimizer, self.model.field, self.model.gaussians, self.config, rates)
         if self.config.poses.on:
             self.poses.values.data.copy_(tensors["poses"])
         restore_optimizer(self._named(), self.optimizer, tensors)

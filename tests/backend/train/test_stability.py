@@ -146,7 +146,7 @@ def test_what_was_in_order_stays_as_it_was_row_by_row(begin):
     params = {name: p.detach()[keep].clone() for name, p in model.gaussians.params.items()}
     moments = {name: trainer.optimizer.state[p]["exp_avg"][keep].clone() for name, p in model.gaussians.params.items()}
     memory = [t[keep].clone() for t in (model.gaussians.open, model.gaussians.support, densifier.gradient)]
-    said = repair(model, trainer.optimizer, densifier, trainer._memory, 30)
+    said = repair(model, trainer.optimizer, densifier, trainer.soundness.memory, 30)
     assert "dropped 3 Gaussians (means, sh0 not finite)" in said
     assert "mended 1 Gaussian (hyper not finite)" in said
     params["hyper"][4] = model.field.owned["hyper"].value
@@ -157,7 +157,7 @@ def test_what_was_in_order_stays_as_it_was_row_by_row(begin):
         assert torch.equal(trainer.optimizer.state[p]["exp_avg"], moments[name]), name
     for kept, now in zip(memory, (model.gaussians.open, model.gaussians.support, densifier.gradient), strict=True):
         assert torch.equal(kept, now)
-    assert repair(model, trainer.optimizer, densifier, trainer._memory, 30) == ""
+    assert repair(model, trainer.optimizer, densifier, trainer.soundness.memory, 30) == ""
 
 
 def test_a_gradient_of_its_own_costs_a_gaussian_and_no_more(begin):
@@ -193,7 +193,7 @@ def test_a_bad_frame_does_not_keep_the_gate_shut(begin):
     go_on(trainer, 19)
     trainer._open_gate()
     go_on(trainer, 5)
-    assert 5 in trainer.unusable
+    assert 5 in trainer.soundness.unusable
     trainer.config.gate.pixels = 1e-6  # any change at all is motion
     trainer._harden_gate()
     assert bool(trainer.model.gaussians.open.any())
@@ -241,8 +241,8 @@ def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(b
     means = trainer.model.gaussians.params["means"].detach()[trainer.model.open_rows()]
     shift = torch.zeros_like(means)
     shift[: round(share * len(means)), 0] = times * (means - means.median(0).values).norm(dim=1).median()
-    trainer._memory.heed(shift)
-    trainer._memory.heed(torch.zeros_like(means))
+    trainer.soundness.memory.heed(shift)
+    trainer.soundness.memory.heed(torch.zeros_like(means))
     trainer.inspect_nonfinite()
     assert len(warnings(trainer)) == said
 
@@ -250,15 +250,15 @@ def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(b
 def test_a_small_thing_may_move_by_many_times_its_size(begin):
     trainer = begin("hexplane", 30)
     means = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)) * 0.02
-    trainer._memory.keep(trainer.model.field, means)
-    trainer._memory.heed(torch.full_like(means, 0.9))
+    trainer.soundness.memory.keep(trainer.model.field, means)
+    trainer.soundness.memory.heed(torch.full_like(means, 0.9))
     trainer.inspect_nonfinite()
     assert not warnings(trainer)
 
 
 def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin, tmp_path):
     trainer = begin("hexplane", 30)
-    trainer._memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
+    trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
     trainer.inspect_nonfinite()
     trainer.save(tmp_path / "checkpoint.safetensors")
     resumed = begin("hexplane", 0)
