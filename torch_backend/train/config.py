@@ -194,20 +194,21 @@ def _rates_for(config: TrainConfig) -> None:
     config.densify.every = min(100, max(50, round(config.iterations / 30)))
 
 
-_STATIC, _MOST_STATIC = 0.2, 3000
-"""Share of a run with a gate that stays static, and its most steps. In 10,000 of them, 350,000 Gaussians paint what
-moves as ghosts that fit one view each, far behind it, and no field puts them right (docs/benchmarks.md)."""
+_STATIC, _MOST_STATIC = 0.2, 600
+"""Share of a run with a gate that stays static, and its most steps. In more of them Gaussians paint what moves as
+ghosts that fit one view each, far behind it, and no field puts them right (docs/benchmarks.md, "Presets")."""
+_MOST_PER_DEGREE = 1350
+"""Most steps between two raises of the SH degree. A long run needs no more; in a short one each degree has fewer, and
+needs them, or none seems worth its while."""
 
 
 def _gate_for(config: TrainConfig) -> None:
-    """Opens the gate sooner than published; the trial is as long as it was, anchors and price begin with it. So do
-    harmonics in a long run: else what changes with the view is taken for motion. In a short one each degree needs its
-    steps, or none seems worth its while."""
+    """Opens the gate sooner than published; the trial is as long as it was, anchors and price begin with it."""
     if config.method != "auto" or config.host_config == "reference":
         return
     gate, anchors, steps = config.gate, config.supervision, max(1, config.iterations)
     sooner = gate.start - min(_STATIC, _MOST_STATIC / steps)
-    config.sh_every *= min(1.0, 3.0 * _MOST_STATIC / steps)
+    config.sh_every = min(config.sh_every, _MOST_PER_DEGREE / steps)
     gate.start, gate.harden, anchors.start = gate.start - sooner, gate.harden - sooner, anchors.start - sooner
 
 
