@@ -70,17 +70,15 @@ def moving_frames(run: RunView, share: float) -> Tensor:
     return counts
 
 
-def _paints_movers(run: RunView) -> Tensor:
-    """bool [N]: who paints what moves in several frames, and in a good share of those in which it was seen."""
-    gate: GateConfig = run.config.gate
-    moving = moving_frames(run, gate.moving_share)
-    return (moving >= gate.moving_often * run.model.gaussians.support.sum(1)) & (moving >= gate.moving_frames)
-
-
 def on_trial(run: RunView) -> Tensor:
     """bool [N]: who the gate opens on trial: all that is painted, or of it what moves in several frames and often."""
+    gate: GateConfig = run.config.gate
     candidates = painted(run.model.gaussians)
-    return candidates if run.movers is None else candidates & _paints_movers(run)
+    if run.movers is None:
+        return candidates
+    moving = moving_frames(run, gate.moving_share)
+    often = moving >= gate.moving_often * run.model.gaussians.support.sum(1)
+    return candidates & often & (moving >= gate.moving_frames)
 
 
 @torch.no_grad()
@@ -100,16 +98,16 @@ def harden(run: RunView) -> bool:
 
 @torch.no_grad()
 def close_strays(run: RunView) -> None:
-    """Closes who paints no movers any more; its mean change stays.
+    """Closes who hardly paints movers any more; its mean change stays.
 
     What is split while it is open leaves open children, of which many paint what stands still beside a mover.
     """
-    model = run.model
+    model, (share, frames) = run.model, GateConfig.STRAY
     rows = model.open_rows()
     if run.movers is None or not len(rows):
         return
     _, mean = _changes(model, rows, torch.zeros(len(rows), device=model.device), run.config.gate)
-    _close(model, rows, ~_paints_movers(run)[rows], mean)
+    _close(model, rows, moving_frames(run, share)[rows] < frames, mean)
 
 
 def _close(model: DynamicModel, rows: Tensor, strays: Tensor, mean: Deltas) -> None:

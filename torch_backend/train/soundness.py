@@ -28,14 +28,17 @@ class MendedRun(RunView, Protocol):
 
     scene: Scene
     """What it is trained on."""
-    optimizer: torch.optim.Optimizer
-    """Of everything that is learnt."""
     densifier: Densifier
     """Drops Gaussians with the model."""
     iteration: int
     """Steps that are done."""
     order: list[int]
     """Positions of the trained frames that come next, the next one last."""
+
+    @property
+    def optimizer(self) -> torch.optim.Optimizer:
+        """Of everything that is learnt."""
+        ...
 
     def image_of(self, frame: int) -> Tensor:
         """[H, W, 3] float32, the trained frame at position `frame`."""

@@ -98,7 +98,8 @@ def test_when_growth_ends_who_is_open_and_paints_no_mover_closes(painted_world, 
     model, config = trainer.model, trainer.config
     movers = model.gaussians.open.clone()
     assert trainer.policy.facts.hardened is not None and movers.any()
-    beside = (centred_on_movers(trainer, 4) == 0) & model.gaussians.support.any(1) & ~movers
+    beside = (centred_on_movers(trainer, 4) == 0) & (moving_frames(trainer, 0.05) == 0)
+    beside &= model.gaussians.support.any(1) & ~movers
     strays = torch.nonzero(beside).flatten()[:20]
     model.gaussians.open[strays] = True
     mean = mean_of(model, strays)
