@@ -34,8 +34,11 @@ class GateConfig:
     WIDTH: ClassVar[int] = 320
     """Width of the pictures that `pixels` counts in, whatever is trained on: a motion is as large as it looks."""
     STRAY: ClassVar[tuple[float, int]] = 0.25, 2
-    """Who is open later on paints movers with this share of its paint in so many frames, or closes: less than is asked
-    for to be opened, because mattes miss much of an arm (on truth a quarter to a third of its pixels are found)."""
+    """Who is open later on in a long run paints movers with this share of its paint in so many frames, or closes: less
+    than is asked for to be opened, because mattes miss much of an arm."""
+    LONG: ClassVar[int] = 3000
+    """Steps up to which that is not asked: what is open doubles at most then, and developing takes who is closed for
+    still, which costs arms of which mattes find a third."""
 
     start: float = 1.0 / 3.0
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""

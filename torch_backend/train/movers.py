@@ -98,13 +98,13 @@ def harden(run: RunView) -> bool:
 
 @torch.no_grad()
 def close_strays(run: RunView) -> None:
-    """Closes who hardly paints movers any more; its mean change stays.
+    """In a long run closes who hardly paints movers any more; its mean change stays.
 
     What is split while it is open leaves open children, of which many paint what stands still beside a mover.
     """
     model, (share, frames) = run.model, GateConfig.STRAY
     rows = model.open_rows()
-    if run.movers is None or not len(rows):
+    if run.movers is None or not len(rows) or run.config.iterations <= GateConfig.LONG:
         return
     _, mean = _changes(model, rows, torch.zeros(len(rows), device=model.device), run.config.gate)
     _close(model, rows, moving_frames(run, share)[rows] < frames, mean)

@@ -6,6 +6,7 @@ import torch
 
 from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world, paint_motion
 from torch_backend.contract import Cancelled, JobError, TrainParams
+from torch_backend.deformation import GateConfig
 from torch_backend.scene import load_images, load_scene
 from torch_backend.solve.motion import MOVING, PAINTED, STILL, UNKNOWN, load_motion, write_matte
 from torch_backend.train import config_from_params, load_run, train_shot
@@ -92,7 +93,7 @@ def test_what_lies_in_movers_goes_on_trial_and_nothing_else(painted_world, quiet
     assert on_trial(trainer).float().mean() > 0.8, "without mattes all that is painted is tried"
 
 
-def test_when_growth_ends_who_is_open_and_paints_no_mover_closes(painted_world, quiet):
+def test_when_growth_of_a_long_run_ends_who_is_open_and_paints_no_mover_closes(painted_world, quiet):
     """Children of what is open are open: some are put beside the patch here, with a change of their own."""
     trainer = trainer_of(painted_world, quiet, 140)
     model, config = trainer.model, trainer.config
@@ -104,6 +105,10 @@ def test_when_growth_ends_who_is_open_and_paints_no_mover_closes(painted_world, 
     model.gaussians.open[strays] = True
     mean = mean_of(model, strays)
     trainer.config.densify.every = 1000  # no round of growth at that step
+    trainer.iteration = round(config.densify.stop * config.iterations)
+    trainer.schedule_events()
+    assert model.gaussians.open[strays].all(), "a short run is left alone"
+    config.iterations = GateConfig.LONG + 1
     trainer.iteration = round(config.densify.stop * config.iterations)
     trainer.schedule_events()
     assert len(strays) == 20 and not model.gaussians.open[strays].any()
