@@ -45,6 +45,9 @@ class DetailConfig:
     believed where plate t* agrees with the render: something held still that was elsewhere."""
     own_time: float = 0.3
     """Share of such a difference that must be gone in the render of the plate's own time."""
+    of_its_time: tuple[float, float] = (0.06, 0.5)
+    """Where that render is nearer to the plate than the frozen one by so much, display-referred, and this share of the
+    difference, the plate is not believed: it shows what the model has at that time and not at t*."""
     denied_too: float = 0.08
     """The same, for what hangs together with such a spot."""
     beyond: float = 100.0

@@ -133,6 +133,7 @@ def _let_go(
     off, gained = _off(sightings, posed, frame, render)
     travel = _travel(sightings, config, posed, frame)
     wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
+    wrong = wrong | _of_its_time(sightings, config, off, gained)
     both = None if truth is None else _both_plates(sightings, posed, frame, truth)
     contrary = off if both is None else torch.minimum(off, sightings.difference(both.own, both.instant))
     if truth is not None:
@@ -218,6 +219,15 @@ def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: 
     out = (gained > config.borne_out) & (travel > config.travel)
     # Outlines are errors of depth; what moves is a region.
     return opened(out, round(config.thin * sightings.unit))
+
+
+def _of_its_time(sightings: Sightings, config: DetailConfig, off: Tensor, gained: Tensor) -> Tensor:
+    """[h, w] bool: its own plate shows what the model has at its own time, and not what it has at t*.
+
+    So an arm is found that no matte sees and that stands before a wall: there the frozen render shows what never moves.
+    """
+    least, share = config.of_its_time
+    return opened((gained > least) & (gained > share * off), round(config.thin * sightings.unit))
 
 
 def _travel(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int) -> Tensor:

@@ -7,7 +7,8 @@ were seen. Scene and twin are held against plates: that of t*, and the still pix
 Gaussian is closed where the others are worse for it by more than plate t* gains; where the mattes see nothing move at
 t*, by more than a third of that. It is asked of neighbours together: errors are noisy, and things move in pieces. Where
 it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call still, a mean is
-always nearer.
+always nearer. They miss whole arms, too. So what the run shows at a plate's own time better than the twin counts
+against the twin: there something moved, and that plate says nothing of t*.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.model import gathered, render
 from ..train.movers import mean_of
-from .frozen import FrozenGaussians
+from .frozen import FrozenGaussians, freeze_at
 from .sightings import MovingOf
 from .working_plates import WorkingPlates, showing, spread
 
@@ -108,6 +109,8 @@ class _Pair:
     def worse(self, frames: list[int], near: Tensor, still: bool = True) -> Tensor:
         """[M]: squared error of the scene over that of its twin, in pixels, for the mean frame that sees a Gaussian.
 
+        With `still`, less what the run at the frame's own time has less of than the twin.
+
         A pixel's difference is shared by the Gaussians that paint it in either; each is given the mean of those `near`
         [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*.
         """
@@ -131,10 +134,18 @@ class _Pair:
             errors.append((picture - plate).square().mean(-1))
             paints.append(marks[..., 0])
             counts &= (marks[..., 1] < 0.1) | (not still)
-        worse = (errors[0] - errors[1]) * counts / (paints[0] + paints[1]).clamp_min(1e-2)
+        worse = errors[0] - errors[1]
+        if still:
+            worse = worse - (errors[1] - self._own_time(frame)).clamp_min(0.0)
+        worse = worse * counts / (paints[0] + paints[1]).clamp_min(1e-2)
         weights = torch.stack([worse, counts.float()], dim=-1)
         ours, twins = (gathered(scene.state, *camera, weights)[self.rows] for scene in self.scenes)
         return ours + twins
+
+    def _own_time(self, frame: int) -> Tensor:
+        """[H, W] squared error of the run at a frame's own time."""
+        then = freeze_at(self.run.model, self.plates.scene.time_of_frame(frame), 1.0)
+        return (self._shown(then, frame)[0] - self.plates.picture(frame)).square().mean(-1)
 
     @torch.no_grad()
     def _shown(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:

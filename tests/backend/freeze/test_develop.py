@@ -144,6 +144,16 @@ def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(tra
     assert ours[0] > was_moving - 0.1 and ours[0] > twins[0] + 1.0 and bool(stays.any())
 
 
+def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(trained):
+    """Plates in which it stands elsewhere are no evidence that it does harm at t*."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen, rows = field(run, scene), run.model.open_rows()
+    blind = settled(run, scene, frozen, T_STAR, lambda frame: torch.zeros(scene.height, scene.width))
+    was, now = (scores(world, run, scene, f)[0] for f in (frozen, blind))
+    assert float((blind.motion[rows] > 0.5).float().mean()) > 0.8 and now > was - 1.5
+
+
 def test_a_developed_instant_is_nearer_to_the_truth(trained, made):
     world, _ = trained
     run, scene, frozen, now = made

@@ -17,7 +17,10 @@ from torch_backend.freeze.take_frames import small_share
 
 FRAME, T_STAR = 3, 11
 """The board stands wholly apart in these two."""
-BLIND = {"denied": 9.0, "denied_too": 9.0, "held": HeldConfig(apart=9.0), "travel": 1e9, "carried": 1e9}
+BLIND = {
+    "denied": 9.0, "denied_too": 9.0, "held": HeldConfig(apart=9.0), "travel": 1e9, "carried": 1e9,
+    "of_its_time": (9.0, 1.0),
+}  # fmt: skip
 """Of `DetailConfig`: what the model and plate t* say is not asked."""
 
 
