@@ -47,7 +47,7 @@ class DetailConfig:
     """Share of such a difference that must be gone in the render of the plate's own time."""
     of_its_time: tuple[float, float] = (0.06, 0.5)
     """Where that render is nearer to the plate than the frozen one by so much, display-referred, and this share of the
-    difference, the plate is not believed: it shows what the model has at that time and not at t*."""
+    difference, by which plate t* differs from it, too, the plate is not believed: it shows another time than t*."""
     denied_too: float = 0.08
     """The same, for what hangs together with such a spot."""
     beyond: float = 100.0

@@ -133,10 +133,11 @@ def _let_go(
     off, gained = _off(sightings, posed, frame, render)
     travel = _travel(sightings, config, posed, frame)
     wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
-    wrong = wrong | _of_its_time(sightings, config, off, gained)
     both = None if truth is None else _both_plates(sightings, posed, frame, truth)
-    contrary = off if both is None else torch.minimum(off, sightings.difference(both.own, both.instant))
+    apart = off if both is None else sightings.difference(both.own, both.instant)
+    contrary = torch.minimum(off, apart)
     if truth is not None:
+        wrong = wrong | _of_its_time(sightings, config, truth, off, gained, apart)
         wrong = wrong | _denied(sightings, config, truth, contrary)
     # What the model lacks at the plate's own time, too, is its fault and no motion.
     wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
@@ -221,13 +222,17 @@ def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: 
     return opened(out, round(config.thin * sightings.unit))
 
 
-def _of_its_time(sightings: Sightings, config: DetailConfig, off: Tensor, gained: Tensor) -> Tensor:
-    """[h, w] bool: its own plate shows what the model has at its own time, and not what it has at t*.
+def _of_its_time(
+    sightings: Sightings, config: DetailConfig, truth: Sighting, off: Tensor, gained: Tensor, apart: Tensor
+) -> Tensor:
+    """[h, w] bool: its own plate shows what the model has at its own time, and plate t* (`truth`) something else.
 
     So an arm is found that no matte sees and that stands before a wall: there the frozen render shows what never moves.
+    Of what plate t* does not see the model alone would say it, and on truth lost more by that than it gained.
     """
     least, share = config.of_its_time
-    return opened((gained > least) & (gained > share * off), round(config.thin * sightings.unit))
+    shown = (gained > least) & (torch.minimum(gained, apart) > share * off) & (truth.visible > 0.5)
+    return opened(shown, round(config.thin * sightings.unit))
 
 
 def _travel(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int) -> Tensor:

@@ -274,17 +274,6 @@ def test_the_board_is_where_it_was_at_t_star_and_has_its_stripes(world, made, fr
     assert result.plate.numpy()[hole].mean() > 0.9
 
 
-def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
-    """The board stood before the wall at the plate's own time: there the frozen render shows what never moves."""
-    output, still = world.output(3, 11), torch.zeros(H // 2, W // 2)
-    config = DetailConfig(depth_error=0.01)
-    detailer = Detailer(world.run, world.scene, world.plates(), config, lambda frame: still)
-    result, (truth, on) = world.make(output, detailer, withheld=[11]), world.truth(output)
-    plate, board = world.seen_at(3)
-    hole = ~widened(~(board & ~widened(on, 4)), 3)
-    assert hole.sum() > 400 and off(result.color, truth, hole) < 0.2 * off(plate, truth, hole)
-
-
 def test_what_still_is_in_one_plate_only_differs_between_two_instants(world, made):
     early, late = made(6, 2), made(6, 11)
     truths = [world.truth(world.output(6, t)) for t in (2, 11)]

@@ -127,6 +127,17 @@ def test_what_the_model_moves_goes_with_what_moves_beside_it(world):
     assert make(world, mattes, **deaf).matte.numpy()[narrowed(there, 6)].mean() > 0.8, "else there is nothing to mend"
 
 
+def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
+    """At the plate's own time the board stood before the wall: there the frozen render shows what never moves."""
+    none = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
+    made, alone = (
+        make(world, none, **{**BLIND, "of_its_time": told}) for told in (DetailConfig().of_its_time, (9.0, 1))
+    )
+    gone = narrowed(world.seen_at(FRAME)[1], 6) & ~widened(world.truth(world.output(FRAME, T_STAR))[1], 6)
+    assert gone.sum() > 1000 and made.matte.numpy()[gone].max() < 0.01
+    assert alone.matte.numpy()[gone].min() > 0.99, "else something else says so"
+
+
 def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(world):
     """The model has the wall wrong in a spot, at every time: that is no motion."""
     spot = world.run.model.gaussians.params["means"][:, :2]
