@@ -93,7 +93,7 @@ class DetailConfig:
     rim: int = 2
     """Pixels along the outline of what plate t* shows, and along jumps of depth, in which it does not count."""
     medians: int = 3
-    """So many times over the median of 5 x 5 pixels' depths is taken there."""
+    """So many times over the median of 5 x 5 pixels' depths is taken there, of 3 x 3 in small pictures."""
     gap: int = 4
     """Half the width in pixels up to which gaps within what moves belong to it: there depth is rough, and what plate t*
     sees flickers from pixel to pixel."""

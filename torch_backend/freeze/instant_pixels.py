@@ -140,7 +140,7 @@ def _torn(sightings: Sightings, config: DetailConfig, surface: _Surface) -> Tens
 def _plain(sightings: Sightings, config: DetailConfig, posed: PosedFrame, surface: _Surface) -> Tensor:
     """[h, w] bool: what moves is in plain view of plate t*, or looks there as the splats do."""
     rim, jump = max(1, round(config.rim * sightings.unit)), config.outline
-    theirs = smooth_depth(config, sightings.view(posed.t).surface[..., 0])
+    theirs = smooth_depth(config, sightings.view(posed.t).surface[..., 0], sightings.unit)
     theirs = widened(_edges(theirs, jump), rim).float()
     outline = widened(_edges(surface.depth, jump), rim) | (look_up(theirs, surface.places) > 0.5)
     off = blurred(surface.told - surface.shown, config.fine * sightings.unit).abs().amax(-1)

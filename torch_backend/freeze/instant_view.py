@@ -15,6 +15,8 @@ from .posed import PosedFrame
 from .reproject import blurred, inside, look_up, pixel_centres, project, unproject
 from .sightings import Sighting, Sightings
 
+_SMALL = 0.75
+"""Pixels of decisions to one of 640, up to which a picture is small."""
 _FEW = 0.01
 """Share of what lies around a gap that has to be seen for anything to be told of it."""
 
@@ -49,7 +51,7 @@ class InstantView:
 
 def instant_view(sightings: Sightings, config: DetailConfig, posed: PosedFrame) -> InstantView:
     """Plate t* for a frame; which has to be one of those that may be used."""
-    depth = smooth_depth(config, posed.depth)
+    depth = smooth_depth(config, posed.depth, sightings.unit)
     points = _points(posed, depth)
     angle = _angle(points, sightings.centres[sightings.index[posed.t]], posed.centre)
     sighting = sightings.seen(posed.t, points)
@@ -123,13 +125,17 @@ def _angle(points: Tensor, first: Tensor, second: Tensor) -> Tensor:
     return torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
 
 
-def smooth_depth(config: DetailConfig, depth: Tensor) -> Tensor:
-    """[h, w] a depth [h, w] without what single pixels of it are off by; edges stay."""
+def smooth_depth(config: DetailConfig, depth: Tensor, unit: float) -> Tensor:
+    """[h, w] a depth [h, w] without what single pixels of it are off by; edges stay. `unit`: pixels to one of 640.
+
+    Of small pictures fewer pixels: an apple of five would be as deep as the wall.
+    """
     import cv2
 
+    side = 5 if unit > _SMALL else 3
     smooth = np.ascontiguousarray(depth.clamp_max(1e6).numpy())
     for _ in range(config.medians):
-        smooth = np.asarray(cv2.medianBlur(smooth, 5))
+        smooth = np.asarray(cv2.medianBlur(smooth, side))
     return from_numpy(smooth)
 
 
