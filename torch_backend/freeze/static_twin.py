@@ -109,10 +109,9 @@ class _Pair:
     def worse(self, frames: list[int], near: Tensor, still: bool = True) -> Tensor:
         """[M]: squared error of the scene over that of its twin, in pixels, for the mean frame that sees a Gaussian.
 
-        With `still`, less what the run at the frame's own time has less of than the twin.
-
         A pixel's difference is shared by the Gaussians that paint it in either; each is given the mean of those `near`
-        [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*.
+        [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*; and what the twin's error
+        there exceeds that of the run at the frame's own time by is subtracted, for it says that something did.
         """
         sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
         for frame in frames:
