@@ -7,8 +7,8 @@ were seen. Scene and twin are held against plates: that of t*, and the still pix
 Gaussian is closed where the others are worse for it by more than plate t* gains; where the mattes see nothing move at
 t*, by more than a third of that. It is asked of neighbours together: errors are noisy, and things move in pieces. Where
 it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call still, a mean is
-always nearer. They miss whole arms, too. So what the run shows at a plate's own time better than the twin counts
-against the twin: there something moved, and that plate says nothing of t*.
+always nearer. They miss whole arms, too. So of what went farther than a sway, what the run shows at a plate's own time
+better than the twin counts against the twin: that plate says nothing of t*.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..gaussians.neighbours import nearest
 from ..scene import Scene
-from ..torch_types import from_numpy
+from ..torch_types import from_numpy, norm
 from ..train import LoadedRun
 from ..train.model import gathered, render
 from ..train.movers import mean_of
@@ -48,6 +48,9 @@ class TwinConfig:
     doubted: float = 3.0
     """So many times what the others lose must plate t* gain where the mattes say that nothing moves at t*: a field also
     bends to what is wrong with the camera of that one plate, the edge of a desk for instance."""
+    sways: float = 4.0
+    """Pixels of pictures 640 wide from t* to a plate from which on a Gaussian does not only sway: what the run at that
+    plate's time shows better than the twin then counts. Held-still people sway by less; their mean is as good."""
     rounds: int = 2
     """Comparisons: what stays open is held against the twin again without what was closed."""
 
@@ -75,7 +78,8 @@ def settled(
         left = rows[frozen.motion[rows] > 0.5]
         if not len(left):
             break
-        pair = _Pair(run, plates, frozen, held_still(run, frozen, left), left, movers)
+        twin = held_still(run, frozen, left)
+        pair = _Pair(run, plates, frozen, twin, left, movers, config.sways * plates.width / 640)
         near = _nearest(frozen.state["means"][left], config.neighbours)
         gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
         least = torch.where(movers[left] > 0.5, harm, config.doubted * harm)
@@ -101,8 +105,10 @@ class _Pair:
 
     def __init__(
         self, run: LoadedRun, plates: WorkingPlates, frozen: FrozenGaussians, twin: FrozenGaussians, rows: Tensor,
-        movers: Tensor,
+        movers: Tensor, sways: float,
     ) -> None:  # fmt: skip
+        """`sways`: pixels of the plates, as `TwinConfig.sways`."""
+        self.sways = sways
         self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, twin)
         self.marks = torch.stack([torch.zeros_like(movers).index_fill(0, rows, 1.0), movers], dim=1)
 
@@ -111,7 +117,7 @@ class _Pair:
 
         A pixel's difference is shared by the Gaussians that paint it in either; each is given the mean of those `near`
         [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*; and what the twin's error
-        there exceeds that of the run at the frame's own time by is subtracted, for it says that something did.
+        there exceeds that of the run at the frame's own time by is subtracted for what went farther than a sway.
         """
         sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
         for frame in frames:
@@ -133,18 +139,26 @@ class _Pair:
             errors.append((picture - plate).square().mean(-1))
             paints.append(marks[..., 0])
             counts &= (marks[..., 1] < 0.1) | (not still)
-        worse = errors[0] - errors[1]
-        if still:
-            worse = worse - (errors[1] - self._own_time(frame)).clamp_min(0.0)
-        worse = worse * counts / (paints[0] + paints[1]).clamp_min(1e-2)
-        weights = torch.stack([worse, counts.float()], dim=-1)
-        ours, twins = (gathered(scene.state, *camera, weights)[self.rows] for scene in self.scenes)
-        return ours + twins
+        share = counts / (paints[0] + paints[1]).clamp_min(1e-2)
+        weights = [(errors[0] - errors[1]) * share, counts.float()]
+        then = freeze_at(self.run.model, self.plates.scene.time_of_frame(frame), 1.0) if still else None
+        if then is not None:
+            own = (self._shown(then, frame)[0] - plate).square().mean(-1)
+            weights.append((errors[1] - own).clamp_min(0.0) * share)
+        both = (gathered(scene.state, *camera, torch.stack(weights, dim=-1))[self.rows] for scene in self.scenes)
+        told = sum(both, torch.zeros(len(self.rows), len(weights), device=plate.device))
+        if then is not None:
+            told[:, 0] -= told[:, 2] * (self._travel(then, frame) > self.sways)
+        return told[:, :2]
 
-    def _own_time(self, frame: int) -> Tensor:
-        """[H, W] squared error of the run at a frame's own time."""
-        then = freeze_at(self.run.model, self.plates.scene.time_of_frame(frame), 1.0)
-        return (self._shown(then, frame)[0] - self.plates.picture(frame)).square().mean(-1)
+    def _travel(self, then: FrozenGaussians, frame: int) -> Tensor:
+        """[M] pixels by which the rows move from t* to a frame's own time, as that frame sees it."""
+        viewmat, K, _, _ = self.plates.camera(frame)
+        here, there = (
+            scene.state["means"][self.rows] @ viewmat[:3, :3].T + viewmat[:3, 3] for scene in (self.scenes[0], then)
+        )
+        ends = (at[:, :2] / at[:, 2:].clamp_min(1e-3) for at in (here, there))
+        return norm((next(ends) - next(ends)) * K[[0, 1], [0, 1]], 1)
 
     @torch.no_grad()
     def _shown(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:
