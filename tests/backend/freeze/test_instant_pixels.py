@@ -10,7 +10,7 @@ from tests.backend.freeze.test_detail import H, W, build, off, widened
 from torch_backend.freeze.detail import DetailConfig, Detailer
 from torch_backend.freeze.frozen import freeze_at, render_frozen
 from torch_backend.freeze.instant_pixels import InstantPixels
-from torch_backend.freeze.instant_view import bridged, continued
+from torch_backend.freeze.instant_view import bridged, continued, smooth_depth
 from torch_backend.freeze.reproject import pixel_centres
 
 SHARP = DetailConfig(depth_error=0.01)
@@ -109,6 +109,16 @@ def test_between_two_sides_it_is_believed_in_part(world):
         made, truth, on = delivered(world, replace(SHARP, beside=beside), dark)
         shares.append(off(made.color, truth, ~widened(~on, 8)))
     assert shares[0] > 1.2 * shares[1] > 1.2 * shares[2]
+
+
+def test_single_depths_are_smoothed_away_and_an_apple_of_a_small_picture_is_not():
+    y, x = np.mgrid[:40, :60]
+    apple = torch.from_numpy((y - 20) ** 2 + (x - 30) ** 2 < 6)  # five pixels across
+    depth = torch.where(apple, 2.0, 6.0)
+    depth[8, 8] = depth[20, 30] = 1.0
+    small, large = (smooth_depth(SHARP, depth, unit) for unit in (0.375, 1.0))
+    assert small[8, 8] == large[8, 8] == 6.0
+    assert (small[19:22, 29:32] == 2.0).all() and (large == 6.0).all(), "of a large one it is a speck"
 
 
 def test_a_gap_is_shown_as_around_it_unless_two_surfaces_meet_there():
