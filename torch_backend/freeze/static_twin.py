@@ -26,6 +26,7 @@ from ..train import LoadedRun
 from ..train.model import gathered, render
 from ..train.movers import mean_of
 from .frozen import FrozenGaussians, freeze_at
+from .reproject import project
 from .sightings import MovingOf
 from .working_plates import WorkingPlates, showing, spread
 
@@ -145,8 +146,9 @@ class _Pair:
         if then is not None:
             own = (self._shown(then, frame)[0] - plate).square().mean(-1)
             weights.append((errors[1] - own).clamp_min(0.0) * share)
-        both = (gathered(scene.state, *camera, torch.stack(weights, dim=-1))[self.rows] for scene in self.scenes)
-        told = sum(both, torch.zeros(len(self.rows), len(weights), device=plate.device))
+        stacked = torch.stack(weights, dim=-1)
+        ours, twins = (gathered(scene.state, *camera, stacked)[self.rows] for scene in self.scenes)
+        told = ours + twins
         if then is not None:
             told[:, 0] -= told[:, 2] * (self._travel(then, frame) > self.sways)
         return told[:, :2]
@@ -154,11 +156,8 @@ class _Pair:
     def _travel(self, then: FrozenGaussians, frame: int) -> Tensor:
         """[M] pixels by which the rows move from t* to a frame's own time, as that frame sees it."""
         viewmat, K, _, _ = self.plates.camera(frame)
-        here, there = (
-            scene.state["means"][self.rows] @ viewmat[:3, :3].T + viewmat[:3, 3] for scene in (self.scenes[0], then)
-        )
-        ends = (at[:, :2] / at[:, 2:].clamp_min(1e-3) for at in (here, there))
-        return norm((next(ends) - next(ends)) * K[[0, 1], [0, 1]], 1)
+        here, there = (project(scene.state["means"][self.rows], viewmat, K)[0] for scene in (self.scenes[0], then))
+        return norm(here - there, -1)
 
     @torch.no_grad()
     def _shown(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:
