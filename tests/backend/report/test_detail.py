@@ -6,8 +6,9 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 
-from benchmarks import detail, detail_cost, detail_flow, detail_truth
+from benchmarks import detail, detail_cost, detail_flow, detail_truth, still_truth
 from benchmarks.detail_clip import VARIANTS, open_clip
 from torch_backend.footage.images import read_png
 from torch_backend.footage.plates import Plates
@@ -142,3 +143,23 @@ def test_regions_that_got_worse_are_named():
     absent = [{detail_truth.PERCEIVED: {name: {"whole": None} for name in detail_truth.VARIANTS}}]
     assert detail_truth.perceived_table({"room": detail_truth.perceived(absent)}) == [], "no made-up figure"
     json.dumps(mean)
+
+
+def test_a_sway_that_mattes_miss_makes_plates_prefer_the_mean_and_truth_the_instant():
+    def picture(*places: int) -> torch.Tensor:
+        shown = torch.full((40, 60, 3), 0.2)
+        for at in places:
+            shown[10:30, at : at + 8] += 0.6 / len(places)
+        return shown
+
+    plate, target = picture(26), picture(20)  # of its own time, and as it stood at t*
+    moves = (plate - target).abs().amax(-1) > 0.0
+    everything = torch.ones_like(moves)
+    row = still_truth.compared({"auto": target + 0.01, "static": picture(20, 26)}, plate, target, everything, moves)
+    rows = [{"kind": "developed", **row}, {"kind": "field", **row}]
+    assert still_truth.gains(rows, "developed", "plate")[0] < -4.0, "the mean of two places is nearer to either"
+    assert still_truth.gains(rows, "developed", "truth")[0] > 10.0
+    assert still_truth.gains(rows, "developed", "sway")[0] > 10.0 and row["sways"] == moves.float().mean()
+    assert row["static"]["held"] > 100.0 > row["auto"]["held"] > 39.0, "the mean errs nowhere else, 0.01 is 40 dB"
+    none = still_truth.compared({"auto": target, "static": target}, plate, target, ~everything, moves)
+    assert still_truth.gains([{"kind": "field", **none}], "field", "truth") == []
