@@ -71,9 +71,12 @@ class InstantConfig:
 class InstantBench:
     """Plate t* and its camera, with its neighbours, at the size at which they are compared."""
 
-    def __init__(self, run: LoadedRun, scene: Scene, index: int, config: InstantConfig, motion: Motion | None) -> None:
-        self.config, self.exposure, self.index = config, run.model.exposure, index
-        self.width = min(run.width, config.width)
+    def __init__(
+        self, run: LoadedRun, scene: Scene, index: int, config: InstantConfig, motion: Motion | None, width: int = 0
+    ) -> None:
+        """`width` in pixels; 0: as the run was trained, `InstantConfig.width` at most."""
+        self.config, self.exposure, self.index, self._run = config, run.model.exposure, index, run
+        self.width = width or min(run.width, config.width)
         self.height = max(1, round(run.height * self.width / run.width))
         self.unit = self.width / _SIZE
         self.time = float(scene.times[index])
@@ -84,6 +87,13 @@ class InstantBench:
         mask = ignore_mattes(Shot(scene.folder.parent))(scene.frames[index])
         self._ignored = None if mask is None else resized(mask, self.width, self.height).numpy() > 0.0
         """[h, w] bool what of plate t* is no part of the scene: nothing is missing there."""
+
+    def as_plate(self) -> InstantBench:
+        """The same at the plate's size, `InstantConfig.width` at most: what is drawn is as sharp as the plate."""
+        width = min(self.scene.width, self.config.width)
+        if width <= self.width:
+            return self
+        return InstantBench(self._run, self.scene, self.index, self.config, self._motion, width)
 
     def at(self, index: int) -> View:
         """Delivered frame `index`: its plate and camera. Kept."""

@@ -22,7 +22,7 @@ from ..train import LoadedRun
 from ..train.exposure import Exposure
 from ..train.model import gathered
 from .frozen import FrozenGaussians, FrozenImage
-from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed
+from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed, resized_array
 from .instant_depth import Region, as_field, inverse_depth, own_motion
 from .instant_track import Track, swing, tracks
 
@@ -174,10 +174,43 @@ def _shell(
         stronger = soft > cover
         inverse[stronger], cover[stronger] = depths[stronger], soft[stronger]
         facts_of_regions.append(facts)
-    colors, cover = _matted(view.picture, image.color.numpy(), cover, bench.unit)
+    if not (cover > 0.1).any():
+        return {name: value[:0] for name, value in frozen.state.items()}, cover, facts_of_regions
+    state, drawn = _drawn(bench, frozen, image, inverse, cover)
+    return state, drawn, facts_of_regions
+
+
+def _drawn(
+    bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage, inverse: NDArray[np.float32],
+    cover: NDArray[np.float32],
+) -> tuple[dict[str, Tensor], NDArray[np.float32]]:  # fmt: skip
+    """The Gaussians of a layer by its inverse depths and cover [h, w], and its opacity [h, w], outlines taken apart.
+
+    It is found at the size that the run was trained at, and drawn from the plate's pixels, as many as are delivered.
+    """
+    fine = bench.as_plate()
+    if fine is not bench:
+        image = fine.render(frozen)
+        inverse, cover = _enlarged(inverse, cover, fine.width, fine.height)
+    colors, cover = _matted(fine.view.picture, image.color.numpy(), cover, fine.unit)
     rows, columns = np.nonzero(cover > 0.1)
-    means = view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
-    return _gaussians(bench, frozen, means, rows, columns, inverse, cover, colors), cover, facts_of_regions
+    means = fine.view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
+    state = _gaussians(fine, frozen, means, rows, columns, inverse, cover, colors)
+    return state, resized_array(cover, bench.width, bench.height)
+
+
+def _enlarged(
+    inverse: NDArray[np.float32], cover: NDArray[np.float32], width: int, height: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(inverse depths, cover) [h, w] of a layer at a larger size; depths are those of what is covered alone."""
+    import cv2
+
+    known = (inverse > 0.0).astype(np.float32)
+    soft, depths, weight = (
+        cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR) for values in (cover, inverse, known)
+    )
+    depths = np.where(weight > 1e-3, depths / np.maximum(weight, 1e-3), 0.0)
+    return depths.astype(np.float32), np.where(weight > 1e-3, soft, 0.0).astype(np.float32)
 
 
 def _fields_inverse(bench: InstantBench, frozen: FrozenGaussians) -> NDArray[np.float32]:

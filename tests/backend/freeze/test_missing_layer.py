@@ -142,10 +142,10 @@ def waving(tmp_path_factory):
     return world(tmp_path_factory.mktemp("waving"), static, lambda n: together(static, hand(n)))
 
 
-def where(made, state):
-    """Pixels [H, W] of plate t* that show a state, wholly."""
+def where(made, state, n=T_STAR):
+    """Pixels [H, W] of plate n that show a state, wholly."""
     frozen = frozen_of(state)
-    return render_frozen(frozen, made.scene.viewmats[T_STAR - 1], made.scene.Ks[0], W, H).alpha.numpy() > 0.9
+    return render_frozen(frozen, made.scene.viewmats[n - 1], made.scene.Ks[0], W, H).alpha.numpy() > 0.9
 
 
 def test_a_hand_that_the_model_lacks_is_found_as_deep_as_the_arm_it_hangs_on(waving):
@@ -183,6 +183,32 @@ def test_twice_as_large_the_layer_has_no_holes(waving):
     inside = np.kron(where(waving, hand(T_STAR)) & (layer.mask.numpy() > 0.9), np.ones((2, 2), bool))
     assert image.alpha.numpy()[inside].min() > 0.85
     assert image.motion.numpy()[inside].min() > 0.99 and image.support.numpy()[inside].min() > 0.99
+
+
+def test_of_a_run_on_small_pictures_the_layer_is_as_sharp_as_the_plate(tmp_path):
+    """Bright and dark stripes of 3 pixels, which pictures half as large show as grey."""
+
+    def striped(n):
+        state = hand(n)
+        bright = ((state["means"][:, 0] / 0.05).floor() % 2 > 0).float()
+        color = (0.3 + 0.6 * bright)[:, None] * torch.tensor([1.0, 0.7, 0.6])
+        return {**state, "sh0": ((color - 0.5) / SH_C0)[:, None]}
+
+    static = together(wall(), arm())
+    made = world(tmp_path, static, lambda n: together(static, striped(n)))
+    made.run.width, made.run.height = W // 2, H // 2
+    truth = together(static, striped(T_STAR))
+    errors, counts = [], []
+    for width in (W // 2, W):
+        layer = made.layer(config=InstantConfig(width=width))
+        assert layer is not None and layer.mask.shape == (H // 2, W // 2)
+        counts.append(len(layer.state["means"]))
+        for n in (T_STAR, 10):
+            seen = where(made, striped(T_STAR), n) & ~where(made, arm(), n)
+            shown, target = (made.image(state, n) for state in (join(made.frozen, layer).state, truth))
+            errors.append(np.square(shown - target)[seen].mean())
+    assert 3.0 < counts[1] / counts[0] < 5.0, "four pixels of the plate for one of the run"
+    assert errors[2] < 0.9 * errors[0] and errors[3] < 0.6 * errors[1], errors
 
 
 def layer_alone(layer):
