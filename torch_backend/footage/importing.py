@@ -11,7 +11,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..contract import (
     FRAMES_FILE,
@@ -29,8 +31,9 @@ from ..contract import (
 )
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
+from .burnt_in import find_mark, looked_at, place_of
 from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
-from .images import is_whole_png, resize, working_size, write_png
+from .images import is_whole_png, read_frame, resize, working_size, write_png
 from .ocio import Colours
 from .opening import open_source
 from .reading import read_as
@@ -41,6 +44,8 @@ LEAST_FRAMES = 8
 MANY_FRAMES = 1500
 EXPOSURE_DRIFT_STOPS = 1.0
 CLIPPED_SHARE = 0.01
+BURNT_IN_FILE = "burnt_in.png"
+"""Mask of what is burnt into the clip, beside frames.json, if something is."""
 _PARTIAL = "raw.partial"
 """What a killed import of an earlier version left."""
 """What a killed process leaves of a file that it was writing, see `shot.atomic_path`."""
@@ -93,6 +98,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
             report.warning(message, hint)
         record = _record(opened, config, extracted, key)
         record["beside"] = _beside(shot, source)
+        record |= _marked(shot, record, fresh, report)
         write_json(fresh / FRAMES_FILE, record)
         _keep_strangers(shot.frames, fresh, record)
     _publish(shot, record, source)
@@ -366,6 +372,33 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
     }
 
 
+def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -> dict[str, Any]:
+    """What frames.json says of something burnt into the clip; its mask is written beside, and the artist is told."""
+    usable = [row["file"] for row in record["frames"] if not row["flags"]]
+    pictures: list[NDArray[np.uint8]] = []
+    for n in looked_at(len(usable)):
+        report.check_cancelled()
+        pictures.append(_grey(fresh / usable[n]))
+    mark = find_mark(pictures)
+    if mark is None:
+        return {}
+    write_png(fresh / BURNT_IN_FILE, np.repeat(np.where(mark, np.uint8(255), np.uint8(0))[..., None], 3, axis=2))
+    share, place = float(mark.mean()), place_of(mark)
+    report.warning(
+        f"Something stands still on the picture {place}, {100 * share:.1f} % of it, while the world goes by: a logo, a "
+        "caption? It would smear in frozen frames.",
+        "If it is no part of the scene, give its mask as what is ignored (--ignore-mask): "
+        f"{shot.frames / BURNT_IN_FILE}",
+    )
+    return {"burnt_in": {"file": BURNT_IN_FILE, "share": round(share, 5), "place": place}}
+
+
+def _grey(path: Path) -> NDArray[np.uint8]:
+    pixels = read_frame(path)
+    pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
 def _displayed(info: SourceInfo, measures: list[FrameMeasures]) -> dict[str, Any]:
     """What frames.json says of the working frames' display, as `display_of` reads it."""
     display = display_for(info)
@@ -403,7 +436,7 @@ def _listed(listing: Path) -> set[Path]:
 def _names(record: dict[str, Any]) -> set[Path]:
     """Files of an import, relative to the frames folder, and the undistorted ones that a solve writes beside raw/."""
     files = [Path(str(row["file"])) for row in record["frames"]]
-    return {Path(FRAMES_FILE), *files, *(Path(file.name) for file in files)}
+    return {Path(FRAMES_FILE), Path(BURNT_IN_FILE), *files, *(Path(file.name) for file in files)}
 
 
 def _publish(shot: Shot, record: dict[str, Any], source: str) -> None:

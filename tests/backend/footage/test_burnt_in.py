@@ -1,0 +1,80 @@
+"""What is burnt into a clip is found and masked, whatever goes by behind it; a camera that stands finds nothing."""
+
+import cv2
+import numpy as np
+import pytest
+
+from torch_backend.footage import FootageConfig, import_footage, load_frames
+from torch_backend.footage.burnt_in import find_mark, looked_at, place_of
+from torch_backend.footage.images import read_png
+from torch_backend.footage.masks import read_masks
+from torch_backend.shot import Shot
+
+H, W = 180, 320
+
+
+def grey(frames):
+    return [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
+
+
+def stamped(frames, x, y, strength=0.6):
+    """A half transparent ring with a cross in it, 36 pixels wide, at x, y; and where it is, bool [H, W]."""
+    mark, inside = np.zeros((H, W), np.uint8), np.zeros((H, W), np.uint8)
+    cv2.circle(mark, (x, y), 16, 255, 3)
+    cv2.line(mark, (x - 10, y), (x + 10, y), 255, 3)
+    cv2.line(mark, (x, y - 10), (x, y + 10), 255, 3)
+    cv2.circle(inside, (x, y), 18, 1, -1)
+    cover = strength * mark[..., None] / 255.0
+    shown = [np.rint(frame * (1.0 - cover) + 255.0 * cover).astype(np.uint8) for frame in frames]
+    return shown, inside > 0
+
+
+@pytest.fixture
+def panned(pan):
+    return pan(30, H, W, speed=4)
+
+
+def test_a_logo_is_found_whole_where_it_is_and_nothing_else(panned):
+    frames, inside = stamped(panned, 280, 150)
+    mark = find_mark(grey(frames))
+    assert mark is not None and place_of(mark) == "at the bottom right"
+    assert (mark & inside).sum() > 0.97 * inside.sum() and (mark & ~inside).sum() < 0.5 * inside.sum()
+    faint = find_mark(grey(stamped(panned, 40, 30, strength=0.3)[0]))
+    assert faint is not None and place_of(faint) == "at the top left"
+
+
+def test_a_clip_without_one_and_a_camera_that_stands_have_none(panned, pan):
+    assert find_mark(grey(panned)) is None
+    frames, _ = stamped([panned[0]] * 30, 280, 150)
+    assert find_mark(grey(frames)) is None, "all of it stands: nobody can tell"
+    crept, _ = stamped([panned[n // 15] for n in range(30)], 280, 150)
+    assert find_mark(grey(crept)) is None
+    small, _ = stamped(panned, 280, 150)
+    assert find_mark(grey(small)[:8]) is None and find_mark([g[:, :128] for g in grey(small)]) is None
+
+
+def test_a_cameras_own_rim_is_left_alone(panned):
+    rimmed = [np.pad(frame[:, :-2], ((0, 0), (0, 2), (0, 0))) for frame in panned]
+    assert find_mark(grey(rimmed)) is None
+
+
+def test_so_many_pictures_are_looked_at_and_no_more():
+    assert looked_at(0) == [] and looked_at(3) == [0, 1, 2] and len(looked_at(5000)) == 48
+    assert looked_at(5000)[0] == 0 and looked_at(5000)[-1] == 4999
+
+
+def test_an_import_says_so_writes_the_mask_and_takes_it_away_with_the_clip(tmp_path, panned, write_video, recorder):
+    frames, inside = stamped(panned, 280, 150)
+    write_video(tmp_path / "marked.mp4", frames, rate=10)
+    write_video(tmp_path / "clean.mp4", panned, rate=10)
+    shot, report = Shot.create(tmp_path / "a.splannequin"), recorder()
+    import_footage(shot, str(tmp_path / "marked.mp4"), FootageConfig(step=1), report)
+    (said,) = report.warnings
+    assert said.startswith("Something stands still on the picture at the bottom right, ")
+    told, file = load_frames(shot)["burnt_in"], shot.frames / "burnt_in.png"
+    assert told["share"] == pytest.approx(float((read_png(file)[..., 0] > 0).mean()), abs=1e-5)
+    (mask,) = read_masks(shot, {"ignore": str(file), "people": ""}, recorder()).values()
+    assert (mask.of(5) & inside).sum() > 0.97 * inside.sum(), "the solve takes it as it is"
+    report = recorder()
+    import_footage(shot, str(tmp_path / "clean.mp4"), FootageConfig(step=1), report)
+    assert report.warnings == [] and "burnt_in" not in load_frames(shot) and not file.exists()
