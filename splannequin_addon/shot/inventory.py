@@ -83,6 +83,12 @@ def plate_range(folder: Path) -> tuple[int, int] | None:
     return (min(numbers), max(numbers)) if numbers else None
 
 
+def burnt_in(shot: Path) -> Path | None:
+    """Mask of what the import found to be burnt into the clip; None if it found nothing."""
+    mask = ShotFolder(shot).burnt_in
+    return mask if mask.is_file() else None
+
+
 def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
     """Those of some frames that a take lacks."""
     there = set(numbered.frame_numbers(ShotFolder(shot).takes / take))

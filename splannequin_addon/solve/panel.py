@@ -9,7 +9,7 @@ from ..access import layout_of, scene_in, settings_of
 from ..process import steps
 from ..ui import icons, step_panel
 from ..ui.sentences import wrap
-from . import align_operators, cameras, matte_operators
+from . import align_operators, cameras, mask_operators, matte_operators
 
 
 def can_load_camera(running: str | None) -> bool:
@@ -73,6 +73,7 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
     def _masks(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """What is ignored, and what alone may move."""
         props = settings_of(scene_in(context))
+        mask_operators.draw(layout, context)
         for kind in contract.MASK_KINDS:
             layout.prop(props, f"{kind}_from")
             shown = {"FILE": "path", "DRAWN": "drawn"}.get(getattr(props, f"{kind}_from"))

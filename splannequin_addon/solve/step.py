@@ -11,7 +11,19 @@ from ..process import job_timer, jobs
 from ..process.steps import Step, View
 from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
-from . import align_operators, arrival, cameras, exchange, guesses, masks, matte_operators, operators, panel, points
+from . import (
+    align_operators,
+    arrival,
+    cameras,
+    exchange,
+    guesses,
+    mask_operators,
+    masks,
+    matte_operators,
+    operators,
+    panel,
+    points,
+)
 
 if TYPE_CHECKING:
     import bpy
@@ -26,7 +38,13 @@ class Solve(Step):
     button = "Solve Camera"
     again = "Solve Again"
     needs = "Import the clip first."
-    classes = (*operators.CLASSES, *align_operators.CLASSES, *matte_operators.CLASSES, *panel.CLASSES)
+    classes = (
+        *operators.CLASSES,
+        *align_operators.CLASSES,
+        *mask_operators.CLASSES,
+        *matte_operators.CLASSES,
+        *panel.CLASSES,
+    )
     parts = (points, align_operators, operators)
 
     def params(self, scene: bpy.types.Scene) -> contract.SolveParams:

@@ -92,3 +92,19 @@ def test_a_mask_follows_the_frames_that_its_clip_shows(addon, scene, shot, drawn
     assert shift(folder) == -4
     clip.frame_start = 5
     assert shift(folder) == 0
+
+
+def test_what_the_import_found_to_be_burnt_in_is_ignored_at_the_press_of_a_button(addon, contract, scene, shot):
+    props, step = scene.splannequin, addon("process.steps").STEPS["solve"]
+    props.shot_path = str(shot)
+    with pytest.raises(RuntimeError, match="poll"):
+        bpy.ops.splannequin.ignore_burnt_in()
+    mask = contract.ShotFolder(shot).burnt_in
+    mask.parent.mkdir(exist_ok=True)
+    mask.write_bytes(b"a picture")
+    try:
+        assert bpy.ops.splannequin.ignore_burnt_in() == {"FINISHED"}
+        assert step.params(scene).ignore_mask == str(mask)
+    finally:
+        mask.unlink()
+        props.ignore_from, props.ignore_path = "NONE", ""

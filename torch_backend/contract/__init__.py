@@ -176,6 +176,7 @@ from .results import (
     verdict_of,
 )
 from .shot_folder import (
+    BURNT_IN_FILE,
     CAMERAS_FILE,
     CHECKPOINT_FILE,
     COLMAP_FOLDER,
@@ -264,6 +265,7 @@ from .writing import (
 __all__ = [
     "BACKEND",
     "BLENDER",
+    "BURNT_IN_FILE",
     "CAMERAS_FILE",
     "CAMERA_MODELS",
     "CANCEL_FILE",

@@ -26,7 +26,7 @@ SHOT_SUFFIX = ".splannequin"
 """Of a shot folder's own name."""
 INFO_FILE, WRITER_FILE = "shot.json", "lock.json"
 FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER = "frames", "solve", "runs", "takes", "jobs"
-FRAMES_FILE, RAW_FOLDER = "frames.json", "raw"
+FRAMES_FILE, RAW_FOLDER, BURNT_IN_FILE = "frames.json", "raw", "burnt_in.png"
 CAMERAS_FILE, SOLVE_FILE, POINTS_FILE = "cameras.json", "solve.json", "points.npz"
 COLMAP_FOLDER, COLMAP_LOG = "colmap", "colmap.log"
 STMAP_FILES = ("stmap_undistort.exr", "stmap_redistort.exr")
@@ -82,6 +82,11 @@ class ShotFolder:
     def raw(self) -> Path:
         """Frames as imported, with the lens's distortion."""
         return self.frames / RAW_FOLDER
+
+    @property
+    def burnt_in(self) -> Path:
+        """Mask of what is burnt into the clip, a logo for instance; there if the import found something."""
+        return self.frames / BURNT_IN_FILE
 
     def plate(self, frame: int) -> Path:
         """The undistorted plate of a frame."""

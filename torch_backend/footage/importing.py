@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contract import (
+    BURNT_IN_FILE,
     FRAMES_FILE,
     LAST_FRAME,
     PICTURE,
@@ -44,8 +45,6 @@ LEAST_FRAMES = 8
 MANY_FRAMES = 1500
 EXPOSURE_DRIFT_STOPS = 1.0
 CLIPPED_SHARE = 0.01
-BURNT_IN_FILE = "burnt_in.png"
-"""Mask of what is burnt into the clip, beside frames.json, if something is."""
 _PARTIAL = "raw.partial"
 """What a killed import of an earlier version left."""
 """What a killed process leaves of a file that it was writing, see `shot.atomic_path`."""
@@ -385,10 +384,9 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
     write_png(fresh / BURNT_IN_FILE, np.repeat(np.where(mark, np.uint8(255), np.uint8(0))[..., None], 3, axis=2))
     share, place = float(mark.mean()), place_of(mark)
     report.warning(
-        f"Something stands still on the picture {place}, {100 * share:.1f} % of it, while the world goes by: a logo, a "
-        "caption? It would smear in frozen frames.",
-        "If it is no part of the scene, give its mask as what is ignored (--ignore-mask): "
-        f"{shot.frames / BURNT_IN_FILE}",
+        f"{100 * share:.1f} % of the picture stands still while the world goes by: a logo, a caption? "
+        "It would smear in frozen frames.",
+        f"If it is no part of the scene, have it ignored (Masks, or --ignore-mask {shot.burnt_in}).",
     )
     return {"burnt_in": {"file": BURNT_IN_FILE, "share": round(share, 5), "place": place}}
 
