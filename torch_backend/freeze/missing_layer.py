@@ -26,6 +26,9 @@ from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed
 from .instant_depth import Region, as_field, inverse_depth, own_motion
 from .instant_track import Track, swing, tracks
 
+_NOTHING = 0.15
+"""Share of the way from what is behind to a thing's colour below which a pixel has nothing of it."""
+
 
 @dataclass
 class InstantLayer:
@@ -146,8 +149,7 @@ def _shell(
     things: list[Track],
 ) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
     """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
-    view, cover = bench.view, np.zeros((bench.height, bench.width), np.float32)
-    inverse, facts_of_regions = np.zeros_like(cover), list[Region]()
+    nothing, parts, facts_of_regions = np.zeros((bench.height, bench.width), np.float32), list[_Part](), list[Region]()
     others = bench.neighbours() if regions or things else []
     explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9)
     matte = bench.matte()
@@ -156,12 +158,12 @@ def _shell(
     covers: list[tuple[NDArray[np.float32], Track | None]]
     covers = [(_cover(bench, image, r), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
     covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
-    fields = _fields_inverse(bench, frozen) if covers else inverse
+    fields = _fields_inverse(bench, frozen) if covers else nothing
     for soft, thing in covers:
         if soft.max() < 0.5:
             continue
         depths, facts = inverse_depth(
-            view, others, soft >= 0.5, explained & (soft < 0.1), image.depth.numpy(), mover, bench.config.depth,
+            bench.view, others, soft >= 0.5, explained & (soft < 0.1), image.depth.numpy(), mover, bench.config.depth,
             bench.unit,
         )  # fmt: skip
         swings = None if thing is None else swing(thing, bench.index, bench.camera, bench.config.track, bench.unit)
@@ -171,27 +173,47 @@ def _shell(
         elif (told := as_field(fields, soft >= 0.5, bench.config.depth, bench.unit)) is not None:
             depths = told
             facts = replace(facts, depth=1.0 / float(np.median(told[soft >= 0.5])))
-        stronger = soft > cover
-        inverse[stronger], cover[stronger] = depths[stronger], soft[stronger]
+        parts.append(_Part(soft, depths, thing))
         facts_of_regions.append(facts)
-    if not (cover > 0.1).any():
-        return {name: value[:0] for name, value in frozen.state.items()}, cover, facts_of_regions
-    state, drawn = _drawn(bench, frozen, image, inverse, cover)
-    return state, drawn, facts_of_regions
+    if not parts:
+        return {name: value[:0] for name, value in frozen.state.items()}, nothing, facts_of_regions
+    state, cover = _drawn(bench, frozen, image, parts)
+    return state, cover, facts_of_regions
+
+
+@dataclass
+class _Part:
+    """What one region or thing adds to the layer, at the size at which it was found."""
+
+    soft: NDArray[np.float32]
+    """[h, w] in 0..1: how much of each pixel it covers."""
+    inverse: NDArray[np.float32]
+    """[h, w] inverse depths where it does."""
+    thing: Track | None
+
+    def enlarged(self, fine: InstantBench, image: FrozenImage) -> _Part:
+        """The same at the size of `image`, less what there has nothing of a small thing's colour."""
+        inverse, soft = _enlarged(self.inverse, self.soft, fine.width, fine.height)
+        if self.thing is not None:
+            soft = np.where(_share(fine, image, self.thing) > _NOTHING, soft, np.float32(0.0))
+        return _Part(soft, inverse, self.thing)
 
 
 def _drawn(
-    bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage, inverse: NDArray[np.float32],
-    cover: NDArray[np.float32],
-) -> tuple[dict[str, Tensor], NDArray[np.float32]]:  # fmt: skip
-    """The Gaussians of a layer by its inverse depths and cover [h, w], and its opacity [h, w], outlines taken apart.
+    bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage, parts: list[_Part]
+) -> tuple[dict[str, Tensor], NDArray[np.float32]]:
+    """The Gaussians of a layer of parts, and its opacity [h, w], outlines taken apart.
 
     It is found at the size that the run was trained at, and drawn from the plate's pixels, as many as are delivered.
     """
     fine = bench.as_plate()
     if fine is not bench:
         image = fine.render(frozen)
-        inverse, cover = _enlarged(inverse, cover, fine.width, fine.height)
+        parts = [part.enlarged(fine, image) for part in parts]
+    cover, inverse = np.zeros((2, fine.height, fine.width), np.float32)
+    for part in parts:
+        stronger = part.soft > cover
+        inverse[stronger], cover[stronger] = part.inverse[stronger], part.soft[stronger]
     colors, cover = _matted(fine.view.picture, image.color.numpy(), cover, fine.unit)
     rows, columns = np.nonzero(cover > 0.1)
     means = fine.view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
@@ -202,10 +224,11 @@ def _drawn(
 def _enlarged(
     inverse: NDArray[np.float32], cover: NDArray[np.float32], width: int, height: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(inverse depths, cover) [h, w] of a layer at a larger size; depths are those of what is covered alone."""
+    """(inverse depths, cover) [h, w] at a larger size; depths are those of what is covered alone."""
     import cv2
 
-    known = (inverse > 0.0).astype(np.float32)
+    known = ((inverse > 0.0) & (cover > 0.0)).astype(np.float32)
+    inverse = inverse * known
     soft, depths, weight = (
         cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR) for values in (cover, inverse, known)
     )
@@ -230,6 +253,13 @@ def _small_things(bench: InstantBench, image: FrozenImage) -> list[Track]:
     return tracks(bench.frame, bench.index, image.color.numpy(), c.track, bench.unit)
 
 
+def _share(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArray[np.float32]:
+    """How far each pixel [h, w] of plate t* is on the way from what is behind to a small thing's colour."""
+    plate, behind = bench.view.picture, image.color.numpy()
+    way = thing.color - behind
+    return ((plate - behind) * way).sum(-1) / np.maximum(np.square(way).sum(-1), 1e-4)
+
+
 def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArray[np.float32]:
     """How much of each pixel [h, w] a small thing covers: how far it is on the way from what is behind to its colour.
 
@@ -238,11 +268,8 @@ def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArr
     """
     import cv2
 
-    plate, behind = bench.view.picture, image.color.numpy()
-    way = thing.color - behind
-    share = ((plate - behind) * way).sum(-1) / np.maximum(np.square(way).sum(-1), 1e-4)
     near = cv2.dilate(thing.pixels.astype(np.uint8), disc(1.0)) > 0
-    covered = np.where(near, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)
+    covered = np.where(near, np.clip(_share(bench, image, thing), 0.0, 1.0), 0.0).astype(np.float32)
     return np.asarray(cv2.morphologyEx(covered, cv2.MORPH_OPEN, disc(1.0 * bench.unit)), np.float32)
 
 
