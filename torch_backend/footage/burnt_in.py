@@ -56,7 +56,8 @@ def find_mark(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.bool_] | None
     length = np.hypot(*middle)
     alike = np.zeros_like(length)
     usual = np.zeros_like(length)
-    for x, y in gradients.astype(np.float32):
+    for gradient in gradients:  # one at a time: all of them in float32 would be a hundred megabytes
+        x, y = gradient.astype(np.float32)
         alike += np.hypot(x - middle[0], y - middle[1]) < _ALIKE * length
         usual += np.hypot(x, y)
     alike, usual = alike / len(gradients), usual / len(gradients)
@@ -70,15 +71,6 @@ def find_mark(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.bool_] | None
         return None
     large = cv2.resize(mark.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(large > 0)
-
-
-def place_of(mark: NDArray[np.bool_]) -> str:
-    """Where in the picture a mark [H, W] lies, in words."""
-    rows, columns = np.nonzero(mark)
-    height, width = mark.shape
-    across = ("left", "", "right")[min(2, int(3 * columns.mean() / width))]
-    down = ("top", "", "bottom")[min(2, int(3 * rows.mean() / height))]
-    return f"at the {' '.join(word for word in (down, across) if word)}" if down or across else "in the middle"
 
 
 def _gradient(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float16]:

@@ -32,7 +32,7 @@ from ..contract import (
 )
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
-from .burnt_in import find_mark, looked_at, place_of
+from .burnt_in import WIDTH, find_mark, looked_at
 from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
 from .images import is_whole_png, read_frame, resize, working_size, write_png
 from .ocio import Colours
@@ -382,19 +382,25 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
     if mark is None:
         return {}
     write_png(fresh / BURNT_IN_FILE, np.repeat(np.where(mark, np.uint8(255), np.uint8(0))[..., None], 3, axis=2))
-    share, place = float(mark.mean()), place_of(mark)
+    share = float(mark.mean())
     report.warning(
         f"{100 * share:.1f} % of the picture stands still while the world goes by: a logo, a caption? "
         "It would smear in frozen frames.",
         f"If it is no part of the scene, have it ignored (Masks, or --ignore-mask {shot.burnt_in}).",
     )
-    return {"burnt_in": {"file": BURNT_IN_FILE, "share": round(share, 5), "place": place}}
+    return {"burnt_in": {"file": BURNT_IN_FILE, "share": round(share, 5)}}
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:
+    """A working frame, no larger than it is looked at: of 48 in 4K all pixels would be 400 MB."""
     pixels = read_frame(path)
     pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    if grey.shape[1] > WIDTH:
+        grey = cv2.resize(
+            grey, (WIDTH, max(1, round(grey.shape[0] * WIDTH / grey.shape[1]))), interpolation=cv2.INTER_AREA
+        )
+    return np.asarray(grey, np.uint8)
 
 
 def _displayed(info: SourceInfo, measures: list[FrameMeasures]) -> dict[str, Any]:

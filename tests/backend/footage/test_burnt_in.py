@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from torch_backend.footage import FootageConfig, import_footage, load_frames
-from torch_backend.footage.burnt_in import find_mark, looked_at, place_of
+from torch_backend.footage.burnt_in import find_mark, looked_at
 from torch_backend.footage.images import read_png
 from torch_backend.footage.masks import read_masks
 from torch_backend.shot import Shot
@@ -37,10 +37,11 @@ def panned(pan):
 def test_a_logo_is_found_whole_where_it_is_and_nothing_else(panned):
     frames, inside = stamped(panned, 280, 150)
     mark = find_mark(grey(frames))
-    assert mark is not None and place_of(mark) == "at the bottom right"
+    assert mark is not None
     assert (mark & inside).sum() > 0.97 * inside.sum() and (mark & ~inside).sum() < 0.5 * inside.sum()
-    faint = find_mark(grey(stamped(panned, 40, 30, strength=0.3)[0]))
-    assert faint is not None and place_of(faint) == "at the top left"
+    faint, inside = stamped(panned, 40, 30, strength=0.3)
+    mark = find_mark(grey(faint))
+    assert mark is not None and (mark & inside).sum() > 0.9 * inside.sum()
 
 
 def test_a_clip_without_one_and_a_camera_that_stands_have_none(panned, pan):
@@ -72,7 +73,6 @@ def test_an_import_says_so_writes_the_mask_and_takes_it_away_with_the_clip(tmp_p
     (said,) = report.warnings
     told, file = load_frames(shot)["burnt_in"], shot.burnt_in
     assert said.startswith(f"{100 * told['share']:.1f} % of the picture stands still while the world goes by: a logo,")
-    assert told["place"] == "at the bottom right"
     assert told["share"] == pytest.approx(float((read_png(file)[..., 0] > 0).mean()), abs=1e-5)
     (mask,) = read_masks(shot, {"ignore": str(file), "people": ""}, recorder()).values()
     assert (mask.of(5) & inside).sum() > 0.97 * inside.sum(), "the solve takes it as it is"
