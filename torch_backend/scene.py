@@ -26,6 +26,7 @@ from .footage.images import read_frame
 from .footage.importing import load_frames
 from .native import default_threads
 from .shot import Shot, make_folder, need_disk
+from .solve.motion import load_surface
 from .solve.stored import damaged, load_cameras, load_points
 from .torch_types import from_numpy
 
@@ -125,6 +126,16 @@ def load_scene(shot: Shot) -> Scene:
         folder=shot.frames,
         display=display_of(load_frames(shot)),
     )
+
+
+def surface_of(scene: Scene) -> tuple[Tensor, Tensor, list[int]]:
+    """(points [S, 3] scene units, colours [S, 3] as `Scene.colors`, frame number of each) of what stands still, dense.
+
+    Of a shot that was solved before such points were kept, none.
+    """
+    found = load_surface(Shot(scene.folder.parent))
+    points = (found.xyz.astype(np.float64) - scene.centre) * scene.scale
+    return from_numpy(points).float(), from_numpy(found.rgb).float() / 255.0, found.frames.tolist()
 
 
 def frame_table(shot: Shot) -> dict[int, dict[str, Any]]:

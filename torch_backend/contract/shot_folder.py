@@ -5,7 +5,7 @@ lock.json                        who writes into it
 frames/NNNNNN.png                undistorted plates
 frames/frames.json, frames/raw/  listing of the imported frames, and themselves
 solve/                           cameras.json, solve.json, points.npz, colmap/, colmap.log, ST maps of the lens
-solve/motion/                    mattes of what moves, as found; motion_paint/ as painted
+solve/motion/                    mattes of what moves as found, points of what does not; motion_paint/ as painted
 solve/ignore/, solve/people/     masks that the solve was given, undistorted; masks/ as drawn in Blender
 runs/NAME/                       a run: `RunFolder`
 takes/NAME/                      frozen frames: `TakeFolder`
@@ -55,8 +55,8 @@ SHOT_NAMES = frozenset({
     DRAWN_FOLDER, FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER,
 })  # fmt: skip
 """All that lies in a shot folder."""
-PICTURE, LAYERS = ".png", ".exr"
-"""Suffixes of plates, mattes and previews; of frozen frames."""
+PICTURE, LAYERS, SURFACE = ".png", ".exr", ".npz"
+"""Suffixes of plates, mattes and previews; of frozen frames; of points of still surfaces."""
 
 
 class ShotFolder:
@@ -127,6 +127,10 @@ class ShotFolder:
     def matte(self, frame: int) -> Path:
         """The found matte of a frame."""
         return self.motion / frame_file(frame, PICTURE)
+
+    def surface(self, frame: int) -> Path:
+        """Points of the still surfaces of a key frame, found with its matte."""
+        return self.motion / frame_file(frame, SURFACE)
 
     @property
     def painted(self) -> Path:

@@ -1,8 +1,10 @@
-"""Where the Gaussians start: the sparse points, and seeds for what has no point.
+"""Where the Gaussians start: the sparse points, points of still surfaces, and seeds for what has no point.
 
-COLMAP leaves walls and skin almost empty. Pixels far from any sparse point are lifted to the depth of the nearest
-points in the same image: right to within a furniture's width, which a few hundred steps repair, and better than
-holes that densification must fill from the rims (measured on the bundled clip: docs/benchmarks.md).
+COLMAP leaves walls and skin almost empty. The search for motion knows the depth of most of what stands still, plain or
+not (`solve.surface`), and training starts from a draw of that. Pixels far from any point are lifted to the depth of the
+nearest points in the same image: right to within a furniture's width, which a few hundred steps repair, and better than
+holes that densification must fill from the rims (both measured: docs/benchmarks.md). A guess that is farther off is not
+repaired: a man before a plain wall, lifted to the depth of somebody before him, is never found, and taken for motion.
 """
 
 from __future__ import annotations
@@ -14,11 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..scene import Scene, evenly_spaced
+from ..scene import Scene, evenly_spaced, surface_of
 from ..torch_types import from_numpy
 from .model import SH_C0, Gaussians, sh_bases
 from .neighbours import nearest
 
+_OUTLIERS = 0.005
+"""Share of the sparse points at either end of each axis that do not say where the scene ends."""
 _PIXELS_PER_SEED = 100
 """A small picture needs no more seeds than one per so many pixels of a frame."""
 
@@ -27,12 +31,14 @@ _PIXELS_PER_SEED = 100
 class InitConfig:
     """How many Gaussians to start with, and how they look."""
 
+    surface: int = 20_000
+    """Most points of still surfaces; never more than a third of the budget."""
     seeds: int = 8000
-    """Seeds lifted from pixels without a sparse point near them, over all frames together."""
+    """Seeds lifted from pixels without a point near them, over all frames together."""
     frames: int = 12
     """Training frames that seeds are lifted from, evenly over the clip."""
     opacity: float = 0.1
-    """Starting opacity of sparse points (3DGS create_from_pcd: 0.1)."""
+    """Starting opacity of points (3DGS create_from_pcd: 0.1)."""
     seed_opacity: float = 0.1
     """Starting opacity of seeds."""
     sh_degree: int = 2
@@ -51,7 +57,7 @@ def initialise(
     budget: int,
     ignored: Mapping[int, Tensor] | None = None,
 ) -> Gaussians:
-    """Gaussians from sparse points and seeds, on the CPU, where the scene is.
+    """Gaussians from points and seeds, on the CPU, where the scene is.
 
     Args:
         scene: the scene; its points [P, 3].
@@ -61,13 +67,15 @@ def initialise(
         budget: most Gaussians to start with; a random choice is kept.
         ignored: frame of the scene -> bool [H, W] which pixels of it are no part of the scene: none of them is lifted.
     """
-    points, colors = scene.points, scene.colors
+    points, colors = _known(scene, indices, min(config.surface, budget // 3), generator)
+    known = points, colors
     opacity = torch.full((len(points),), config.opacity, device="cpu")
     if config.seeds > 0:
         picked = evenly_spaced(len(indices), config.frames)
         each = min(config.seeds // len(picked), images.shape[1] * images.shape[2] // _PIXELS_PER_SEED)
         seeds = [
-            _lift_seeds(scene, images[n], indices[n], each, generator, (ignored or {}).get(indices[n])) for n in picked
+            _lift_seeds(scene, known, images[n], indices[n], each, generator, (ignored or {}).get(indices[n]))
+            for n in picked
         ]
         points = torch.cat([points, *(s[0] for s in seeds)])
         colors = torch.cat([colors, *(s[1] for s in seeds)])
@@ -109,23 +117,43 @@ def neighbour_distance(points: Tensor) -> Tensor:
     return from_numpy(np.sqrt((distances**2).mean(1))).float()
 
 
+def _known(scene: Scene, indices: list[int], most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """(points [P, 3], colours [P, 3]): the sparse ones and up to `most` of still surfaces.
+
+    None that was found in a frame that is held out, `indices` being the frames trained on; none far outside of where
+    sparse points are.
+    """
+    points, colors, frames = surface_of(scene)
+    held = {scene.frames[i] for i in scene.solved} - {scene.frames[i] for i in indices}
+    if not len(points) or not len(scene.points):
+        return scene.points, scene.colors
+    low, high = (torch.quantile(scene.points[:, None], at, dim=0)[0] for at in (_OUTLIERS, 1.0 - _OUTLIERS))
+    room = 0.5 * (high - low)
+    kept = ((points > low - room) & (points < high + room)).all(1)
+    kept &= torch.tensor([frame not in held for frame in frames], device="cpu")
+    places = kept.nonzero()[:, 0]
+    drawn = places[torch.randperm(len(places), generator=generator, device="cpu")[:most]]
+    return torch.cat([scene.points, points[drawn]]), torch.cat([scene.colors, colors[drawn]])
+
+
 def _lift_seeds(
-    scene: Scene, image: Tensor, index: int, count: int, generator: torch.Generator, ignored: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """`count` pixels of one frame, preferably far from sparse points, at a depth between their neighbours' in it.
+    scene: Scene, known: tuple[Tensor, Tensor], image: Tensor, index: int, count: int, generator: torch.Generator,
+    ignored: Tensor | None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """`count` pixels of one frame, preferably far from `known` points, at a depth between their neighbours' in it.
 
     Fewer if some of them are `ignored`, bool [H, W].
     """
     height, width = image.shape[:2]
     K = scene.camera_at(width, height)[index]
     viewmat = scene.viewmats[index]
-    camera = scene.points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    camera = known[0] @ viewmat[:3, :3].T + viewmat[:3, 3]
     in_front = camera[:, 2] > 1e-3
     pixels = (camera[:, :2] / camera[:, 2:].clamp_min(1e-3)) * K[[0, 1], [0, 1]] + K[:2, 2]
     limits = torch.tensor([width, height], device="cpu")
     seen = in_front & ((pixels >= 0) & (pixels < limits)).all(1)
     if seen.sum() < 4:
-        return scene.points[:0], scene.colors[:0]
+        return known[0][:0], known[1][:0]
     candidates = torch.rand(4 * count, 2, generator=generator, device="cpu") * limits
     distance, neighbours = (from_numpy(found) for found in nearest(pixels[seen].numpy(), candidates.numpy(), 4))
     far = distance[:, 0].argsort(descending=True, stable=True)[: 2 * count]

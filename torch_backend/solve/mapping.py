@@ -36,11 +36,10 @@ def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruc
     options.random_seed = SEED
     options.mapper.random_seed = SEED
     options.triangulation.random_seed = SEED
-    # A clip of 75 frames needs no global adjustment every 10 % of growth: 37 % less time, error unchanged (0.795 px
-    # against 0.797 px on examples/sitting.mp4).
+    # A clip of 75 frames needs no global adjustment every 10 % of growth. Each runs until it has settled, though: with
+    # two rounds of it, as with one of the local ones, a start from two frames that show little depth was kept, and a
+    # whole walk was solved wrongly at an error of 0.9 px (docs/benchmarks.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
-    options.ba_global_max_refinements = 2
-    options.ba_local_max_refinements = 1
     if request.reuse:  # it has placed frames of a try before
         options.image_names = request.solved
     if request.masks:

@@ -1,7 +1,8 @@
 """The motion matte of a shot: per delivered frame what stands still, what moves by itself, and what is not known.
 
 SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size: STILL, UNKNOWN or MOVING. motion.json beside them says
-which cameras they belong to; mattes of a solve of before are not read. What an artist paints goes before what is found:
+which cameras they belong to; mattes of a solve of before are not read, nor are the points of still surfaces that lie
+with them (`surface`). What an artist paints goes before what is found:
 SHOT/motion_paint/NNNNNN.png, which no solve touches.
 """
 
@@ -21,6 +22,8 @@ from ..contract import (
     MOTION_FILE,
     MOTION_UNFINISHED_FILE,
     PAINTED_FOLDER,
+    PICTURE,
+    SURFACE,
     ExitCode,
     JobError,
     Reporter,
@@ -29,10 +32,12 @@ from ..contract import (
 )
 from ..footage.images import is_whole_png
 from ..shot import Shot, content_key, make_folder, need_disk, write_json
-from .flow import FlowConfig
+from .flow import FlowConfig, Matches
 from .masks import IGNORE, PEOPLE, limited, load_mask, masks_key, write_grey
 from .moving import Clip, mattes
+from .still import Evidence
 from .stored import load_cameras
+from .surface import NO_SURFACE, SurfacePoints, read_surface, surface_points, write_surface
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
@@ -73,7 +78,18 @@ def find_motion(shot: Shot, report: Reporter) -> MotionResult:
     shares = np.zeros((len(files), 3))
     for n in written:
         shares[n] = _shares(_read_found(files[clip.frames[n]]))
-    for count, (n, labels) in enumerate(mattes(clip, config, written, report), start=len(written) + 1):
+
+    def keep(key: int, found: Evidence, matches: Matches) -> None:
+        """The points of a key frame's still surfaces, unless they are there."""
+        frame, sight = clip.frames[clip.keys[key]], clip.sight(key)
+        file = shot.surface(frame)
+        if sight is None or file.is_file():
+            return
+        mask = load_mask(shot, IGNORE, frame)
+        ignored = None if mask is None else cv2.resize(mask.astype(np.uint8), matches.size) > 0
+        write_surface(file, *surface_points(found, matches.grid, sight, clip.unit, ignored, frame))
+
+    for count, (n, labels) in enumerate(mattes(clip, config, written, report, keep), start=len(written) + 1):
         limited(labels, *(load_mask(shot, kind, clip.frames[n]) for kind in (IGNORE, PEOPLE)))
         write_matte(files[clip.frames[n]], labels)
         shares[n] = _shares(labels)
@@ -91,7 +107,7 @@ def _begin(folder: Path, key: str) -> None:
     if _record(folder / _RECORD).get("key") != key and _record(folder / _UNFINISHED).get("key") != key:
         for name in (_RECORD, _UNFINISHED):  # while neither is there, the mattes belong to nothing
             (folder / name).unlink(missing_ok=True)
-        for file in folder.glob("*.png"):
+        for file in (*folder.glob("*" + PICTURE), *folder.glob("*" + SURFACE)):
             file.unlink(missing_ok=True)  # another task may be at the same
     write_json(folder / _UNFINISHED, {"version": MOTION_VERSION, "key": key})
     (folder / _RECORD).unlink(missing_ok=True)
@@ -162,6 +178,11 @@ def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
     info = shot.info()
     size = (info.width, info.height) if found is None else found.shape[::-1]
     return _painted(painted, found, size)
+
+
+def load_surface(shot: Shot) -> SurfacePoints:
+    """Points of still surfaces of the solve that the shot has now; none if it was solved before they were kept."""
+    return read_surface(shot.motion) if is_found(shot) else NO_SURFACE
 
 
 def write_matte(path: Path, labels: NDArray[np.uint8]) -> None:

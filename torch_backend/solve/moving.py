@@ -6,7 +6,7 @@ through a window of a few seconds, so a clip of any length takes the same memory
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import cv2
@@ -21,7 +21,7 @@ from .fleeting import Fleeting, Other, Shades, Sight, seeded
 from .flow import FlowConfig, Map, Mask, Matches, neighbours, sample
 from .leftover import Leftover
 from .masks import IGNORE, load_mask, painted_over
-from .still import Look, StillTest, evidence
+from .still import Evidence, Look, StillTest, evidence
 from .stored import load_cameras, load_points
 
 _FLOW_WIDTH = 640
@@ -134,9 +134,13 @@ def _typical_depth(points: NDArray[Any], viewmat: NDArray[Any]) -> float:
 
 
 def mattes(
-    clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order."""
+    clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter,
+    tell: Callable[[int, Evidence, Matches], None] | None = None,
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:  # fmt: skip
+    """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order.
+
+    `tell` hears each key's evidence, before the key's matte comes.
+    """
     keys, reach = clip.keys, config.reach * config.baselines[-1]
     groups = [range(keys[k - 1] + 1 if k else 0, keys[k] + 1) for k in range(len(keys))]
     wanted = [any(n not in written for n in group) for group in groups]
@@ -153,7 +157,9 @@ def mattes(
         report.check_cancelled()
         if turn < len(keys):
             left = None if turn % _LEFT_EVERY == 0 else left
-            own[turn], left = _own_score(clip, matches, turn, config, left)
+            own[turn], left, found = _own_score(clip, matches, turn, config, left)
+            if tell is not None:
+                tell(turn, found, matches)
         key = turn - reach
         if key < max(0, first - 1) or not (wanted[key] or wanted[min(key + 1, last)]):
             continue
@@ -176,24 +182,25 @@ def mattes(
 
 def _own_score(
     clip: Clip, matches: Matches, key: int, config: FlowConfig, before: tuple[Map, Map] | None
-) -> tuple[tuple[Map, Map, Map], tuple[Map, Map]]:
-    """((score, weight, inverse), what is left): how surely a key frame's points move, 0 to 1, how much is known of
-    them, and the inverse depths of still points.
+) -> tuple[tuple[Map, Map, Map], tuple[Map, Map], Evidence]:
+    """((score, weight, inverse), what is left, evidence): how surely a key frame's points move, 0 to 1, how much is
+    known of them, and the inverse depths of still points.
 
     What is left of motion is looked for if there is none of the key `before`; else that is followed to here.
     """
     seen = neighbours(matches, key, len(clip.keys), config)
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
-    on, off, inverse = evidence(test, key, seen, clip.depths[key], config)
-    count = on + off
-    score = np.clip(off / (count + config.doubt) / config.share, 0.0, 1.0)
+    told = evidence(test, key, seen, clip.depths[key], config)
+    inverse, count = told.inverse, told.on + told.off
+    score = np.clip(told.off / (count + config.doubt) / config.share, 0.0, 1.0)
     if before is None:
         left, known = Leftover(clip.picture, test, config).score(key, len(clip.keys), inverse, clip.depths[key])
     else:
         last = next(each for each in seen if each.key == key - 1)
         left, known = (sample(values, last.at) * last.found for values in before)
     sure = np.minimum(count / config.sure, 1.0) * (count >= 1.0)
-    return (np.maximum(score, left), np.maximum(sure, known * (left > score)), inverse), (left, known)
+    own = np.maximum(score, left), np.maximum(sure, known * (left > score)), inverse
+    return own, (left, known), told
 
 
 def _followed(

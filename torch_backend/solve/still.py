@@ -22,6 +22,8 @@ _OUTLINE = 0.25
 """Depths that differ by this share are two surfaces."""
 _NEAR = 2
 """Key frames so near show the same even if one is blurred."""
+_AGREES = 1.5
+"""A match agrees with a point up to so many times the distance from which on it may tell of motion."""
 _MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
 """Square differences: above the one all are alike (hidden, or gone), by the other a point's own depth is preferred."""
 
@@ -141,8 +143,24 @@ class Pair:
         return at, x, y, np.hypot(x, y)
 
 
-def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: FlowConfig) -> tuple[Map, Map, Map]:
-    """(on, off, inverse), [h, w] float32: how much of a key's matches says still, how much moving, and 1 / depth.
+@dataclass(frozen=True)
+class Evidence:
+    """What a key frame's matches say, on the grid."""
+
+    on: Map
+    """How much of them says still,"""
+    off: Map
+    """and how much moving."""
+    inverse: Map
+    """1 / depth of the still point that explains them best, 1 / solve units."""
+    agree: Map
+    """So many of them it explains."""
+    parallax: Map
+    """Flow pixels by which one of those would move with a depth twice as near: how well the depth is known."""
+
+
+def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: FlowConfig) -> Evidence:
+    """What a key's matches say of still points.
 
     `seen` are its matches, `depth` is the typical depth in its view, solve units.
     """
@@ -162,9 +180,9 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
         agree += pair.seen.found & (length <= pair.limit)
     depths = _surroundings(inverse, agree >= 3)
     inverse = _best_depth(look, pairs, depths)
-    on, off = _counted(key, look, texture, pairs, inverse, config)
+    on, off, agree, parallax = _counted(key, look, texture, pairs, inverse, config)
     doubt = config.doubt * (1.0 + config.outline * outlines(depths[0]))
-    return on, np.maximum(off - doubt, 0.0), inverse
+    return Evidence(on, np.maximum(off - doubt, 0.0), inverse, agree, parallax)
 
 
 def outlines(inverse: Map) -> Map:
@@ -207,15 +225,19 @@ def still_points(pairs: list[Pair], start: Map, depth: float, unit: float, turns
 
 def _counted(
     key: int, look: Look, texture: Texture, pairs: list[Pair], inverse: Map, config: FlowConfig
-) -> tuple[Map, Map]:
-    """What the pairs say of still points at inverse depths, as `evidence`."""
-    on, off = np.zeros_like(inverse), np.zeros_like(inverse)
+) -> tuple[Map, Map, Map, Map]:
+    """What the pairs say of still points at inverse depths: on, off, agree and parallax, as `Evidence`."""
+    on, off, agree, parallax = (np.zeros_like(inverse) for _ in range(4))
     gone: dict[int, Mask] = {}
     for pair in pairs:
         found, after = pair.seen.found, pair.seen.key - key
         at, x, y, length = pair.miss(inverse)
         unlike = pair.other.unlike(look.grid, at, pair.gain)
         away = found & (length > pair.limit)
+        fits = found & (length <= _AGREES * pair.limit)
+        slope = pair.ray.slope(*pair.ray.project(inverse))
+        agree += fits
+        parallax = np.maximum(parallax, fits * np.hypot(*slope) * inverse)
         alike = unlike - texture.nearly < _like(unlike, found & ~away & texture.telling, config)
         within = inside(at, look.grid.shape)
         better = pair.right & (unlike > config.better * pair.matched + config.contrast**2)
@@ -231,7 +253,7 @@ def _counted(
         if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
             far = config.gone_far if step > _NEAR else 1.0  # behind something is so on one side as a rule.
             off += far * (gone[step] & gone[-step])
-    return on, off
+    return on, off, agree, parallax
 
 
 def _smoothed(values: Map, weight: Map) -> Map:

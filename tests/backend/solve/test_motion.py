@@ -22,9 +22,11 @@ from torch_backend.solve.motion import (
     find_motion,
     is_found,
     load_motion,
+    load_surface,
     motion_key,
 )
 from torch_backend.solve.moving import Clip
+from torch_backend.solve.surface import PER_KEY
 
 WIDTH, HEIGHT, FRAMES, FIRST = 192, 144, 14, 1001
 FOCAL, WALL, BOARD = 180.0, 4.0, 3.0
@@ -266,7 +268,10 @@ def test_a_killed_search_goes_on_where_it_was(swaying, tmp_path, quiet):
     assert {p: p.stat().st_mtime_ns for p in left} == before
     assert [event[2] for event in report.events if event[0] == "progress"] == list(range(len(left) + 1, FRAMES + 1))
     assert (mattes(shot) == mattes(swaying[0])).all()
-    assert {p.name for p in (shot.solve / "motion").iterdir()} == {"motion.json", *(f"{n:06d}.png" for n in NUMBERS)}
+    names = [f"{n:06d}{suffix}" for n in NUMBERS for suffix in (".png", ".npz")]  # of so few frames each is a key
+    assert {p.name for p in (shot.solve / "motion").iterdir()} == {"motion.json", *names}
+    one, other = load_surface(shot), load_surface(swaying[0])
+    assert (one.xyz == other.xyz).all() and (one.frames == other.frames).all()
 
 
 def test_a_shot_without_cameras_says_so(tmp_path, quiet):
@@ -274,6 +279,82 @@ def test_a_shot_without_cameras_says_so(tmp_path, quiet):
     with pytest.raises(JobError, match="has no cameras yet"):
         find_motion(shot, quiet())
     assert load_motion(shot, 1) is None
+
+
+# ------------------------------------------------------------------------------------------ points of what stands still
+
+
+def seen_at(shot: Shot, number: int, xyz: np.ndarray) -> np.ndarray:
+    """[S, 2] int64, pixels (x, y) of a frame in which points are seen."""
+    camera = next(c for c in CameraPath.load(shot.solve / "cameras.json").frames if c.frame == number)
+    local = xyz - -np.array(camera.viewmat).reshape(4, 4)[:3, 3]
+    return np.floor(FOCAL * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]).astype(int)
+
+
+def test_points_of_a_still_world_lie_on_its_surfaces_and_cover_them(tmp_path, quiet):
+    shot, board = build(tmp_path)
+    find_motion(shot, quiet())
+    found = load_surface(shot)
+    assert set(found.frames) == set(NUMBERS) and found.rgb.dtype == np.uint8
+    for n in (2, 7, 11):
+        of = found.frames == NUMBERS[n]
+        xyz = found.xyz[of]
+        x, y = seen_at(shot, NUMBERS[n], xyz).T
+        assert 500 < len(xyz) <= PER_KEY and ((x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)).all()
+        near, far = inner(board)[n][y, x], ~grown(board, 4)[n][y, x]
+        assert near.sum() > 30 and far.sum() > 300
+        assert np.median(np.abs(xyz[near, 2] - BOARD)) < 0.03 and np.median(np.abs(xyz[far, 2] - WALL)) < 0.04
+        assert np.quantile(np.abs(xyz[far, 2] - WALL), 0.95) < 0.2
+        tiles = np.unique(np.stack([x // 24, y // 24]), axis=1).shape[1]
+        assert tiles > 0.7 * (WIDTH // 24) * (HEIGHT // 24)
+        plate = read_png(shot.plate(NUMBERS[n]))[y, x].astype(int)
+        assert np.abs(plate - found.rgb[of]).mean() < 8
+
+
+def test_what_moves_gives_no_points_but_few(swaying):
+    shot, board, _ = swaying
+    found = load_surface(shot)
+    on = []
+    for n in range(3, 11):
+        x, y = seen_at(shot, NUMBERS[n], found.xyz[found.frames == NUMBERS[n]]).T
+        on.append(inner(board)[n][y, x].mean() / inner(board)[n].mean())
+    assert np.mean(on) < 0.35  # of as many as there are elsewhere
+
+
+def test_a_camera_that_stands_still_gives_no_points(tmp_path, quiet):
+    shot, _ = build(tmp_path, travel=0.0)
+    find_motion(shot, quiet())
+    assert not len(load_surface(shot).xyz)
+
+
+def test_what_is_ignored_gives_no_points(tmp_path, quiet):
+    shot, _ = build(tmp_path)
+    covered = np.zeros((HEIGHT, WIDTH), np.uint8)
+    covered[:, : WIDTH // 2] = 255
+    for number in NUMBERS:
+        path = shot.mask("ignore", number)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(cv2.imencode(".png", covered)[1].tobytes())
+    write_json(shot.solve / "solve.json", {"version": 1, "masks": {"ignore": {"key": "half"}}})
+    find_motion(shot, quiet())
+    found = load_surface(shot)
+    x = np.concatenate([seen_at(shot, n, found.xyz[found.frames == n])[:, 0] for n in NUMBERS])
+    assert len(x) > 2000 and (x >= WIDTH // 2 - 2).all()
+
+
+def test_points_go_with_the_mattes_and_a_damaged_file_is_done_without(swaying, tmp_path, quiet):
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    whole = load_surface(shot)
+    shot.surface(NUMBERS[3]).write_bytes(b"PK not a file of arrays")
+    left = load_surface(shot)
+    assert set(whole.frames) - set(left.frames) == {NUMBERS[3]}
+    assert (left.xyz == whole.xyz[whole.frames != NUMBERS[3]]).all()
+    path = CameraPath.load(shot.solve / "cameras.json")
+    path.frames[0].K[0] += 1.0
+    write_json(shot.solve / "cameras.json", path.to_json())
+    assert not len(load_surface(shot).xyz)  # other cameras: they say nothing now
+    find_motion(shot, quiet())
+    assert len(load_surface(shot).xyz) > 2000 and set(load_surface(shot).frames) == set(NUMBERS)
 
 
 # ------------------------------------------------------------------------------------------------- what artists paint

@@ -1,0 +1,99 @@
+"""Points of the surfaces that stand still, as dense as the pictures let: what the search for motion finds on its way.
+
+A wall, a jacket, a dark trouser leg hardly have a sparse point, so training would have nothing there to start from but
+a guess. The search for motion knows the depth of most of their pixels: the still point that explains their matches.
+What several matches agree on, under enough parallax, is kept by key frame beside the mattes, with which it comes and
+goes: SHOT/solve/motion/NNNNNN.npz.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contract import SURFACE, atomic_path, frame_number, open_regular
+from .fleeting import Sight
+from .flow import Map, Mask
+from .still import Evidence
+
+LEAST_AGREEING = 3
+"""Matches that have to agree on a point."""
+LEAST_PARALLAX = 5.0
+"""Pixels of a picture 640 wide by which its place in another frame would differ if it were twice as near: an error of
+one moves it by at most a fifth of its depth."""
+MOST_OFF = 0.5
+"""Of the evidence that it stands still, how much may say that it moves."""
+PER_KEY = 2048
+"""Points kept of a key frame, at most."""
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points of still surfaces, [S]."""
+
+    xyz: NDArray[np.float32]
+    """[S, 3] solve units."""
+    rgb: NDArray[np.uint8]
+    """[S, 3] as the working frames show them."""
+    frames: NDArray[np.int64]
+    """[S] key frame in which each was found."""
+
+
+NO_SURFACE = SurfacePoints(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
+
+
+def surface_points(
+    found: Evidence, grid: tuple[Map, Map], sight: Sight, unit: float, ignored: Mask | None, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """(xyz [S, 3] solve units, rgb [S, 3]) of up to `PER_KEY` points of a key frame, drawn evenly over its picture.
+
+    Args:
+        found: of the key frame, on the grid [h, w].
+        grid: positions x and y of the grid's points in flow pixels.
+        sight: its colours and camera.
+        unit: flow pixels in one pixel of a picture 640 wide.
+        ignored: [h, w] what is no part of the scene.
+        seed: of the draw.
+    """
+    known = (found.agree >= LEAST_AGREEING) & (found.parallax >= LEAST_PARALLAX * unit) & (found.inverse > 1e-6)
+    known &= found.off <= MOST_OFF * found.on
+    if ignored is not None:
+        known &= ~ignored
+    places = np.flatnonzero(known)
+    if len(places) > PER_KEY:
+        places = np.sort(np.random.default_rng(seed).choice(places, PER_KEY, replace=False))
+    x, y, inverse = (plane.reshape(-1)[places].astype(np.float64) for plane in (*grid, found.inverse))
+    z, K, V = 1.0 / inverse, sight.K, sight.viewmat
+    local = np.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], axis=1)
+    xyz = (local - V[:3, 3]) @ V[:3, :3]
+    return xyz.astype(np.float32), sight.shades.colors.reshape(-1, 3)[places]
+
+
+def write_surface(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) -> None:
+    """Keeps the points of a key frame, whole or not at all."""
+    with atomic_path(path) as half, half.open("wb") as handle:
+        np.savez(handle, xyz=xyz, rgb=rgb)
+
+
+def read_surface(folder: Path) -> SurfacePoints:
+    """All points that a folder of mattes holds. A file that is damaged is left out: training can do without."""
+    parts: list[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]] = []
+    for path in sorted(folder.glob("*" + SURFACE)):
+        frame = frame_number(path.stem)
+        if frame is None:
+            continue
+        try:
+            with open_regular(path) as handle, np.load(handle, allow_pickle=False) as data:
+                xyz, rgb = data["xyz"], data["rgb"]
+        except Exception:  # zipfile, zlib and numpy raise a dozen kinds
+            continue
+        whole = xyz.dtype == np.float32 and rgb.dtype == np.uint8 and xyz.shape == rgb.shape == (len(xyz), 3)
+        if whole and np.isfinite(xyz).all():
+            parts.append((xyz, rgb, np.full(len(xyz), frame, np.int64)))
+    if not parts:
+        return NO_SURFACE
+    xyz, rgb, frames = zip(*parts, strict=True)
+    return SurfacePoints(np.concatenate(xyz), np.concatenate(rgb), np.concatenate(frames))
