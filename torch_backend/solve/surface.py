@@ -85,15 +85,21 @@ def read_surface(folder: Path) -> SurfacePoints:
         frame = frame_number(path.stem)
         if frame is None:
             continue
-        try:
-            with open_regular(path) as handle, np.load(handle, allow_pickle=False) as data:
-                xyz, rgb = data["xyz"], data["rgb"]
-        except Exception:  # zipfile, zlib and numpy raise a dozen kinds
-            continue
-        whole = xyz.dtype == np.float32 and rgb.dtype == np.uint8 and xyz.shape == rgb.shape == (len(xyz), 3)
-        if whole and np.isfinite(xyz).all():
-            parts.append((xyz, rgb, np.full(len(xyz), frame, np.int64)))
+        arrays = _arrays(path)
+        if arrays is not None:
+            parts.append((*arrays, np.full(len(arrays[0]), frame, np.int64)))
     if not parts:
         return NO_SURFACE
     xyz, rgb, frames = zip(*parts, strict=True)
     return SurfacePoints(np.concatenate(xyz), np.concatenate(rgb), np.concatenate(frames))
+
+
+def _arrays(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
+    """(xyz, rgb) of a file; None if they cannot be read, or are not what was written."""
+    try:
+        with open_regular(path) as handle, np.load(handle, allow_pickle=False) as data:
+            xyz, rgb = data["xyz"], data["rgb"]
+    except Exception:  # zipfile, zlib and numpy raise a dozen kinds
+        return None
+    whole = xyz.dtype == np.float32 and rgb.dtype == np.uint8 and xyz.shape == rgb.shape == (len(xyz), 3)
+    return (xyz, rgb) if whole and np.isfinite(xyz).all() else None
