@@ -60,6 +60,9 @@ class DetailConfig:
     beside: tuple[float, float] = (10.0, 20.0)
     """Degrees by which plate t* may see it from another side: up to the first it is believed, from the second on not;
     from further round it shows what is turned away."""
+    coarser: tuple[float, float] = (1.5, 2.5)
+    """Times as large as in plate t* may a frame see it: up to the first that plate is believed, from the second on not.
+    A face of six pixels is none of sixty."""
     returns: float = 2.0
     """Pixels from which what plate t* has at the place of a point is seen by the frame, at most: then it shows that
     point, though their depths differ."""

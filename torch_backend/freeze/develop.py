@@ -2,8 +2,9 @@
 
 The field has to explain a whole clip; a freeze needs one instant of it. So the frozen Gaussians, with what plate t*
 shows and the field lost (`missing_layer.py`), become parameters of their own. Still pixels are learnt from all trained
-frames, in each of which what moves stands where the field has it; what moves at t* is learnt from plate t* alone. The
-pictures are larger than those of a preview run, so the frozen scene becomes sharper than the run.
+frames, in each of which what moves stands where the field has it; what moves at t* is learnt from plate t* alone. Of
+what that sees from much farther than others do, it teaches nothing: a face of six pixels is right from there with its
+eyes anywhere. The pictures are larger than those of a preview run, so the frozen scene becomes sharper than the run.
 
 Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/benchmarks.md, "Developed instants").
 """
@@ -23,6 +24,7 @@ from ..train.adam import FusedAdam
 from ..train.average import ParameterMean
 from ..train.losses import photometric
 from ..train.model import render
+from .from_afar import seen_from_afar
 from .frozen import FrozenGaussians
 from .sightings import MovingOf
 from .travel import Travel
@@ -49,6 +51,11 @@ class DevelopConfig:
     half a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it."""
     instant_share: float = 0.1
     """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training."""
+    afar: float = 2.0
+    """Plate t* teaches nothing of what it sees from more than so many times as far as some trained frame does."""
+    looks: int = 12
+    """Frames, at most, that are asked whether such a thing moves: then nothing of it is learnt, for they show it at
+    other times."""
     margin: int = 2
     """Pixels of pictures 640 wide around what moves that are left out with it."""
     dssim: float = 0.2
@@ -89,7 +96,7 @@ def develop(
     """Trains a frozen scene on as the static scene that it is.
 
     Returns what became of it; or the scene as it was, if frames that were left out gained nothing where nothing moves,
-    or plate t* did not: a run that is as sharp as the pictures already is better left alone.
+    or plate t* lost: a run that is as sharp as the pictures already is better left alone.
 
     Args:
         frozen: the run's scene at t*, and behind its Gaussians those of an instant's layer, if it has one.
@@ -121,6 +128,12 @@ class _Darkroom:
         self.optimizer = self._optimizer()
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
         self.mover[len(run.model.gaussians) :] = 1.0
+        self.afar = torch.zeros_like(self.mover)
+        means = frozen.state["means"][: len(run.model.gaussians)]
+        self.afar[: len(means)] = seen_from_afar(run, scene, means, t_star, config.afar).float()
+        moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in spread(self.frames, config.looks)])
+        opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
+        self.held = ((self.afar * opened > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
 
     def run(self, check: Check | None) -> FrozenGaussians:
         """All steps, and the judgement."""
@@ -146,7 +159,7 @@ class _Darkroom:
                 mean.add(self.params)
         mean.put_into(self.params)
         after = self._judged()
-        if after[0] < before[0] + self.config.gain or after[1] <= before[1]:
+        if after[0] < before[0] + self.config.gain or after[1] < before[1]:
             state = dict(self.frozen.state)
         else:
             state = {name: p.detach() for name, p in self.params.items()}
@@ -170,9 +183,14 @@ class _Darkroom:
         shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
         target = torch.where(learnt[..., None], self.plates.picture(frame), shown.detach())
         loss = photometric(shown, target, self.config.dssim)
-        total = loss + self.config.opacity_weight * torch.sigmoid(self.params["opacity_logits"]).mean()
+        # What may be taught by no frame would only fade.
+        shares = torch.sigmoid(self.params["opacity_logits"]) * (1.0 - self.afar)
+        total = loss + self.config.opacity_weight * shares.mean()
         self.optimizer.zero_grad(set_to_none=True)
         backward(total)
+        for parameter in self.params.values():
+            if parameter.grad is not None:
+                parameter.grad[self.held] = 0.0
         self.optimizer.step(guard=[total])
 
     def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -181,21 +199,22 @@ class _Darkroom:
         What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         """
         background = torch.full((3,), 0.5, device=self.device) if background is None else background
+        marks = torch.stack([self.mover, self.afar], dim=1)
         state = self.travel.moved(dict(self.params), frame)
         out = render(
             state, self.frozen.sh_degree, *self.plates.camera(frame),
-            background=torch.cat([background, background.new_zeros(1)]), colors=self.mover[:, None],
+            background=torch.cat([background, background.new_zeros(2)]), colors=marks,
             with_contributions=False,
         )  # fmt: skip
         shown = self.trained.model.exposure.apply(out.colors[0, ..., :3], self.scene.time_of_frame(frame))
-        return shown, self._learnt(frame, out.colors[0, ..., 3].detach())
+        return shown, self._learnt(frame, *out.colors[0, ..., 3:].detach().unbind(-1))
 
-    def _learnt(self, frame: int, mover: Tensor) -> Tensor:
+    def _learnt(self, frame: int, mover: Tensor, afar: Tensor) -> Tensor:
         """bool [H, W]: which pixels of a frame say what the frozen scene should show there."""
         matte, ignored = self.plates.matte(frame), self.plates.ignored(frame)
         learnt = (matte < 0.5) & (mover < 0.1)
         if frame in self.instants:
-            learnt = torch.ones_like(learnt)
+            learnt = learnt | (afar < 0.5)
         return learnt if ignored is None else learnt & ~ignored
 
     def _optimizer(self) -> FusedAdam:

@@ -32,7 +32,7 @@ class InstantView:
     sighting: Sighting
     """How plate t* shows them."""
     near: Tensor
-    """In 0..1: how far it is believed, by the angle between the two views."""
+    """In 0..1: how far it is believed, by the angle between the two views, and by how much larger the frame sees it."""
     picture: Tensor
     """[h, w, 3] plate t* itself, display-referred, as it was exposed."""
     gain: Tensor
@@ -57,8 +57,10 @@ def instant_view(sightings: Sightings, config: DetailConfig, posed: PosedFrame) 
     sighting = sightings.seen(posed.t, points)
     visible = torch.maximum(sighting.visible, _returns(sightings, config, posed, sighting))
     sighting = replace(sighting, visible=visible)
-    picture = sightings.view(posed.t).picture.float()
-    return InstantView(depth, points, sighting, _nearness(config, angle), picture, *exposed(sightings, posed, posed.t))
+    view, (h, w) = sightings.view(posed.t), depth.shape
+    larger = (sighting.depth / view.K[0, 0]) / (depth / _camera(posed, w, h)[0, 0]).clamp_min(1e-6)
+    near = _fading(config.beside, angle) * _fading(config.coarser, larger)
+    return InstantView(depth, points, sighting, near, view.picture.float(), *exposed(sightings, posed, posed.t))
 
 
 def bridged(places: Tensor, seen: Tensor, sigma: float, unsteady: float) -> tuple[Tensor, Tensor]:
@@ -112,10 +114,10 @@ def _returns(sightings: Sightings, config: DetailConfig, posed: PosedFrame, sigh
     return returns if view.ignored is None else returns * (1.0 - look_up(view.ignored, sighting.pixels)[..., 0])
 
 
-def _nearness(config: DetailConfig, beside: Tensor) -> Tensor:
-    """[...] in 0..1: how far plate t* is believed about what it sees from so many degrees aside."""
-    first, last = config.beside
-    return ((last - beside) / max(last - first, 1e-6)).clamp(0.0, 1.0)
+def _fading(between: tuple[float, float], value: Tensor) -> Tensor:
+    """[...] 1 up to the first of two values, 0 from the last on."""
+    first, last = between
+    return ((last - value) / max(last - first, 1e-6)).clamp(0.0, 1.0)
 
 
 def _angle(points: Tensor, first: Tensor, second: Tensor) -> Tensor:

@@ -9,6 +9,9 @@ t*, by more than a third of that. It is asked of neighbours together: errors are
 it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call still, a mean is
 always nearer. They miss whole arms, too. So of what went farther than a sway, what the run shows at a plate's own time
 better than the twin counts against the twin: that plate says nothing of t*.
+
+Of what t* sees from afar its plate cannot say how it looks: a face of six pixels fits it with its eyes anywhere. Plates
+that see such a thing from near are asked with all of its pixels, whether they move or not.
 """
 
 from __future__ import annotations
@@ -52,6 +55,8 @@ class TwinConfig:
     sways: float = 4.0
     """Pixels of pictures 640 wide from t* to a plate from which on a Gaussian does not only sway: what the run at that
     plate's time shows better than the twin then counts. Held-still people sway by less; their mean is as good."""
+    nearer: float = 0.5
+    """A plate sees a Gaussian from near if its distance is at most so much of that at t*."""
     rounds: int = 2
     """Comparisons: what stays open is held against the twin again without what was closed."""
 
@@ -80,7 +85,7 @@ def settled(
         if not len(left):
             break
         twin = held_still(run, frozen, left)
-        pair = _Pair(run, plates, frozen, twin, left, movers, config.sways * plates.width / 640)
+        pair = _Pair(run, plates, frozen, twin, left, movers, t_star, config)
         near = _nearest(frozen.state["means"][left], config.neighbours)
         gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
         least = torch.where(movers[left] > 0.5, harm, config.doubted * harm)
@@ -106,10 +111,13 @@ class _Pair:
 
     def __init__(
         self, run: LoadedRun, plates: WorkingPlates, frozen: FrozenGaussians, twin: FrozenGaussians, rows: Tensor,
-        movers: Tensor, sways: float,
+        movers: Tensor, t_star: int, config: TwinConfig,
     ) -> None:  # fmt: skip
-        """`sways`: pixels of the plates, as `TwinConfig.sways`."""
-        self.sways = sways
+        self.sways = config.sways * plates.width / 640
+        """Pixels of the plates."""
+        places = frozen.state["means"][rows]
+        self.from_near = config.nearer * norm(places - plates.centre(t_star), -1)
+        """[M] distance up to which a plate sees each of the rows from near."""
         self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, twin)
         self.marks = torch.stack([torch.zeros_like(movers).index_fill(0, rows, 1.0), movers], dim=1)
 
@@ -117,8 +125,9 @@ class _Pair:
         """[M]: squared error of the scene over that of its twin, in pixels, for the mean frame that sees a Gaussian.
 
         A pixel's difference is shared by the Gaussians that paint it in either; each is given the mean of those `near`
-        [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*; and what the twin's error
-        there exceeds that of the run at the frame's own time by is subtracted for what went farther than a sway.
+        [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*, unless the plate sees the
+        Gaussian from near; and what the twin's error there exceeds that of the run at the frame's own time by is
+        subtracted for what went farther than a sway.
         """
         sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
         for frame in frames:
@@ -130,27 +139,32 @@ class _Pair:
     def _blamed(self, frame: int, still: bool) -> Tensor:
         """[M, 2]: how much worse a frame is for each of the rows, and how many pixels it sees of it."""
         camera, plate = self.plates.camera(frame), self.plates.picture(frame)
-        errors: list[Tensor] = []
-        paints: list[Tensor] = []
-        counts = self.plates.matte(frame) < 0.5 if still else torch.ones(plate.shape[:2], device=plate.device) > 0
         ignored = self.plates.ignored(frame)
-        counts = counts if ignored is None else counts & ~ignored
-        for scene in self.scenes:
-            picture, marks = self._shown(scene, frame)
-            errors.append((picture - plate).square().mean(-1))
-            paints.append(marks[..., 0])
-            counts &= (marks[..., 1] < 0.1) | (not still)
-        share = counts / (paints[0] + paints[1]).clamp_min(1e-2)
-        weights = [(errors[0] - errors[1]) * share, counts.float()]
+        whole = torch.ones(plate.shape[:2], device=plate.device) > 0 if ignored is None else ~ignored
+        shown = [self._shown(scene, frame) for scene in self.scenes]
+        ours, twins = ((picture - plate).square().mean(-1) for picture, _ in shown)
+        paint = (shown[0][1][..., 0] + shown[1][1][..., 0]).clamp_min(1e-2)
+        masks = [whole]
+        if still:
+            rests = whole & (self.plates.matte(frame) < 0.5)
+            for _, marks in shown:
+                rests = rests & (marks[..., 1] < 0.1)
+            masks.append(rests)
+        own = torch.zeros_like(ours)
         then = freeze_at(self.run.model, self.plates.scene.time_of_frame(frame), 1.0) if still else None
         if then is not None:
-            own = (self._shown(then, frame)[0] - plate).square().mean(-1)
-            weights.append((errors[1] - own).clamp_min(0.0) * share)
-        stacked = torch.stack(weights, dim=-1)
-        ours, twins = (gathered(scene.state, *camera, stacked)[self.rows] for scene in self.scenes)
-        told = ours + twins
-        if then is not None:
-            told[:, 0] -= told[:, 2] * (self._travel(then, frame) > self.sways)
+            own = (twins - (self._shown(then, frame)[0] - plate).square().mean(-1)).clamp_min(0.0)
+        stacked = torch.cat(
+            [torch.stack([(ours - twins) * mask / paint, mask.float(), own * mask / paint], dim=-1) for mask in masks],
+            dim=-1,
+        )
+        first, second = (gathered(scene.state, *camera, stacked)[self.rows] for scene in self.scenes)
+        told = (first + second).reshape(len(self.rows), len(masks), 3)
+        if then is None:
+            return told[:, 0, :2]
+        near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), -1) <= self.from_near
+        told = torch.where(near[:, None], told[:, 0], told[:, 1])
+        told[:, 0] -= told[:, 2] * (self._travel(then, frame) > self.sways)
         return told[:, :2]
 
     def _travel(self, then: FrozenGaussians, frame: int) -> Tensor:

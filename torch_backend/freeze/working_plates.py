@@ -37,6 +37,11 @@ class WorkingPlates:
         i = self.index[frame]
         return self._viewmats[i], self._Ks[i], self.width, self.height
 
+    def centre(self, frame: int) -> Tensor:
+        """[3] where a frame's camera is, scene units."""
+        viewmat = self._viewmats[self.index[frame]]
+        return -viewmat[:3, :3].T @ viewmat[:3, 3]
+
     def picture(self, frame: int) -> Tensor:
         """[H, W, 3] in 0..1 of the scene's display."""
         if frame not in self._pictures:

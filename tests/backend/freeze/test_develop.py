@@ -21,10 +21,11 @@ from torch_backend.freeze.developed_instants import (
     load_developed,
 )
 from torch_backend.freeze.exr import read_key
+from torch_backend.freeze.from_afar import seen_from_afar
 from torch_backend.freeze.frozen import render_frozen, span_of
 from torch_backend.freeze.missing_layer import instant_layer, join
 from torch_backend.freeze.sightings import motion_mattes
-from torch_backend.freeze.static_twin import held_still, settled
+from torch_backend.freeze.static_twin import TwinConfig, held_still, settled
 from torch_backend.freeze.travel import Stage, Travel
 from torch_backend.live import LiveSession
 from torch_backend.scene import load_scene
@@ -142,6 +143,57 @@ def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(tra
     was_moving, was_still = scores(world, run, scene, torn)
     assert ours[1] > was_still + 2.0 and ours[1] > twins[1] - 0.05, "no worse than static where nothing moves"
     assert ours[0] > was_moving - 0.1 and ours[0] > twins[0] + 1.0 and bool(stays.any())
+
+
+def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(trained):
+    """In tatters at t*, and mattes call all of it moving: no still pixel says anything against it."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen = field(run, scene)
+    wall = torch.arange(len(frozen.support))[frozen.motion < 0.5]
+    wall = wall[frozen.state["means"][wall, 0] > frozen.state["means"][wall, 0].median()]
+    run.model.gaussians.open[wall] = True
+    torn = dataclasses.replace(frozen, motion=frozen.motion.index_fill(0, wall, 1.0), state=dict(frozen.state))
+    torn.state["opacity_logits"] = frozen.state["opacity_logits"].clone()
+    torn.state["opacity_logits"][wall] -= 1.5
+    closed = []
+    for nearer in (0.0, 1e9):  # no plate sees it from near, every one does
+        moving = lambda frame: torch.ones(scene.height, scene.width)  # noqa: E731
+        mended = settled(run, scene, torn, T_STAR, moving, TwinConfig(nearer=nearer))
+        closed.append(float((mended.motion[wall] < 0.5).float().mean()))
+    assert closed[0] == 0.0 and closed[1] > 0.8
+
+
+def test_what_is_seen_from_afar(trained):
+    """Only what some frame saw from less than half as far counts, and only from frames that saw it."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    centres = -(scene.viewmats[:, :3, :3].mT @ scene.viewmats[:, :3, 3:])[..., 0]
+    first, last = (scene.frames.index(run.train_frames[n]) for n in (0, -1))
+    support = run.model.gaussians.support
+    support[:4] = False
+    support[0, -1] = support[2, 0] = support[3, 0] = support[3, -1] = True
+    near_last = centres[last] + 0.1 * (centres[last] - centres[first])
+    means = near_last.repeat(4, 1)
+    found = seen_from_afar(run, scene, means, scene.frames[first], 2.0)
+    assert found.tolist() == [True, False, False, True]
+    assert not seen_from_afar(run, scene, means, scene.frames[last], 2.0).any()
+    assert seen_from_afar(run, scene, means, scene.frames[first], 20.0).tolist() == [False] * 4
+
+
+def test_of_what_t_star_sees_from_afar_nothing_is_learnt_where_it_moves(trained):
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen, rows, mattes = field(run, scene), run.model.open_rows(), motion_mattes(world.shot)
+    config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005)
+    made = develop(run, scene, frozen, T_STAR, mattes, config)
+    changed = (made.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
+    afar = seen_from_afar(run, scene, frozen.state["means"], T_STAR, 1.005)
+    far, near = rows[afar[rows]], rows[~afar[rows]]
+    assert len(far) > 8 and len(near) > 8, "or the test says nothing"
+    assert float(changed[near].float().mean()) > 0.9
+    assert float(changed[far].float().mean()) < 0.3, "those that no matte calls moving"
+    assert float(changed[frozen.motion < 0.5].float().mean()) > 0.9, "others show it as it is, too"
 
 
 def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(trained):

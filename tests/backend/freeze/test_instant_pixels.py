@@ -50,6 +50,15 @@ def test_splats_that_fall_apart_seen_from_elsewhere_give_way_to_the_plate_of_the
     assert off(good.color, truth, ~widened(on, 12)) == off(whole.color, truth, ~widened(on, 12))
 
 
+def test_a_plate_that_shows_it_much_smaller_does_not_stand_for_it(world):
+    """This frame sees the board no larger than plate t* does: by less than that it would be believed no more."""
+    (usual, truth, on), (never, _, _) = (
+        delivered(world, config, lambda color: color * 0.5) for config in (SHARP, replace(SHARP, coarser=(0.2, 0.4)))
+    )
+    inner = ~widened(~on, 8)
+    assert off(usual.color, truth, inner) < 0.2 * off(never.color, truth, inner)
+
+
 def test_a_second_nose_that_no_low_pass_sees_gives_way_as_well(world):
     """Splats of a face are double from aside: no more than that, so no region of them has fallen apart."""
 

@@ -1,0 +1,142 @@
+"""Our frozen frames beside those that somebody else published of the same clip. `python -m benchmarks.published ...`
+
+The authors of the Splannequin paper show, on the page of their user study, clips of the Mannequin Challenge, and each
+frozen at one instant by several methods: one frozen frame per frame of the clip, seen by that frame's camera. A shot
+imported from the same clip has a camera for the same frames, so a take of it at the same instant can be held beside
+them. Their videos are not ours to distribute: docs/benchmarks.md says where they are.
+
+    python -m benchmarks.published SHOT TAKE CLIP VIDEO [VIDEO ...] [--half right] [--results FILE]
+
+SHOT is solved from CLIP, TAKE is a take of it, every VIDEO has a frame for each of CLIP's (with --half, one half of its
+width does). For the take's frames, for the take, its splats alone, and each video, the mean of
+
+* whole, best 90 %: PSNR in dB against the clip's own frame. A frozen frame should be that frame wherever nothing moves;
+  the worst tenth of the pixels is left to what does. The take is compared as it was solved, without its lens, a video
+  as it is: each with what its method saw.
+* gradient: mean length of the gradient over that of the clip's frame. 1 is as sharp as the plate.
+
+A method that handed the clip back would be perfect here: whether what moves stands as it stood at the instant has to be
+looked at. (The share of pixels that move against the cameras was tried for that: in every eighth frame the flow's noise
+hides it.)
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_backend.contract import JobError
+from torch_backend.footage import load_frames
+from torch_backend.footage.display import display_of
+from torch_backend.footage.images import read_png
+from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
+from torch_backend.shot import Shot, write_json
+from torch_backend.solve.stored import load_cameras
+from torch_backend.torch_types import from_numpy
+
+Picture = NDArray[np.uint8]
+"""[H, W, 3]."""
+FIGURES = ("whole", "best_90", "gradient")
+
+
+def video_frames(path: Path, wanted: Sequence[int], size: tuple[int, int], half: str = "") -> Iterator[Picture]:
+    """Frames of a video by their place in it, ascending, each at `size` (width, height)."""
+    with av.open(str(path)) as video:
+        left = list(wanted)
+        for place, frame in enumerate(video.decode(video=0)):
+            if left and place == left[0]:
+                left.pop(0)
+                pixels = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+                middle = pixels.shape[1] // 2
+                pixels = pixels[:, middle:] if half == "right" else pixels[:, :middle] if half == "left" else pixels
+                yield fitted(np.ascontiguousarray(pixels), size)
+    if left:
+        raise JobError(f"{path} has no frame {left[0]}.", "It should have a frame for each of the clip's.")
+
+
+def fitted(pixels: Picture, size: tuple[int, int]) -> Picture:
+    """A picture at another size."""
+    if pixels.shape[1::-1] == size:
+        return pixels
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def compared(picture: Picture, plate: Picture) -> dict[str, float]:
+    """`FIGURES` of a frozen frame beside the plate of its pose."""
+    one, other = (from_numpy(p).float() / 255.0 for p in (picture, plate))
+    return {
+        "whole": psnr_of(float((one - other).double().square().mean())),
+        "best_90": best_share_psnr(one, other),
+        "gradient": gradient_magnitude(one) / max(gradient_magnitude(other), 1e-9),
+    }
+
+
+def judged(shot: Shot, take: str, clip: Path, videos: Sequence[Path], half: str) -> dict[str, dict[str, float]]:
+    """Name -> mean of `FIGURES` over the take's frames: of the take, of its splats alone, and of each video."""
+    files = sorted(path for path in (shot.takes / take).glob("*.exr") if path.stem.isdigit())
+    frames = [int(path.stem) for path in files]
+    if not frames:
+        raise JobError(f"{shot.root.name} has no frames of a take {take!r}.", "Freeze it first.")
+    delivered = [int(row["frame"]) for row in load_frames(shot)["frames"]]
+    places = [delivered.index(frame) for frame in frames]
+    path, display = load_cameras(shot), display_of(load_frames(shot))
+    size = path.width, path.height
+
+    def ours(splats: bool) -> Iterator[Picture]:
+        for file in files:
+            frame = read_frozen_exr(file)
+            if splats and frame.detail is None:
+                raise JobError(f"{file} has no splats alone.", "Freeze with detail on.")
+            light = frame.detail.splat if splats and frame.detail is not None else frame.rgba
+            shown = display.from_light(np.asarray(light, np.float32)[..., :3])
+            yield fitted(np.rint(np.clip(shown, 0.0, 1.0) * 255.0).astype(np.uint8), size)
+
+    def plates() -> Iterator[Picture]:
+        for frame in frames:
+            pixels = read_png(shot.plate(frame))
+            yield fitted(pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8), size)
+
+    pairs = {"take": (ours(splats=False), plates()), "splats": (ours(splats=True), plates())}
+    for file in videos:
+        truth = video_frames(clip, places, size, "left" if clip == file else "")
+        pairs[file.stem] = video_frames(file, places, size, half), truth
+    found: dict[str, dict[str, float]] = {}
+    for name, (pictures, truth) in pairs.items():
+        rows = [compared(*pair) for pair in zip(pictures, truth, strict=True)]
+        found[name] = {figure: statistics.fmean(row[figure] for row in rows) for figure in FIGURES}
+    return found
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints a row for the take, its splats and each video."""
+    parser = argparse.ArgumentParser(description="Our frozen frames beside published ones of the same clip.")
+    parser.add_argument("shot", type=Path)
+    parser.add_argument("take")
+    parser.add_argument("clip", type=Path, help="the video that the shot was imported from")
+    parser.add_argument("videos", type=Path, nargs="+", help="frozen frames of it, one for each of its frames")
+    parser.add_argument("--half", choices=("left", "right"), default="", help="where in the videos the frozen frame is")
+    parser.add_argument("--results", type=Path, help="JSON file of the figures")
+    args = parser.parse_args(argv)
+    try:
+        found = judged(Shot.open(args.shot), args.take, args.clip, args.videos, args.half)
+    except (JobError, FileNotFoundError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    for name, row in found.items():
+        print(f"{name}: " + ", ".join(f"{figure} {value:.4f}" for figure, value in row.items()))
+    if args.results:
+        write_json(args.results, {"version": 1, "figures": found})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
