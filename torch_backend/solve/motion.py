@@ -32,12 +32,12 @@ from ..contract import (
 )
 from ..footage.images import is_whole_png
 from ..shot import Shot, content_key, make_folder, need_disk, write_json
-from .flow import FlowConfig, Matches
+from .flow import FlowConfig, Map
 from .masks import IGNORE, PEOPLE, limited, load_mask, masks_key, write_grey
 from .moving import Clip, mattes
 from .still import Evidence
 from .stored import load_cameras
-from .surface import NO_SURFACE, SurfacePoints, read_surface, surface_points, write_surface
+from .surface import AWAY, NO_SURFACE, KeyEvidence, SurfacePoints, read_surface, surface_points, write_surface
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
@@ -79,18 +79,20 @@ def find_motion(shot: Shot, report: Reporter) -> MotionResult:
     for n in written:
         shares[n] = _shares(_read_found(files[clip.frames[n]]))
 
-    def keep(key: int, found: Evidence, matches: Matches) -> None:
-        """The points of a key frame's still surfaces, unless they are there."""
-        frame, sight = clip.frames[clip.keys[key]], clip.sight(key)
-        file = shot.surface(frame)
-        if sight is None or file.is_file():
-            return
-        mask = load_mask(shot, IGNORE, frame)
-        ignored = None if mask is None else cv2.resize(mask.astype(np.uint8), matches.size) > 0
-        write_surface(file, *surface_points(found, matches.grid, sight, clip.unit, ignored, frame))
+    told: dict[int, KeyEvidence] = {}
+    """By frame index: of the key frames whose mattes are to come."""
 
-    for count, (n, labels) in enumerate(mattes(clip, config, written, report, keep), start=len(written) + 1):
-        limited(labels, *(load_mask(shot, kind, clip.frames[n]) for kind in (IGNORE, PEOPLE)))
+    def hear(key: int, grid: tuple[Map, Map], evidence: Evidence) -> None:
+        sight = clip.sight(key)
+        if sight is not None:
+            told[clip.keys[key]] = KeyEvidence(evidence, grid, sight)
+
+    found = mattes(clip, config, written, report, hear)
+    for count, (n, labels) in enumerate(found, start=len(written) + 1):
+        ignored, people = (load_mask(shot, kind, clip.frames[n]) for kind in (IGNORE, PEOPLE))
+        if n in told:
+            _keep_surface(shot, clip, n, told.pop(n), labels, ignored)
+        limited(labels, ignored, people)
         write_matte(files[clip.frames[n]], labels)
         shares[n] = _shares(labels)
         report.progress("solve: motion", count, len(files), f"frame {clip.frames[n]}")
@@ -99,6 +101,19 @@ def find_motion(shot: Shot, report: Reporter) -> MotionResult:
     write_json(folder / _RECORD, {"version": MOTION_VERSION, "key": key, "result": result})
     (folder / _UNFINISHED).unlink(missing_ok=True)
     return result
+
+
+def _keep_surface(
+    shot: Shot, clip: Clip, n: int, found: KeyEvidence, labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None
+) -> None:
+    """Writes the points of a key frame's still surfaces, frame `n`: of what its matte [H, W] calls still, away from all
+    else. What moves is matched by a still point now and then, at a depth at which there is nothing."""
+    apart = (labels != STILL).astype(np.uint8)
+    reach = 2 * round(AWAY * clip.width / 640) + 1
+    apart = cv2.dilate(apart, np.ones((reach, reach), np.uint8)) > 0
+    excluded = apart if ignored is None else apart | ignored
+    points = surface_points(found, clip.unit, np.asarray(excluded, np.bool_), clip.frames[n])
+    write_surface(shot.surface(clip.frames[n]), *points)
 
 
 def _begin(folder: Path, key: str) -> None:

@@ -135,11 +135,11 @@ def _typical_depth(points: NDArray[Any], viewmat: NDArray[Any]) -> float:
 
 def mattes(
     clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter,
-    tell: Callable[[int, Evidence, Matches], None] | None = None,
+    tell: Callable[[int, tuple[Map, Map], Evidence], None] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:  # fmt: skip
     """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order.
 
-    `tell` hears each key's evidence, before the key's matte comes.
+    `tell` hears each key's evidence and the grid it is on, before the key's matte comes.
     """
     keys, reach = clip.keys, config.reach * config.baselines[-1]
     groups = [range(keys[k - 1] + 1 if k else 0, keys[k] + 1) for k in range(len(keys))]
@@ -159,7 +159,7 @@ def mattes(
             left = None if turn % _LEFT_EVERY == 0 else left
             own[turn], left, found = _own_score(clip, matches, turn, config, left)
             if tell is not None:
-                tell(turn, found, matches)
+                tell(turn, matches.grid, found)
         key = turn - reach
         if key < max(0, first - 1) or not (wanted[key] or wanted[min(key + 1, last)]):
             continue

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +27,8 @@ LEAST_PARALLAX = 5.0
 one moves it by at most a fifth of its depth."""
 MOST_OFF = 0.5
 """Of the evidence that it stands still, how much may say that it moves."""
+AWAY = 6.0
+"""Pixels of a picture 640 wide from what is not known to stand still, at least."""
 PER_KEY = 2048
 """Points kept of a key frame, at most."""
 
@@ -45,27 +48,36 @@ class SurfacePoints:
 NO_SURFACE = SurfacePoints(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
 
 
+@dataclass(frozen=True)
+class KeyEvidence:
+    """What is known of a key frame."""
+
+    evidence: Evidence
+    """On the grid [h, w]."""
+    grid: tuple[Map, Map]
+    """Positions x and y of its points in flow pixels."""
+    sight: Sight
+    """Colours on the grid, and the camera."""
+
+
 def surface_points(
-    found: Evidence, grid: tuple[Map, Map], sight: Sight, unit: float, ignored: Mask | None, seed: int
+    key: KeyEvidence, unit: float, excluded: Mask, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """(xyz [S, 3] solve units, rgb [S, 3]) of up to `PER_KEY` points of a key frame, drawn evenly over its picture.
 
     Args:
-        found: of the key frame, on the grid [h, w].
-        grid: positions x and y of the grid's points in flow pixels.
-        sight: its colours and camera.
         unit: flow pixels in one pixel of a picture 640 wide.
-        ignored: [h, w] what is no part of the scene.
+        excluded: [H, W] of the working frame: none of that.
         seed: of the draw.
     """
+    found, sight = key.evidence, key.sight
     known = (found.agree >= LEAST_AGREEING) & (found.parallax >= LEAST_PARALLAX * unit) & (found.inverse > 1e-6)
     known &= found.off <= MOST_OFF * found.on
-    if ignored is not None:
-        known &= ~ignored
+    known &= cv2.resize(excluded.astype(np.uint8), known.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT) == 0
     places = np.flatnonzero(known)
     if len(places) > PER_KEY:
         places = np.sort(np.random.default_rng(seed).choice(places, PER_KEY, replace=False))
-    x, y, inverse = (plane.reshape(-1)[places].astype(np.float64) for plane in (*grid, found.inverse))
+    x, y, inverse = (plane.reshape(-1)[places].astype(np.float64) for plane in (*key.grid, found.inverse))
     z, K, V = 1.0 / inverse, sight.K, sight.viewmat
     local = np.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], axis=1)
     xyz = (local - V[:3, 3]) @ V[:3, :3]

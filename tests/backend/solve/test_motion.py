@@ -311,14 +311,13 @@ def test_points_of_a_still_world_lie_on_its_surfaces_and_cover_them(tmp_path, qu
         assert np.abs(plate - found.rgb[of]).mean() < 8
 
 
-def test_what_moves_gives_no_points_but_few(swaying):
+def test_what_moves_gives_no_points(swaying):
+    """Now and then a still point explains its matches, at a depth at which there is nothing."""
     shot, board, _ = swaying
     found = load_surface(shot)
-    on = []
     for n in range(3, 11):
         x, y = seen_at(shot, NUMBERS[n], found.xyz[found.frames == NUMBERS[n]]).T
-        on.append(inner(board)[n][y, x].mean() / inner(board)[n].mean())
-    assert np.mean(on) < 0.35  # of as many as there are elsewhere
+        assert len(x) > 500 and inner(board)[n][y, x].mean() < 0.01
 
 
 def test_a_camera_that_stands_still_gives_no_points(tmp_path, quiet):
