@@ -57,11 +57,15 @@ class MotionResult(TypedDict):
     """Share of them of which nothing is known."""
 
 
-def find_motion(shot: Shot, report: Reporter) -> MotionResult:
-    """Writes the motion matte of every delivered frame, from optical flow against the camera's own motion.
+def find_motion(shot: Shot, report: Reporter, with_points: bool = False) -> MotionResult:
+    """Writes the motion matte of every delivered frame, from optical flow against the camera's own motion, and points
+    of what stands still.
 
     Mattes that are there and belong to these cameras are left alone; a run that was stopped is gone on with. JobError
     if the shot is not solved or a frame is damaged, and Cancelled.
+
+    Args:
+        with_points: mattes without points, of a solve before those were kept, are found once more.
     """
     config = FlowConfig()
     key = _solve_key(shot, config)
@@ -69,12 +73,13 @@ def find_motion(shot: Shot, report: Reporter) -> MotionResult:
     done = _record(folder / _RECORD)
     path = load_cameras(shot)
     files = {camera.frame: shot.matte(camera.frame) for camera in path.frames}
-    if done.get("key") == key and all(is_whole_png(file) for file in files.values()):
+    anew = with_points and done.get("key") == key and not any(folder.glob("*" + SURFACE))
+    if not anew and done.get("key") == key and all(is_whole_png(file) for file in files.values()):
         return MotionResult(**done["result"])
     need_disk(shot.root, 0.1 * path.width * path.height * len(files), "The motion matte")
     _begin(folder, key)
     clip = Clip(shot)
-    written = {n for n, frame in enumerate(clip.frames) if is_whole_png(files[frame])}
+    written = {n for n, frame in enumerate(clip.frames) if not anew and is_whole_png(files[frame])}
     shares = np.zeros((len(files), 3))
     for n in written:
         shares[n] = _shares(_read_found(files[clip.frames[n]]))

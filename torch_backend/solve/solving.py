@@ -217,7 +217,7 @@ def _with_motion(shot: Shot, result: SolveResult, report: Reporter) -> SolveResu
     try:
         from .motion import find_motion
 
-        found = find_motion(shot, report)
+        found = find_motion(shot, report, with_points=True)
         return {**result, **found}
     except Cancelled:
         raise

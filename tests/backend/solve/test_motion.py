@@ -341,6 +341,20 @@ def test_what_is_ignored_gives_no_points(tmp_path, quiet):
     assert len(x) > 2000 and (x >= WIDTH // 2 - 2).all()
 
 
+def test_a_shot_solved_before_points_were_kept_has_them_when_it_is_solved_again(swaying, tmp_path, quiet):
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    for file in shot.motion.glob("*.npz"):
+        file.unlink()
+    key, pictures = motion_key(shot), {p: p.read_bytes() for p in shot.motion.glob("*.png")}
+    assert find_motion(shot, quiet()) == swaying[2] and not len(load_surface(shot).xyz)  # a freeze asks for none
+    assert find_motion(shot, quiet(), with_points=True) == swaying[2]
+    assert (load_surface(shot).xyz == load_surface(swaying[0]).xyz).all()
+    assert motion_key(shot) == key and {p: p.read_bytes() for p in shot.motion.glob("*.png")} == pictures
+    before = stamps(shot)
+    find_motion(shot, quiet(), with_points=True)
+    assert stamps(shot) == before
+
+
 def test_points_go_with_the_mattes_and_a_damaged_file_is_done_without(swaying, tmp_path, quiet):
     shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
     whole = load_surface(shot)
