@@ -124,17 +124,22 @@ def test_developed_gaussians_travel_with_those_they_descend_from(made):
     assert torch.equal(stage.strangers(now), torch.arange(len(moved)) >= len(then))
 
 
-def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(trained):
-    """Part of the wall was opened by mistake, and at t* the field has it in tatters."""
-    world, _ = trained
-    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
-    frozen, patch = field(run, scene), run.model.open_rows()
+def in_tatters(run, frozen):
+    """(the scene with part of the wall opened by mistake and faded at t*, rows of that part)."""
     wall = torch.arange(len(frozen.support))[frozen.motion < 0.5]
     wall = wall[frozen.state["means"][wall, 0] > frozen.state["means"][wall, 0].median()]
     run.model.gaussians.open[wall] = True
     torn = dataclasses.replace(frozen, motion=frozen.motion.index_fill(0, wall, 1.0), state=dict(frozen.state))
     torn.state["opacity_logits"] = frozen.state["opacity_logits"].clone()
     torn.state["opacity_logits"][wall] -= 1.5
+    return torn, wall
+
+
+def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(trained):
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen, patch = field(run, scene), run.model.open_rows()
+    torn, wall = in_tatters(run, frozen)
     mended = settled(run, scene, torn, T_STAR, motion_mattes(world.shot))
     shut = (torn.motion > 0.5) & (mended.motion < 0.5)
     assert float(shut[wall].float().mean()) > 0.8, "what is seen of it"
@@ -149,13 +154,7 @@ def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(train
     """In tatters at t*, and mattes call all of it moving: no still pixel says anything against it."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
-    frozen = field(run, scene)
-    wall = torch.arange(len(frozen.support))[frozen.motion < 0.5]
-    wall = wall[frozen.state["means"][wall, 0] > frozen.state["means"][wall, 0].median()]
-    run.model.gaussians.open[wall] = True
-    torn = dataclasses.replace(frozen, motion=frozen.motion.index_fill(0, wall, 1.0), state=dict(frozen.state))
-    torn.state["opacity_logits"] = frozen.state["opacity_logits"].clone()
-    torn.state["opacity_logits"][wall] -= 1.5
+    torn, wall = in_tatters(run, field(run, scene))
     closed = []
     for nearer in (0.0, 1e9):  # no plate sees it from near, every one does
         moving = lambda frame: torch.ones(scene.height, scene.width)  # noqa: E731
