@@ -35,6 +35,21 @@ def sparse_entries(
     return library.csr_array(library.coo_array((weights, (rows, columns)), shape=shape))
 
 
+def connected(values: NDArray[np.floating[Any]], step: float) -> NDArray[np.int32]:
+    """Labels [H, W] from 0 of the parts of a picture [H, W] whose pixels are joined by neighbours, across or down, that
+    differ by less than `step`."""
+    from scipy.sparse import csgraph
+
+    height, width = values.shape
+    places = np.arange(height * width, dtype=np.int64).reshape(height, width)
+    across, down = (np.asarray(np.abs(np.diff(values, axis=axis)) < step, np.bool_) for axis in (1, 0))
+    ends = np.concatenate([places[:, 1:][across], places[1:][down]])
+    others = np.concatenate([places[:, :-1][across], places[:-1][down]])
+    graph = sparse_entries(np.ones(len(ends), np.float32), ends, others, (height * width, height * width))
+    labels = cast(Any, csgraph).connected_components(graph, directed=False)[1]
+    return np.asarray(labels, np.int32).reshape(height, width)
+
+
 def meshgrid(x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """`np.meshgrid` of two axes [W] and [H]: x and y at each place, [H, W] each."""
     return cast(tuple[NDArray[Any], NDArray[Any]], np.meshgrid(x, y))

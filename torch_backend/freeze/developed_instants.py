@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..contract import DEVELOPED_FOLDER, JobError, Reporter, frame_file, frame_number, sweep_half_written
@@ -18,6 +20,7 @@ from ..shot import Shot, content_key, path_error
 from ..solve.motion import load_motion, motion_key
 from ..train import LoadedRun
 from ..train.checkpoint import load_checkpoint, read_meta, save_checkpoint
+from .adrift import put_back
 from .develop import DevelopConfig, develop
 from .frozen import FrozenGaussians, freeze_at, span_of
 from .missing_layer import instant_layer, join
@@ -26,7 +29,7 @@ from .static_twin import settled
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 11
+VERSION = 12
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -203,8 +206,13 @@ def _make(
     check: Callable[[int, int], None] | None,
 ) -> FrozenGaussians:  # fmt: skip
     moving = motion_mattes(shot)
+
+    def labels(frame: int) -> NDArray[np.uint8] | None:
+        return load_motion(shot, frame)
+
     frozen = settled(run, scene, frozen, t_star, moving)
-    layer = instant_layer(run, scene, frozen, float(t_star), motion=lambda frame: load_motion(shot, frame))
+    frozen = put_back(run, scene, frozen, t_star, labels)
+    layer = instant_layer(run, scene, frozen, t_star, motion=labels)
     joined = frozen if layer is None else join(frozen, layer)
     return develop(run, scene, joined, t_star, moving, config, check)
 

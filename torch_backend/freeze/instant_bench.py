@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..scene import Scene, evenly_spaced, read_image, resize_intrinsics
 from ..shot import Shot
+from ..torch_types import from_numpy
 from ..train import LoadedRun
+from ..train.model import gathered
 from .frozen import FrozenGaussians, FrozenImage, render_frozen
 from .ignored import ignore_mattes
 from .instant_depth import DepthConfig, View
@@ -139,6 +142,23 @@ class InstantBench:
         """A frozen scene as camera t* sees it, exposed as plate t* is."""
         camera = self.scene.viewmats[self.index], self.Ks[self.index]
         return render_frozen(frozen, *camera, self.width, self.height, self.exposure, self.time)
+
+    def seen_inside(self, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+        """What camera t* sees of each Gaussian, [N] each: sums of alpha T over pixels of a mask [h, w], and all."""
+        inside = self.gathered(frozen, mask.astype(np.float32))
+        return inside, self.gathered(frozen, np.ones_like(mask, np.float32))
+
+    def gathered(self, frozen: FrozenGaussians, values: NDArray[np.float32]) -> Tensor:
+        """[N]: sums of alpha T times `values` [h, w] over the pixels in which camera t* sees each Gaussian."""
+        device, i = frozen.support.device, self.index
+        camera = self.scene.viewmats[i].to(device), self.Ks[i].to(device)
+        asked = from_numpy(values).to(device)[..., None]
+        return gathered(frozen.state, *camera, self.width, self.height, asked).cpu()[:, 0]
+
+    def depths(self, frozen: FrozenGaussians) -> Tensor:
+        """[N] scene units from camera t* to each Gaussian, along its axis."""
+        view = self.scene.viewmats[self.index].to(frozen.support.device)
+        return (frozen.state["means"] @ view[2, :3] + view[2, 3]).cpu()
 
     def difference(self, image: FrozenImage) -> NDArray[np.float32]:
         """Low-passed difference [h, w] between plate and render, beyond what misplaced edges explain."""

@@ -159,7 +159,7 @@ def inverse_depth(
     hidden = float(np.median(behind[region]))
     held = float(weight.sum())
     attached = held / (held + config.holds * unit)
-    at = _weighted_median(behind[ring], weight) if held > 0 else hidden
+    at = weighted_median(behind[ring], weight) if held > 0 else hidden
     low, high = _range(behind, region, ring, weight, mover, config)
     grid = np.geomspace(low, high, config.steps)
     cost = _parallax(view, others, region, grid, config, unit)
@@ -250,7 +250,7 @@ def _nearby(
     held = float(weight[use].sum())
     if not use.any():
         return 0.0, 0.0
-    return _weighted_median(behind[use], weight[use].astype(np.float64)), held / (held + config.nearby**2 * unit**2)
+    return weighted_median(behind[use], weight[use].astype(np.float64)), held / (held + config.nearby**2 * unit**2)
 
 
 def _spread(values: NDArray[np.float32], mask: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
@@ -351,7 +351,8 @@ def _bent(
     return (pulled + alone * best) / (held + alone)
 
 
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Of values [P] by weights [P], of which some are above zero: the least at which half of the weight is reached."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])

@@ -20,7 +20,6 @@ from ..scene import Scene
 from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.exposure import Exposure
-from ..train.model import gathered
 from .frozen import FrozenGaussians, FrozenImage
 from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed, resized_array
 from .instant_depth import Region, as_field, inverse_depth, own_motion
@@ -362,23 +361,13 @@ def _ghosts(bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage) ->
     ghost = _large(ghost, before >= bench.config.seed, bench.config.least * bench.unit**2)
     if not ghost.any():
         return kept, nothing
-    inside, whole = _shares(bench, frozen, ghost)
+    inside, whole = bench.seen_inside(frozen, ghost)
     share = inside / whole.clamp_min(1e-6)
     guilty = moves.cpu() & (whole > 1e-3) & (share >= bench.config.fade)
     kept[guilty] = 1.0 - share[guilty]
     if not _helps(bench, bench.render(fade(frozen, kept)), image, ghost):
         return torch.ones_like(kept), nothing
     return kept, ghost
-
-
-def _shares(bench: InstantBench, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
-    """What camera t* sees of each Gaussian, [N] each: inside a mask [h, w], and at all. Sums of alpha T over pixels."""
-    device, scene, i = frozen.support.device, bench.scene, bench.index
-    where = from_numpy(mask).to(device, torch.float32)
-    weights = torch.stack([where, torch.ones_like(where)], dim=-1)
-    camera = scene.viewmats[i].to(device), bench.Ks[i].to(device)
-    inside, whole = gathered(frozen.state, *camera, bench.width, bench.height, weights).cpu().unbind(1)
-    return inside, whole
 
 
 def _helps(bench: InstantBench, after: FrozenImage, before: FrozenImage, where: NDArray[np.bool_]) -> bool:

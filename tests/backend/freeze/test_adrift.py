@@ -1,0 +1,113 @@
+"""Half a hand that stands at two thirds of its distance: put back to the other half; what is meant to be near stays."""
+
+import numpy as np
+import pytest
+import torch
+
+from torch_backend.array_types import connected
+from torch_backend.footage.images import write_png
+from torch_backend.freeze.adrift import AdriftConfig, put_back
+from torch_backend.freeze.frozen import render_frozen
+
+from .test_missing_layer import ARM, T_STAR, H, W, arm, frozen_of, sheet, skin, together, wall, world
+
+NEAR = ARM / 1.5
+
+
+def blue(x, y):
+    return torch.tensor([0.3, 0.4, 0.9]) + 0.0 * x[:, None]
+
+
+def hand_at(z, x, color=skin):
+    """A hand at depth z that to a camera at the origin, looking along z, is where one at `ARM` would be from x to x."""
+    share = z / ARM
+    return sheet(tuple(share * v for v in x), (-0.2 * share, 0.2 * share), z, 0.02 * share, color)
+
+
+def drawn(tmp_path, near, far):
+    """(world, frozen, rows of `near`): a wall, what moves `far` and `near`; the plate of t* is what they paint."""
+    state = together(wall(), far, near)
+    still = len(wall()["means"])
+    motion = (torch.arange(len(state["means"])) >= still).float()
+    made = world(tmp_path, state, lambda n: state, motion=motion)
+    made.scene.viewmats[T_STAR - 1] = torch.eye(4)  # at the origin, along z
+    picture = made.image(state, T_STAR)
+    write_png(tmp_path / f"{T_STAR:06d}.png", (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8))
+    rows = torch.arange(len(state["means"])) >= len(state["means"]) - len(near["means"])
+    return made, frozen_of(state, motion), rows
+
+
+def seen(made, frozen):
+    image = render_frozen(frozen, made.scene.viewmats[T_STAR - 1], made.scene.Ks[0], W, H)
+    return image.color.numpy(), image.depth.numpy()
+
+
+def test_half_a_hand_before_its_other_half_is_put_back_to_it(tmp_path):
+    palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
+    made, frozen, rows = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06)), palm)
+    after = put_back(made.run, made.scene, frozen, T_STAR)
+    depths = after.state["means"][rows, 2]
+    assert abs(float(depths.median()) / ARM - 1.0) < 0.05 and bool((depths > 0.9 * ARM).all())
+    assert bool((after.state["means"][~rows] == frozen.state["means"][~rows]).all())
+    before, now = seen(made, frozen), seen(made, after)
+    # The same to t*'s camera, but for what is before what at the seam.
+    assert np.abs(before[0] - now[0]).mean() < 2e-3
+    assert before[1].min() < 1.05 * NEAR and now[1].min() > 0.9 * ARM
+
+
+def test_its_veil_goes_with_it(tmp_path):
+    palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
+    thin = hand_at(NEAR, (-0.06, 0.06))
+    thin["opacity_logits"] = torch.full_like(thin["opacity_logits"], -3.0)
+    near = hand_at(NEAR, (-0.36, -0.06))
+    made, frozen, _ = drawn(tmp_path, together(near, thin), palm)
+    after = put_back(made.run, made.scene, frozen, T_STAR)
+    veil = after.state["means"][-len(thin["means"]) :, 2]
+    assert float((veil > 0.9 * ARM).float().mean()) > 0.9
+
+
+def test_an_arm_that_reaches_for_the_camera_stays(tmp_path):
+    far = arm()
+    far["means"][:, 2] = ARM - 1.1 * (0.9 - far["means"][:, 0])  # its end is at 2.1, and joins it all the way
+    made, frozen, _ = drawn(tmp_path, hand_at(ARM - 1.1 * 0.8, (-0.1, 0.15)), far)
+    after = put_back(made.run, made.scene, frozen, T_STAR)
+    assert after.state["means"] is frozen.state["means"]
+
+
+@pytest.mark.parametrize("color", [skin, blue])
+def test_a_thing_that_swings_before_the_wall_stays_whatever_moves_elsewhere(tmp_path, color):
+    far = sheet((0.6, 1.2), (-0.5, 0.5), ARM, 0.02, skin)
+    made, frozen, _ = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06), color), far)
+    after = put_back(made.run, made.scene, frozen, T_STAR)
+    assert after.state["means"] is frozen.state["means"]
+
+
+def test_a_thing_of_another_colour_before_a_hand_stays(tmp_path):
+    palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
+    made, frozen, _ = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06), blue), palm)
+    after = put_back(made.run, made.scene, frozen, T_STAR)
+    assert after.state["means"] is frozen.state["means"]
+
+
+def test_what_holds_still_stays(tmp_path):
+    palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
+    made, frozen, rows = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06)), palm)
+    frozen.motion[rows] = 0.0
+    after = put_back(made.run, made.scene, frozen, T_STAR)
+    assert after.state["means"] is frozen.state["means"]
+
+
+def test_large_pieces_are_no_pieces(tmp_path):
+    palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
+    made, frozen, _ = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06)), palm)
+    after = put_back(made.run, made.scene, frozen, T_STAR, config=AdriftConfig(most=0.001))
+    assert after.state["means"] is frozen.state["means"]
+
+
+def test_connected_parts_of_a_picture():
+    values = np.array([[0.0, 0.1, 0.9], [0.5, 0.2, 1.0], [0.4, 0.3, 0.6]])
+    labels = connected(values, 0.15)
+    assert labels.shape == (3, 3) and labels.min() == 0 and labels.max() == 2
+    # 0.0 to 0.5 by steps of 0.1 around the corner; 0.9 with 1.0; 0.6 differs from 0.3 and from 1.0.
+    assert len({int(labels[place]) for place in [(0, 0), (0, 1), (1, 1), (2, 1), (2, 0), (1, 0)]}) == 1
+    assert labels[0, 2] == labels[1, 2] != labels[2, 2]
