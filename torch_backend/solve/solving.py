@@ -52,7 +52,7 @@ from .poses import camera_centre, fill_poses
 from .stored import load_cameras, load_points, load_record
 from .straight import Straight
 from .undistort import Undistorter, of_frames
-from .verdict import FAIR_ERROR_PX, quality_words
+from .verdict import FAIR_ERROR_PX, doubt_of, quality_words
 
 SOLVE_VERSION = 1
 _WRITERS = 2
@@ -218,6 +218,8 @@ def _with_motion(shot: Shot, result: SolveResult, report: Reporter) -> SolveResu
         from .motion import find_motion
 
         found = find_motion(shot, report, with_points=True)
+        if (doubt := doubt_of(found["motion_pixels_share"])) is not None:
+            report.warning(*doubt)
         return {**result, **found}
     except Cancelled:
         raise

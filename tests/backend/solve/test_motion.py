@@ -1,5 +1,6 @@
 """The motion matte of small worlds with exact cameras: a textured wall, and a board before it that stands or moves."""
 
+import json
 import os
 import shutil
 import signal
@@ -26,8 +27,13 @@ from torch_backend.solve.motion import (
     motion_key,
 )
 from torch_backend.solve.moving import Clip
+from torch_backend.solve.solving import SolveResult, _with_motion
 from torch_backend.solve.surface import PER_KEY
 
+SOLVED: SolveResult = {
+    "frames": 14, "solved_frames": 14, "registered": 14, "localised": 0, "interpolated": 0,
+    "reprojection_error_px": 0.9, "points": 200, "focal_px": 180.0, "quality": "Good",
+}  # fmt: skip
 WIDTH, HEIGHT, FRAMES, FIRST = 192, 144, 14, 1001
 FOCAL, WALL, BOARD = 180.0, 4.0, 3.0
 NUMBERS = [FIRST + 3 * n for n in range(FRAMES)]
@@ -472,3 +478,20 @@ print("whole")
         [sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True, check=False
     )
     assert (ran.returncode, ran.stdout.strip()) == (0, "whole"), ran.stderr[-2000:]
+
+
+def test_cameras_by_which_everything_moves_are_doubted(tmp_path, quiet):
+    shot, _ = build(tmp_path)
+    good, bad = quiet(), quiet()
+    _with_motion(shot, SOLVED, good)
+    assert not [event for event in good.events if event[0] == "warning"]
+    # Nearly on the spot, as a solve without depth has them: what is before the wall and the wall itself both move.
+    cameras = json.loads((shot.solve / "cameras.json").read_text())
+    for n, frame in enumerate(cameras["frames"]):
+        frame["viewmat"][3] *= 0.3
+        frame["viewmat"][7] = 0.05 * (-1) ** n
+    write_json(shot.solve / "cameras.json", cameras)
+    found = _with_motion(shot, SOLVED, bad)
+    assert found["motion_pixels_share"] > 0.2
+    (warning,) = [event for event in bad.events if event[0] == "warning"]
+    assert "the cameras are wrong" in warning[1]
