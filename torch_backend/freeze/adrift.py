@@ -5,7 +5,8 @@ waves at its arm, paint the same pictures, and the price on motion prefers the f
 two thirds of the distance of the other half, and float beside the arm in every view but that of t*. In the depth of
 t*'s view such a piece is an island: all around it is much farther. An arm that reaches for the camera is none, it joins
 its shoulder; an apple on a thread is one, but behind it moves nothing of its colour. What does, an island belongs to.
-It goes there along the rays of t*'s camera, and grows as it goes: to that camera it looks the same.
+It goes there along the rays of t*'s camera, and grows as it goes: to that camera it looks the same. Where plate t*
+shows it to be sharp, it is taken out instead, and `missing_layer` makes it anew of the plate's pixels, at that depth.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from .frozen import FrozenGaussians, FrozenImage
 from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed
 from .instant_depth import weighted_median
 from .missing_layer import fade
+
+_REPLACED = 0.6
+"""Share of what was adrift that a layer of plate t* has to cover to stand for it."""
 
 
 @dataclass(frozen=True)
@@ -73,16 +77,32 @@ class _Piece:
     """Depth of what it belongs to, scene units."""
 
 
+@dataclass
+class Adrift:
+    """What was adrift in a frozen scene."""
+
+    put_back: FrozenGaussians
+    """The scene with it at its place, as blurred as it was."""
+    without: FrozenGaussians
+    """The scene without it: plate t* has it, and sharper."""
+    inverse: NDArray[np.float32]
+    """[h, w] its inverse depth at its place, at the size of the bench; 0 elsewhere."""
+
+    def replaced_by(self, mask: Tensor) -> bool:
+        """True if a layer of opacity `mask` [h, w] stands for it."""
+        return bool((mask.numpy()[self.inverse > 0.0] > 0.5).mean() >= _REPLACED)
+
+
 @torch.no_grad()
-def put_back(
+def adrift(
     run: LoadedRun,
     scene: Scene,
     frozen: FrozenGaussians,
     t_star: float,
     motion: Motion | None = None,
     config: AdriftConfig | None = None,
-) -> FrozenGaussians:
-    """A run's scene at t*, pieces of which that are adrift are as far away as what they belong to.
+) -> Adrift | None:
+    """Pieces of a run's scene at t* that stand far before what they belong to; None if there are none.
 
     Args:
         frozen: the scene at t*, on any device.
@@ -90,19 +110,25 @@ def put_back(
         motion: motion mattes.
     """
     if not bool((frozen.motion > 0.5).any()):
-        return frozen
+        return None
     config = config or AdriftConfig()
     index = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
     bench = InstantBench(run, scene, index, InstantConfig(), motion)
-    done = np.zeros((bench.height, bench.width), bool)
+    inverse, now = np.zeros((bench.height, bench.width), np.float32), frozen
     for _ in range(config.rounds):
-        piece = _adrift(bench, frozen, done, config)
+        piece = _adrift(bench, now, inverse > 0.0, config)
         if piece is None:
             break
-        done |= piece.mask
-        factor = piece.belongs / (1.0 + config.front) / piece.depth
-        frozen = _moved_along(bench, frozen, piece.rows, torch.full_like(piece.rows, factor, dtype=torch.float32))
-    return _cleared(bench, frozen, done, config) if done.any() else frozen
+        place = piece.belongs / (1.0 + config.front)
+        inverse[piece.mask] = 1.0 / place
+        now = _moved_along(
+            bench, now, piece.rows, torch.full_like(piece.rows, place / piece.depth, dtype=torch.float32)
+        )
+    if not inverse.any():
+        return None
+    now = _cleared(bench, now, inverse > 0.0, config)
+    stays = (now.state["means"] == frozen.state["means"]).all(1).float()
+    return Adrift(now, fade(frozen, stays), inverse)
 
 
 def _cleared(

@@ -20,7 +20,7 @@ from ..shot import Shot, content_key, path_error
 from ..solve.motion import load_motion, motion_key
 from ..train import LoadedRun
 from ..train.checkpoint import load_checkpoint, read_meta, save_checkpoint
-from .adrift import put_back
+from .adrift import adrift
 from .develop import DevelopConfig, develop
 from .frozen import FrozenGaussians, freeze_at, span_of
 from .missing_layer import instant_layer, join
@@ -29,7 +29,7 @@ from .static_twin import settled
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 12
+VERSION = 13
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -211,7 +211,12 @@ def _make(
         return load_motion(shot, frame)
 
     frozen = settled(run, scene, frozen, t_star, moving)
-    frozen = put_back(run, scene, frozen, t_star, labels)
+    found = adrift(run, scene, frozen, t_star, labels)
+    if found is not None:
+        layer = instant_layer(run, scene, found.without, t_star, motion=labels, known=found.inverse)
+        if layer is not None and found.replaced_by(layer.mask):
+            return develop(run, scene, join(found.without, layer), t_star, moving, config, check)
+        frozen = found.put_back
     layer = instant_layer(run, scene, frozen, t_star, motion=labels)
     joined = frozen if layer is None else join(frozen, layer)
     return develop(run, scene, joined, t_star, moving, config, check)

@@ -28,6 +28,9 @@ from .instant_track import Track, swing, tracks
 _NOTHING = 0.15
 """Share of the way from what is behind to a thing's colour below which a pixel has nothing of it."""
 
+_KNOWN = 0.25
+"""Share of a region whose depth is known from which on all of it is as deep as that."""
+
 
 @dataclass
 class InstantLayer:
@@ -55,6 +58,7 @@ def instant_layer(
     t_star: float,
     config: InstantConfig | None = None,
     motion: Motion | None = None,
+    known: NDArray[np.float32] | None = None,
 ) -> InstantLayer | None:
     """Finds what plate t* shows and a scene frozen at t* does not, and makes Gaussians of it.
 
@@ -62,6 +66,7 @@ def instant_layer(
         frozen: the scene at t*, on any device.
         t_star: frame number; between two frames the nearer one's plate is looked at.
         motion: motion mattes; without them flow off its epipolar lines alone tells what moves.
+        known: [h, w] inverse depth of what is missing, at the size of the bench, 0 where it has to be told.
 
     Returns None if plate and scene agree.
     """
@@ -76,7 +81,7 @@ def instant_layer(
     if ghost.any():
         frozen = fade(frozen, kept)
         image = bench.render(frozen)
-    state, mask, regions = _shell(bench, frozen, image, _regions(bench, image), things)
+    state, mask, regions = _shell(bench, frozen, image, _regions(bench, image), things, known)
     layer = InstantLayer(state, scene.frames[index], from_numpy(mask), from_numpy(ghost), kept, regions)
     if len(state["means"]) and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, mask > 0):
         empty = {name: value[:0] for name, value in state.items()}
@@ -146,6 +151,7 @@ def _shell(
     image: FrozenImage,
     regions: list[NDArray[np.bool_]],
     things: list[Track],
+    known: NDArray[np.float32] | None,
 ) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
     """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
     nothing, parts, facts_of_regions = np.zeros((bench.height, bench.width), np.float32), list[_Part](), list[Region]()
@@ -169,6 +175,9 @@ def _shell(
         if swings is not None:
             depths = np.full_like(depths, 1.0 / swings.depth)
             facts = replace(facts, depth=swings.depth, deviation=swings.deviation)
+        elif known is not None and (known[soft >= 0.5] > 0.0).mean() >= _KNOWN:
+            inverse = float(np.median(known[(soft >= 0.5) & (known > 0.0)]))
+            depths, facts = np.full_like(depths, inverse), replace(facts, depth=1.0 / inverse)
         elif (told := as_field(fields, soft >= 0.5, bench.config.depth, bench.unit)) is not None:
             depths = told
             facts = replace(facts, depth=1.0 / float(np.median(told[soft >= 0.5])))

@@ -6,8 +6,9 @@ import torch
 
 from torch_backend.array_types import connected
 from torch_backend.footage.images import write_png
-from torch_backend.freeze.adrift import AdriftConfig, put_back
+from torch_backend.freeze.adrift import AdriftConfig, adrift
 from torch_backend.freeze.frozen import render_frozen
+from torch_backend.freeze.missing_layer import instant_layer, join
 
 from .test_missing_layer import ARM, T_STAR, H, W, arm, frozen_of, sheet, skin, together, wall, world
 
@@ -37,6 +38,12 @@ def drawn(tmp_path, near, far):
     return made, frozen_of(state, motion), rows
 
 
+def found(made, frozen):
+    pieces = adrift(made.run, made.scene, frozen, T_STAR)
+    assert pieces is not None
+    return pieces
+
+
 def seen(made, frozen):
     image = render_frozen(frozen, made.scene.viewmats[T_STAR - 1], made.scene.Ks[0], W, H)
     return image.color.numpy(), image.depth.numpy()
@@ -45,7 +52,7 @@ def seen(made, frozen):
 def test_half_a_hand_before_its_other_half_is_put_back_to_it(tmp_path):
     palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
     made, frozen, rows = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06)), palm)
-    after = put_back(made.run, made.scene, frozen, T_STAR)
+    after = found(made, frozen).put_back
     depths = after.state["means"][rows, 2]
     assert abs(float(depths.median()) / ARM - 1.0) < 0.05 and bool((depths > 0.9 * ARM).all())
     assert bool((after.state["means"][~rows] == frozen.state["means"][~rows]).all())
@@ -55,13 +62,29 @@ def test_half_a_hand_before_its_other_half_is_put_back_to_it(tmp_path):
     assert before[1].min() < 1.05 * NEAR and now[1].min() > 0.9 * ARM
 
 
+def test_plate_t_star_stands_for_it_at_its_place(tmp_path):
+    palm = sheet((-0.10, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
+    made, frozen, rows = drawn(tmp_path, hand_at(NEAR, (-0.45, -0.10)), palm)
+    pieces = found(made, frozen)
+    inside = pieces.inverse > 0.0
+    assert np.abs(1.0 / pieces.inverse[inside] / ARM - 1.0).max() < 0.05
+    assert bool((pieces.without.state["opacity_logits"][rows] < -10.0).float().mean() > 0.9)
+    layer = instant_layer(made.run, made.scene, pieces.without, T_STAR, known=pieces.inverse)
+    assert layer is not None and pieces.replaced_by(layer.mask)
+    assert float((layer.state["means"][:, 2] / ARM - 1.0).abs().max()) < 0.05
+    color, depth = seen(made, join(pieces.without, layer))
+    assert np.abs(color - seen(made, frozen)[0])[inside].mean() < 0.02
+    assert np.abs(depth[inside] / ARM - 1.0).mean() < 0.05
+    assert not pieces.replaced_by(torch.zeros_like(layer.mask))
+
+
 def test_its_veil_goes_with_it(tmp_path):
     palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
     thin = hand_at(NEAR, (-0.06, 0.06))
     thin["opacity_logits"] = torch.full_like(thin["opacity_logits"], -3.0)
     near = hand_at(NEAR, (-0.36, -0.06))
     made, frozen, _ = drawn(tmp_path, together(near, thin), palm)
-    after = put_back(made.run, made.scene, frozen, T_STAR)
+    after = found(made, frozen).put_back
     veil = after.state["means"][-len(thin["means"]) :, 2]
     assert float((veil > 0.9 * ARM).float().mean()) > 0.9
 
@@ -70,38 +93,33 @@ def test_an_arm_that_reaches_for_the_camera_stays(tmp_path):
     far = arm()
     far["means"][:, 2] = ARM - 1.1 * (0.9 - far["means"][:, 0])  # its end is at 2.1, and joins it all the way
     made, frozen, _ = drawn(tmp_path, hand_at(ARM - 1.1 * 0.8, (-0.1, 0.15)), far)
-    after = put_back(made.run, made.scene, frozen, T_STAR)
-    assert after.state["means"] is frozen.state["means"]
+    assert adrift(made.run, made.scene, frozen, T_STAR) is None
 
 
 @pytest.mark.parametrize("color", [skin, blue])
 def test_a_thing_that_swings_before_the_wall_stays_whatever_moves_elsewhere(tmp_path, color):
     far = sheet((0.6, 1.2), (-0.5, 0.5), ARM, 0.02, skin)
     made, frozen, _ = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06), color), far)
-    after = put_back(made.run, made.scene, frozen, T_STAR)
-    assert after.state["means"] is frozen.state["means"]
+    assert adrift(made.run, made.scene, frozen, T_STAR) is None
 
 
 def test_a_thing_of_another_colour_before_a_hand_stays(tmp_path):
     palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
     made, frozen, _ = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06), blue), palm)
-    after = put_back(made.run, made.scene, frozen, T_STAR)
-    assert after.state["means"] is frozen.state["means"]
+    assert adrift(made.run, made.scene, frozen, T_STAR) is None
 
 
 def test_what_holds_still_stays(tmp_path):
     palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
     made, frozen, rows = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06)), palm)
     frozen.motion[rows] = 0.0
-    after = put_back(made.run, made.scene, frozen, T_STAR)
-    assert after.state["means"] is frozen.state["means"]
+    assert adrift(made.run, made.scene, frozen, T_STAR) is None
 
 
 def test_large_pieces_are_no_pieces(tmp_path):
     palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
     made, frozen, _ = drawn(tmp_path, hand_at(NEAR, (-0.36, -0.06)), palm)
-    after = put_back(made.run, made.scene, frozen, T_STAR, config=AdriftConfig(most=0.001))
-    assert after.state["means"] is frozen.state["means"]
+    assert adrift(made.run, made.scene, frozen, T_STAR, config=AdriftConfig(most=0.001)) is None
 
 
 def test_connected_parts_of_a_picture():
