@@ -24,8 +24,8 @@ this share of the frames without a place are, that is said."""
 ENOUGH_MATCHES = 100
 """Matches with which two frames could begin a solve, COLMAP's own number: if none can, it is for lack of parallax."""
 MUCH_MOVES = 0.2
-"""Share of a clip's pixels that move by themselves from which on its cameras are doubted. Held-still people leave 0.02
-to 0.1; a solve that had taken a start without depth left 0.31, at an error of 0.9 pixels."""
+"""Share of a clip's pixels that move by themselves from which on its cameras are doubted. Clips looked at leave 0.02
+to 0.08; a solve that had taken a start without depth left 0.31, at an error of 0.9 pixels."""
 _TURNING = "The camera only turns on the spot: there is nothing to tell depth by."
 _RANGE_HINT = "Import a longer range, in which the camera moves sideways by a step or more."
 _BARE_HINT = "Choose a sharper range, or film with more light and texture in view."
