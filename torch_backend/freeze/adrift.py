@@ -5,8 +5,8 @@ waves at its arm, paint the same pictures, and the price on motion prefers the f
 two thirds of the distance of the other half, and float beside the arm in every view but that of t*. In the depth of
 t*'s view such a piece is an island: all around it is much farther. An arm that reaches for the camera is none, it joins
 its shoulder; an apple on a thread is one, but behind it moves nothing of its colour. What does, an island belongs to.
-It goes there along the rays of t*'s camera, and grows as it goes: to that camera it looks the same. Where plate t*
-shows it to be sharp, it is taken out instead, and `missing_layer` makes it anew of the plate's pixels, at that depth.
+It goes there along the rays of t*'s camera, and grows as it goes: to that camera it looks the same. Where a
+layer of plate t* covers it, it is taken out instead: `missing_layer` makes it anew of the plate's pixels, that deep.
 """
 
 from __future__ import annotations
@@ -137,11 +137,12 @@ def _cleared(
     """The scene with the veil of pieces `done` [h, w] put back, too: what moves, is seen about them, and stands far
     before what is seen there for the most part, so that no median shows it."""
     about = _grown(done, config.veil * bench.unit)
-    inside, whole = bench.seen_inside(frozen, about)
     image = bench.render(frozen)
     covered = (image.alpha.numpy() > 0.5).astype(np.float32)
     log_depth = np.log(np.maximum(image.depth.numpy(), 1e-6)) * covered
-    behind = bench.gathered(frozen, log_depth) / bench.gathered(frozen, covered).clamp_min(1e-6)
+    asked = about.astype(np.float32), np.ones_like(covered), log_depth, covered
+    inside, whole, log_sum, count = bench.gathered(frozen, *asked).unbind(1)
+    behind = log_sum / count.clamp_min(1e-6)
     factor = behind.exp() / (1.0 + config.front) / bench.depths(frozen).clamp_min(1e-6)
     veils = (whole > 1e-3) & (inside >= 0.5 * whole) & (factor > config.near) & (frozen.motion > 0.5).cpu()
     rows = torch.nonzero(veils).flatten()

@@ -145,15 +145,15 @@ class InstantBench:
 
     def seen_inside(self, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """What camera t* sees of each Gaussian, [N] each: sums of alpha T over pixels of a mask [h, w], and all."""
-        inside = self.gathered(frozen, mask.astype(np.float32))
-        return inside, self.gathered(frozen, np.ones_like(mask, np.float32))
+        inside, whole = self.gathered(frozen, mask.astype(np.float32), np.ones_like(mask, np.float32)).unbind(1)
+        return inside, whole
 
-    def gathered(self, frozen: FrozenGaussians, values: NDArray[np.float32]) -> Tensor:
-        """[N]: sums of alpha T times `values` [h, w] over the pixels in which camera t* sees each Gaussian."""
+    def gathered(self, frozen: FrozenGaussians, *values: NDArray[np.float32]) -> Tensor:
+        """[N, C]: sums of alpha T times each of C `values` [h, w] over the pixels in which t* sees a Gaussian."""
         device, i = frozen.support.device, self.index
         camera = self.scene.viewmats[i].to(device), self.Ks[i].to(device)
-        asked = from_numpy(values).to(device)[..., None]
-        return gathered(frozen.state, *camera, self.width, self.height, asked).cpu()[:, 0]
+        asked = from_numpy(np.stack(values, axis=-1)).to(device)
+        return gathered(frozen.state, *camera, self.width, self.height, asked).cpu()
 
     def depths(self, frozen: FrozenGaussians) -> Tensor:
         """[N] scene units from camera t* to each Gaussian, along its axis."""
