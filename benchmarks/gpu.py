@@ -9,10 +9,12 @@ Stages, of at most 8 minutes each; docs/gpu.md says what each answers:
   limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, views a second, a CUDA graph
 
 Each writes DIR/gpu-STAGE.json. A part that fails is a sentence there, and the others go on; so is a part for which no
-time was left. `--dry-run` carries the same code out on the processor, at tiny sizes: its figures mean nothing.
+time was left. `--only PART ...` asks for some parts of a stage. `--dry-run` carries the same code out on the processor,
+at tiny sizes: its figures mean nothing.
 """
 
 import argparse
+import cProfile
 import itertools
 import json
 import math
@@ -22,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +34,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
+from torch.nn.functional import interpolate
 
 from benchmarks import raster as raster_bench
 from benchmarks.workload import WORKLOADS, room
@@ -84,11 +88,11 @@ class Silent:
 class Stage:
     """A stage that runs: its parts, its clock, what it found."""
 
-    def __init__(self, dry: bool, shot: Path | None, results: Path) -> None:
-        self.dry, self.shot, self.results = dry, shot, results
+    def __init__(self, dry: bool, shot: Path | None, results: Path, seconds: float, only: list[str]) -> None:
+        self.dry, self.shot, self.results, self.only = dry, shot, results, only
         self.device = torch.device("cpu" if dry else "cuda")
         self.found: dict[str, Any] = {}
-        self.until = time.monotonic() + SECONDS
+        self.until = time.monotonic() + seconds
 
     @property
     def left(self) -> float:
@@ -97,6 +101,8 @@ class Stage:
 
     def part(self, name: str, call: Callable[[], Any], needs: float = 0.0) -> None:
         """Notes what a part found, or why it found nothing; needs: seconds without which it is not begun."""
+        if self.only and name not in self.only:
+            return
         if self.left < needs and not self.dry:
             self.found[name] = {"left_out": f"{self.left:.0f} s were left, {needs:.0f} are needed"}
             return
@@ -104,6 +110,7 @@ class Stage:
         try:
             told = call()
         except Exception as error:  # the stage goes on: the card is not at hand for long
+            traceback.print_exc()
             told = {"failed": f"{type(error).__name__}: {error}".splitlines()[0]}
         self.found[name] = {"seconds": round(time.monotonic() - since, 2), **told}
         print(f"{name}: {json.dumps(self.found[name])[:400]}", flush=True)
@@ -111,13 +118,16 @@ class Stage:
     def child(self, command: list[str], most: float, **environ: str) -> dict[str, Any]:
         """A process of its own: its exit code, seconds, and the end of what it said."""
         since = time.monotonic()
-        whole = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1", **environ}
+        paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+        whole = {**os.environ, "PYTHONPATH": paths, "PYTHONSAFEPATH": "1", **environ}
         limit = max(10.0, min(most, self.left))
         try:
             ran = subprocess.run(command, cwd=ROOT, env=whole, capture_output=True, text=True, timeout=limit)
         except subprocess.TimeoutExpired:
             return {"exit_code": None, "seconds": round(limit, 1), "said": "it was ended: no time was left"}
         said = (ran.stdout + ran.stderr).strip().splitlines()
+        if ran.returncode:
+            print("\n".join(said), file=sys.stderr)
         return {"exit_code": ran.returncode, "seconds": round(time.monotonic() - since, 2), "said": said[-25:]}
 
     def scratch_shot(self) -> Shot:
@@ -178,6 +188,7 @@ def sanitizer(stage: Stage) -> None:
     tests = [sys.executable, "-P", "-m", "pytest", "-q", *picked]
     for name in TOOLS:
         before = [] if tool is None else [tool, "--tool", name, "--error-exitcode", "99", "--target-processes", "all"]
+        before += ["--racecheck-report", "all"] if tool is not None and name == "racecheck" else []
         stage.part(name, lambda before=before: stage.child([*before, *tests], SECONDS / len(TOOLS)), needs=20.0)
 
 
@@ -197,6 +208,8 @@ def raster(stage: Stage) -> None:
         stage.part(name, lambda n=name, r=rounds: raster_bench.measure(WORKLOADS[n], bodies, rivals, r), needs=60.0)
     largest = "W0" if stage.dry else "W4"
     stage.part("profile", lambda: _profile(stage, largest), needs=30.0)
+    small = raster_bench._Case(room(*WORKLOADS["W0" if stage.dry else "W2"]), bodies["ours"])
+    stage.part("host", lambda: _host(stage, small.image, 20 if stage.dry else 500), needs=20.0)
     stage.part("short_list", lambda: _short_list(stage, largest), needs=30.0)
     stage.part("planes", lambda: _planes(stage), needs=20.0)
 
@@ -219,6 +232,53 @@ def _profile(stage: Stage, name: str) -> dict[str, Any]:
 
     rows = sorted(seen.key_averages(), key=spent, reverse=True)[:20]
     return {"us": [{"what": row.key[:80], "self_us": round(spent(row), 1), "calls": row.count} for row in rows]}
+
+
+def _host(stage: Stage, run: Callable[[], Any], count: int) -> dict[str, Any]:
+    """What the host does in one of `count` runs: ms in all, without a profiler, and by Python's the functions it spends
+    most on, [calls, own us, us with what they call] (a profiler makes small functions look larger)."""
+    for _ in range(5):
+        run()
+    stage.wait()
+    since = time.perf_counter()
+    for _ in range(count):
+        run()
+    issued = time.perf_counter() - since
+    stage.wait()
+    whole = time.perf_counter() - since
+    watch = cProfile.Profile()
+    watch.enable()
+    for _ in range(count):
+        run()
+    watch.disable()
+    stage.wait()
+    rows: dict[str, list[float]] = {}
+    for entry in watch.getstats():
+        code = entry.code
+        name = code if isinstance(code, str) else f"{Path(code.co_filename).name}:{code.co_firstlineno} {code.co_name}"
+        spent = [entry.callcount, 1e6 * entry.inlinetime, 1e6 * entry.totaltime]
+        rows[name[:70]] = [round(value / count, 2) for value in spent]
+
+    def most(column: int) -> dict[str, Any]:
+        return dict(sorted(rows.items(), key=lambda row: row[1][column], reverse=True)[:45])
+
+    told = {"ms": round(1e3 * whole / count, 3), "issued_ms": round(1e3 * issued / count, 3)}
+    return {**told, "own": most(1), "with_calls": most(2)}
+
+
+def _late_step(stage: Stage) -> dict[str, Any]:
+    """A step of `preview` past its half, the field there and the trial over: host and card, as `_host`, `_busy`."""
+    scene = load_scene(stage.scratch_shot())
+    few, width = (600, 64) if stage.dry else (PRESETS["preview"]().densify.budget, PRESETS["preview"]().width)
+    config = config_from_params(
+        TrainParams(preset="preview", iterations=100 if stage.dry else 0, max_gaussians=few, width=width)
+    )
+    images = load_images(scene, scene.solved, *training_size(scene, width)).to(stage.device)
+    trainer = Trainer(scene, images, scene.solved, config, Silent(), {}, stage.device)
+    while trainer.iteration < 0.6 * config.iterations:
+        _step(trainer)
+    told = {"gaussians": len(trainer.model.gaussians), "open": len(trainer.model.open_rows())}
+    return {**told, **_busy(stage, trainer), **_host(stage, lambda: _step(trainer), 20 if stage.dry else 200)}
 
 
 def _short_list(stage: Stage, name: str) -> dict[str, Any]:
@@ -281,7 +341,9 @@ def training(stage: Stage) -> None:
                 name = f"{preset}-{device}-{seed}"
                 needs = 20.0 if device == "cuda" else 150.0
                 stage.part(name, lambda p=preset, d=device, s=seed: _trained(stage, p, d, s), needs=needs)
+    stage.part("full_hd", lambda: _full_hd(stage), needs=30.0)
     stage.part("waits", lambda: _waits(stage), needs=20.0)
+    stage.part("step", lambda: _late_step(stage), needs=20.0)
 
 
 def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any]:
@@ -308,14 +370,20 @@ def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any
     return {**{key: summary[key] for key in kept}, "ms_per_step": pace, "warnings": report.warnings}
 
 
-def _trainer(stage: Stage, iterations: int, most: int, width: int = 0, method: str = "auto") -> Trainer:
-    """A run of `final` that nothing is saved of."""
+def _trainer(
+    stage: Stage, iterations: int, most: int, width: int = 0, method: str = "auto", stretched: tuple[int, int] = (0, 0)
+) -> Trainer:
+    """A run of `final` that nothing is saved of; its frames stretched to a width and height, if those are given."""
     scene = load_scene(stage.scratch_shot())
     config = config_from_params(
         TrainParams(preset="final", iterations=iterations, max_gaussians=most, method=method, width=width)
     )
     size = training_size(scene, config.width)
     images = load_images(scene, scene.solved, *size).to(stage.device)
+    if stretched[0]:
+        planes = [image.permute(2, 0, 1)[None].float() for image in images]
+        images = torch.cat([interpolate(plane, stretched[::-1], mode="bilinear").half() for plane in planes])
+        images = images.permute(0, 2, 3, 1).contiguous()
     return Trainer(scene, images, scene.solved, config, Silent(), {}, stage.device)
 
 
@@ -323,6 +391,63 @@ def _step(trainer: Trainer) -> None:
     trainer.schedule_events()
     trainer.step()
     trainer.iteration += 1
+
+
+def _enlarged(trainer: Trainer, many: int) -> None:
+    """`many` Gaussians of those a run has: each split into smaller ones about its place, all of them open."""
+    gaussians = trainer.model.gaussians
+    few, device = len(gaussians), gaussians.open.device
+    rows = torch.arange(many, device=device) % few
+    gaussians.rebuild(rows, torch.zeros(many, dtype=torch.bool, device=device), trainer.optimizer)
+    with torch.no_grad():
+        means, log_scales = gaussians.params["means"], gaussians.params["log_scales"]
+        means += log_scales.exp() * torch.randn(means.shape, generator=trainer.generator).to(device)
+        log_scales -= 0.5 * math.log(max(1.0, many / few))
+    gaussians.open[:] = True
+    trainer.densifier.reset(many)
+
+
+def _full_hd(stage: Stage) -> dict[str, Any]:
+    """A step of `final` with 1,000,000 Gaussians on frames stretched to 1920 x 1080: ms while nothing, a tenth and all
+    of them may move, and what of it the card was busy, by how many kernels."""
+    many, size, count = (2000, (64, 36), 2) if stage.dry else (1_000_000, (1920, 1080), 30)
+    trainer = _trainer(stage, 300, 2000 if stage.dry else 100_000, 64 if stage.dry else 0, "hexplane", size)
+    trainer.schedule_events()
+    told: dict[str, Any] = {"gaussians": many, "width": size[0], "height": size[1], "frames": len(trainer.times)}
+    for name, share in (("static", 0.0), ("tenth", 0.1), ("all", 1.0)):
+        if name == "tenth":
+            trainer.iteration = 101  # a third: the field is made
+            trainer.schedule_events()
+        if len(trainer.model.gaussians) != many:
+            _enlarged(trainer, many)
+        trainer.model.gaussians.open[:] = torch.rand(many, device=stage.device) < share
+        for _ in range(3):
+            trainer.step()
+        stage.wait()
+        since = time.perf_counter()
+        for _ in range(count):
+            trainer.step()
+        stage.wait()
+        told[name] = {"ms": round(1e3 * (time.perf_counter() - since) / count, 2), **_busy(stage, trainer)}
+        if stage.device.type == "cuda":
+            told[name]["peak_gb"] = round(torch.cuda.max_memory_allocated() / 1e9, 2)
+    return told
+
+
+def _busy(stage: Stage, trainer: Trainer) -> dict[str, Any]:
+    """Of three steps, by torch's profiler: ms that the card was busy in each, how many kernels, the ten longest."""
+    if stage.device.type != "cuda":
+        return {}
+    kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=kinds) as seen:
+        for _ in range(3):
+            trainer.step()
+        stage.wait()
+    kernels = [row for row in seen.key_averages() if "CUDA" in str(row.device_type)]
+    kernels.sort(key=lambda row: row.self_device_time_total, reverse=True)
+    longest = {row.key[:60]: round(row.self_device_time_total / 3e3, 3) for row in kernels[:10]}
+    busy = sum(row.self_device_time_total for row in kernels) / 3e3
+    return {"busy_ms": round(busy, 2), "kernels": sum(row.count for row in kernels) // 3, "longest_ms": longest}
 
 
 def _waits(stage: Stage) -> dict[str, Any]:
@@ -371,11 +496,7 @@ def _memory(stage: Stage, gb: int) -> dict[str, Any]:
     trainer.iteration = 21  # a third: the field is made
     trainer.schedule_events()
     trainer.model.pieces = 500 if stage.dry else plan.pieces
-    gaussians, many = trainer.model.gaussians, 2000 if stage.dry else plan.gaussians
-    rows = torch.arange(many, device=stage.device) % len(gaussians)
-    gaussians.rebuild(rows, torch.zeros(many, dtype=torch.bool, device=stage.device), trainer.optimizer)
-    gaussians.open[:] = True
-    trainer.densifier.reset(many)
+    _enlarged(trainer, 2000 if stage.dry else plan.gaussians)
     told: dict[str, Any] = {"planned": {"gaussians": plan.gaussians, "pieces": plan.pieces}, "sentence": plan.sentence}
     if stage.device.type == "cuda":
         whole = torch.cuda.get_device_properties(stage.device).total_memory
@@ -394,7 +515,7 @@ def _memory(stage: Stage, gb: int) -> dict[str, Any]:
             told["peak_gb"] = round(torch.cuda.max_memory_allocated() / 1e9, 3)
             told["reserved_gb"] = round(torch.cuda.max_memory_reserved() / 1e9, 3)
             torch.cuda.set_per_process_memory_fraction(1.0)
-            del trainer, gaussians
+            del trainer
             torch.cuda.empty_cache()
     return told
 
@@ -525,13 +646,15 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("stage", choices=tuple(STAGES))
     parser.add_argument("--results", type=Path, default=Path("output/gpu"), metavar="DIR")
     parser.add_argument("--shot", type=Path, help="a solved shot folder, copied: for training and limits")
+    parser.add_argument("--only", nargs="+", default=[], metavar="PART", help="these parts of the stage alone")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of the stage (default: %(default)g)")
     parser.add_argument("--dry-run", action="store_true", help="on the processor, at tiny sizes: figures mean nothing")
     args = parser.parse_args(words)
     if not args.dry_run and (refusal := cuda_refusal()):
         print(f"{refusal} --dry-run goes through the stage on the processor.", file=sys.stderr)
         return 9
     args.results.mkdir(parents=True, exist_ok=True)
-    stage = Stage(args.dry_run, args.shot, args.results.absolute())
+    stage = Stage(args.dry_run, args.shot, args.results.absolute(), args.seconds, args.only)
     since = time.monotonic()
     STAGES[args.stage](stage)
     report = {

@@ -31,6 +31,8 @@ Launch = Callable[[int, int, int], None]
 """A compiled snippet, called as f(address of the block, stage, worker)."""
 _lock = threading.RLock()
 _pools: dict[int, ThreadPoolExecutor] = {}
+_recorded = threading.local()
+"""A thread's launches, by kernel, device and threads of a block."""
 
 PRELUDE = kernel_text(Path(__file__).with_name("kernels") / "prelude.cpp")
 POINTER, INTEGER = (ctypes.c_uint64, "float*"), (ctypes.c_int64, "long long")
@@ -172,12 +174,47 @@ def warp_stream(device: torch.device) -> Any:
     return _stream(f"cuda:{current.device_index}", current.cuda_stream)
 
 
-def launch_on(kernel: Any, dim: Any, inputs: list[Any], device: torch.device) -> None:
-    """Launches a Warp kernel where a torch tensor's `device` is; on CUDA behind torch's work, on its current stream."""
-    warp = initialised_warp()
-    if device.type == "cpu":
-        warp.launch(kernel, dim=dim, inputs=inputs, device="cpu")
+def launch_on(
+    kernel: Any, dim: int, inputs: list[Any], device: torch.device, block: int | None = None, stream: Any = None
+) -> None:
+    """Launches a Warp kernel where a torch tensor's `device` is; on CUDA behind torch's work, on its current stream.
+
+    Warp looks at kernel, module and arguments anew in each launch, which takes the host longer than a small kernel
+    takes a card. So a thread has it recorded once, and from then on says only what is other.
+
+    Args:
+        dim: threads.
+        inputs: numbers, or ctypes structures in the layout of a Warp structure.
+        block: threads of a block (default: Warp's).
+        stream: what `warp_stream` says of the device, from whoever launches several.
+    """
+    if not dim:
         return
-    # Warp leaves its device current; the caller's may be another one.
-    with torch.cuda.device(device):
-        warp.launch(kernel, dim=dim, inputs=inputs, stream=warp_stream(device))
+    if device.type == "cuda" and _cards() > 1:
+        with torch.cuda.device(device):  # Warp leaves its device current; the caller's may be another one
+            _relaunch(kernel, dim, inputs, device, block, stream or warp_stream(device))
+    else:
+        on_card = device.type == "cuda"
+        _relaunch(kernel, dim, inputs, device, block, stream or (warp_stream(device) if on_card else None))
+
+
+@functools.cache
+def _cards() -> int:
+    return torch.cuda.device_count()
+
+
+def _relaunch(kernel: Any, dim: int, inputs: list[Any], device: torch.device, block: int | None, stream: Any) -> None:
+    known: dict[Any, Any] = _recorded.__dict__
+    key = kernel, device, block
+    command = known.get(key)
+    if command is None:
+        blank = [arg.type() for arg in kernel.adj.args]
+        command = known[key] = initialised_warp().launch(
+            kernel, dim=dim, inputs=blank, block_dim=block, record_cmd=True, record_tape=False, stream=stream,
+            device=None if stream else "cpu",
+        )  # fmt: skip
+    if command.bounds.size != dim:
+        command.set_dim(dim)
+    for index, value in enumerate(inputs):
+        command.set_param_at_index_from_ctype(index, value)
+    command.launch(stream)

@@ -166,7 +166,7 @@ def _adrift(
     pieces = [(float(np.median(depth[labels == label])), labels == label) for label in np.nonzero(right)[0]]
     for near, mask in sorted(pieces, key=lambda piece: piece[0]):
         core, ring = _around(mask, bench.unit, config)
-        if (depth[ring] < config.near * near).mean() > config.ahead:
+        if not ring.any() or (depth[ring] < config.near * near).mean() > config.ahead:
             continue
         piece = _Piece(mask, near, _painters(bench, frozen, core, near, config), 0.0)
         piece = _belonging(bench, frozen, image, piece, config)

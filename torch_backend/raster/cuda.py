@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..native import initialised_warp, warp_stream
+from ..native import initialised_warp, launch_on, warp_stream
 from ..torch_types import AutogradContext, applied, once_differentiable
 from . import cuda_source as source
 from .constants import TILE
@@ -90,23 +90,15 @@ class _Launcher:
 
     def __init__(self, device: torch.device):
         self.wp, self.device = initialised_warp(), device
-        self.where = {"stream": warp_stream(device)} if device.type == "cuda" else {"device": "cpu"}
+        self.stream = warp_stream(device) if device.type == "cuda" else None
 
     def __call__(self, name: str, args: Any, threads: int, channels: int = 0) -> None:
         """Run kernel `name` on at least `threads` threads."""
         if threads == 0:
             return
-        blocks = -(-threads // source.BLOCK)
-        kernel = build(name, channels)
+        dim = -(-threads // source.BLOCK) * source.BLOCK
         with nullcontext() if self.device.type == "cuda" else _Fibers(self.wp):
-            self.wp.launch(
-                kernel,
-                dim=blocks * source.BLOCK,
-                inputs=[args],
-                block_dim=source.BLOCK,
-                record_tape=False,
-                **self.where,
-            )
+            launch_on(build(name, channels), dim, [args], self.device, source.BLOCK, self.stream)
 
 
 class _Fibers:
@@ -191,8 +183,11 @@ def _demand(scene: Scene, hit_count: Tensor) -> _Demand:
 
 
 def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
-    """Parameter structure with the sizes and flags of a call."""
-    args = _structure(wp)()
+    """Parameter structure with the sizes and flags of a call.
+
+    The bare ctypes one: Warp's own around it takes twenty times as long to set a field, and there are a hundred.
+    """
+    args = _structure(wp).ctype()
     args.n, args.cameras, args.width, args.height = (
         scene.means.shape[0],
         scene.viewmats.shape[0],
@@ -256,10 +251,11 @@ def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_c
     """List the hits tile by tile, front to back."""
     make, capacity = _Maker(depth_key.device), demand.capacity
     slots, tiles = hit_count.shape[0], args.tiles_x * args.tiles_y * args.cameras
-    tile_start, tile_end = make.zeros(tiles, dtype=torch.int32), make.zeros(tiles, dtype=torch.int32)
-    hits = make.zeros(2, dtype=torch.int64)
+    # Each operator of torch is a launch, or two: what begins at zero does so in one.
+    zeros = make.zeros(4 + 2 * tiles, dtype=torch.int32)
+    hits, tile_start, tile_end = zeros[:4].view(torch.int64), zeros[4 : 4 + tiles], zeros[4 + tiles :]
     order = torch.sort(depth_key, stable=True).indices
-    ends = torch.cumsum(hit_count[order], 0, dtype=torch.int64)
+    ends = torch.cumsum(hit_count.index_select(0, order), 0, dtype=torch.int64)
     sorted_slot = make.empty(capacity, dtype=torch.int32)
     _point(args, order=order, ends=ends, sorted_slot=sorted_slot, tile_start=tile_start, tile_end=tile_end)
     args.capacity = capacity
@@ -281,34 +277,32 @@ class _Images(NamedTuple):
     image: Tensor
     """[C, H, W, D]: channels of the scene, then with depth the sum of alpha T depth."""
     alpha: Tensor
-    median: Tensor
-    """This one and the last four but `hits` are empty where nobody wants them."""
     radii: Tensor
     means2d: Tensor
-    weight_sum: Tensor
-    weight_max: Tensor
-    top_id: Tensor
-    top_weight: Tensor
-    hits: Tensor
+    hits: Tensor | None
+    """None until they are counted, those below where nobody wants them."""
+    median: Tensor | None
+    weight_sum: Tensor | None
+    weight_max: Tensor | None
+    top_id: Tensor | None
+    top_weight: Tensor | None
 
 
 def _unfilled(make: _Maker, scene: Scene) -> _Images:
     """Room for what a call leaves. `weight_sum` is of the kernels' integer parts still, `hits` are not counted."""
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
-    size, none = (cameras, scene.height, scene.width), (0,)
-    depth, top = size if scene.with_depth else none, size if scene.with_top else none
-    per_slot = (cameras, n) if scene.with_contributions else none
+    size, weights = (cameras, scene.height, scene.width), scene.with_contributions
     return _Images(
         image=make.empty(*size, scene.channels + int(scene.with_depth)),
         alpha=make.empty(*size),
-        median=make.empty(*depth),
         radii=make.empty(cameras, n, dtype=torch.int32),
         means2d=make.empty(cameras, n, 2),
-        weight_sum=make.zeros(*per_slot, dtype=torch.int64),
-        weight_max=make.zeros(*per_slot),
-        top_id=make.empty(*top, dtype=torch.int32),
-        top_weight=make.empty(*top),
-        hits=make.empty(0, dtype=torch.int64),
+        hits=None,
+        median=make.empty(*size) if scene.with_depth else None,
+        weight_sum=make.zeros(cameras, n, dtype=torch.int64) if weights else None,
+        weight_max=make.zeros(cameras, n) if weights else None,
+        top_id=make.empty(*size, dtype=torch.int32) if scene.with_top else None,
+        top_weight=make.empty(*size) if scene.with_top else None,
     )
 
 
@@ -365,15 +359,12 @@ class _Rasterize(torch.autograd.Function):
         cameras, n = viewmats.shape[0], means.shape[0]
         channels, slots = scene.channels + int(scene.with_depth), cameras * n
         out = _unfilled(make, scene)
-        behind = make.zeros(channels)
-        if background is not None:
-            behind[: scene.channels] = background
         args = _arguments(launch.wp, scene, channels)
         record, aux = make.empty(slots, args.record_stride), make.empty(slots, 2)
         hit_count, depth_key = make.empty(slots, dtype=torch.int32), make.empty(slots, dtype=torch.int32)
         inputs = (means, quats, log_scales, logits, colors, sh, viewmats)
         _point(args, means=means, quats=quats, log_scales=log_scales, logits=logits, colors=colors, sh=sh)
-        _point(args, viewmats=viewmats, Ks=scene.Ks, background=behind)
+        _point(args, viewmats=viewmats, Ks=scene.Ks, background=background)
         _point(args, record=record, aux=aux, hit_count=hit_count, depth_key=depth_key)
         _point(args, radii=out.radii, means2d=out.means2d)
         launch("raster_project", args, slots)
@@ -385,9 +376,10 @@ class _Rasterize(torch.autograd.Function):
             saved = _Saved(*inputs, background, out.image, out.alpha, record, aux, hit_count, *binned)
             ctx.save_for_backward(*saved)
             ctx.scene, ctx.norms, ctx.capacity = scene, norms, args.capacity
-        weight_sum = (out.weight_sum.double() / source.WEIGHT_SCALE).float()
-        out = out._replace(weight_sum=weight_sum, hits=binned.hits)
-        ctx.mark_non_differentiable(*out[2:])
+        out = out._replace(hits=binned.hits)
+        if out.weight_sum is not None:
+            out = out._replace(weight_sum=out.weight_sum * (1.0 / source.WEIGHT_SCALE))
+        ctx.mark_non_differentiable(*(value for value in out[2:] if value is not None))
         ctx.set_materialize_grads(False)
         return out
 
@@ -399,7 +391,7 @@ class _Rasterize(torch.autograd.Function):
         make, launch = _Maker(means.device), _Launcher(means.device)
         channels, cameras, n = image.shape[-1], viewmats.shape[0], means.shape[0]
         grad_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
-        grad_alpha = torch.zeros_like(alpha) if grads[1] is None else grads[1].contiguous()
+        grad_alpha = None if grads[1] is None else grads[1].contiguous()
         args = _arguments(launch.wp, scene, channels)
         args.capacity, args.want_view = ctx.capacity, int(ctx.needs_input_grad[8])
         grad = make.zeros(cameras * n, args.grad_stride)
@@ -412,7 +404,7 @@ class _Rasterize(torch.autograd.Function):
             "grad_sh": saved.sh,
         }
         out = {name: None if value is None else torch.empty_like(value) for name, value in inputs.items()}
-        grad_view = torch.zeros_like(viewmats)
+        grad_view = torch.zeros_like(viewmats) if args.want_view else None
         # Of what was saved all but the background and the count of hits is an input here, under the same name.
         kept = {name: value for name, value in saved._asdict().items() if name not in ("background", "hits")}
         _point(
@@ -470,7 +462,7 @@ def rasterize(scene: Scene) -> RasterOutput:
             f"{cameras} cameras of {scene.width} x {scene.height} px with {n} Gaussians are too much for "
             "one call: split the cameras"
         )
-    norms = (torch.zeros(cameras, n, device=device), torch.zeros(cameras, n, device=device))
+    norms = torch.zeros(2, cameras, n, device=device).unbind()
     # Warp leaves its device current; a caller's may be another one.
     with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
         inputs = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh)
@@ -479,19 +471,18 @@ def rasterize(scene: Scene) -> RasterOutput:
     if scene.with_depth:
         colors, depth_sum = out.image[..., :-1], out.image[..., -1]
         depth = expected_depth(depth_sum, out.alpha)
-    weights, top = scene.with_contributions, scene.with_top
     return RasterOutput(
         colors=colors,
         alphas=out.alpha,
         depth_expected=depth,
-        depth_median=out.median if scene.with_depth else None,
+        depth_median=out.median,
         radii=out.radii,
         means2d=out.means2d,
-        weight_sum=out.weight_sum if weights else None,
-        weight_max=out.weight_max if weights else None,
+        weight_sum=out.weight_sum,
+        weight_max=out.weight_max,
         means2d_grad=norms[0],
         means2d_absgrad=norms[1],
-        top_ids=out.top_id if top else None,
-        top_weights=out.top_weight if top else None,
+        top_ids=out.top_id,
+        top_weights=out.top_weight,
         hits=out.hits,
     )

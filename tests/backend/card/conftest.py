@@ -44,6 +44,7 @@ WALKS = (
     "step_bytes static hexplane control_points",
     "memory_ends hexplane 0.6",
     "memory_ends static 0.85",
+    "bad_frames",
     "self_test",
     "station",
 )

@@ -256,12 +256,11 @@ def pretended_card() -> Iterator[Card]:
         saved.append((where, name, getattr(where, name)))
         setattr(where, name, value)
 
-    def launch_on(kernel: Any, dim: Any, inputs: list[Any], device: torch.device) -> None:
-        CARD.launched[kernel.key] += device.type == "cuda"
-        native.initialised_warp().launch(kernel, dim=dim, inputs=inputs, device="cpu")
+    host, launch_here = torch.device("cpu"), native.launch_on
 
-    def launcher(self: Any, device: torch.device) -> None:
-        self.wp, self.device, self.where = native.initialised_warp(), device, {"device": "cpu"}
+    def launch_on(kernel: Any, dim: int, inputs: list[Any], device: torch.device) -> None:
+        CARD.launched[kernel.key] += device.type == "cuda"
+        launch_here(kernel, dim, inputs, host)
 
     def launch(self: Any, name: str, args: Any, threads: int, channels: int = 0) -> None:
         if threads:
@@ -269,10 +268,7 @@ def pretended_card() -> Iterator[Card]:
             CARD.launched[name] += 1
             dim = -(-threads // cuda.source.BLOCK) * cuda.source.BLOCK
             with cuda._Fibers(self.wp):
-                self.wp.launch(
-                    cuda.build(name, channels), dim=dim, inputs=[args], block_dim=cuda.source.BLOCK, record_tape=False,
-                    **self.where,
-                )  # fmt: skip
+                launch_here(cuda.build(name, channels), dim, [args], host, cuda.source.BLOCK)
 
     plain = torch.tensor
     patch(torch, "tensor", lambda *values, pin_memory=False, **options: plain(*values, **options))
@@ -290,7 +286,7 @@ def pretended_card() -> Iterator[Card]:
     patch(chosen, "card_verdict", SelfTest)  # it would ask a process of its own, which has no such card
     for module in (native, ssim_cuda, adam, planes_cuda):
         patch(module, "launch_on", launch_on)
-    patch(cuda._Launcher, "__init__", launcher)
+    patch(cuda, "warp_stream", lambda device: None)
     patch(cuda._Launcher, "__call__", launch)
     patch(cuda, "_refusal", lambda device: None)
     overwritten = torch.__future__.get_overwrite_module_params_on_conversion()

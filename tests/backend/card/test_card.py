@@ -54,6 +54,12 @@ def test_where_memory_ends_without_a_field_the_least_go(walk):
     assert told["budget"] == 330, "what was asked for is the run's key"
 
 
+def test_frames_of_no_numbers_change_nothing_on_a_card(walk):
+    told = walk("bad_frames")
+    assert told["changed"] == [] and any("not finite" in warning for warning in told["warnings"])
+    assert "unstable" in told["ended"]
+
+
 def test_a_card_is_tested_before_its_first_use(walk):
     told = walk("self_test")
     assert told["sound"] == "" and told["checks"] > 8

@@ -210,6 +210,30 @@ def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def bad_frames(folder: Path) -> dict[str, Any]:
+    """Steps on frames of no numbers: what the run says of nine, what of its parameters they changed, and of 21."""
+    from torch_backend.contract import JobError
+
+    world, quiet = small_world(folder)
+    with pretended_card():
+        trainer = new_trainer(world, quiet, "auto", "support", False)
+        trainer.images = trainer.images * float("nan")  # not before: colours begin as the frames'
+        before = {name: p.detach().clone() for name, p in trainer.model.gaussians.params.items()}
+        for _ in range(9):
+            trainer.step()
+        trainer.inspect_nonfinite()
+        changed = [name for name, p in trainer.model.gaussians.params.items() if not bool((before[name] == p).all())]
+        warnings = [event[1] for event in trainer.report.events if event[0] == "warning"]
+        for _ in range(12):
+            trainer.step()
+        try:
+            trainer.inspect_nonfinite()
+            ended = ""
+        except JobError as error:
+            ended = str(error)
+    return {"changed": changed, "warnings": warnings, "ended": ended}
+
+
 def self_test(folder: Path) -> dict[str, Any]:
     """The self-test of the card as it is, of one whose kernels fail to launch, and of one that is full."""
     import torch
@@ -234,7 +258,7 @@ def self_test(folder: Path) -> dict[str, Any]:
 
 WALKS = {
     "steps": steps, "launches": launches, "resume": resume, "station": station, "step_bytes": step_bytes,
-    "memory_ends": memory_ends, "self_test": self_test,
+    "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test,
 }  # fmt: skip
 
 if __name__ == "__main__":

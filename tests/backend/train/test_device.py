@@ -115,14 +115,23 @@ def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
 
 @needs_gpu
 def test_a_gpu_run_is_as_good_as_a_cpu_run(world, quiet):
+    """Without a field: with one, five seeds of this small a run are 10 dB apart on one device."""
     found = {}
     for device in ("cpu", "cuda"):
-        params = TrainParams(run=f"on-{device}", iterations=600, max_gaussians=1500, holdout=8, device=device)
+        params = TrainParams(
+            run=f"on-{device}", iterations=300, max_gaussians=1500, holdout=8, device=device, method="static"
+        )
         found[device] = train_shot(world.shot, params, quiet())["heldout_psnr_db"]
         run = load_run(world.shot, params.run, choose_device(device))
         assert run.model.device.type == device
-        freeze_shot(world.shot, FreezeParams(run=params.run, take=params.run, device=device), quiet())
-    assert found["cuda"] > found["cpu"] - 0.5
+    assert abs(found["cuda"] - found["cpu"]) < 0.5
+
+
+@needs_gpu
+def test_a_gpu_run_with_a_field_is_trained_and_frozen(world, quiet):
+    params = TrainParams(run="moves", iterations=600, max_gaussians=1500, holdout=8, device="cuda")
+    assert train_shot(world.shot, params, quiet())["moving_gaussians"] > 0
+    assert freeze_shot(world.shot, FreezeParams(run="moves", take="moves", device="cuda"), quiet())["frames"] > 0
 
 
 @needs_gpu
@@ -130,7 +139,8 @@ def test_bad_frames_are_left_out_on_the_gpu_too(world, quiet):
     scene = load_scene(world.shot)
     images = load_images(scene, scene.solved, 64, 48).cuda()
     report = quiet()
-    trainer = Trainer(scene, images * float("nan"), scene.solved, config_from_params(TrainParams()), report, {}, "cuda")
+    trainer = Trainer(scene, images, scene.solved, config_from_params(TrainParams()), report, {}, "cuda")
+    trainer.images = images * float("nan")  # not before: colours begin as the frames'
     before = {name: p.detach().clone() for name, p in trainer.model.gaussians.params.items()}
     for _ in range(9):
         trainer.step()

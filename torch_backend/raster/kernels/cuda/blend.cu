@@ -36,5 +36,6 @@ UNROLL for (int s = 0; s < SLOTS; s++) if (inside[s]) {
     if (P.want_depth) P.median[pixel] = median[s];
     if (P.want_top) {
         P.top_weight[pixel] = largest[s]; P.top_id[pixel] = winner[s] < 0 ? -1 : winner[s] - camera * P.n; }
-    UNROLL for (int c = 0; c < NCH; c++) P.image[pixel * NCH + c] = C[s][c] + T[s] * P.background[c];
+    UNROLL for (int c = 0; c < NCH; c++)
+        P.image[pixel * NCH + c] = P.background && c < NCH - P.want_depth ? C[s][c] + T[s] * P.background[c] : C[s][c];
 }

@@ -8,7 +8,7 @@ UNROLL for (int s = 0; s < SLOTS; s++) {
     left[s] = 0.f;
     UNROLL for (int c = 0; c < NCH; c++) G[s][c] = 0.f;
     if (!inside[s]) continue;
-    left[s] = -P.grad_alpha[pixel] * (1.f - P.alpha[pixel]);
+    if (P.grad_alpha) left[s] = -P.grad_alpha[pixel] * (1.f - P.alpha[pixel]);
     UNROLL for (int c = 0; c < NCH; c++) {
         G[s][c] = P.grad_image[pixel * NCH + c]; left[s] = fmaf(G[s][c], P.image[pixel * NCH + c], left[s]); }
 }

@@ -39,6 +39,8 @@ for (int c = 0; c < P.n_colors; c++) {
     ok = ok && finite(value); channel[c] = value; }
 if (!ok) return;
 if (P.want_depth) channel[P.n_colors] = pz;
+// Tiles read records by four floats.
+for (int c = P.n_sh + P.n_colors + P.want_depth; c & 3; c++) channel[c - P.n_sh] = 0.f;
 const Extent e = {mx, my, -0.5f * LOG2E * yy / det, xy / yy, -0.5f * LOG2E / yy, lop, my - hy, my + hy, hx,
                   xy / xx * hx};
 float4* head = (float4*)(P.record + slot * P.record_stride);
