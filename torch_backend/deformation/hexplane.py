@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +25,7 @@ from ..torch_types import unflatten
 from . import network, planes_cuda
 from . import planes as compiled
 from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_scale
+from .stacked import stacked
 
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
 PUBLISHED_ITERATIONS = 33_000
@@ -77,10 +78,10 @@ class HexPlaneConfig(HostConfig):
     (on)."""
 
     def row_bytes(self) -> int:
-        """A level's product and its gradient (by torch's own operators six samples and their products), and a layer
-        before and after it bends: the trunk's, five heads'; on the way back the gradients of three layers."""
+        """A level's product and its gradient (by torch's own operators six samples and their products); before they
+        bend the layers of the trunk and of five heads; on the way back those heads' once bent, and a layer more."""
         kept = 12 if planes_cuda.refused else 2
-        return 4 * (kept * self.features * len(self.levels) + self.width * (2 * (1 + len(_WIDTHS)) + 3))
+        return 4 * (kept * self.features * len(self.levels) + self.width * (2 + 2 * len(_WIDTHS)))
 
 
 def _reference(iterations: int) -> HexPlaneConfig:
@@ -103,6 +104,15 @@ def _reference(iterations: int) -> HexPlaneConfig:
         stretch=0.0,
         published=True,
     )
+
+
+class _InOrder(NamedTuple):
+    """A field's parameters in the order in which they are used."""
+
+    planes: list[Tensor]
+    """Three of space, then three of time, level by level."""
+    trunk: network.Layer
+    heads: list[tuple[network.Layer, network.Layer]]
 
 
 class HexPlane(Deformation):
@@ -147,6 +157,7 @@ class HexPlane(Deformation):
         widths = {**_WIDTHS, "shN": 3 * harmonics} if config.published and harmonics else _WIDTHS
         self.hidden = nn.ModuleDict({name: _linear(config.width, config.width, generator) for name in widths})
         self.out = nn.ModuleDict({n: nn.Linear(config.width, size, device="cpu") for n, size in widths.items()})
+        self._held: _InOrder | None = None
         for head in self.out.values():
             if config.published:
                 nn.init.xavier_uniform_(head.weight, generator=generator)  # type: ignore[arg-type]
@@ -196,18 +207,25 @@ class HexPlane(Deformation):
 
     def _network(self, features: Tensor) -> tuple[Tensor, ...]:
         """What each head says of features [M, features * levels]."""
-        trunk = _layer(self.trunk)
-        heads = [(_layer(self.hidden[name]), _layer(self.out[name])) for name in self.out]
+        _, trunk, heads = self._in_order()
         if self.config.silu and network.supports(features, trunk, heads):
             return network.network(features, trunk, heads)
-        bent = F.silu if self.config.silu else F.relu
-        hidden = bent(F.linear(features, *trunk))
-        return tuple(F.linear(bent(F.linear(hidden, *first)), *last) for first, last in heads)
+        return stacked(features, trunk, heads, self.config.silu)
 
     def _by_level(self) -> list[Tensor]:
         """Three planes of space, then three of time, level by level."""
-        levels = range(0, len(self.spatial), 3)
-        return [plane for n in levels for plane in (*self.spatial[n : n + 3], *self.temporal[n : n + 3])]
+        return self._in_order().planes
+
+    def _in_order(self) -> _InOrder:
+        """Torch's lists of parameters look names up at each turn: a millisecond of a step on a card's host."""
+        if self._held is None or self._held.trunk.weight is not self.trunk.weight:
+            levels = range(0, len(self.spatial), 3)
+            self._held = _InOrder(
+                [plane for n in levels for plane in (*self.spatial[n : n + 3], *self.temporal[n : n + 3])],
+                _layer(self.trunk),
+                [(_layer(self.hidden[name]), _layer(self.out[name])) for name in self.out],
+            )
+        return self._held
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Two groups: the planes and the network. Published: their schedule begins when the field does."""

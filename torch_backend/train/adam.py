@@ -8,11 +8,14 @@ runs over chunks on threads; on CUDA a Warp kernel does the same per element, an
 import functools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..kernel_text import kernel_text
@@ -104,6 +107,7 @@ class FusedAdam(torch.optim.Optimizer):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "rows": False, "clamp": (-math.inf, math.inf)})
         self.threads, self.kernel = threads, kernel
         self.applied = torch.tensor(True, device="cpu")
+        self._plan: _Plan | None = None
 
     @torch.no_grad()
     def step(self, closure: None = None, *, visible: Tensor | None = None, guard: Sequence[Tensor] = ()) -> None:  # type: ignore[override]
@@ -119,6 +123,12 @@ class FusedAdam(torch.optim.Optimizer):
             return
         device = found[0][0].device
         kernel = device.type != "cpu" if self.kernel is None else self.kernel
+        rows = None if visible is None else visible.contiguous().view(torch.uint8)
+        if kernel:
+            bad = torch.zeros(1, dtype=torch.int32, device=device)
+            self._run_kernel(found, guard, bad, rows)
+            self.applied = bad[0] == 0
+            return
         whole: list[int] = []
         real: list[float] = []
         kept: list[Tensor] = []  # alive until the step is done: the tables hold their addresses
@@ -131,8 +141,7 @@ class FusedAdam(torch.optim.Optimizer):
             chunks += -(-value.numel() // _CHUNK)
         steps: list[Tensor] = []
         for p, group in found:
-            if p.dtype != torch.float32 or p.device != device:
-                raise ValueError(f"FusedAdam takes float32 parameters on one device, got {p.dtype} on {p.device}")
+            self._check(p, device)
             m, v, t = self._state_of(p)
             grad = p.grad if p.grad.stride() == p.stride() else torch.empty_like(p).copy_(p.grad)
             kept.append(grad)
@@ -140,20 +149,20 @@ class FusedAdam(torch.optim.Optimizer):
             lr, (b1, b2), (low, high) = group["lr"], group["betas"], group["clamp"]
             width = p.numel() // max(1, len(p)) if group["rows"] else 0
             whole += (p.data_ptr(), grad.data_ptr(), m.data_ptr(), v.data_ptr(), p.numel(), width, chunks, t.data_ptr())
-            count = 0.0 if kernel else float(t) + 1.0
-            scale = (0.0, 0.0) if kernel else (lr / (1.0 - b1**count), 1.0 / math.sqrt(1.0 - b2**count))
+            count = float(t) + 1.0
+            scale = lr / (1.0 - b1**count), 1.0 / math.sqrt(1.0 - b2**count)
             real += (lr, 1.0 - b1, 1.0 - b2, group["eps"], low, high, *scale)
             chunks += -(-p.numel() // _CHUNK)
-        rows = None if visible is None else visible.contiguous().view(torch.uint8)
         bad = torch.zeros(1, dtype=torch.int32, device=device)
-        if kernel:
-            self._run_kernel(whole, real, bad, rows, chunks)
-            self.applied = bad[0] == 0
-        else:
-            self.applied = self._run_snippet(whole, real, bad, rows, chunks)
-            if bool(self.applied):
-                for t in steps:
-                    t += 1.0
+        self.applied = self._run_snippet(whole, real, bad, rows, chunks)
+        if bool(self.applied):
+            for t in steps:
+                t += 1.0
+
+    @staticmethod
+    def _check(p: Tensor, device: torch.device) -> None:
+        if p.dtype != torch.float32 or p.device != device:
+            raise ValueError(f"FusedAdam takes float32 parameters on one device, got {p.dtype} on {p.device}")
 
     def _state_of(self, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Moments and step count; moments lie in memory as their parameter does, wherever they came from."""
@@ -186,14 +195,89 @@ class FusedAdam(torch.optim.Optimizer):
         return bad[0] == 0
 
     def _run_kernel(
-        self, whole: list[int], real: list[float], bad: Tensor, visible: Tensor | None, chunks: int
+        self, found: list[tuple[Any, dict[str, Any]]], guard: Sequence[Tensor], bad: Tensor, visible: Tensor | None
     ) -> None:
-        pinned = bad.device.type == "cuda"
-        table = torch.tensor(whole, dtype=torch.int64, device="cpu", pin_memory=pinned)
-        numbers = torch.tensor(real, dtype=torch.float32, device="cpu", pin_memory=pinned)
-        table, numbers = table.to(bad.device, non_blocking=True), numbers.to(bad.device, non_blocking=True)
-        segments = len(whole) // _WHOLE
+        """The step on a card. All but gradients and rates is the same from step to step and kept in a `_Plan`."""
+        device, plan = bad.device, self._plan
+        if plan is None or not plan.fits(found, self.state):
+            for p, _ in found:
+                self._check(p, device)
+            plan = self._plan = _Plan.of(found, [self._state_of(p) for p, _ in found], self.param_groups)
+        checked = [value.detach().float().reshape(-1) for value in guard]
+        grads = [
+            p.grad if p.grad.stride() == stride else torch.empty_like(p).copy_(p.grad)
+            for (p, _), stride in zip(found, plan.strides, strict=True)
+        ]
+        segments = len(checked) + len(grads)
+        # One table, so one way to the card: the integers, then the floats, two of them in the place of an integer.
+        table = np.zeros((segments, _WHOLE + _REAL // 2), np.int64).reshape(-1)
+        whole = table[: segments * _WHOLE].reshape(segments, _WHOLE)
+        real = table[segments * _WHOLE :].view(np.float32).reshape(segments, _REAL)
+        chunks = 0
+        for row, value in enumerate(checked):
+            whole[row, 1], whole[row, 4], whole[row, 6] = value.data_ptr(), value.numel(), chunks
+            chunks += -(-value.numel() // _CHUNK)
+        whole[len(checked) :] = plan.whole
+        whole[len(checked) :, 1] = [grad.data_ptr() for grad in grads]
+        whole[len(checked) :, 6] += chunks
+        chunks += plan.chunks
+        rates = [
+            (g["lr"], 1.0 - g["betas"][0], 1.0 - g["betas"][1], g["eps"], *g["clamp"], 0.0, 0.0)
+            for g in self.param_groups
+        ]
+        real[len(checked) :] = np.array(rates, np.float32)[plan.group_of]
+        sent: Tensor = torch.from_numpy(table)  # pyright: ignore[reportUnknownMemberType]
+        sent = (sent.pin_memory() if device.type == "cuda" else sent).to(device, non_blocking=True)
         mask = 0 if visible is None else visible.data_ptr()
+        address = sent.data_ptr()
         for stage, threads in ((0, chunks * _CHUNK), (1, segments), (2, chunks * _CHUNK)):
-            inputs = [table.data_ptr(), numbers.data_ptr(), bad.data_ptr(), mask, segments, stage]
-            launch_on(_kernel(), threads, inputs, bad.device)
+            inputs = [address, address + 8 * _WHOLE * segments, bad.data_ptr(), mask, segments, stage]
+            launch_on(_kernel(), threads, inputs, device)
+
+
+@dataclass
+class _Plan:
+    """What a step's tables say that is the same in the next one, S parameters with gradients."""
+
+    params: list[Tensor]
+    moments: list[Tensor]
+    """Their first moments: other ones mean that a state was restored."""
+    addresses: list[int]
+    """Where the parameters lie."""
+    strides: list[tuple[int, ...]]
+    whole: NDArray[np.int64]
+    """[S, _WHOLE], without the gradients' addresses."""
+    group_of: NDArray[np.int64]
+    """[S] which group each is of."""
+    chunks: int
+
+    @classmethod
+    def of(
+        cls,
+        found: list[tuple[Any, dict[str, Any]]],
+        states: list[tuple[Tensor, Tensor, Tensor]],
+        groups: list[dict[str, Any]],
+    ) -> "_Plan":
+        rows: list[tuple[int, ...]] = []
+        chunks = 0
+        for (p, group), (m, v, t) in zip(found, states, strict=True):
+            width = p.numel() // max(1, len(p)) if group["rows"] else 0
+            rows.append((p.data_ptr(), 0, m.data_ptr(), v.data_ptr(), p.numel(), width, chunks, t.data_ptr()))
+            chunks += -(-p.numel() // _CHUNK)
+        places = {id(group): place for place, group in enumerate(groups)}
+        return cls(
+            params=[p for p, _ in found],
+            moments=[m for m, _, _ in states],
+            addresses=[row[0] for row in rows],
+            strides=[p.stride() for p, _ in found],
+            whole=np.array(rows, np.int64),
+            group_of=np.array([places[id(group)] for _, group in found], np.int64),
+            chunks=chunks,
+        )
+
+    def fits(self, found: list[tuple[Any, dict[str, Any]]], state: Any) -> bool:
+        """Is it of these parameters, with these states, where they lie now?"""
+        return len(found) == len(self.params) and all(
+            p is known and state[p].get("exp_avg") is moment and p.data_ptr() == address
+            for (p, _), known, moment, address in zip(found, self.params, self.moments, self.addresses, strict=True)
+        )
