@@ -17,6 +17,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, cast
 
@@ -190,12 +191,15 @@ def launch_on(
     """
     if not dim:
         return
-    if device.type == "cuda" and _cards() > 1:
-        with torch.cuda.device(device):  # Warp leaves its device current; the caller's may be another one
-            _relaunch(kernel, dim, inputs, device, block, stream or warp_stream(device))
-    else:
+    with current(device):
         on_card = device.type == "cuda"
         _relaunch(kernel, dim, inputs, device, block, stream or (warp_stream(device) if on_card else None))
+
+
+def current(device: torch.device) -> AbstractContextManager[Any]:
+    """Makes a card the current one, for Warp leaves its device current, and the caller's may be another one. Nothing
+    on a machine without a second card: to ask takes longer than to launch."""
+    return torch.cuda.device(device) if device.type == "cuda" and _cards() > 1 else contextlib.nullcontext()
 
 
 @functools.cache

@@ -12,9 +12,10 @@ _BANDS = {1: 0, 4: 1, 9: 2, 16: 3}
 
 def _shape(name: str, value: Tensor, expected: tuple[int | str, ...]) -> None:
     """Raise ValueError unless `value` has the shape `expected`, where a string stands for any size."""
-    ok = value.dim() == len(expected)
-    ok = ok and all(isinstance(e, str) or e == s for e, s in zip(expected, value.shape, strict=True))
-    if not ok:
+    shape = value.shape
+    if len(shape) != len(expected) or any(
+        e != s and not isinstance(e, str) for e, s in zip(expected, shape, strict=True)
+    ):
         dimensions = ", ".join(str(e) for e in expected)
         raise ValueError(f"{name} must have shape [{dimensions}], not {list(value.shape)}")
 

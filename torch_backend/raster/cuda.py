@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..native import initialised_warp, launch_on, warp_stream
+from ..native import current, initialised_warp, launch_on, warp_stream
 from ..torch_types import AutogradContext, applied, once_differentiable
 from . import cuda_source as source
 from .constants import TILE
@@ -230,6 +230,41 @@ class _Maker:
         return torch.zeros(shape, dtype=dtype, device=self.device)
 
 
+class _Zeros(NamedTuple):
+    """What begins at zero in a call: parts of one tensor, since each operator of torch is a launch or two."""
+
+    whole: Tensor
+    """int32, the tiles' first and last hits at its end."""
+    norms: tuple[Tensor, Tensor]
+    """[C, N] each: where the backward pass writes `means2d_grad` and `means2d_absgrad`."""
+    hits: Tensor
+    """[2] int64: hits of the call, and how many the list holds."""
+    weight_sum: Tensor | None
+    """[C, N] int64 parts; this one and the next for a call with contributions."""
+    weight_max: Tensor | None
+
+    @classmethod
+    def of(cls, scene: Scene) -> "_Zeros":
+        """For a call on this scene."""
+        cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
+        slots, tiles = cameras * n, cameras * -(-scene.width // TILE) * -(-scene.height // TILE)
+        wanted = scene.with_contributions
+        weighed = 3 * slots if wanted else 0
+        whole = torch.zeros(4 + weighed + 2 * slots + 2 * tiles, dtype=torch.int32, device=scene.means.device)
+        real = whole.view(torch.float32)
+
+        def part(of: Tensor, first: int) -> Tensor:
+            return of.as_strided((cameras, n), (n, 1), first)
+
+        return cls(
+            whole=whole,
+            norms=(part(real, 4 + weighed), part(real, 4 + weighed + slots)),
+            hits=whole[:4].view(torch.int64),
+            weight_sum=part(whole[: 4 + weighed - weighed % 2].view(torch.int64), 2) if wanted else None,
+            weight_max=part(real, 4 + 2 * slots) if wanted else None,
+        )
+
+
 class _Binned(NamedTuple):
     """The hits of a call, listed tile by tile, front to back. S slots, T tiles."""
 
@@ -239,25 +274,19 @@ class _Binned(NamedTuple):
     """[S] int64: hits up to and with each rank."""
     sorted_slot: Tensor
     """[capacity] int32: slot of each hit."""
-    tile_start: Tensor
-    """[T] int32: first hit of each tile."""
-    tile_end: Tensor
-    """[T] int32"""
-    hits: Tensor
-    """[2] int64: hits of the call, and how many the list holds."""
+    zeros: Tensor
+    """int32, whose end [2, T] is of each tile the first hit and that behind the last."""
 
 
-def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_count: Tensor) -> _Binned:
+def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_count: Tensor, zeros: _Zeros) -> _Binned:
     """List the hits tile by tile, front to back."""
     make, capacity = _Maker(depth_key.device), demand.capacity
     slots, tiles = hit_count.shape[0], args.tiles_x * args.tiles_y * args.cameras
-    # Each operator of torch is a launch, or two: what begins at zero does so in one.
-    zeros = make.zeros(4 + 2 * tiles, dtype=torch.int32)
-    hits, tile_start, tile_end = zeros[:4].view(torch.int64), zeros[4 : 4 + tiles], zeros[4 + tiles :]
     order = torch.sort(depth_key, stable=True).indices
     ends = torch.cumsum(hit_count.index_select(0, order), 0, dtype=torch.int64)
     sorted_slot = make.empty(capacity, dtype=torch.int32)
-    _point(args, order=order, ends=ends, sorted_slot=sorted_slot, tile_start=tile_start, tile_end=tile_end)
+    _point(args, order=order, ends=ends, sorted_slot=sorted_slot)
+    _point_tiles(args, zeros.whole, tiles)
     args.capacity = capacity
     if slots and tiles:
         key = torch.full((capacity,), tiles, dtype=torch.int32 if args.wide else torch.int16, device=make.device)
@@ -265,10 +294,15 @@ def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_c
         _point(args, hit_key=key, hit_slot=hit_slot)
         launch("raster_emit", args, slots)
         sorted_key, permutation = torch.sort(key, stable=True)
-        _point(args, sorted_key=sorted_key, permutation=permutation, hits=hits, demand=demand.most)
+        _point(args, sorted_key=sorted_key, permutation=permutation, hits=zeros.hits, demand=demand.most)
         launch("raster_ranges", args, capacity)
         demand.report()
-    return _Binned(order, ends, sorted_slot, tile_start, tile_end, hits)
+    return _Binned(order, ends, sorted_slot, zeros.whole)
+
+
+def _point_tiles(args: Any, zeros: Tensor, tiles: int) -> None:
+    tile_start, tile_end = zeros[zeros.numel() - 2 * tiles :].view(2, tiles).unbind()
+    _point(args, tile_start=tile_start, tile_end=tile_end)
 
 
 class _Images(NamedTuple):
@@ -279,28 +313,28 @@ class _Images(NamedTuple):
     alpha: Tensor
     radii: Tensor
     means2d: Tensor
-    hits: Tensor | None
-    """None until they are counted, those below where nobody wants them."""
+    hits: Tensor
     median: Tensor | None
+    """None, like those below, where nobody wants it."""
     weight_sum: Tensor | None
     weight_max: Tensor | None
     top_id: Tensor | None
     top_weight: Tensor | None
 
 
-def _unfilled(make: _Maker, scene: Scene) -> _Images:
+def _unfilled(make: _Maker, scene: Scene, zeros: _Zeros) -> _Images:
     """Room for what a call leaves. `weight_sum` is of the kernels' integer parts still, `hits` are not counted."""
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
-    size, weights = (cameras, scene.height, scene.width), scene.with_contributions
+    size = cameras, scene.height, scene.width
     return _Images(
         image=make.empty(*size, scene.channels + int(scene.with_depth)),
         alpha=make.empty(*size),
         radii=make.empty(cameras, n, dtype=torch.int32),
         means2d=make.empty(cameras, n, 2),
-        hits=None,
+        hits=zeros.hits,
         median=make.empty(*size) if scene.with_depth else None,
-        weight_sum=make.zeros(cameras, n, dtype=torch.int64) if weights else None,
-        weight_max=make.zeros(cameras, n) if weights else None,
+        weight_sum=zeros.weight_sum,
+        weight_max=zeros.weight_max,
         top_id=make.empty(*size, dtype=torch.int32) if scene.with_top else None,
         top_weight=make.empty(*size) if scene.with_top else None,
     )
@@ -325,9 +359,7 @@ class _Saved(NamedTuple):
     order: Tensor
     ends: Tensor
     sorted_slot: Tensor
-    tile_start: Tensor
-    tile_end: Tensor
-    hits: Tensor
+    zeros: Tensor
 
 
 class _Context(AutogradContext, Protocol):
@@ -345,7 +377,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: _Context,
         scene: Scene,
-        norms: tuple[Tensor, Tensor],
+        zeros: _Zeros,
         means: Tensor,
         quats: Tensor,
         log_scales: Tensor,
@@ -358,7 +390,7 @@ class _Rasterize(torch.autograd.Function):
         make, launch = _Maker(means.device), _Launcher(means.device)
         cameras, n = viewmats.shape[0], means.shape[0]
         channels, slots = scene.channels + int(scene.with_depth), cameras * n
-        out = _unfilled(make, scene)
+        out = _unfilled(make, scene, zeros)
         args = _arguments(launch.wp, scene, channels)
         record, aux = make.empty(slots, args.record_stride), make.empty(slots, 2)
         hit_count, depth_key = make.empty(slots, dtype=torch.int32), make.empty(slots, dtype=torch.int32)
@@ -368,15 +400,14 @@ class _Rasterize(torch.autograd.Function):
         _point(args, record=record, aux=aux, hit_count=hit_count, depth_key=depth_key)
         _point(args, radii=out.radii, means2d=out.means2d)
         launch("raster_project", args, slots)
-        binned = _bin(launch, args, _demand(scene, hit_count), depth_key, hit_count)
+        binned = _bin(launch, args, _demand(scene, hit_count), depth_key, hit_count, zeros)
         _point(args, image=out.image, alpha=out.alpha, median=out.median, top_id=out.top_id, top_weight=out.top_weight)
         _point(args, weight_sum=out.weight_sum, weight_max=out.weight_max)
         launch("raster_blend", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)
         if any(ctx.needs_input_grad):
             saved = _Saved(*inputs, background, out.image, out.alpha, record, aux, hit_count, *binned)
             ctx.save_for_backward(*saved)
-            ctx.scene, ctx.norms, ctx.capacity = scene, norms, args.capacity
-        out = out._replace(hits=binned.hits)
+            ctx.scene, ctx.norms, ctx.capacity = scene, zeros.norms, args.capacity
         if out.weight_sum is not None:
             out = out._replace(weight_sum=out.weight_sum * (1.0 / source.WEIGHT_SCALE))
         ctx.mark_non_differentiable(*(value for value in out[2:] if value is not None))
@@ -405,8 +436,9 @@ class _Rasterize(torch.autograd.Function):
         }
         out = {name: None if value is None else torch.empty_like(value) for name, value in inputs.items()}
         grad_view = torch.zeros_like(viewmats) if args.want_view else None
-        # Of what was saved all but the background and the count of hits is an input here, under the same name.
-        kept = {name: value for name, value in saved._asdict().items() if name not in ("background", "hits")}
+        # Of what was saved all but the background and the zeros is an input here, under the same name.
+        kept = {name: value for name, value in saved._asdict().items() if name not in ("background", "zeros")}
+        _point_tiles(args, saved.zeros, args.tiles_x * args.tiles_y * cameras)
         _point(
             args,
             **kept,
@@ -462,11 +494,10 @@ def rasterize(scene: Scene) -> RasterOutput:
             f"{cameras} cameras of {scene.width} x {scene.height} px with {n} Gaussians are too much for "
             "one call: split the cameras"
         )
-    norms = torch.zeros(2, cameras, n, device=device).unbind()
-    # Warp leaves its device current; a caller's may be another one.
-    with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
+    zeros = _Zeros.of(scene)
+    with current(device):
         inputs = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh)
-        out = _Images(*applied(_Rasterize, scene, norms, *inputs, scene.viewmats, scene.background))
+        out = _Images(*applied(_Rasterize, scene, zeros, *inputs, scene.viewmats, scene.background))
     colors, depth = out.image, None
     if scene.with_depth:
         colors, depth_sum = out.image[..., :-1], out.image[..., -1]
@@ -480,8 +511,8 @@ def rasterize(scene: Scene) -> RasterOutput:
         means2d=out.means2d,
         weight_sum=out.weight_sum,
         weight_max=out.weight_max,
-        means2d_grad=norms[0],
-        means2d_absgrad=norms[1],
+        means2d_grad=zeros.norms[0],
+        means2d_absgrad=zeros.norms[1],
         top_ids=out.top_id,
         top_weights=out.top_weight,
         hits=out.hits,

@@ -229,9 +229,9 @@ class FusedAdam(torch.optim.Optimizer):
         sent: Tensor = torch.from_numpy(table)  # pyright: ignore[reportUnknownMemberType]
         sent = (sent.pin_memory() if device.type == "cuda" else sent).to(device, non_blocking=True)
         mask = 0 if visible is None else visible.data_ptr()
-        address = sent.data_ptr()
+        wholes, reals = sent[: segments * _WHOLE], sent[segments * _WHOLE :].view(torch.float32)
         for stage, threads in ((0, chunks * _CHUNK), (1, segments), (2, chunks * _CHUNK)):
-            inputs = [address, address + 8 * _WHOLE * segments, bad.data_ptr(), mask, segments, stage]
+            inputs = [wholes.data_ptr(), reals.data_ptr(), bad.data_ptr(), mask, segments, stage]
             launch_on(_kernel(), threads, inputs, device)
 
 
