@@ -11,6 +11,7 @@ OpenMP threads would take the cores.
 import contextlib
 import ctypes
 import functools
+import importlib
 import os
 import sys
 import tempfile
@@ -32,7 +33,7 @@ Launch = Callable[[int, int, int], None]
 """A compiled snippet, called as f(address of the block, stage, worker)."""
 _lock = threading.RLock()
 _pools: dict[int, ThreadPoolExecutor] = {}
-_raw_stream: Callable[[int], int] | None = getattr(torch._C, "_cuda_getCurrentRawStream", None)
+_raw_stream: Any = getattr(importlib.import_module("torch._C"), "_cuda_getCurrentRawStream", None)
 """The handle of torch's current stream of a card, without an object around it: what torch's own compiler asks."""
 _recorded = threading.local()
 """A thread's launches, by kernel, device and threads of a block."""
@@ -173,7 +174,8 @@ def _stream(device: str, handle: int) -> Any:
 
 def warp_stream(device: torch.device) -> Any:
     """Warp's name for torch's current stream of a CUDA device; kept for good, as torch keeps its streams."""
-    index = torch.cuda.current_device() if device.index is None else device.index
+    given: Any = device.index  # None for plain "cuda"
+    index: int = torch.cuda.current_device() if given is None else given
     if _raw_stream is not None:
         return _stream(f"cuda:{index}", _raw_stream(index))
     return _stream(f"cuda:{index}", torch.cuda.current_stream(device).cuda_stream)
