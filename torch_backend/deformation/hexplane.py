@@ -25,7 +25,6 @@ from ..torch_types import unflatten
 from . import network, planes_cuda
 from . import planes as compiled
 from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_scale
-from .stacked import stacked
 
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
 PUBLISHED_ITERATIONS = 33_000
@@ -78,10 +77,10 @@ class HexPlaneConfig(HostConfig):
     (on)."""
 
     def row_bytes(self) -> int:
-        """A level's product and its gradient (by torch's own operators six samples and their products); before they
-        bend the layers of the trunk and of five heads; on the way back those heads' once bent, and a layer more."""
+        """A level's product and its gradient (by torch's own operators six samples and their products), and a layer
+        before and after it bends: the trunk's, five heads'; on the way back the gradients of three layers."""
         kept = 12 if planes_cuda.refused else 2
-        return 4 * (kept * self.features * len(self.levels) + self.width * (2 + 2 * len(_WIDTHS)))
+        return 4 * (kept * self.features * len(self.levels) + self.width * (2 * (1 + len(_WIDTHS)) + 3))
 
 
 def _reference(iterations: int) -> HexPlaneConfig:
@@ -210,7 +209,9 @@ class HexPlane(Deformation):
         _, trunk, heads = self._in_order()
         if self.config.silu and network.supports(features, trunk, heads):
             return network.network(features, trunk, heads)
-        return stacked(features, trunk, heads, self.config.silu)
+        bent = F.silu if self.config.silu else F.relu
+        hidden = bent(F.linear(features, *trunk))
+        return tuple(F.linear(bent(F.linear(hidden, *first)), *last) for first, last in heads)
 
     def _by_level(self) -> list[Tensor]:
         """Three planes of space, then three of time, level by level."""

@@ -1,10 +1,10 @@
 """The HexPlane's network on the CPU, compiled: a trunk and heads of two layers, and their gradients.
 
-By torch's operators (`stacked`, for every other device and type) each layer of all Gaussians is written before and
-after it bends, some hundred floats apiece, and read again on the way back: with many Gaussians that is more memory than
-arithmetic. Here a few dozen Gaussians at a time go through the whole network, nothing is kept but what comes out, and
-the way back makes the layers anew. The gradients of the weights are sums over fixed shares of the Gaussians, so that
-any number of threads gives the same bits.
+torch's own path (`hexplane`) is the specification and serves every other device and type. It writes each layer of all
+Gaussians before and after it bends, some hundred floats apiece, and reads them again on the way back: with many
+Gaussians that is more memory than arithmetic. Here a few dozen Gaussians at a time go through the whole network,
+nothing is kept but what comes out, and the way back makes the layers anew. The gradients of the weights are sums over
+fixed shares of the Gaussians, so that any number of threads gives the same bits.
 """
 
 from __future__ import annotations

@@ -167,7 +167,7 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
             trainer.iteration = 4
             trainer.schedule_events()
             peaks: list[tuple[int, int]] = []
-            for times in (4, 4):
+            for times in (2, 2):
                 many = len(trainer.model.gaussians) * times
                 rows = torch.arange(many, device="cuda") % len(trainer.model.gaussians)
                 fresh = torch.zeros(many, dtype=torch.bool, device="cuda")
