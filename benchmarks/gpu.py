@@ -26,7 +26,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +88,10 @@ class Silent:
 class Stage:
     """A stage that runs: its parts, its clock, what it found."""
 
-    def __init__(self, dry: bool, shot: Path | None, results: Path, seconds: float, only: list[str]) -> None:
+    def __init__(
+        self, dry: bool, shot: Path | None, results: Path, seconds: float = SECONDS, only: Sequence[str] = ()
+    ) -> None:
+        """`only`: names of parts; none: all."""
         self.dry, self.shot, self.results, self.only = dry, shot, results, only
         self.device = torch.device("cpu" if dry else "cuda")
         self.found: dict[str, Any] = {}

@@ -31,6 +31,13 @@ def test_a_part_that_fails_is_a_sentence_and_the_others_go_on(tmp_path):
     assert "30 are needed" in stage.found["too late"]["left_out"]
 
 
+def test_parts_can_be_asked_for_by_name(tmp_path):
+    assert gpu.main(["raster", "--dry-run", "--only", "host", "planes", "--results", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "gpu-raster.json").read_text())["found"]
+    assert set(found) == {"peer", "host", "planes"}
+    assert found["host"]["ms"] > 0.0 and any("forward" in name for name in found["host"]["with_calls"])
+
+
 @pytest.mark.skipif(not cuda_refusal(), reason="there is a card")
 def test_without_a_card_it_says_how_to_go_on(tmp_path, capsys):
     assert gpu.main(["raster", "--results", str(tmp_path)]) == 9
