@@ -233,8 +233,9 @@ class _Maker:
 class _Zeros(NamedTuple):
     """What begins at zero in a call: parts of one tensor, since each operator of torch is a launch or two."""
 
-    whole: Tensor
-    """int32, the tiles' first and last hits at its end."""
+    tile_start: Tensor
+    tile_end: Tensor
+    """Of `_Binned`."""
     norms: tuple[Tensor, Tensor]
     """[C, N] each: where the backward pass writes `means2d_grad` and `means2d_absgrad`."""
     hits: Tensor
@@ -256,8 +257,10 @@ class _Zeros(NamedTuple):
         def part(of: Tensor, first: int) -> Tensor:
             return of.as_strided((cameras, n), (n, 1), first)
 
+        tile_start, tile_end = whole[whole.numel() - 2 * tiles :].view(2, tiles).unbind()
         return cls(
-            whole=whole,
+            tile_start=tile_start,
+            tile_end=tile_end,
             norms=(part(real, 4 + weighed), part(real, 4 + weighed + slots)),
             hits=whole[:4].view(torch.int64),
             weight_sum=part(whole[: 4 + weighed - weighed % 2].view(torch.int64), 2) if wanted else None,
@@ -274,8 +277,10 @@ class _Binned(NamedTuple):
     """[S] int64: hits up to and with each rank."""
     sorted_slot: Tensor
     """[capacity] int32: slot of each hit."""
-    zeros: Tensor
-    """int32, whose end [2, T] is of each tile the first hit and that behind the last."""
+    tile_start: Tensor
+    """[T] int32: first hit of each tile."""
+    tile_end: Tensor
+    """[T] int32"""
 
 
 def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_count: Tensor, zeros: _Zeros) -> _Binned:
@@ -286,7 +291,7 @@ def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_c
     ends = torch.cumsum(hit_count.index_select(0, order), 0, dtype=torch.int64)
     sorted_slot = make.empty(capacity, dtype=torch.int32)
     _point(args, order=order, ends=ends, sorted_slot=sorted_slot)
-    _point_tiles(args, zeros.whole, tiles)
+    _point(args, tile_start=zeros.tile_start, tile_end=zeros.tile_end)
     args.capacity = capacity
     if slots and tiles:
         key = torch.full((capacity,), tiles, dtype=torch.int32 if args.wide else torch.int16, device=make.device)
@@ -297,12 +302,7 @@ def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_c
         _point(args, sorted_key=sorted_key, permutation=permutation, hits=zeros.hits, demand=demand.most)
         launch("raster_ranges", args, capacity)
         demand.report()
-    return _Binned(order, ends, sorted_slot, zeros.whole)
-
-
-def _point_tiles(args: Any, zeros: Tensor, tiles: int) -> None:
-    tile_start, tile_end = zeros[zeros.numel() - 2 * tiles :].view(2, tiles).unbind()
-    _point(args, tile_start=tile_start, tile_end=tile_end)
+    return _Binned(order, ends, sorted_slot, zeros.tile_start, zeros.tile_end)
 
 
 class _Images(NamedTuple):
@@ -359,7 +359,8 @@ class _Saved(NamedTuple):
     order: Tensor
     ends: Tensor
     sorted_slot: Tensor
-    zeros: Tensor
+    tile_start: Tensor
+    tile_end: Tensor
 
 
 class _Context(AutogradContext, Protocol):
@@ -436,9 +437,8 @@ class _Rasterize(torch.autograd.Function):
         }
         out = {name: None if value is None else torch.empty_like(value) for name, value in inputs.items()}
         grad_view = torch.zeros_like(viewmats) if args.want_view else None
-        # Of what was saved all but the background and the zeros is an input here, under the same name.
-        kept = {name: value for name, value in saved._asdict().items() if name not in ("background", "zeros")}
-        _point_tiles(args, saved.zeros, args.tiles_x * args.tiles_y * cameras)
+        # Of what was saved all but the background is an input here, under the same name.
+        kept = {name: value for name, value in saved._asdict().items() if name != "background"}
         _point(
             args,
             **kept,
