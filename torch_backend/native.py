@@ -197,12 +197,12 @@ def launch_on(
     """
     if not dim:
         return
-    with current(device):
+    with current_card(device):
         on_card = device.type == "cuda"
         _relaunch(kernel, dim, inputs, device, block, stream or (warp_stream(device) if on_card else None))
 
 
-def current(device: torch.device) -> AbstractContextManager[Any]:
+def current_card(device: torch.device) -> AbstractContextManager[Any]:
     """Makes a card the current one, for Warp leaves its device current, and the caller's may be another one. Nothing
     on a machine without a second card: to ask takes longer than to launch."""
     return torch.cuda.device(device) if device.type == "cuda" and _cards() > 1 else contextlib.nullcontext()

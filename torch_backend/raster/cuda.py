@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..native import current, initialised_warp, launch_on, warp_stream
+from ..native import current_card, initialised_warp, launch_on, warp_stream
 from ..torch_types import AutogradContext, applied, once_differentiable
 from . import cuda_source as source
 from .constants import TILE
@@ -185,7 +185,7 @@ def _demand(scene: Scene, hit_count: Tensor) -> _Demand:
 def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
     """Parameter structure with the sizes and flags of a call.
 
-    The bare ctypes one: Warp's own around it takes twenty times as long to set a field, and there are a hundred.
+    The bare ctypes one: Warp's own around it takes ten times as long to set a field, and there are a hundred.
     """
     args = _structure(wp).ctype()
     args.n, args.cameras, args.width, args.height = (
@@ -495,7 +495,7 @@ def rasterize(scene: Scene) -> RasterOutput:
             "one call: split the cameras"
         )
     zeros = _Zeros.of(scene)
-    with current(device):
+    with current_card(device):
         inputs = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.colors, scene.sh)
         out = _Images(*applied(_Rasterize, scene, zeros, *inputs, scene.viewmats, scene.background))
     colors, depth = out.image, None

@@ -153,13 +153,36 @@ def test_any_number_of_threads_gives_the_same_bits():
     assert all(torch.equal(results[0], other) for other in results[1:])
 
 
-def test_parameters_without_gradient_stay_without_state():
+@pytest.mark.parametrize("kernel", BODIES)
+def test_parameters_without_gradient_stay_without_state(kernel):
     p, q = torch.nn.Parameter(torch.zeros(4)), torch.nn.Parameter(torch.zeros(4))
-    optimizer = FusedAdam([p, q])
+    optimizer = FusedAdam([p, q], kernel=kernel)
     p.grad = torch.ones(4)
     optimizer.step()
     assert q not in optimizer.state
     assert float(q.detach().abs().max()) == 0.0
+    before = p.detach().clone()
+    p.grad, q.grad = None, torch.ones(4)  # another one than in the step before
+    optimizer.step()
+    assert torch.equal(p.detach(), before) and float(q.detach().abs().min()) > 0.0
+
+
+@pytest.mark.parametrize("kernel", BODIES)
+def test_moments_that_are_put_back_count_from_the_next_step(kernel):
+    """As a repair does in mid-run: the same parameter, other moments, and other memory under the parameter."""
+    p, q = (torch.nn.Parameter(torch.ones(6)) for _ in range(2))
+    ours, theirs = FusedAdam([p], lr=0.1, kernel=kernel), torch.optim.Adam([q], lr=0.1, eps=1e-15)
+    for step in range(6):
+        p.grad, q.grad = torch.full((6,), 1.0 + step), torch.full((6,), 1.0 + step)
+        if step == 2:
+            for optimizer, value in ((ours, p), (theirs, q)):
+                for name in ("exp_avg", "exp_avg_sq"):
+                    optimizer.state[value][name] = torch.full((6,), 0.25)
+        if step == 4:
+            p.data, q.data = p.data.clone() + 1.0, q.data.clone() + 1.0
+        ours.step()
+        theirs.step()
+    torch.testing.assert_close(p.detach(), q.detach(), rtol=1e-5, atol=1e-6)
 
 
 def gaussians():
@@ -169,7 +192,8 @@ def gaussians():
     return Gaussians({name: torch.randn(shape, generator=g) for name, shape in shapes.items()}, 4)
 
 
-def test_checkpoints_of_torch_adam_go_on():
+@pytest.mark.parametrize("kernel", BODIES)
+def test_checkpoints_of_torch_adam_go_on(kernel):
     """State names are torch's: what torch.optim.Adam wrote, the fused one continues, to rounding."""
     old, new = gaussians(), gaussians()
     generator = torch.Generator().manual_seed(6)
@@ -179,7 +203,7 @@ def test_checkpoints_of_torch_adam_go_on():
     stored = optimizer_state(dict(old.params), first)
     for name, p in new.params.items():
         p.data.copy_(old.params[name].detach())
-    second = FusedAdam(list(new.params.values()), lr=1e-2)
+    second = FusedAdam(list(new.params.values()), lr=1e-2, kernel=kernel)
     restore_optimizer(dict(new.params), second, stored)
     for _ in range(5):
         give_gradients(old.params.values(), generator)
@@ -191,9 +215,10 @@ def test_checkpoints_of_torch_adam_go_on():
         torch.testing.assert_close(p.detach(), old.params[name].detach(), rtol=1e-5, atol=1e-6)
 
 
-def test_growth_keeps_moments_and_later_groups_join():
+@pytest.mark.parametrize("kernel", BODIES)
+def test_growth_keeps_moments_and_later_groups_join(kernel):
     model = gaussians()
-    optimizer = FusedAdam([{"params": [p], "rows": True} for p in model.params.values()], lr=1e-2)
+    optimizer = FusedAdam([{"params": [p], "rows": True} for p in model.params.values()], lr=1e-2, kernel=kernel)
     generator = torch.Generator().manual_seed(7)
     give_gradients(model.params.values(), generator)
     optimizer.step()
