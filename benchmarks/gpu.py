@@ -211,8 +211,7 @@ def raster(stage: Stage) -> None:
         stage.part(name, lambda n=name, r=rounds: raster_bench.measure(WORKLOADS[n], bodies, rivals, r), needs=60.0)
     largest = "W0" if stage.dry else "W4"
     stage.part("profile", lambda: _profile(stage, largest), needs=30.0)
-    small = raster_bench._Case(room(*WORKLOADS["W0" if stage.dry else "W2"]), bodies["ours"])
-    stage.part("host", lambda: _host(stage, small.image, 20 if stage.dry else 500), needs=20.0)
+    stage.part("host", lambda: _frames_host(stage, bodies["ours"]), needs=20.0)
     stage.part("short_list", lambda: _short_list(stage, largest), needs=30.0)
     stage.part("planes", lambda: _planes(stage), needs=20.0)
 
@@ -267,6 +266,12 @@ def _host(stage: Stage, run: Callable[[], Any], count: int) -> dict[str, Any]:
 
     told = {"ms": round(1e3 * whole / count, 3), "issued_ms": round(1e3 * issued / count, 3)}
     return {**told, "own": most(1), "with_calls": most(2)}
+
+
+def _frames_host(stage: Stage, body: raster_bench.Body) -> dict[str, Any]:
+    """`_host` of a small frame and its gradient."""
+    case = raster_bench._Case(room(*WORKLOADS["W0" if stage.dry else "W2"]), body)
+    return _host(stage, case.image, 20 if stage.dry else 500)
 
 
 def _late_step(stage: Stage) -> dict[str, Any]:

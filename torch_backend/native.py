@@ -197,9 +197,10 @@ def launch_on(
     """
     if not dim:
         return
+    if stream is None and device.type == "cuda":
+        stream = warp_stream(device)
     with current_card(device):
-        on_card = device.type == "cuda"
-        _relaunch(kernel, dim, inputs, device, block, stream or (warp_stream(device) if on_card else None))
+        _relaunch(kernel, dim, inputs, device, block, stream)
 
 
 def current_card(device: torch.device) -> AbstractContextManager[Any]:

@@ -218,7 +218,8 @@ class HexPlane(Deformation):
         return self._in_order().planes
 
     def _in_order(self) -> _InOrder:
-        """Torch's lists of parameters look names up at each turn: a millisecond of a step on a card's host."""
+        """Kept, for torch's lists of parameters look each up by its name: a fifteenth of what a card's host did in a
+        step."""
         if self._held is None or self._held.trunk.weight is not self.trunk.weight:
             levels = range(0, len(self.spatial), 3)
             self._held = _InOrder(

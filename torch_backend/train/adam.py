@@ -7,6 +7,7 @@ runs over chunks on threads; on CUDA a Warp kernel does the same per element, an
 
 import functools
 import math
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -239,11 +240,8 @@ class FusedAdam(torch.optim.Optimizer):
 class _Plan:
     """What a step's tables say that is the same in the next one, S parameters with gradients."""
 
-    params: list[Tensor]
-    moments: list[Tensor]
-    """Their first moments: other ones mean that a state was restored."""
-    addresses: list[int]
-    """Where the parameters lie."""
+    known: list[tuple[weakref.ref[Tensor], ...]]
+    """Parameter, moments and step count of each. Not held: what growth replaced would stay until the next step."""
     strides: list[tuple[int, ...]]
     whole: NDArray[np.int64]
     """[S, _WHOLE], without the gradients' addresses."""
@@ -266,9 +264,7 @@ class _Plan:
             chunks += -(-p.numel() // _CHUNK)
         places = {id(group): place for place, group in enumerate(groups)}
         return cls(
-            params=[p for p, _ in found],
-            moments=[m for m, _, _ in states],
-            addresses=[row[0] for row in rows],
+            known=[tuple(map(weakref.ref, (p, *state))) for (p, _), state in zip(found, states, strict=True)],
             strides=[p.stride() for p, _ in found],
             whole=np.array(rows, np.int64),
             group_of=np.array([places[id(group)] for _, group in found], np.int64),
@@ -277,7 +273,13 @@ class _Plan:
 
     def fits(self, found: list[tuple[Any, dict[str, Any]]], state: Any) -> bool:
         """Is it of these parameters, with these states, where they lie now?"""
-        return len(found) == len(self.params) and all(
-            p is known and state[p].get("exp_avg") is moment and p.data_ptr() == address
-            for (p, _), known, moment, address in zip(found, self.params, self.moments, self.addresses, strict=True)
-        )
+        if len(found) != len(self.known):
+            return False
+        for (p, _), known, row in zip(found, self.known, self.whole.tolist(), strict=True):
+            of = state.get(p, {})
+            now = p, of.get("exp_avg"), of.get("exp_avg_sq"), of.get("step")
+            if any(there() is not value for there, value in zip(known, now, strict=True)):
+                return False
+            if [value.data_ptr() for value in now] != [row[0], row[2], row[3], row[7]]:
+                return False
+        return True

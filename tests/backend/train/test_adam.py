@@ -1,6 +1,7 @@
 """The fused Adam against torch's, on both bodies: equal paths, skipped rows, steps left out, checkpoints."""
 
 import math
+import weakref
 
 import pytest
 import torch
@@ -233,6 +234,20 @@ def test_growth_keeps_moments_and_later_groups_join(kernel):
     give_gradients([*model.params.values(), late], generator)
     optimizer.step(visible=torch.tensor([True, False, True]))
     assert float(late.detach().abs().min()) > 0.0
+
+
+@pytest.mark.parametrize("kernel", BODIES)
+def test_what_growth_replaced_is_let_go_of(kernel):
+    """On a card it is most of a run's memory, and a step's forward pass comes before the optimiser's next."""
+    model = gaussians()
+    optimizer = FusedAdam([{"params": [p], "rows": True} for p in model.params.values()], lr=1e-2, kernel=kernel)
+    give_gradients(model.params.values(), torch.Generator().manual_seed(8))
+    optimizer.step()
+    means = model.params["means"]
+    before = [weakref.ref(means), weakref.ref(optimizer.state[means]["exp_avg"])]
+    del means
+    model.rebuild(torch.tensor([0, 1, 1]), torch.zeros(3, dtype=torch.bool), optimizer)
+    assert [there() for there in before] == [None, None]
 
 
 def test_wrong_calls_are_named():
