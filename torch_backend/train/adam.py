@@ -21,12 +21,14 @@ from torch import Tensor
 
 from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet, func_native, initialised_warp, launch_on
+from ..torch_types import norm
 
 _CHUNK = 4096
 """Elements per unit of work."""
-_WHOLE, _REAL = 8, 8
-"""Columns of a segment's tables: addresses of p, g, m, v, elements, row width (0: no rows), first chunk, address of
-the step count | rate, 1 - b1, 1 - b2, eps, low, high, rate / (1 - b1^t), 1 / sqrt(1 - b2^t). No p: only a check."""
+_WHOLE, _REAL = 9, 8
+"""Columns of a segment's tables: addresses of p, g, m, v, elements, row width (0: no rows), first chunk, addresses of
+the step count and of a factor of the rate per element (0: none) | rate, 1 - b1, 1 - b2, eps, low, high, rate /
+(1 - b1^t), 1 / sqrt(1 - b2^t). No p: only a check."""
 
 _KERNELS = Path(__file__).with_name("kernels")
 
@@ -76,7 +78,7 @@ def all_finite(tensors: Sequence[Tensor], threads: int | None = None) -> bool:
     whole: list[int] = []
     chunks = 0
     for values in tensors:
-        whole += (0, values.data_ptr(), 0, 0, values.numel(), 0, chunks, 0)
+        whole += (0, values.data_ptr(), 0, 0, values.numel(), 0, chunks, 0, 0)
         chunks += -(-values.numel() // _CHUNK)
     table = torch.tensor(whole, dtype=torch.int64, device="cpu")
     bad = torch.zeros(1, dtype=torch.int32, device="cpu")
@@ -91,7 +93,9 @@ class FusedAdam(torch.optim.Optimizer):
     """Adam as `torch.optim.Adam(params, lr, betas, eps)`, for float32 parameters on one device.
 
     A group may say `rows=True`: its parameters' first axis is the Gaussian's, and `step(visible=...)` skips the rows
-    that are not visible, moments included; and `clamp=(low, high)`: the range its parameters are kept in.
+    that are not visible, moments included; `clamp=(low, high)`: the range its parameters are kept in; and `reach`: a
+    row's rate is times its length, which counts as one at least, over `reach` (0: all rows have the same). A mean that
+    is twice as far moves by as many pixels then.
     `applied` is 0-dim bool on the parameters' device: whether the last step was carried out.
     """
 
@@ -105,7 +109,8 @@ class FusedAdam(torch.optim.Optimizer):
         kernel: bool | None = None,
     ) -> None:
         """`threads`: workers on the CPU (default: all cores). `kernel`: use the Warp kernel (default: not on a CPU)."""
-        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "rows": False, "clamp": (-math.inf, math.inf)})
+        usual = {"rows": False, "clamp": (-math.inf, math.inf), "reach": 0.0}
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, **usual})
         self.threads, self.kernel = threads, kernel
         self.applied = torch.tensor(True, device="cpu")
         self._plan: _Plan | None = None
@@ -137,7 +142,7 @@ class FusedAdam(torch.optim.Optimizer):
         for value in guard:
             value = value.detach().float().reshape(-1)
             kept.append(value)
-            whole += (0, value.data_ptr(), 0, 0, value.numel(), 0, chunks, 0)
+            whole += (0, value.data_ptr(), 0, 0, value.numel(), 0, chunks, 0, 0)
             real += (0.0,) * _REAL
             chunks += -(-value.numel() // _CHUNK)
         steps: list[Tensor] = []
@@ -145,11 +150,13 @@ class FusedAdam(torch.optim.Optimizer):
             self._check(p, device)
             m, v, t = self._state_of(p)
             grad = p.grad if p.grad.stride() == p.stride() else torch.empty_like(p).copy_(p.grad)
-            kept.append(grad)
+            factor = _factors(p, group)
+            kept += [grad] if factor is None else [grad, factor]
             steps.append(t)
             lr, (b1, b2), (low, high) = group["lr"], group["betas"], group["clamp"]
             width = p.numel() // max(1, len(p)) if group["rows"] else 0
             whole += (p.data_ptr(), grad.data_ptr(), m.data_ptr(), v.data_ptr(), p.numel(), width, chunks, t.data_ptr())
+            whole.append(0 if factor is None else factor.data_ptr())
             count = float(t) + 1.0
             scale = lr / (1.0 - b1**count), 1.0 / math.sqrt(1.0 - b2**count)
             real += (lr, 1.0 - b1, 1.0 - b2, group["eps"], low, high, *scale)
@@ -209,6 +216,7 @@ class FusedAdam(torch.optim.Optimizer):
             p.grad if p.grad.stride() == stride else torch.empty_like(p).copy_(p.grad)
             for (p, _), stride in zip(found, plan.strides, strict=True)
         ]
+        factors = [_factors(p, group) for p, group in found]
         segments = len(checked) + len(grads)
         # One table, so one way to the card: the integers, then the floats, two of them in the place of an integer.
         table = np.zeros((segments, _WHOLE + _REAL // 2), np.int64).reshape(-1)
@@ -220,6 +228,7 @@ class FusedAdam(torch.optim.Optimizer):
             chunks += -(-value.numel() // _CHUNK)
         whole[len(checked) :] = plan.whole
         whole[len(checked) :, 1] = [grad.data_ptr() for grad in grads]
+        whole[len(checked) :, 8] = [0 if factor is None else factor.data_ptr() for factor in factors]
         whole[len(checked) :, 6] += chunks
         chunks += plan.chunks
         rates = [
@@ -236,6 +245,15 @@ class FusedAdam(torch.optim.Optimizer):
             launch_on(_kernel(), threads, inputs, device)
 
 
+def _factors(p: Tensor, group: dict[str, Any]) -> Tensor | None:
+    """What a group's `reach` makes of the rate of each element, laid out as `p` is; None if it is one for all."""
+    if not group["reach"]:
+        return None
+    rows = p.detach().reshape(len(p), -1)
+    factor = norm(rows, 1).clamp_min(1.0) / group["reach"]
+    return torch.empty_like(p, memory_format=torch.preserve_format).copy_(factor.view(-1, *[1] * (p.dim() - 1)))
+
+
 @dataclass
 class _Plan:
     """What a step's tables say that is the same in the next one, S parameters with gradients."""
@@ -244,7 +262,7 @@ class _Plan:
     """Parameter, moments and step count of each. Not held: what growth replaced would stay until the next step."""
     strides: list[tuple[int, ...]]
     whole: NDArray[np.int64]
-    """[S, _WHOLE], without the gradients' addresses."""
+    """[S, _WHOLE], without the addresses of gradients and factors."""
     group_of: NDArray[np.int64]
     """[S] which group each is of."""
     chunks: int
@@ -260,7 +278,7 @@ class _Plan:
         chunks = 0
         for (p, group), (m, v, t) in zip(found, states, strict=True):
             width = p.numel() // max(1, len(p)) if group["rows"] else 0
-            rows.append((p.data_ptr(), 0, m.data_ptr(), v.data_ptr(), p.numel(), width, chunks, t.data_ptr()))
+            rows.append((p.data_ptr(), 0, m.data_ptr(), v.data_ptr(), p.numel(), width, chunks, t.data_ptr(), 0))
             chunks += -(-p.numel() // _CHUNK)
         places = {id(group): place for place, group in enumerate(groups)}
         return cls(

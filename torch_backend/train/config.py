@@ -52,8 +52,12 @@ class TrainConfig:
     """The SH degree rises by one every this share of the run."""
     lr_means: float = 1.6e-3
     """Start learning rate of means (3DGS 1.6e-4 over 30,000 steps; shorter runs need longer ones)."""
-    lr_means_end: float = 6e-6
+    lr_means_end: float = 3.2e-4
     """End learning rate of means."""
+    lr_means_reach: float = 5.0
+    """Distance from the cameras' centre, in scene units, at which a mean has these rates. Others have them in proportion
+    to theirs, of one unit at least, so that near and far ones move by as many pixels; 0: all have the same, as in
+    3DGS."""
     lr_scales: float = 2.8e-2
     """Learning rate of log-scales (3DGS: 5e-3)."""
     lr_quats: float = 5.6e-3
@@ -71,7 +75,7 @@ class TrainConfig:
     softened pictures (`softened.py`); 0: none, as published."""
     soft_block: float = 8.0
     """Side of a pixel of these, in pixels of pictures 640 wide."""
-    average: float = 0.04
+    average: float = 0.1
     """Share of the run, its end, whose steps' mean the run keeps (`average.py`); 0: the last step."""
     opacity_weight: float = 2e-3
     """Weight of the mean opacity: keeps what no image needs from staying (3DGS-MCMC: 1e-2)."""
@@ -189,7 +193,7 @@ _RATES_FOR = 3000
 def _rates_for(config: TrainConfig) -> None:
     """Scales the Gaussians' rates, and how often they multiply, to the length of the run."""
     scale = min(max(math.sqrt(_RATES_FOR / max(1, config.iterations)), 0.3), 1.5)
-    for name in ("lr_means", "lr_scales", "lr_quats", "lr_sh0", "lr_sh_rest"):
+    for name in ("lr_means", "lr_means_end", "lr_scales", "lr_quats", "lr_sh0", "lr_sh_rest"):
         setattr(config, name, getattr(config, name) * scale)
     config.densify.every = min(100, max(50, round(config.iterations / 30)))
 
@@ -238,8 +242,10 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
         "lr_end": 0.1,
         "average": 0.0,
         "soft_movers": 0.0,
+        "lr_means_reach": 0.0,
         **data,
-    }  # earlier runs decided nothing, kept their last step and softened nothing; a finished one is only read
+    }  # earlier runs decided nothing, kept their last step, softened nothing, moved near and far means alike; a
+    # finished one is only read
     values.pop("coarse", None)  # builds of a day began on coarse pictures
     if "hexplane" in values:  # written before there were other hosts
         values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))

@@ -54,6 +54,31 @@ def test_two_hundred_steps_match_torch(kernel):
 
 
 @pytest.mark.parametrize("kernel", BODIES)
+def test_a_row_twice_as_far_moves_twice_as_fast(kernel):
+    reach = 4.0
+    ours = parameters()[:4]
+    with torch.no_grad():
+        for p in ours:  # from nearer than one unit, which counts as one, to a hundred
+            p.mul_(torch.logspace(-2, 2, len(p)).view(-1, *[1] * (p.dim() - 1)))
+    theirs = [torch.nn.Parameter(p.detach().double()) for p in ours]
+    fused = FusedAdam([{**g, "reach": reach} for g in groups(ours)], eps=1e-15, kernel=kernel)
+    other = torch.optim.Adam([{k: v for k, v in g.items() if k != "rows"} for g in groups(theirs)], eps=1e-15)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(50):
+        give_gradients(ours, generator)
+        for p, q in zip(ours, theirs, strict=True):
+            q.grad = p.grad.double()
+        before = [q.detach().clone() for q in theirs]
+        fused.step()
+        other.step()
+        for q, was in zip(theirs, before, strict=True):
+            length = was.reshape(len(was), -1).norm(dim=1).clamp_min(1.0).view(-1, *[1] * (was.dim() - 1))
+            q.data = was + (q.data - was) * length / reach
+    for p, q in zip(ours, theirs, strict=True):
+        assert float(((p.detach() - q.detach()).abs() / q.detach().abs().clamp_min(1.0)).max()) < 2e-5
+
+
+@pytest.mark.parametrize("kernel", BODIES)
 def test_rows_that_are_not_visible_stay_with_their_moments(kernel):
     params = parameters()
     optimizer = FusedAdam(groups(params), kernel=kernel)

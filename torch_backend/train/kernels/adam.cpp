@@ -10,7 +10,7 @@ for (long long chunk, s = 0; (chunk = take()) < P.chunks;) {
     long long first = (chunk - w[6]) * CHUNK, last = first + CHUNK < w[4] ? first + CHUNK : w[4];
     if (stage == 1 && !w[0]) continue;
     float *p = (float*)w[0], *m = (float*)w[2], *v = (float*)w[3];
-    const float* g = (const float*)w[1];
+    const float *g = (const float*)w[1], *factor = (const float*)w[8];
     if (stage == 0) {
         // A value minus itself is 0 unless it is infinite or no number.
         F odd = (F)0.f; float rest = 0.f; long long i = first;
@@ -22,22 +22,23 @@ for (long long chunk, s = 0; (chunk = take()) < P.chunks;) {
         continue;
     }
     float w1 = r[1], w2 = r[2], eps = r[3], low = r[4], high = r[5], step = r[6], spread = r[7];
-    auto update = FN(F G, F& M, F& V, F& X) -> void {
+    auto update = FN(F G, F K, F& M, F& V, F& X) -> void {
         M += w1 * (G - M);
         V += w2 * (G * G - V);
-        X -= step * (M / (root(V) * spread + eps));
+        X -= step * K * (M / (root(V) * spread + eps));
         X = X < low ? (F)low : (X > high ? (F)high : X); };
-    float edge[4][16] = {};
+    float edge[5][16] = {};
     auto run = FN(long long i, long long count) -> void {
         if (count == 16) {
             F M = load(m + i), V = load(v + i), X = load(p + i);
-            update(load(g + i), M, V, X);
+            update(load(g + i), factor ? load(factor + i) : (F)1.f, M, V, X);
             store(m + i, M); store(v + i, V); store(p + i, X);
             return; }
         for (long long l = 0; l < count; l++) {
-            edge[0][l] = g[i + l]; edge[1][l] = m[i + l]; edge[2][l] = v[i + l]; edge[3][l] = p[i + l]; }
+            edge[0][l] = g[i + l]; edge[1][l] = m[i + l]; edge[2][l] = v[i + l]; edge[3][l] = p[i + l];
+            edge[4][l] = factor ? factor[i + l] : 1.f; }
         F M = load(edge[1]), V = load(edge[2]), X = load(edge[3]);
-        update(load(edge[0]), M, V, X);
+        update(load(edge[0]), load(edge[4]), M, V, X);
         store(edge[1], M); store(edge[2], V); store(edge[3], X);
         for (long long l = 0; l < count; l++) {
             m[i + l] = edge[1][l]; v[i + l] = edge[2][l]; p[i + l] = edge[3][l]; } };

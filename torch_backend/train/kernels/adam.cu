@@ -21,5 +21,6 @@ if (stage == 0) { float odd = g[i] - g[i]; if (!(odd == 0.f)) bad[0] = 1; return
 if (bad[0] || !w[0] || (w[5] > 0 && visible && !((const unsigned char*)visible)[i / w[5]])) return;
 float *p = (float*)w[0], *m = (float*)w[2], *v = (float*)w[3];
 float M = m[i] + r[1] * (g[i] - m[i]), V = v[i] + r[2] * (g[i] * g[i] - v[i]);
-float X = p[i] - r[6] * (M / (wp::sqrt(V) * r[7] + r[3]));
+float rate = w[8] ? r[6] * ((const float*)w[8])[i] : r[6];
+float X = p[i] - rate * (M / (wp::sqrt(V) * r[7] + r[3]));
 m[i] = M; v[i] = V; p[i] = X < r[4] ? r[4] : (X > r[5] ? r[5] : X);
