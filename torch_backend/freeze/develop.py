@@ -12,6 +12,7 @@ Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 from dataclasses import dataclass
 
 import torch
