@@ -12,7 +12,6 @@ Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 from dataclasses import dataclass
 
 import torch
@@ -63,8 +62,6 @@ class DevelopConfig:
     """As in `TrainConfig`."""
     lr_means: float = 1e-4
     """Start rate of means."""
-    reach: float = 0.0
-    """As `TrainConfig.lr_means_reach`."""
     lr_quats: float = 2e-3
     """Of quaternions."""
     lr_scales: float = 1.2e-2
@@ -226,8 +223,5 @@ class _Darkroom:
             "means": c.lr_means, "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities,
             "sh0": c.lr_sh0, "shN": c.lr_sh_rest,
         }  # fmt: skip
-        groups: list[dict[str, Any]] = [
-            {"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()
-        ]
-        groups[0]["reach"] = c.reach
+        groups = [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()]
         return FusedAdam(groups, eps=1e-15)
