@@ -2,9 +2,9 @@
 
 A bin is a trained frame; of a clip that has more than 256 of them, some share one (`supervision.bin_times`).
 
-A camera on automatic changes by several percent within a second (measured on the bundled clip: docs/benchmarks.md).
-Left alone, the gate would open for it and the field would learn it as motion; so it is fitted from the first step on,
-long before the gate opens.
+A camera on automatic changes by several percent within a second: what runs of three clips fitted goes up or down by 8
+to 9 % within one at most. Left alone, the gate would open for it and the field would learn it as motion; so it
+is fitted from the first step on, long before the gate opens.
 """
 
 from __future__ import annotations

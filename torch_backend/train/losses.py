@@ -63,7 +63,7 @@ def psnr(image: Tensor, target: Tensor, ignored: Tensor | None = None) -> float:
 def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """[size, size] matrix that blurs along an axis; rows sum to 1.
 
-    Two dense products beat torch's depthwise 11-tap convolution on CPU at these sizes (docs/benchmarks.md).
+    Two dense products beat torch's depthwise 11-tap convolution on CPU at these sizes.
     """
     offset = torch.arange(size, dtype=torch.float64, device="cpu")
     distance = offset[:, None] - offset[None, :]
