@@ -55,9 +55,9 @@ class TrainConfig:
     lr_means_end: float = 3.2e-4
     """End learning rate of means."""
     lr_means_reach: float = 5.0
-    """Distance from the cameras' centre, in scene units, at which a mean has these rates. Others have them in proportion
-    to theirs, of one unit at least, so that near and far ones move by as many pixels; 0: all have the same, as in
-    3DGS."""
+    """Distance from the cameras' centre, in scene units, at which a mean has these rates. Others have them in
+    proportion to theirs, of one unit at least, so that near and far ones move by as many pixels; 0: all have the same,
+    as in 3DGS."""
     lr_scales: float = 2.8e-2
     """Learning rate of log-scales (3DGS: 5e-3)."""
     lr_quats: float = 5.6e-3

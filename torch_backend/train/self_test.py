@@ -260,13 +260,13 @@ def _loss(device: torch.device) -> list[Check]:
 
 
 def _adam(device: torch.device) -> list[Check]:
-    """Two steps of Adam."""
+    """Two steps of Adam, of rows that are near and far."""
     g = torch.Generator(device="cpu").manual_seed(5)
-    start, *gradients = torch.randn(3, 5000, generator=g, device="cpu")
+    start, *gradients = torch.randn(3, 5000, 3, generator=g, device="cpu")
     found: list[Tensor] = []
     for where, kernel in ((torch.device("cpu"), False), (device, True)):
         parameter = torch.nn.Parameter(start.to(where, copy=True))
-        optimizer = FusedAdam([parameter], lr=0.1, kernel=kernel)
+        optimizer = FusedAdam([{"params": [parameter], "reach": 2.0}], lr=0.1, kernel=kernel)
         for gradient in gradients:
             parameter.grad = gradient.to(where)
             optimizer.step()

@@ -226,6 +226,32 @@ def test_config_round_trip():
             assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config
 
 
+def test_near_and_far_means_move_by_as_many_pixels(world, quiet):
+    scene = load_scene(world.shot)
+    images = load_images(scene, scene.solved, 64, 48)
+    for reach, exponent in ((5.0, 1.0), (0.0, 0.0)):
+        config = config_from_params(TrainParams())
+        config.lr_means_reach = reach
+        trainer = Trainer(scene, images, scene.solved, config, quiet())
+        means = trainer.model.gaussians.params["means"]
+        with torch.no_grad():  # the scene lies a few units away: some of it comes near, some goes far
+            means *= torch.logspace(-1, 1, len(means))[:, None]
+        before = means.detach().clone()
+        trainer.step()
+        pulled = means.grad.abs() > 1e-9  # Adam's first step is as long as its rate, whatever pulls
+        length = before.norm(dim=1, keepdim=True).clamp_min(1.0).expand_as(means)
+        expected = config.lr_means * (length / (reach or 1.0)) ** exponent
+        assert int(pulled.sum()) > 100
+        assert length[pulled].max() > 3.0 * length[pulled].min()
+        assert torch.allclose((means.detach() - before).abs()[pulled], expected[pulled], rtol=0.02, atol=1e-6)
+
+
+def test_runs_of_before_move_near_and_far_means_alike():
+    stored = config_to_json(config_from_params(TrainParams()))
+    assert stored.pop("lr_means_reach") > 0.0
+    assert config_from_json(stored).lr_means_reach == 0.0
+
+
 def iteration_of(folder):
     return read_meta(folder / "checkpoint.safetensors")["iteration"]
 
