@@ -121,9 +121,7 @@ def adrift(
             break
         place = piece.belongs / (1.0 + config.front)
         inverse[piece.mask] = 1.0 / place
-        now = _moved_along(
-            bench, now, piece.rows, torch.full_like(piece.rows, place / piece.depth, dtype=torch.float32)
-        )
+        now = moved_along(bench, now, piece.rows, torch.full_like(piece.rows, place / piece.depth, dtype=torch.float32))
     if not inverse.any():
         return None
     now = _cleared(bench, now, inverse > 0.0, config)
@@ -146,7 +144,7 @@ def _cleared(
     factor = behind.exp() / (1.0 + config.front) / bench.depths(frozen).clamp_min(1e-6)
     veils = (whole > 1e-3) & (inside >= 0.5 * whole) & (factor > config.near) & (frozen.motion > 0.5).cpu()
     rows = torch.nonzero(veils).flatten()
-    return _moved_along(bench, frozen, rows, factor[rows])
+    return moved_along(bench, frozen, rows, factor[rows])
 
 
 def _adrift(
@@ -222,8 +220,9 @@ def _belonging(
     return replace(piece, belongs=1.0 / weighted_median(1.0 / behind[tells], weight.astype(np.float64)))
 
 
-def _moved_along(bench: InstantBench, frozen: FrozenGaussians, rows: Tensor, factor: Tensor) -> FrozenGaussians:
-    """The scene with Gaussians `rows` [M] `factor` [M] times as far from camera t*, and as large: the same to it."""
+def moved_along(bench: InstantBench, frozen: FrozenGaussians, rows: Tensor, factor: Tensor) -> FrozenGaussians:
+    """The scene with Gaussians `rows` int64 [M] `factor` [M] times as far from camera t*, and as large: to that camera
+    the same."""
     state = dict(frozen.state)
     means, scales = state["means"].clone(), state["log_scales"].clone()
     rows, factor, view = rows.to(means.device), factor.to(means)[:, None], bench.scene.viewmats[bench.index].to(means)

@@ -25,11 +25,12 @@ from .develop import DevelopConfig, develop
 from .frozen import FrozenGaussians, freeze_at, span_of
 from .missing_layer import instant_layer, join
 from .sightings import motion_mattes
+from .specks import without_specks
 from .static_twin import settled
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 13
+VERSION = 14
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -210,7 +211,7 @@ def _make(
     def labels(frame: int) -> NDArray[np.uint8] | None:
         return load_motion(shot, frame)
 
-    frozen = settled(run, scene, frozen, t_star, moving)
+    frozen = without_specks(run, scene, settled(run, scene, frozen, t_star, moving), t_star)
     found = adrift(run, scene, frozen, t_star, labels)
     if found is not None:
         layer = instant_layer(run, scene, found.without, t_star, motion=labels, known=found.inverse)
