@@ -52,7 +52,7 @@ class TrainConfig:
     """The SH degree rises by one every this share of the run."""
     lr_means: float = 1.6e-3
     """Start learning rate of means (3DGS 1.6e-4 over 30,000 steps; shorter runs need longer ones)."""
-    lr_means_end: float = 3.2e-4
+    lr_means_end: float = 8e-5
     """End learning rate of means."""
     lr_means_reach: float = 5.0
     """Distance from the cameras' centre, in scene units, at which a mean has these rates. Others have them in
