@@ -1,17 +1,25 @@
-"""Specks before what moves: put back to it, the same to t*'s camera; what is solid, or holds still, stays."""
+"""Specks before what moves: put back to it, the same to t*'s camera, or taken out; what is solid, or still, stays."""
 
 import numpy as np
 import torch
 
 from torch_backend.freeze.specks import SpecksConfig, without_specks
 
-from .test_adrift import NEAR, drawn, hand_at, seen
+from .test_adrift import drawn, hand_at, seen
 from .test_missing_layer import ARM, T_STAR, sheet, skin
+
+NEAR = ARM / 1.4
 
 
 def faint(sheet_of, logit=-3.0):
     """A hand that hardly shows."""
     return {**sheet_of, "opacity_logits": torch.full_like(sheet_of["opacity_logits"], logit)}
+
+
+def assert_taken_out(after, frozen, rows):
+    assert float(torch.sigmoid(after.state["opacity_logits"][rows]).max()) < 1e-5
+    assert torch.equal(after.state["means"][~rows], frozen.state["means"][~rows])
+    assert torch.equal(after.state["opacity_logits"][~rows], frozen.state["opacity_logits"][~rows])
 
 
 def palm():
@@ -37,6 +45,26 @@ def test_specks_beside_a_hand_go_to_the_hand(tmp_path):
     made, frozen, rows = drawn(tmp_path, faint(hand_at(NEAR, (-0.42, -0.40))), palm())
     after = without_specks(made.run, made.scene, frozen, T_STAR)
     assert float((after.state["means"][rows, 2] / ARM - 1.0).abs().max()) < 0.02
+
+
+def test_specks_far_before_it_are_taken_out(tmp_path):
+    made, frozen, rows = drawn(tmp_path, faint(hand_at(ARM / 1.6, (-0.36, -0.06))), palm())
+    after = without_specks(made.run, made.scene, frozen, T_STAR)
+    assert_taken_out(after, frozen, rows)
+
+
+def test_specks_that_would_come_near_another_camera_are_taken_out(tmp_path):
+    made, frozen, rows = drawn(tmp_path, faint(hand_at(NEAR, (-0.36, -0.06))), palm())
+    made.scene.viewmats[0] = torch.eye(4)
+    made.scene.viewmats[0, 2, 3] = -0.8 * ARM
+    assert_taken_out(without_specks(made.run, made.scene, frozen, T_STAR), frozen, rows)
+
+
+def test_large_ones_stay(tmp_path):
+    near = faint(hand_at(NEAR, (-0.36, -0.06)))
+    near["log_scales"] = near["log_scales"] + 3.0
+    made, frozen, _ = drawn(tmp_path, near, palm())
+    assert without_specks(made.run, made.scene, frozen, T_STAR) is frozen
 
 
 def test_a_solid_hand_stays_where_it_is(tmp_path):
