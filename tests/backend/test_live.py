@@ -127,7 +127,7 @@ def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, traine
     difference = np.abs(made[0][..., :3] - shown).max(-1)
     assert np.quantile(difference, 0.9) < 4e-3
     assert difference.max() < 0.05  # where it is filled: fewer plates are looked at
-    assert np.abs(made[0][..., 3] - want.rgba[..., 3]).max() < 1e-3
+    assert np.abs(made[0][..., 3] - want.rgba[..., 3]).max() < 1 / 255
     seen = want.rgba[..., 3] > 0.99
     assert np.abs(made[1][seen] / want.depth[seen] - 1).max() < 1e-3
     assert np.abs(splats[0][..., :3] - shown).mean() > 3.0 * difference.mean()

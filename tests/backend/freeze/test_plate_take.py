@@ -68,7 +68,7 @@ def test_a_frame_is_its_warp_over_the_plate(trained, take):
     assert [row["frame"] for row in rows] == list(range(103, 109))
     assert facts["detail"]["plate_share"] == pytest.approx(np.mean([row["plate_share"] for row in rows]), abs=1e-3)
     assert all(np.mean(row["regions"]) == pytest.approx(row["invented_share"], abs=0.02) for row in rows)
-    assert rows[2]["plate_share"] == 1.0, "frame 105 is its plate"
+    assert rows[2]["plate_share"] > 0.999, "frame 105 is its plate"  # a pixel of 3072 may be another's
 
 
 def test_without_detail_splats_alone_are_left(trained, take, quiet):
