@@ -72,6 +72,14 @@ class Scene:
         """Normalised time of a (possibly fractional) frame number, clamped to the range."""
         return float(np.interp(frame, self.frames, self.times))
 
+    def nearest(self, frame: float) -> int:
+        """Index of the frame whose number is nearest to a (possibly fractional) one; of two as near the earlier."""
+        return int(np.abs(np.asarray(self.frames, np.float64) - frame).argmin())
+
+    def camera_centres(self) -> Tensor:
+        """Where the cameras stand, [F, 3]."""
+        return -(self.viewmats[:, :3, :3].mT @ self.viewmats[:, :3, 3:])[..., 0]
+
     def from_solve(self, viewmats: np.ndarray) -> Tensor:
         """World-to-camera matrices [..., 4, 4] of solve units, in scene units, float32."""
         return from_numpy(_in_scene(viewmats, self.scale, self.centre)).float()

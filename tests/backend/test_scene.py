@@ -32,6 +32,11 @@ def test_time_and_frame_numbers(world):
     assert scene.times[-1] == 1.0
     assert scene.time_of_frame(101 + 7.5) == pytest.approx(0.5)
     assert scene.time_of_frame(5) == 0.0
+    assert [scene.frames[scene.nearest(frame)] for frame in (5, 101, 108.4, 108.5, 108.6, 900)] == [
+        101, 101, 108, 108, 109, 116,
+    ]  # fmt: skip
+    seen = torch.einsum("fij,fj->fi", scene.viewmats[:, :3, :3], scene.camera_centres()) + scene.viewmats[:, :3, 3]
+    assert float(seen.abs().max()) < 1e-5, "a camera is where it sees itself at nought"
 
 
 def test_holdout_never_takes_the_ends():

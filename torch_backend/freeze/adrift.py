@@ -112,7 +112,7 @@ def adrift(
     if not bool((frozen.motion > 0.5).any()):
         return None
     config = config or AdriftConfig()
-    index = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
+    index = scene.nearest(t_star)
     bench = InstantBench(run, scene, index, InstantConfig(), motion)
     inverse, now = np.zeros((bench.height, bench.width), np.float32), frozen
     for _ in range(config.rounds):

@@ -19,11 +19,11 @@ def seen_from_afar(run: LoadedRun, scene: Scene, means: Tensor, t_star: float, t
     means [M, 3] is where they are at t*, a frame number; what was never seen is not among them.
     """
     model, trained = run.model, [scene.frames.index(frame) for frame in run.train_frames]
-    centres = -(scene.viewmats[:, :3, :3].mT @ scene.viewmats[:, :3, 3:])[..., 0]
+    centres = scene.camera_centres()
     gaps = np.abs(scene.times[trained][None] - model.centres.cpu().numpy()[:, None])
     of_bins = centres[[trained[i] for i in gaps.argmin(1)]].to(means.device)
     least = torch.full_like(means[:, 0], torch.inf)
     for of_bin, seen in zip(of_bins, model.gaussians.support[: len(means)].unbind(1), strict=True):
         least = torch.where(seen, torch.minimum(least, norm(means - of_bin, -1)), least)
-    at = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
+    at = scene.nearest(t_star)
     return norm(means - centres[at].to(means.device), -1) > times * least

@@ -71,7 +71,7 @@ def instant_layer(
     Returns None if plate and scene agree.
     """
     config = config or InstantConfig()
-    index = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
+    index = scene.nearest(t_star)
     bench = InstantBench(run, scene, index, config, motion)
     image = bench.render(frozen)
     things = _small_things(bench, image)

@@ -55,7 +55,7 @@ def without_specks(
     config, moves = config or SpecksConfig(), frozen.motion > 0.5
     if not bool(moves.any()):
         return frozen
-    index = int(np.abs(np.asarray(scene.frames, np.float64) - t_star).argmin())
+    index = scene.nearest(t_star)
     bench = InstantBench(run, scene, index, InstantConfig(), None)
     alone = bench.render(fade(frozen, moves.float()))
     nowhere = 1e9
@@ -73,7 +73,7 @@ def without_specks(
     if not len(rows):
         return frozen
     moved = moved_along(bench, frozen, rows, factor[rows])
-    centres = -(scene.viewmats[:, :3, :3].mT @ scene.viewmats[:, :3, 3:])[..., 0]
+    centres = scene.camera_centres()
     close = torch.cdist(moved.state["means"].cpu()[rows], centres).amin(1)
     veils = (factor[rows] > config.veil) | (close < config.beside * (factor * depths)[rows])
     return fade(moved, torch.ones_like(factor).index_fill(0, rows[veils], 0.0))
