@@ -52,7 +52,7 @@ class AdriftConfig:
     """What a piece belongs to is seen through it, or at most so far beside it,"""
     alike: float = 0.15
     """in colours no farther from its own than about this (display-referred)."""
-    held: float = 0.12
+    held: float = 0.05
     """As many alike pixels must tell of what it belongs to, as a share of its own; and more by a half than those
     beside it that move as near as itself."""
     veil: float = 16.0
@@ -188,10 +188,13 @@ def _grown(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
 def _painters(
     bench: InstantBench, frozen: FrozenGaussians, core: NDArray[np.bool_], near: float, config: AdriftConfig
 ) -> Tensor:
-    """int64 [M]: what moves, is about as `near` and is seen inside `core` [h, w] for the most part."""
+    """int64 [M]: what is about as `near` and is seen inside `core` [h, w] for the most part, also where the run holds
+    it for still; and what moves and is hidden behind that. Left behind, it would hang in the air."""
     inside, whole = bench.seen_inside(frozen, core)
-    paints = (whole > 1e-3) & (inside >= 0.5 * whole) & (bench.depths(frozen) < config.near * near)
-    return torch.nonzero(paints & (frozen.motion > 0.5).cpu()).flatten()
+    seen = whole > 1e-3
+    hidden = ~seen & (frozen.motion > 0.5).cpu() & bench.within(frozen, core)
+    paints = ((seen & (inside >= 0.5 * whole)) | hidden) & (bench.depths(frozen) < config.near * near)
+    return torch.nonzero(paints).flatten()
 
 
 def _belonging(
@@ -202,8 +205,9 @@ def _belonging(
     if not len(piece.rows):
         return None
     moves = frozen.motion > 0.5
-    others = moves.index_fill(0, piece.rows.to(moves.device), value=False)
-    rest, still = bench.render(fade(frozen, others.float())), bench.render(fade(frozen, (~moves).float()))
+    rows = piece.rows.to(moves.device)
+    others, holds = (mask.index_fill(0, rows, value=False).float() for mask in (moves, ~moves))
+    rest, still = bench.render(fade(frozen, others)), bench.render(fade(frozen, holds))
     core, _ = _around(piece.mask, bench.unit, config)
     about = _grown(piece.mask, config.reach * bench.unit)
     behind, alpha, least = rest.depth.numpy(), rest.alpha.numpy(), config.near * piece.depth

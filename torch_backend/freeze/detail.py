@@ -130,7 +130,7 @@ class Detailer:
             withheld: frames whose plates are not to be used.
         """
         splat = image
-        self._turn_to(frozen)
+        self._turn_to(frozen, output.t_star)
         frozen, image = self._joined(output, frozen, image, width, height)
         posed = posed_frame(self.seen, output, frozen, image, width, height)
         usable = [frame for frame in self.seen.frames if frame not in withheld]
@@ -141,12 +141,12 @@ class Detailer:
 
     # ------------------------------------------------------------------------------------------------- the frame
 
-    def _turn_to(self, frozen: FrozenGaussians) -> None:
+    def _turn_to(self, frozen: FrozenGaussians, t_star: float) -> None:
         """Looks at the plates as a scene has them; frames of one instant come one after another."""
         developed = frozen if frozen.descent is not None else None
         if developed is not self.seen.stage.developed:
             config = self.config.sightings
-            self.seen = Sightings(self.run, self.scene, self.plates, self._moving, config, developed)
+            self.seen = Sightings(self.run, self.scene, self.plates, self._moving, config, developed, round(t_star))
 
     def _joined(
         self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, width: int, height: int

@@ -6,6 +6,10 @@ frames, in each of which what moves stands where the field has it; what moves at
 what that sees from much farther than others do, it teaches nothing: a face of six pixels is right from there with its
 eyes anywhere. The pictures are larger than those of a preview run, so the frozen scene becomes sharper than the run.
 
+A run as sharp as its pictures has nothing to gain where nothing moves, and is left alone there. What moves it may show
+blurred all the same. That is trained alone then, and goes part of the way to what plate t* made of it: as far as its
+neighbours in time bear, in which what one plate got wrong would stand in the wrong place.
+
 Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/benchmarks.md, "Developed instants").
 """
 
@@ -49,6 +53,15 @@ class DevelopConfig:
     gain: float = 0.2
     """dB that the still pixels of the frames left out must gain: by less, at the size of the run, frozen truth lost
     half a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it."""
+    alone: float = 0.2
+    """Where they gain less, what moves is trained alone, on plate t*, in so many steps as a share of `steps`;"""
+    near: int = 2
+    """trained frames on either side of t* that are asked about it then:"""
+    worth: float = 3.0
+    """of the way to what it became it goes so far that plate t* gains most beyond so many times what those lose (mean
+    squared errors),"""
+    ways: int = 4
+    """in so many parts."""
     instant_share: float = 0.1
     """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training."""
     afar: float = 2.0
@@ -95,8 +108,8 @@ def develop(
 ) -> FrozenGaussians:
     """Trains a frozen scene on as the static scene that it is.
 
-    Returns what became of it; or the scene as it was, if frames that were left out gained nothing where nothing moves,
-    or plate t* lost: a run that is as sharp as the pictures already is better left alone.
+    Returns what became of it. If frames that were left out gained nothing where nothing moves, or plate t* lost, that
+    stays as it was; and what moves does, or goes as far as t*'s neighbours bear.
 
     Args:
         frozen: the run's scene at t*, and behind its Gaussians those of an instant's layer, if it has one.
@@ -122,7 +135,7 @@ class _Darkroom:
         frames = [frame for frame in spread(run.train_frames, config.frames) if frame not in self.instants]
         self.probes = spread(frames[1:-1], min(config.probes, len(frames) // 4))
         self.frames = sorted({*frames, *self.instants} - {*self.probes})
-        self.travel = Travel(run, scene, frozen)
+        self.travel = Travel(run, scene, frozen, t_star)
         self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
         self.params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in frozen.state.items()}
         self.optimizer = self._optimizer()
@@ -134,22 +147,39 @@ class _Darkroom:
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in spread(self.frames, config.looks)])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
         self.held = ((self.afar * opened > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
+        opened[len(run.model.gaussians) :] = 1.0
+        self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
+        """Rows of what moves and stands, at t*, in what the plate says moves."""
 
     def run(self, check: Check | None) -> FrozenGaussians:
         """All steps, and the judgement."""
+        steps, before = self.config.steps, self._judged()
+
+        def checked(done: int) -> None:
+            if check is not None:
+                check(done, steps)
+
+        self._train(steps, self.config.instant_share, checked)
+        after = self._judged()
+        state = {name: p.detach() for name, p in self.params.items()}
+        if after[0] < before[0] + self.config.gain or after[1] < before[1]:
+            state = self._movers_alone(lambda _: checked(steps))
+        was = self.frozen
+        return FrozenGaussians(state, was.sh_degree, was.support, was.motion, was)
+
+    def _train(self, steps: int, instant_share: float, check: Callable[[int], None]) -> None:
+        """So many steps, a share of them on plate t*; `check` is called with how many are done."""
         order: list[int] = []
         mean = ParameterMean()
-        steps, before = self.config.steps, self._judged()
         for n in range(steps):
-            if check is not None:
-                check(n, steps)
+            check(n)
             for group in self.optimizer.param_groups:
                 group["lr"] = (
                     group["first"]
                     * self.config.lr_end ** (n / steps)
                     * min(1.0, (n + 1) / (self.config.warm * steps + 1))
                 )
-            if float(torch.rand(1, generator=self.generator, device="cpu")) < self.config.instant_share:
+            if float(torch.rand(1, generator=self.generator, device="cpu")) < instant_share:
                 frame = self.instants[n % len(self.instants)]
             else:
                 order = order or integers(torch.randperm(len(self.frames), generator=self.generator, device="cpu"))
@@ -158,26 +188,62 @@ class _Darkroom:
             if n >= steps - round(self.config.average * steps):
                 mean.add(self.params)
         mean.put_into(self.params)
-        after = self._judged()
-        if after[0] < before[0] + self.config.gain or after[1] < before[1]:
-            state = dict(self.frozen.state)
-        else:
-            state = {name: p.detach() for name, p in self.params.items()}
-        was = self.frozen
-        return FrozenGaussians(state, was.sh_degree, was.support, was.motion, was)
 
-    @torch.no_grad()
+    def _movers_alone(self, check: Callable[[int], None]) -> dict[str, Tensor]:
+        """The scene as it was, but for what moves at t*: that is trained on plate t*, and goes as far towards it as
+        t*'s neighbours bear, which may be not at all."""
+        was, rows, near = self.frozen.state, self.alone, self._near()
+        kept = dict(was)
+        if not len(rows) or not near:
+            return kept
+        self._show(was)
+        self.optimizer = self._optimizer()
+        self.held = torch.ones_like(self.mover).index_fill(0, rows, 0.0).index_fill(0, self.held, 1.0).nonzero()[:, 0]
+        steps = max(1, round(self.config.alone * self.config.steps))
+        self._train(steps, 1.0, check)
+        developed = {name: p.detach()[rows] for name, p in self.params.items()}
+        best, first = 0.0, (0.0, 0.0)
+        for n in range(self.config.ways + 1):
+            part = n / self.config.ways
+            state = {k: v.index_copy(0, rows, torch.lerp(v[rows], developed[k], part)) for k, v in was.items()}
+            self._show(state)
+            errors = self._error(self.instants, movers=True), self._error(near, movers=True)
+            first = first if n else errors
+            worth = first[0] - errors[0] - self.config.worth * max(0.0, errors[1] - first[1])
+            if worth > best:
+                best, kept = worth, state
+        return kept
+
+    def _show(self, state: dict[str, Tensor]) -> None:
+        for name, value in state.items():
+            self.params[name].data = value.clone()
+
+    def _near(self) -> list[int]:
+        """Trained frames on either side of those that show t*, without them."""
+        frames, most = self.trained.train_frames, self.config.near
+        before = [frame for frame in frames if frame < min(self.instants)]
+        after = [frame for frame in frames if frame > max(self.instants)]
+        return [*before[len(before) - min(most, len(before)) :], *after[:most]]
+
     def _judged(self) -> tuple[float, float]:
         """(PSNR in dB of the still pixels of the probes, of plate t* or its neighbours)."""
-        sums = torch.zeros(2, 2, dtype=torch.float64, device=self.device)
-        for n, frames in enumerate((self.probes, self.instants)):
-            for frame in frames:
-                shown, learnt = self._shown(frame)
-                error = (shown.clamp(0.0, 1.0) - self.plates.picture(frame)).square().mean(-1)[learnt]
-                sums[n] += torch.stack([error.double().sum(), torch.tensor(float(error.numel()), device=self.device)])
-        errors = (sums[:, 0] / sums[:, 1].clamp_min(1.0)).clamp_min(1e-12)
-        still, instants = floats(-10.0 * errors.log10())
+        errors = torch.tensor([self._error(self.probes), self._error(self.instants)], dtype=torch.float64)
+        still, instants = floats(-10.0 * errors.clamp_min(1e-12).log10())
         return still, instants
+
+    @torch.no_grad()
+    def _error(self, frames: list[int], movers: bool = False) -> float:
+        """Mean squared error of frames, display-referred: of what they say of the frozen scene, or of what moves in
+        them. 0 where there is nothing."""
+        sums = torch.zeros(2, dtype=torch.float64, device=self.device)
+        for frame in frames:
+            shown, pixels = self._shown(frame, carried=movers)
+            if movers:
+                ignored, pixels = self.plates.ignored(frame), self.plates.matte(frame) > 0.5
+                pixels = pixels if ignored is None else pixels & ~ignored
+            error = (shown.clamp(0.0, 1.0) - self.plates.picture(frame)).square().mean(-1)[pixels]
+            sums += torch.stack([error.double().sum(), torch.tensor(float(error.numel()), device=self.device)])
+        return float(sums[0] / sums[1].clamp_min(1.0))
 
     def _step(self, frame: int) -> None:
         shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
@@ -193,14 +259,18 @@ class _Darkroom:
                 parameter.grad[self.held] = 0.0
         self.optimizer.step(guard=[total])
 
-    def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def _shown(
+        self, frame: int, background: Tensor | None = None, carried: bool = False
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """A frame as the scene has it, [H, W, 3], and bool [H, W]: what it says of the frozen scene.
 
+        `carried`: as `Travel.carried`, which is how frames that show t* are always looked at.
         What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         """
         background = torch.full((3,), 0.5, device=self.device) if background is None else background
         marks = torch.stack([self.mover, self.afar], dim=1)
-        state = self.travel.moved(dict(self.params), frame)
+        travelled = self.travel.carried if carried or frame in self.instants else self.travel.moved
+        state = travelled(dict(self.params), frame)
         out = render(
             state, self.frozen.sh_degree, *self.plates.camera(frame),
             background=torch.cat([background, background.new_zeros(2)]), colors=marks,

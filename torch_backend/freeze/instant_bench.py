@@ -19,7 +19,7 @@ from .frozen import FrozenGaussians, FrozenImage, render_frozen
 from .ignored import ignore_mattes
 from .instant_depth import DepthConfig, View
 from .instant_track import TrackConfig
-from .reproject import resized
+from .reproject import inside, look_up, project, resized
 from .sightings import matte_of
 
 _SIZE = 320.0
@@ -145,8 +145,8 @@ class InstantBench:
 
     def seen_inside(self, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """What camera t* sees of each Gaussian, [N] each: sums of alpha T over pixels of a mask [h, w], and all."""
-        inside, whole = self.gathered(frozen, mask.astype(np.float32), np.ones_like(mask, np.float32)).unbind(1)
-        return inside, whole
+        within, whole = self.gathered(frozen, mask.astype(np.float32), np.ones_like(mask, np.float32)).unbind(1)
+        return within, whole
 
     def gathered(self, frozen: FrozenGaussians, *values: NDArray[np.float32]) -> Tensor:
         """[N, C]: sums of alpha T times each of C `values` [h, w] over the pixels in which t* sees a Gaussian."""
@@ -154,6 +154,12 @@ class InstantBench:
         camera = self.scene.viewmats[i].to(device), self.Ks[i].to(device)
         asked = from_numpy(np.stack(values, axis=-1)).to(device)
         return gathered(frozen.state, *camera, self.width, self.height, asked).cpu()
+
+    def within(self, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> Tensor:
+        """bool [N]: whose middle camera t* has inside a mask [h, w], seen or not."""
+        pixels, _ = project(frozen.state["means"].cpu(), self.scene.viewmats[self.index], self.Ks[self.index])
+        found = look_up(from_numpy(mask.astype(np.float32)), pixels, "nearest")
+        return (found > 0.5) & (inside(pixels, self.width, self.height) > 0.0)
 
     def depths(self, frozen: FrozenGaussians) -> Tensor:
         """[N] scene units from camera t* to each Gaussian, along its axis."""

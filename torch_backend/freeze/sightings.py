@@ -136,10 +136,11 @@ class Sightings:
         moving: MovingOf | None = None,
         config: SightingConfig | None = None,
         frozen: FrozenGaussians | None = None,
+        t_star: int | None = None,
     ) -> None:
         """`moving` None: the shot's motion mattes, and where it has none the model's own matte.
 
-        `frozen`: an instant that was developed, which then is the model; None: the run.
+        `frozen`: an instant that was developed, at frame `t_star`, which then is the model; None: the run.
         """
         self.run, self.scene, self.plates = run, scene, plates
         self.moving = moving or motion_mattes(Shot(scene.folder.parent))
@@ -153,7 +154,7 @@ class Sightings:
         self.size = width, max(8, round(plates.height * width / plates.width))
         self.unit = width / _LENGTHS_OF
         """Pixels of decisions to a pixel in which lengths are configured."""
-        self.stage = Stage(run, scene, frozen)
+        self.stage = Stage(run, scene, frozen, t_star)
         """The model in every frame."""
         self.rows = self.stage.rows.cpu()
         views = scene.viewmats

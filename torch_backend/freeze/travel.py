@@ -23,44 +23,69 @@ class Travel:
     what was closed at t* (`static_twin.py`).
     """
 
-    def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians) -> None:
+    def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int) -> None:
         self.run, self.scene = run, scene
         rows = run.model.open_rows()
         self.rows = rows[frozen.motion[rows] > 0.5]
         """[M] int64, rows of the run's Gaussians that move."""
         self.known = len(run.model.gaussians)
         """How many Gaussians the run has."""
-        self._now = {name: frozen.state[name][self.rows] for name in PARAM_NAMES}
+        self.t_star = t_star
+        """Frame number."""
+        field = self._field(t_star)
+        self._mended = {name: frozen.state[name][self.rows] - field[name] for name in PARAM_NAMES}
+        """What was put elsewhere at t*, or taken out of it (`adrift.py`, `specks.py`)."""
         self._changes: dict[int, dict[str, Tensor]] = {}
+        self._at_t_star = field
 
     def moved(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
-        """The scene, or what it was developed to, as it is in a frame; with gradients."""
+        """The scene, or what it was developed to, as it is in a frame; with gradients.
+
+        What was put elsewhere at t* is there at t* alone: in other frames it stands where the run has it, which is
+        where it is seen there.
+        """
+        if frame == self.t_star:
+            return dict(state)
+        return self._by(state, {name: value - self._mended[name] for name, value in self._change(frame).items()})
+
+    def carried(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
+        """The same, but what was put elsewhere at t* goes from there: for frames that show what t* shows."""
+        return self._by(state, self._change(frame))
+
+    def _by(self, state: dict[str, Tensor], change: dict[str, Tensor]) -> dict[str, Tensor]:
         if not len(self.rows):
             return dict(state)
-        change = self._change(frame)
         return {name: value.index_add(0, self.rows, change[name]) for name, value in state.items()}
 
     @torch.no_grad()
     def _change(self, frame: int) -> dict[str, Tensor]:
+        """What the field changes from t* to a frame, of the rows that move."""
         if frame not in self._changes:
-            then = freeze_at(self.run.model, self.scene.time_of_frame(frame), 1.0).state
-            self._changes[frame] = {name: then[name][self.rows] - now for name, now in self._now.items()}
+            then, now = self._field(frame), self._at_t_star
+            self._changes[frame] = {name: then[name] - now[name] for name in PARAM_NAMES}
             while len(self._changes) > _KEPT:
                 del self._changes[next(iter(self._changes))]
         return self._changes[frame]
+
+    @torch.no_grad()
+    def _field(self, frame: int) -> dict[str, Tensor]:
+        state = freeze_at(self.run.model, self.scene.time_of_frame(frame), 1.0).state
+        return {name: state[name][self.rows] for name in PARAM_NAMES}
 
 
 class Stage:
     """The scene as it stood in every frame of the clip: the run's own, or that which an instant was developed to."""
 
-    def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians | None = None) -> None:
-        """`frozen` None or not developed: the run's own."""
+    def __init__(
+        self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians | None = None, t_star: int | None = None
+    ) -> None:
+        """`frozen` at frame `t_star`; None or not developed: the run's own."""
         self.run, self.scene, self.developed = run, scene, None
         self.rows = run.model.open_rows()
         """[M] int64, rows of the scene's Gaussians that move."""
         self._travel = None
-        if frozen is not None and frozen.descent is not None:
-            self.developed, self._travel = frozen, Travel(run, scene, frozen.descent)
+        if frozen is not None and frozen.descent is not None and t_star is not None:
+            self.developed, self._travel = frozen, Travel(run, scene, frozen.descent, t_star)
             self.rows = self._travel.rows
 
     def at(self, frame: int) -> FrozenGaussians:

@@ -89,6 +89,20 @@ def test_its_veil_goes_with_it(tmp_path):
     assert float((veil > 0.9 * ARM).float().mean()) > 0.9
 
 
+def test_what_it_hides_and_what_hangs_in_it_go_with_it(tmp_path):
+    """Behind its skin stands more of it that t* does not see; and of what t* sees some is held for still."""
+    palm = sheet((-0.30, 0.9), (-0.2, 0.2), ARM, 0.02, skin)
+    near, inner = hand_at(NEAR, (-0.36, -0.06)), hand_at(1.1 * NEAR, (-0.30, -0.12))
+    near["opacity_logits"] = torch.full_like(near["opacity_logits"], 6.0)
+    made, frozen, rows = drawn(tmp_path, together(near, inner), palm)
+    first = int(rows.nonzero()[0])
+    held = torch.arange(first, first + len(near["means"]), 5)
+    frozen.motion[held] = 0.0
+    depths = found(made, frozen).put_back.state["means"][:, 2]
+    assert bool((depths[held] > 0.9 * ARM).float().mean() > 0.9)
+    assert float((depths[first + len(near["means"]) :] > 0.9 * ARM).float().mean()) > 0.9
+
+
 def test_an_arm_that_reaches_for_the_camera_stays(tmp_path):
     far = arm()
     far["means"][:, 2] = ARM - 1.1 * (0.9 - far["means"][:, 0])  # its end is at 2.1, and joins it all the way

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_backend.contract import Cancelled, FreezeParams, LiveView, TrainParams
-from torch_backend.footage.images import read_png
+from torch_backend.footage.images import read_png, write_png
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.develop import DevelopConfig, develop
 from torch_backend.freeze.developed_instants import (
@@ -28,7 +28,7 @@ from torch_backend.freeze.sightings import motion_mattes
 from torch_backend.freeze.static_twin import TwinConfig, held_still, settled
 from torch_backend.freeze.travel import Stage, Travel
 from torch_backend.live import LiveSession
-from torch_backend.scene import load_scene
+from torch_backend.scene import load_scene, read_image
 from torch_backend.solve.motion import load_motion
 from torch_backend.train import load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, read_meta, save_checkpoint
@@ -103,7 +103,7 @@ def same(one, other):
 
 def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, made):
     run, scene, frozen, _ = made
-    travel = Travel(run, scene, frozen)
+    travel = Travel(run, scene, frozen, T_STAR)
     assert len(travel.rows) > 30
     for frame in (101, 109, 116):
         then = freeze_at(run.model, scene.time_of_frame(frame), 1.0).state
@@ -114,7 +114,8 @@ def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, mad
 
 def test_developed_gaussians_travel_with_those_they_descend_from(made):
     run, scene, frozen, now = made
-    stage = Stage(run, scene, now)
+    stage = Stage(run, scene, now, T_STAR)
+    assert all(torch.equal(value, now.state[name]) for name, value in stage.at(T_STAR).state.items())
     # From where it begins to be developed: a speck that was put back goes where the run has it.
     begun = now.descent.state["means"][: len(frozen.motion)]
     then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state["means"] - begun
@@ -124,6 +125,24 @@ def test_developed_gaussians_travel_with_those_they_descend_from(made):
     torch.testing.assert_close(moved[: len(then)][moves], then[moves], atol=1e-5, rtol=1e-4)
     assert not bool(moved[: len(then)][~moves].any()) and not bool(moved[len(then) :].any())
     assert torch.equal(stage.strangers(now), torch.arange(len(moved)) >= len(then))
+
+
+def test_what_was_put_elsewhere_is_there_at_t_star_alone(made):
+    run, scene, frozen, _ = made
+    rows = run.model.open_rows()[:8]
+    state = {name: value.clone() for name, value in frozen.state.items()}
+    state["means"][rows] += 0.5
+    state["opacity_logits"][rows] -= 9.0
+    travel = Travel(run, scene, dataclasses.replace(frozen, state=state), T_STAR)
+    then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state
+    now, undone, carried = travel.moved(state, T_STAR), travel.moved(state, 112), travel.carried(state, 112)
+    at_t_star = travel.carried(state, T_STAR)
+    for name in ("means", "opacity_logits"):
+        assert torch.equal(now[name], state[name])
+        torch.testing.assert_close(at_t_star[name], state[name])
+        torch.testing.assert_close(undone[name], then[name], rtol=1e-5, atol=1e-5)
+        put = (state[name] - frozen.state[name])[rows]
+        torch.testing.assert_close((carried[name] - then[name])[rows], put, rtol=1e-4, atol=1e-4)
 
 
 def in_tatters(run, frozen):
@@ -256,17 +275,46 @@ def test_a_kept_instant_is_read_back_to_the_bit(trained, made):
     assert load_developed(world.shot, run, 106, frozen) is None
 
 
-def test_an_instant_that_developing_would_harm_is_kept_as_it_was(trained, made):
+def test_where_still_pixels_gain_too_little_what_moves_is_developed_alone(trained, made):
     world, _ = trained
     run, scene, frozen, _ = made
-    config, path = dataclasses.replace(SHORT, gain=99.0), developed_path(run, 106)
+    config, path = DevelopConfig(steps=150, gain=99.0), developed_path(run, 106)
+    frozen = field(run, scene, 106)
     try:
         now = developed(world.shot, run, scene, 106, frozen, config)
         again = load_developed(world.shot, run, 106, frozen, config)
     finally:
         path.unlink(missing_ok=True)
     assert again is not None and same(again, now)
-    assert all(torch.equal(now.state[name], value) for name, value in now.descent.state.items())
+    changed = torch.stack([(now.state[n] != v).flatten(1).any(1) for n, v in now.descent.state.items() if v.ndim > 1])
+    changed = changed.any(0)
+    may = torch.arange(len(changed)) >= len(frozen.motion)
+    may[run.model.open_rows()] = True
+    assert not bool(changed[~may].any()) and int(changed[may].sum()) > 20
+    now_moving, was_moving = (plate_error(run, scene, world.shot, of, 106) for of in (now, now.descent))
+    assert now_moving < 0.8 * was_moving
+
+
+def plate_error(run, scene, shot, frozen, frame):
+    """Mean squared error of what moves in a frame, from its own pose."""
+    plate = read_image(scene.image_path(scene.frames.index(frame)), scene.width, scene.height)
+    moves = torch.from_numpy(load_motion(shot, frame)) > 127
+    return float((shown(run, scene, frozen, frame) - plate).square().mean(-1)[moves].mean())
+
+
+def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_neighbours_bear(apart):
+    """In them what moves looks otherwise."""
+    shot, run, scene, frozen = apart
+    path = scene.image_path(scene.frames.index(T_STAR))
+    plate, moves = read_png(path), load_motion(shot, T_STAR) > 127
+    plate[moves] = 255 - plate[moves]
+    write_png(path, plate)
+    states = {}
+    for worth in (0.0, 100.0):
+        config = DevelopConfig(steps=150, gain=99.0, worth=worth, lr_sh0=0.1)
+        states[worth] = develop(run, scene, frozen, T_STAR, motion_mattes(shot), config).state["sh0"]
+    deceived, careful = ((sh0 - frozen.state["sh0"]).abs().mean() for sh0 in states.values())
+    assert deceived > 0.0 and careful < 0.6 * deceived
 
 
 @pytest.fixture
