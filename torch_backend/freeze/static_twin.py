@@ -5,13 +5,14 @@ how the world of t* looks from the other poses, the wall behind a person, say, t
 there. The static twin of a frozen scene has the same Gaussians, the open ones at the mean of the times at which they
 were seen. Scene and twin are held against plates: that of t*, and the still pixels of others, all over the clip. A
 Gaussian is closed where the others are worse for it by more than plate t* gains; where the mattes see nothing move at
-t*, by more than a third of that. It is asked of neighbours together: errors are noisy, and things move in pieces. Where
-it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call still, a mean is
-always nearer. They miss whole arms, too. So of what went farther than a sway, what the run shows at a plate's own time
-better than the twin counts against the twin: that plate says nothing of t*.
+t* and it only sways, by more than a third of that. It is asked of neighbours together: errors are noisy, and things
+move in pieces. Where it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call
+still, a mean is always nearer. They miss whole arms, too. So of what went farther than a sway, what the run shows at a
+plate's own time better than the twin counts against the twin: that plate says nothing of t*.
 
 Of what t* sees from afar its plate cannot say how it looks: a face of six pixels fits it with its eyes anywhere. Plates
-that see such a thing from near are asked with all of its pixels, whether they move or not.
+that see such a thing from near are asked with all of its pixels, whether they move or not; and there, where they do
+move, what the run shows better at the plate's own time counts against the twin even of a sway.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ class TwinConfig:
     neighbours: int = 16
     """So many nearest open Gaussians are asked together."""
     doubted: float = 3.0
-    """So many times what the others lose must plate t* gain where the mattes say that nothing moves at t*: a field also
-    bends to what is wrong with the camera of that one plate, the edge of a desk for instance."""
+    """So many times what the others lose must plate t* gain for what only sways where the mattes say that nothing moves
+    at t*: a field also bends to what is wrong with the camera of that one plate, the edge of a desk for instance."""
     sways: float = 4.0
     """Pixels of pictures 640 wide from t* to a plate from which on a Gaussian does not only sway: what the run at that
     plate's time shows better than the twin then counts. Held-still people sway by less; their mean is as good."""
@@ -88,7 +89,7 @@ def settled(
         pair = _Pair(run, plates, frozen, twin, left, movers, t_star, config)
         near = _nearest(frozen.state["means"][left], config.neighbours)
         gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
-        least = torch.where(movers[left] > 0.5, harm, config.doubted * harm)
+        least = torch.where((movers[left] > 0.5) | pair.went, harm, config.doubted * harm)
         stays = (harm <= 0.0) | (gain > least)
         if bool(stays.all()):
             break
@@ -119,6 +120,8 @@ class _Pair:
         self.from_near = config.nearer * norm(places - plates.centre(t_star), -1)
         """[M] distance up to which a plate sees each of the rows from near."""
         self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, twin)
+        self.went = torch.zeros(len(rows), dtype=torch.bool, device=movers.device)
+        """[M] True for what some plate that was asked saw farther from its place at t* than a sway."""
         self.marks = torch.stack([torch.zeros_like(movers).index_fill(0, rows, 1.0), movers], dim=1)
 
     def worse(self, frames: list[int], near: Tensor, still: bool = True) -> Tensor:
@@ -127,7 +130,7 @@ class _Pair:
         A pixel's difference is shared by the Gaussians that paint it in either; each is given the mean of those `near`
         [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*, unless the plate sees the
         Gaussian from near; and what the twin's error there exceeds that of the run at the frame's own time by is
-        subtracted for what went farther than a sway.
+        subtracted for what went farther than a sway, and for what is seen from near.
         """
         sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
         for frame in frames:
@@ -164,7 +167,9 @@ class _Pair:
             return told[:, 0, :2]
         near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), -1) <= self.from_near
         told = torch.where(near[:, None], told[:, 0], told[:, 1])
-        told[:, 0] -= told[:, 2] * (self._travel(then, frame) > self.sways)
+        went = self._travel(then, frame) > self.sways
+        self.went |= went & (told[:, 1] > _SEEN)
+        told[:, 0] -= told[:, 2] * (near | went)
         return told[:, :2]
 
     def _travel(self, then: FrozenGaussians, frame: int) -> Tensor:

@@ -184,6 +184,20 @@ def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(train
     assert closed[0] == 0.0 and closed[1] > 0.8
 
 
+def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
+    """Of what sways more is asked where the mattes say that nothing moves; of what went farther, never."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen, blind = field(run, scene), lambda frame: torch.zeros(scene.height, scene.width)
+    left = {}
+    for sways in (0.0, 1e9):  # all of it went far, none did
+        for doubted in (1.0, 1e9):
+            mended = settled(run, scene, frozen, T_STAR, blind, TwinConfig(sways=sways, doubted=doubted))
+            left[sways, doubted] = int((mended.motion > 0.5).sum())
+    assert left[0.0, 1.0] == left[0.0, 1e9] > 0
+    assert left[1e9, 1.0] > 1.2 * left[1e9, 1e9]
+
+
 def test_what_is_seen_from_afar(trained):
     """Only what some frame saw from less than half as far counts, and only from frames that saw it."""
     world, _ = trained
