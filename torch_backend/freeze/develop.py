@@ -15,6 +15,7 @@ Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -22,7 +23,7 @@ import torch
 from torch import Tensor
 
 from ..scene import Scene
-from ..torch_types import backward, floats, integers
+from ..torch_types import backward, integers
 from ..train import LoadedRun
 from ..train.adam import FusedAdam
 from ..train.average import ParameterMean
@@ -227,8 +228,7 @@ class _Darkroom:
 
     def _judged(self) -> tuple[float, float]:
         """(PSNR in dB of the still pixels of the probes, of plate t* or its neighbours)."""
-        errors = torch.tensor([self._error(self.probes), self._error(self.instants)], dtype=torch.float64)
-        still, instants = floats(-10.0 * errors.clamp_min(1e-12).log10())
+        still, instants = (-10.0 * math.log10(max(self._error(of), 1e-12)) for of in (self.probes, self.instants))
         return still, instants
 
     @torch.no_grad()
@@ -259,9 +259,7 @@ class _Darkroom:
                 parameter.grad[self.held] = 0.0
         self.optimizer.step(guard=[total])
 
-    def _shown(
-        self, frame: int, background: Tensor | None = None, carried: bool = False
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+    def _shown(self, frame: int, background: Tensor | None = None, carried: bool = False) -> tuple[Tensor, Tensor]:
         """A frame as the scene has it, [H, W, 3], and bool [H, W]: what it says of the frozen scene.
 
         `carried`: as `Travel.carried`, which is how frames that show t* are always looked at.

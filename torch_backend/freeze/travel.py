@@ -79,12 +79,13 @@ class Stage:
     def __init__(
         self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians | None = None, t_star: int | None = None
     ) -> None:
-        """`frozen` at frame `t_star`; None or not developed: the run's own."""
+        """`frozen` is the scene at frame `t_star`; None or not developed: the run's own, and no t* is needed."""
         self.run, self.scene, self.developed = run, scene, None
         self.rows = run.model.open_rows()
         """[M] int64, rows of the scene's Gaussians that move."""
         self._travel = None
-        if frozen is not None and frozen.descent is not None and t_star is not None:
+        if frozen is not None and frozen.descent is not None:
+            assert t_star is not None
             self.developed, self._travel = frozen, Travel(run, scene, frozen.descent, t_star)
             self.rows = self._travel.rows
 
