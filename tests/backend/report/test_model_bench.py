@@ -14,7 +14,8 @@ from torch_backend.solve.masks import write_grey
 def test_a_trained_run_is_judged_frozen_and_developed_on_frames_that_it_has_not_seen(trained, tmp_path):
     world, _ = trained
     command = [str(world.shot.root), "--run", "main", "--results", str(tmp_path), "--t-star", "103", "--develop"]
-    assert main([*command, "--develop-set", "steps=40", "gain=-99", "--held", "1"]) == 0
+    # So sharp a run loses on plate t* unless that is learnt more than others, and is left as it was then.
+    assert main([*command, "--develop-set", "steps=40", "gain=-99", "instant_share=0.6", "--held", "1"]) == 0
     result = json.loads((tmp_path / "model.json").read_text())
     figures = result["figures"]
     assert all(20.0 < figures[f"{kind}_large_{n}"] < 60.0 for kind in ("field", "developed") for n in OF_FROZEN[:2])
