@@ -45,11 +45,12 @@ from torch_backend.freeze import freeze_shot
 from torch_backend.live import LiveSession
 from torch_backend.native import default_threads
 from torch_backend.raster import cuda
-from torch_backend.scene import load_images, load_scene
+from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot, write_json
 from torch_backend.train import PRESETS, config_from_params, train_shot
 from torch_backend.train.device import cuda_refusal
 from torch_backend.train.memory import plan_memory
+from torch_backend.train.recorder import Recorder
 from torch_backend.train.run import training_size
 from torch_backend.train.trainer import Trainer
 
@@ -201,10 +202,12 @@ def sanitizer(stage: Stage) -> None:
 def raster(stage: Stage) -> None:
     torch.set_num_threads(default_threads())
     bodies = {"ours": raster_bench.Body("cpu" if stage.dry else "cuda", stage.device.type)}
+    if not stage.dry:
+        bodies["graph"] = raster_bench.Body("cuda", stage.device.type, graph=True)
     missing = raster_bench._peer(PEER).missing(stage.device.type)
     if missing is None:
         bodies["gsplat"] = raster_bench.Body("peer", stage.device.type, peer=PEER)
-    rivals = [name for name in bodies if name != "ours"]
+    rivals = [name for name in bodies if name == "gsplat"]
     stage.found["peer"] = missing or "measured beside ours, round by round"
     for name in ("W0",) if stage.dry else ("W2", "W3", "W4"):
         rounds = 2 if stage.dry else 30
@@ -285,8 +288,51 @@ def _late_step(stage: Stage) -> dict[str, Any]:
     trainer = Trainer(scene, images, scene.solved, config, Silent(), {}, stage.device)
     while trainer.iteration < 0.6 * config.iterations:
         _step(trainer)
-    told = {"gaussians": len(trainer.model.gaussians), "open": len(trainer.model.open_rows())}
-    return {**told, **_busy(stage, trainer), **_host(stage, lambda: _step(trainer), 20 if stage.dry else 200)}
+    told: dict[str, Any] = {"gaussians": len(trainer.model.gaussians), "open": len(trainer.model.open_rows())}
+    for name, recorder in _ways(trainer).items():
+        trainer.recorder = recorder
+        told[name] = {**_busy(stage, trainer), **_host(stage, lambda: _step(trainer), 20 if stage.dry else 200)}
+    return {**told, **_replays(trainer)}
+
+
+def _ways(trainer: Trainer) -> dict[str, Recorder | None]:
+    """How a step is carried out."""
+    ways: dict[str, Recorder | None] = {"launched": None}
+    return ways if trainer.recorder is None else {**ways, "recorded": trainer.recorder}
+
+
+def _replays(trainer: Trainer) -> dict[str, Any]:
+    """How many steps were replayed, and why no more are."""
+    recorder = trainer.recorder
+    return {} if recorder is None else {"replayed": recorder.replayed, "refused": recorder.refused}
+
+
+def _whole_runs(stage: Stage) -> dict[str, Any]:
+    """Whole runs of `preview`, two seeds, their steps recorded and launched in turn: seconds, dB held out."""
+    scene = load_scene(stage.scratch_shot())
+    few, width = (600, 64) if stage.dry else (PRESETS["preview"]().densify.budget, PRESETS["preview"]().width)
+    train, test = split_frames(scene.solved, 8, 0)
+    images = load_images(scene, train + test, *training_size(scene, width)).to(stage.device)
+    told: dict[str, Any] = {}
+    for seed in (0,) if stage.dry else (0, 1):
+        for records in (False, True):
+            steps = 20 if stage.dry else 0
+            asked = TrainParams(
+                preset="preview", iterations=steps, max_gaussians=few, width=width, seed=seed, holdout=8
+            )
+            config = config_from_params(asked)
+            trainer = Trainer(scene, images[: len(train)], train, config, Silent(), {}, stage.device)
+            trainer.recorder = trainer.recorder if records else None
+            stage.wait()
+            since = time.perf_counter()
+            trainer.run(stage.results / "gpu-scratch.safetensors", lambda _: None)
+            stage.wait()
+            seconds = time.perf_counter() - since
+            told[f"{'recorded' if records else 'launched'}-{seed}"] = {
+                "seconds": round(seconds, 2), "steps": trainer.iteration, "gaussians": len(trainer.model.gaussians),
+                "heldout_db": trainer.heldout_psnr(test, images[len(train) :]), **_replays(trainer),
+            }  # fmt: skip
+    return told
 
 
 def _short_list(stage: Stage, name: str) -> dict[str, Any]:
@@ -352,6 +398,7 @@ def training(stage: Stage) -> None:
     stage.part("full_hd", lambda: _full_hd(stage), needs=30.0)
     stage.part("waits", lambda: _waits(stage), needs=20.0)
     stage.part("step", lambda: _late_step(stage), needs=20.0)
+    stage.part("whole", lambda: _whole_runs(stage), needs=90.0)
 
 
 def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any]:
@@ -429,17 +476,22 @@ def _full_hd(stage: Stage) -> dict[str, Any]:
         if len(trainer.model.gaussians) != many:
             _enlarged(trainer, many)
         trainer.model.gaussians.open[:] = torch.rand(many, device=stage.device) < share
-        for _ in range(3):
-            trainer.step()
-        stage.wait()
-        since = time.perf_counter()
-        for _ in range(count):
-            trainer.step()
-        stage.wait()
-        told[name] = {"ms": round(1e3 * (time.perf_counter() - since) / count, 2), **_busy(stage, trainer)}
-        if stage.device.type == "cuda":
-            told[name]["peak_gb"] = round(torch.cuda.max_memory_allocated() / 1e9, 2)
-    return told
+        for way, recorder in _ways(trainer).items():
+            trainer.recorder = recorder
+            if stage.device.type == "cuda":
+                torch.cuda.reset_peak_memory_stats()
+            for _ in range(3):
+                trainer.step()
+            stage.wait()
+            since = time.perf_counter()
+            for _ in range(count):
+                trainer.step()
+            stage.wait()
+            ms = round(1e3 * (time.perf_counter() - since) / count, 2)
+            row = told[f"{name}, {way}"] = {"ms": ms, **_busy(stage, trainer)}
+            if stage.device.type == "cuda":
+                row["peak_gb"] = round(torch.cuda.max_memory_allocated() / 1e9, 2)
+    return {**told, **_replays(trainer)}
 
 
 def _busy(stage: Stage, trainer: Trainer) -> dict[str, Any]:

@@ -56,6 +56,8 @@ class Body:
     peer: str = ""
     """Import path of the peer's module."""
     dtype: torch.dtype = torch.float32
+    graph: bool = False
+    """A frame and its gradient are one CUDA graph, as a training step's are (`train.recorder`)."""
 
     def prepare(self, work: Workload) -> Prepared:
         if self.backend == "peer":
@@ -111,6 +113,17 @@ class _Case:
     def __init__(self, work: Workload, body: Body):
         self.body, self.prepared = body, body.prepare(work)
         self.g = torch.tensor(work.g).to(body.device, body.dtype)
+        self._graph = self._captured() if body.graph else None
+
+    def _captured(self) -> torch.cuda.CUDAGraph:
+        """A frame and its gradient; the last of three plain ones before it has learnt how long the list is."""
+        for _ in range(3):
+            self.image()
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self.image()
+        return graph
 
     def image(self) -> torch.Tensor:
         """Forward and backward, untimed; gradients are in the leaves afterwards."""
@@ -121,7 +134,15 @@ class _Case:
         return image.detach()
 
     def run(self) -> tuple[float, float]:
-        """Milliseconds of (forward, forward and backward)."""
+        """Milliseconds of (forward, forward and backward); a graph has no time for its first half alone."""
+        if self._graph is not None:
+            torch.cuda.synchronize()
+            events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
+            events[0].record()
+            self._graph.replay()
+            events[1].record()
+            torch.cuda.synchronize()
+            return events[0].elapsed_time(events[1]), events[0].elapsed_time(events[1])
         for leaf in self.prepared.leaves.values():
             leaf.grad = None
         if self.body.device == "cuda":

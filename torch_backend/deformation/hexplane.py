@@ -204,6 +204,11 @@ class HexPlane(Deformation):
             shN=unflatten(out["shN"], 1, (-1, 3)) if "shN" in out else None,
         )
 
+    @property
+    def recordable(self) -> bool:
+        """It is."""
+        return True
+
     def _network(self, features: Tensor) -> tuple[Tensor, ...]:
         """What each head says of features [M, features * levels]."""
         _, trunk, heads = self._in_order()

@@ -179,6 +179,11 @@ class Mlp(Deformation):
             shift = screw(place, shift[:, :3], shift[:, 3:]) - place
         return Deltas(means=shift, quats=self.heads["quats"](hidden), log_scales=self.heads["log_scales"](hidden))
 
+    @property
+    def recordable(self) -> bool:
+        """It is."""
+        return True
+
     def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:
         """Blurred by normal noise of `noise` frames, falling linearly to nothing at `noise_until`."""
         return blurred(time, self.frame_count, progress, self.config.noise, self.config.noise_until, generator)

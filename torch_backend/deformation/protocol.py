@@ -178,6 +178,12 @@ class Deformation(nn.Module):
         return False
 
     @property
+    def recordable(self) -> bool:
+        """Is a step's work the same at every step, but for the numbers it is told, and does it ask a GPU nothing? Then
+        it is recorded, and launched at once (`train.recorder`)."""
+        return False
+
+    @property
     def rehearsal(self) -> float:
         """Share of the run that the pre-stage takes; 0: there is none."""
         return 0.0

@@ -36,6 +36,8 @@ MAX_CHANNELS = 64 - source.MOMENTS
 """Channels, depth included, that one call can carry."""
 _HITS_MAX = 2**27
 _HITS_STEP = 2**12
+_FULL = 0.9
+"""Share of a list from which on it is made larger."""
 HIT_BYTES = 40
 """Bytes of one hit: its tile and slot, both sorted, the order that sorts them, and the sort's own scratch."""
 _lock = threading.RLock()
@@ -136,7 +138,7 @@ class _Demand:
         if self.slots and slots > self.slots:
             demand = demand * slots // self.slots
         self.slots = max(self.slots, slots)
-        if self.capacity == 0 or demand > 0.9 * self.capacity:
+        if self.capacity == 0 or demand > _FULL * self.capacity:
             wanted = max(demand * 4 // 3, self.capacity, 1)
             most = max(min(_hits_at_most(self.most.device), _HITS_MAX), self.capacity, _HITS_STEP)
             self.capacity = min(-(-wanted // _HITS_STEP) * _HITS_STEP, most)
@@ -160,6 +162,22 @@ def forget_demands() -> None:
     """Drops the lists' sizes: each is asked for anew, by the memory that is free then."""
     with _lock:
         _demands.clear()
+
+
+def outgrown(device: torch.device, cameras: int, width: int, height: int) -> int:
+    """Hits that calls of this device and size came to want, as far as the host knows, if that is more than they have
+    room for with a margin; else 0."""
+    demand = _demands.get((device, cameras, width, height))
+    wanted = 0 if demand is None else int(demand.host[0])
+    return wanted if demand is not None and wanted > _FULL * demand.capacity else 0
+
+
+def report_demands(device: torch.device) -> None:
+    """Has the host told what calls came to want: those that a CUDA graph carries out do not tell it themselves."""
+    with _lock:
+        for (of, *_), demand in _demands.items():
+            if of == device:
+                demand.report()
 
 
 def _capturing(device: torch.device) -> bool:

@@ -111,19 +111,49 @@ class Anchored:
     """[S] 1 for a pair that counts, 0 for one that does not."""
 
 
-def draw_anchored(
-    model: Gaussians, rows: Tensor, config: SupervisionConfig, generator: torch.Generator
-) -> Anchored | None:
-    """Draws pairs among the open `rows` [M]; None if there is nothing to draw from.
+@dataclass
+class Draws:
+    """Random numbers that pairs to anchor are drawn by: they lie on the CPU, wherever the run is."""
 
-    Random numbers come from the CPU `generator` on every device. On a GPU pairs that do not count stay, with weight 0:
-    to leave them out, the host would have to wait for their number.
+    picked: Tensor
+    """[P] int64 places among the open rows: the first lie anywhere in time, the last `support_samples` near support."""
+    anywhere: Tensor
+    """[P - support_samples] int64 time bins of the first."""
+    start: Tensor
+    """[support_samples] float32 in [0, 1): which of a row's supported bins the others begin at."""
+    step: Tensor
+    """[support_samples] int64 how many bins they go from there, in either direction."""
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All of them."""
+        return self.picked, self.anywhere, self.start, self.step
+
+    def to(self, device: torch.device) -> Draws:
+        """The same numbers on a device."""
+        return Draws(*(t.to(device, non_blocking=True) for t in self.tensors()))
+
+
+def draw(rows: int, bins: int, config: SupervisionConfig, generator: torch.Generator) -> Draws:
+    """Draws for so many open rows and time bins."""
+    count = config.support_samples
+    far = _FAR * count
+    picked = torch.randint(rows, (far + count,), generator=generator, device="cpu")
+    anywhere = torch.randint(bins, (far,), generator=generator, device="cpu")
+    start, reach = torch.rand(2, count, generator=generator, device="cpu")
+    step = torch.exp(reach * math.log(max(bins, 2))).long()
+    sign = 2 * torch.randint(2, (count,), generator=generator, device="cpu") - 1
+    return Draws(picked, anywhere, start, sign * step)
+
+
+def anchored_pairs(model: Gaussians, rows: Tensor, draws: Draws, config: SupervisionConfig) -> Anchored | None:
+    """The pairs among the open `rows` [M] that numbers drawn for so many stand for; None if none of them counts.
+
+    On a GPU pairs that do not count stay, with weight 0: to leave them out, the host would have to wait for their
+    number.
     """
-    if not len(rows):
-        return None
     support = model.support[rows]
     lacking = ~support & model.hidden[rows] if config.anchor == "hidden" else ~support
-    picked, bins, valid = _draw(support, lacking, config.support_samples, generator)
+    picked, bins, valid = _pairs(support, lacking, draws)
     rows = rows[picked]
     if rows.device.type == "cpu":
         rows, bins = rows[valid], bins[valid]
@@ -178,7 +208,12 @@ def _columns(deltas: Deltas) -> tuple[Tensor, list[tuple[str, int]]]:
     return torch.cat(list(parts.values()), dim=1), [(name, part.shape[1]) for name, part in parts.items()]
 
 
-def stillness(deltas: Deltas, count: int, error: Tensor, progress: float, config: SupervisionConfig) -> Tensor:
+def still_weight(progress: float, config: SupervisionConfig) -> float:
+    """What `stillness` weighs once a share `progress` of the run is done."""
+    return config.still_weight * min(max((progress - config.start) / max(config.still_ramp, 1e-6), 0.0), 1.0)
+
+
+def stillness(deltas: Deltas, count: int, error: Tensor, weight: Tensor, config: SupervisionConfig) -> Tensor:
     """What the `deltas` [M] of one frame cost in a model of `count` Gaussians.
 
     At its own time a Gaussian is seen from one side only, so whatever a field does to it there to please that one
@@ -190,44 +225,37 @@ def stillness(deltas: Deltas, count: int, error: Tensor, progress: float, config
     Args:
         error: the frame's photometric loss, 0-dim, which is the currency: an image that is harder to fit gains more
             from any motion, a false one too.
-        progress: share of the run that is done.
+        weight: 0-dim, what `still_weight` says of the run's progress.
     """
     moved, widths = _columns(deltas)
     names = [name for name, _ in widths]
     member = tuple(tuple(float(name == of) for name in names) for of, width in widths for _ in range(width))
-    weights = tuple((_STILL_WEIGHTS[name],) for name in names)
+    shares = tuple((_STILL_WEIGHTS[name],) for name in names)
     knees = (tuple(config.still_knee * _STILL_WEIGHTS["means"] / _STILL_WEIGHTS[name] for name in names),)
-    group, weight, knee = (small_table(rows, torch.float32, moved.device) for rows in (member, weights, knees))
-    total = ((torch.sqrt(moved.square() @ group + knee.square()) - knee) @ weight)[:, 0]
+    group, share, knee = (small_table(rows, torch.float32, moved.device) for rows in (member, shares, knees))
+    total = ((torch.sqrt(moved.square() @ group + knee.square()) - knee) @ share)[:, 0]
     price = config.still_scale * torch.log1p(total / config.still_scale)
-    grown = min(max((progress - config.start) / max(config.still_ramp, 1e-6), 0.0), 1.0)
-    return config.still_weight * grown * error.detach() * price.sum() / max(1, count)
+    return weight * error.detach() * price.sum() / max(1, count)
 
 
 _FAR = 4
 """So many pairs anywhere are drawn for each one near support; near ones fill what is then left of the count."""
 
 
-def _draw(support: Tensor, lacking: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """(row, bin, valid) of drawn pairs; up to `count` are valid: lacking [M, B], in a row with support [M, B].
+def _pairs(support: Tensor, lacking: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
+    """(row, bin, valid) of drawn pairs; of them as many as are drawn near support are valid at most: lacking [M, B], in
+    a row with support [M, B].
 
-    The first lie anywhere, the last `count` at a log-uniform distance from support.
+    The first lie anywhere, the last at a log-uniform distance from support.
 
     Near pairs pull hardest, also at what faded because it moved away: an even mix of both kinds with weight 1 trained
     the bundled clip to 22.96 dB on held-out frames, against 24.39 dB with that weight and mostly far pairs.
     """
-    bins, device = support.shape[1], support.device
-    far = _FAR * count
-    picked = torch.randint(len(support), (far + count,), generator=generator, device="cpu")
-    anywhere = torch.randint(bins, (far,), generator=generator, device="cpu")
-    start, reach = torch.rand(2, count, generator=generator, device="cpu")
-    step = torch.exp(reach * math.log(max(bins, 2))).long()
-    sign = 2 * torch.randint(2, (count,), generator=generator, device="cpu") - 1
-    picked, anywhere, start, step = (t.to(device, non_blocking=True) for t in (picked, anywhere, start, sign * step))
+    bins, count, picked = support.shape[1], len(draws.start), draws.picked
     # The k-th supported bin of a row is where the running count first exceeds k.
-    seen = support[picked[far:]].cumsum(1)
-    near = (seen <= (start * seen[:, -1]).long()[:, None]).sum(1) + step
-    chosen = torch.cat([anywhere, near])
+    seen = support[picked[len(picked) - count :]].cumsum(1)
+    near = (seen <= (draws.start * seen[:, -1]).long()[:, None]).sum(1) + draws.step
+    chosen = torch.cat([draws.anywhere, near])
     valid = (chosen >= 0) & (chosen < bins)
     chosen = chosen.clamp(0, bins - 1)
     at = (picked, chosen)

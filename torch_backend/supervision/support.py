@@ -35,16 +35,20 @@ def bin_of(centres: Tensor, time: float) -> int:
 
 
 @torch.no_grad()
-def mark_seen(model: Gaussians, time_bin: int, weight_sum: Tensor) -> None:
-    """Notes who contributed to a training frame; weight_sum [N] is the sum of alpha * T over its pixels."""
-    model.support[:, time_bin] |= weight_sum > SEEN_WEIGHT
+def mark_seen(model: Gaussians, time_bin: Tensor, weight_sum: Tensor) -> None:
+    """Notes who contributed to a training frame; weight_sum [N] is the sum of alpha * T over its pixels.
+
+    time_bin: int64 [1], on the model's device: a recorded step (`train.recorder`) is told another one each time.
+    """
+    seen = weight_sum[:, None] > SEEN_WEIGHT
+    model.support.index_copy_(1, time_bin, model.support.index_select(1, time_bin) | seen)
 
 
 @torch.no_grad()
 def mark_hidden(
     model: Gaussians,
     rows: Tensor,
-    time_bin: int,
+    time_bin: Tensor,
     state: dict[str, Tensor],
     viewmat: Tensor,
     K: Tensor,
@@ -53,9 +57,10 @@ def mark_hidden(
     """Notes who of `rows` [M] could not have been seen in a frame: out of it, or behind what is there.
 
     A Gaussian in plain view that does not contribute is not unsupervised: the frame says that it is not there. It may
-    have faded, or its owner moved on; it is not to be drawn back to where it was seen (`anchors.draw_anchored`).
+    have faded, or its owner moved on; it is not to be drawn back to where it was seen (`anchors.anchored_pairs`).
 
     Args:
+        time_bin: int64 [1], on the model's device.
         state: the Gaussians at the frame's time.
         viewmat: [4, 4]; K: [3, 3] px.
         depth: [H, W] median depth of the frame's render, 1e10 where there is nothing.

@@ -5,10 +5,12 @@ state, so checkpoints fit both. A step whose gradients are not all finite change
 runs over chunks on threads; on CUDA a Warp kernel does the same per element, and nothing waits for the device.
 """
 
+import contextlib
+import dataclasses
 import functools
 import math
 import weakref
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,6 +116,36 @@ class FusedAdam(torch.optim.Optimizer):
         self.threads, self.kernel = threads, kernel
         self.applied = torch.tensor(True, device="cpu")
         self._plan: _Plan | None = None
+        self._recorded: StepTable | None = None
+
+    @contextlib.contextmanager
+    def recording(self, device: torch.device) -> Generator["StepTable"]:
+        """A step in here, on a card, is recorded and not carried out (`recorder`): its table is sent by `send`, before
+        each replay. Every parameter that the step will update has been updated by one before."""
+        rows = sum(len(group["params"]) for group in self.param_groups) + _GUARDS
+        sent = torch.zeros(rows * (_WHOLE + _REAL // 2), dtype=torch.int64, device=device)
+        self._recorded = StepTable(sent)
+        try:
+            yield self._recorded
+        finally:
+            self._recorded = None
+
+    def send(self, table: "StepTable") -> None:
+        """Sends a recorded step its table, with the rates of now."""
+        rows = len(table.values) // (_WHOLE + _REAL // 2)
+        real = table.values[rows * _WHOLE :].view(np.float32).reshape(rows, _REAL)
+        real[rows - len(table.group_of) :] = self._rates()[table.group_of]
+        values: Tensor = torch.from_numpy(table.values)  # pyright: ignore[reportUnknownMemberType]
+        values = values.pin_memory() if table.sent.device.type == "cuda" else values
+        table.sent[: len(values)].copy_(values, non_blocking=True)
+
+    def _rates(self) -> NDArray[np.float32]:
+        """[groups, _REAL], as a segment has them."""
+        rates = [
+            (g["lr"], 1.0 - g["betas"][0], 1.0 - g["betas"][1], g["eps"], *g["clamp"], 0.0, 0.0)
+            for g in self.param_groups
+        ]
+        return np.array(rates, np.float32)
 
     @torch.no_grad()
     def step(self, closure: None = None, *, visible: Tensor | None = None, guard: Sequence[Tensor] = ()) -> None:  # type: ignore[override]
@@ -231,18 +263,38 @@ class FusedAdam(torch.optim.Optimizer):
         whole[len(checked) :, 8] = [0 if factor is None else factor.data_ptr() for factor in factors]
         whole[len(checked) :, 6] += chunks
         chunks += plan.chunks
-        rates = [
-            (g["lr"], 1.0 - g["betas"][0], 1.0 - g["betas"][1], g["eps"], *g["clamp"], 0.0, 0.0)
-            for g in self.param_groups
-        ]
-        real[len(checked) :] = np.array(rates, np.float32)[plan.group_of]
-        sent: Tensor = torch.from_numpy(table)  # pyright: ignore[reportUnknownMemberType]
-        sent = (sent.pin_memory() if device.type == "cuda" else sent).to(device, non_blocking=True)
+        real[len(checked) :] = self._rates()[plan.group_of]
+        if self._recorded is None:
+            sent: Tensor = torch.from_numpy(table)  # pyright: ignore[reportUnknownMemberType]
+            sent = (sent.pin_memory() if device.type == "cuda" else sent).to(device, non_blocking=True)
+        else:
+            sent = self._recorded.filled(table, plan.group_of)
         mask = 0 if visible is None else visible.data_ptr()
         wholes, reals = sent[: segments * _WHOLE], sent[segments * _WHOLE :].view(torch.float32)
         for stage, threads in ((0, chunks * _CHUNK), (1, segments), (2, chunks * _CHUNK)):
             inputs = [wholes.data_ptr(), reals.data_ptr(), bad.data_ptr(), mask, segments, stage]
             launch_on(_kernel(), threads, inputs, device)
+
+
+_GUARDS = 4
+"""Values that a recorded step may guard, at most."""
+
+
+@dataclass
+class StepTable:
+    """What a recorded step reads from its card: addresses of gradients stay as they were recorded, rates do not."""
+
+    sent: Tensor
+    """int64, on the card, at least as long as `values`."""
+    values: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+    """The table on the host."""
+    group_of: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+    """Which group each of the table's last rows is of."""
+
+    def filled(self, values: NDArray[np.int64], group_of: NDArray[np.int64]) -> Tensor:
+        """Where the step will find these values."""
+        self.values, self.group_of = values, group_of
+        return self.sent[: len(values)]
 
 
 def _factors(p: Tensor, group: dict[str, Any]) -> Tensor | None:

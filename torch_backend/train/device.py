@@ -8,6 +8,7 @@ from ..cards import why_unused
 from ..contract import DEVICES, ExitCode, JobError, Reporter
 from ..deformation import planes_cuda
 from ..native import initialised_warp
+from . import recorder
 from .self_test import SelfTest, card_verdict
 
 _HINT = "Choose --device cpu, or auto."
@@ -35,6 +36,12 @@ def choose_device(requested: str, report: Reporter | None = None, doing: str = "
             f"that part of its self-test ({planes_cuda.refused}).",
             _REPORT,
         )
+    if report is not None and device.type == "cuda" and recorder.refused and doing == "Training":
+        report.warning(
+            "Training launches every kernel by itself, which takes longer: the graphics card failed that part of its "
+            f"self-test ({recorder.refused}).",
+            _REPORT,
+        )
     return device
 
 
@@ -51,7 +58,7 @@ def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]
     found = None if refusal else card_verdict()  # asked once: a card that does not answer is waited for
     unused = _unused(refusal) if found is None else _failed(found)
     if found is not None and unused is None:
-        planes_cuda.refused = found.planes
+        planes_cuda.refused, recorder.refused = found.planes, found.recording
         return torch.device("cuda"), None
     if requested == "cuda":
         sentence, advice = unused or (refusal, "")

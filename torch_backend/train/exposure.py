@@ -41,12 +41,18 @@ class Exposure:
         self.values = torch.nn.Parameter(torch.zeros(len(times), 2, 3, device=times.device))
         self._at = times.cpu().numpy()  # times are looked up on the host: a GPU need not be asked where a frame lies
 
-    def at(self, time: float) -> tuple[Tensor, Tensor]:
-        """(gain [3], offset [3]) at a normalised time; held constant beyond the ends."""
+    def place(self, time: float) -> tuple[int, int, float]:
+        """The bins at or before and at or after a normalised time, and the share of the second; held constant beyond
+        the ends."""
         right = min(int(np.searchsorted(self._at, np.float32(time))), len(self._at) - 1)
         left = max(right - 1, 0)
         span = float(self._at[right] - self._at[left])
         share = min(max((time - float(self._at[left])) / span, 0.0), 1.0) if span > 0 else 0.0
+        return left, right, share
+
+    def at(self, time: float) -> tuple[Tensor, Tensor]:
+        """(gain [3], offset [3]) at a normalised time."""
+        left, right, share = self.place(time)
         log_gain, offset = torch.lerp(self.values[left], self.values[right], share)
         return log_gain.exp(), offset
 
@@ -56,6 +62,14 @@ class Exposure:
             return color
         gain, offset = self.at(time)
         return color * gain + (offset if alpha is None else offset * alpha[..., None])
+
+    def apply_at(self, color: Tensor, bins: Tensor, share: Tensor) -> Tensor:
+        """`apply` at a place [2] int64, 0-dim float32 on the device (a recorded step is told another one each time)."""
+        if not self.config.on:
+            return color
+        left, right = self.values.index_select(0, bins)
+        log_gain, offset = torch.lerp(left, right, share)
+        return color * log_gain.exp() + offset
 
     def regularisation(self) -> Tensor:
         """Smooth in time, and no larger than needed."""

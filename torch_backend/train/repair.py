@@ -64,12 +64,13 @@ class FieldMemory:
     change.
     """
 
-    def __init__(self, extent: float) -> None:
+    def __init__(self, extent: float, device: torch.device) -> None:
         self.extent = extent
         """Of the scene, in its units: farther than this is always out of place."""
         self._kept: list[dict[str, Tensor]] = []  # the newest last
-        self._reach: Tensor | None = None
-        self._worst: Tensor | None = None
+        # They stay where they lie: a recorded step reads the one and writes the other (`recorder`).
+        self._reach = torch.full((), math.inf, device=device)
+        self._worst = torch.zeros((), device=device)
         self.rates = 1.0
         """Share of the learning rates it began with that a field has after it was put back."""
 
@@ -84,18 +85,18 @@ class FieldMemory:
             self._kept.append(self._kept.pop(0))
             for name, p in named.items():
                 self._kept[-1][name].copy_(p)
-        self._worst = None
-        self._reach = None
+        self._worst.zero_()
+        self._reach.fill_(math.inf)
         if len(means):
             around = norm(means - means.median(0).values, 1).median()
-            self._reach = (_FAR * around).clamp(min(_LEAST_FAR, self.extent), self.extent)
+            self._reach.copy_((_FAR * around).clamp(min(_LEAST_FAR, self.extent), self.extent))
 
     @torch.no_grad()
     def heed(self, shift: Tensor) -> None:
         """A step's `shift` [M, 3] of the means it moves, scene units; what is not finite is for `repair`."""
-        if self._reach is not None and len(shift):
+        if len(shift):
             thrown = (shift.abs().amax(1) > self._reach).float().mean()
-            self._worst = thrown if self._worst is None else torch.maximum(self._worst, thrown)
+            self._worst.copy_(torch.maximum(self._worst, thrown))
 
     def of(self, name: str, p: Tensor) -> Tensor | None:
         """What parameter `name` was; None if not known."""
@@ -109,8 +110,11 @@ class FieldMemory:
         It goes back to the look before the last: what was kept last may have begun to come apart. Halves the learning
         rates of what the field owns. Returns what was done, in words.
         """
-        worst, self._worst = self._worst, None
-        if worst is None or not self._kept or not bool(worst > _THROWN):
+        if not self._kept:
+            return ""
+        worst = float(self._worst)
+        self._worst.zero_()
+        if not worst > _THROWN:
             return ""
         named, before = dict(field.named_parameters()), self._kept[0]
         if {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in before.items()}:
@@ -124,7 +128,7 @@ class FieldMemory:
         for group in optimizer.param_groups:
             if any(id(p) in owned for p in group["params"]):
                 group["lr_start"], group["lr_end"] = 0.5 * group["lr_start"], 0.5 * group["lr_end"]
-        share = f"{100.0 * float(worst):.0f} % of what moves"
+        share = f"{100.0 * worst:.0f} % of what moves"
         return f"put the field back to what it was, at half the learning rates ({share} was thrown out of its place)"
 
 

@@ -33,8 +33,9 @@ from ..shot import write_json
 from ..torch_types import backward, norm_of_all
 from .adam import FusedAdam
 from .losses import photometric
+from .recorder import CudaGraphs
 
-SELF_TEST_VERSION = 2
+SELF_TEST_VERSION = 3
 _SECONDS = 240.0
 """A card that has not answered by then hangs; cold, the kernels take tens of seconds to compile."""
 _GAUSSIANS, _WIDTH, _HEIGHT = 300, 64, 48
@@ -72,6 +73,8 @@ class SelfTest:
     """What is wrong, in a sentence; empty if nothing is."""
     planes: str = ""
     """The same of the kernels of the field's planes alone, for which torch's own operators can stand in on the card."""
+    recording: str = ""
+    """The same of steps that are recorded as CUDA graphs; launched one by one they serve as well."""
     lasting: bool = True
     """Will it be so the next time, too? Not if the card was full, or did not answer."""
     seconds: float = 0.0
@@ -93,6 +96,8 @@ def run_self_test(device: torch.device, key: str = "") -> SelfTest:
     found.problem = _problem(found, lambda: [*_frame(device), *_loss(device), *_adam(device)])
     if not found.problem:  # last: a kernel that breaks the card breaks it for the process
         found.planes = _problem(found, lambda: _planes(device))
+        if device.type == "cuda":
+            found.recording = _problem(found, lambda: _recording(device))
     found.seconds = round(time.perf_counter() - since, 2)
     return found
 
@@ -272,6 +277,40 @@ def _adam(device: torch.device) -> list[Check]:
             optimizer.step()
         found.append(parameter.detach().cpu() - start)
     return [Check("a step of Adam", _relative(found[1], found[0]), _EXACT)]
+
+
+def _recording(device: torch.device) -> list[Check]:
+    """Three steps of Adam on a frame, two of them replayed, against three that are launched."""
+    start = {name: value.to(device) for name, value in _scene().items()}
+    camera: dict[str, Any] = {
+        "viewmats": torch.eye(4, device=device)[None],
+        "Ks": torch.tensor([[[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]], device="cpu").to(device),
+    }
+    found: list[Tensor] = []
+    for records in (False, True):
+        leaves: dict[str, Any] = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
+        optimizer = FusedAdam(list(leaves.values()), lr=1e-2)
+
+        def step(leaves: dict[str, Any] = leaves, optimizer: FusedAdam = optimizer) -> Tensor:
+            total = rasterize(**leaves, **camera, width=_WIDTH, height=_HEIGHT, backend="cuda").colors.square().sum()
+            optimizer.zero_grad(set_to_none=True)
+            backward(total)
+            optimizer.step(guard=[total])
+            return total.detach()
+
+        step()
+        if records:
+            optimizer.zero_grad(set_to_none=True)
+            with optimizer.recording(device) as table:
+                replay, _ = CudaGraphs(device).record(step)
+            for _ in range(2):
+                optimizer.send(table)
+                replay()
+        else:
+            step()
+            step()
+        found.append(torch.cat([(leaves[name] - value).flatten() for name, value in start.items()]))
+    return [Check("a recorded step", _relative(found[1], found[0]), _GRADIENT)]
 
 
 def _planes(device: torch.device) -> list[Check]:

@@ -40,8 +40,14 @@ class SoftenedMovers:
         """Share of the run at which the last softened picture was learnt from; 0: none is."""
         return 0.0 if not any(self._any) else self.span[1]
 
+    def movers_at(self, frame: int, progress: float) -> Tensor | None:
+        """bool [H, W] what moves in the trained frame at position `frame`, if that is softened once a share `progress`
+        of the run is done."""
+        due = self.movers is not None and self.span[0] <= progress < self.span[1] and self._any[frame] > 0
+        return self.movers[frame] if due and self.movers is not None else None
+
     def loss(
-        self, image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None, frame: int, progress: float
+        self, image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None, movers: Tensor | None
     ) -> Tensor:
         """As `photometric`, 0-dim.
 
@@ -49,13 +55,11 @@ class SoftenedMovers:
             image, target: [H, W, 3].
             dssim: weight of structure.
             ignored: bool [H, W] pixels that teach nothing; None: all do.
-            frame: position among the trained frames.
-            progress: share of the run that is done.
+            movers: bool [H, W] what moves, of a frame that is softened; None: it is not.
         """
-        if self.movers is None or not self.span[0] <= progress < self.span[1] or not self._any[frame]:
+        if movers is None:
             return photometric(image, target, dssim, ignored)
-        moves = self.movers[frame].to(image.device, non_blocking=True)[None, None].float()
-        moves = F.max_pool2d(moves, 2 * self.margin + 1, 1, self.margin)[0, 0] > 0.0
+        moves = F.max_pool2d(movers[None, None].float(), 2 * self.margin + 1, 1, self.margin)[0, 0] > 0.0
         taught = moves if ignored is None else moves & ~ignored
         sharp = photometric(image, target, dssim, moves if ignored is None else moves | ignored)
         return sharp + photometric(self._soft(image), self._soft(target), dssim, ~self._touched(taught))

@@ -50,10 +50,15 @@ class Soundness:
 
     def __init__(self, extent: float, device: torch.device) -> None:
         """`extent`: of the scene, in its units."""
-        self.memory = FieldMemory(extent)
+        self.memory = FieldMemory(extent, device)
         """What the field was when it was in order."""
         self.unusable: set[int] = set()
         """Positions of the trained frames whose pictures are not finite; nobody trains on them again."""
+        self.mended = 0
+        """How often something was found out of order."""
+        self.troubled = False
+        """Was the last step before the last look left out? Its successors are taken one launch at a time (`recorder`),
+        so that the next look finds the gradients of one."""
         self._in_a_row = 0
         self._counted = torch.zeros(2, dtype=torch.int32, device=device)
         self._recent: deque[int] = deque(maxlen=2 * INSPECT_EVERY)
@@ -67,7 +72,7 @@ class Soundness:
         self._in_a_row = 0
         if applied.device.type != "cpu":
             left_out = ~applied
-            self._counted = torch.stack([self._counted[0] + left_out, (self._counted[1] + 1) * left_out])
+            self._counted.copy_(torch.stack([self._counted[0] + left_out, (self._counted[1] + 1) * left_out]))
 
     def skipped(self, run: MendedRun, frame: int) -> None:
         """After a step that was left out on the CPU: repairs; a run that keeps failing ends in words."""
@@ -84,6 +89,9 @@ class Soundness:
         self._counted[0] = 0
         if in_a_row >= _MAX_BAD_STEPS:
             raise unstable(run.iteration)
+        self.troubled = in_a_row > 0
+        if self.troubled and all(p.grad is None for p in run.model.gaussians.params.values()):
+            self._counted.zero_()  # recorded steps leave no gradients to look into: their successors count anew
         text = f"{count} of the steps up to {run.iteration} were skipped: their loss or gradient is not finite."
         self._recover(run, text if count else "", gradients=in_a_row > 0)
 
@@ -106,6 +114,7 @@ class Soundness:
             done = f"left frame {names} out from now on (its image is not finite)"
         elif gradients and not done:
             done = drop_offenders(model, run.optimizer, run.densifier)
+        self.mended += bool(done) or gradients
         if done:
             run.report.warning(f"{skipped or f'Step {run.iteration}.'} Repaired: {done}. Training goes on.")
         elif skipped:

@@ -18,7 +18,18 @@ from ..gaussians import Densifier, DensifyConfig, covering, initialise
 from ..raster import RasterOutput
 from ..raster.cuda import forget_demands
 from ..scene import Scene
-from ..supervision import Anchored, bin_of, bin_times, draw_anchored, mark_hidden, mark_seen, stillness, support_loss
+from ..supervision import (
+    Anchored,
+    anchored_pairs,
+    bin_of,
+    bin_times,
+    draw,
+    mark_hidden,
+    mark_seen,
+    still_weight,
+    stillness,
+    support_loss,
+)
 from ..torch_types import backward, integers, norm_of_all
 from . import memory
 from .average import ParameterMean
@@ -33,9 +44,11 @@ from .movers import close_strays, harden, on_trial
 from .optimizer import add_field, limit_harmonics, optimizer_of, schedule_rates
 from .paper import paper_step
 from .poses import Poses, corrected
+from .recorder import Recorder
 from .residual import correlation_of_movers
 from .softened import SoftenedMovers
 from .soundness import INSPECT_EVERY, Soundness
+from .step_facts import StepFacts, StepKind
 from .stopping import RunSchedule, StoppingPolicy
 
 
@@ -82,7 +95,6 @@ class Trainer:
         self.viewmats = scene.viewmats.to(self.device)
         self.Ks = scene.camera_at(self.width, self.height).to(self.device)
         self.times = [float(scene.times[i]) for i in train]
-        self._time_tensor = torch.tensor(self.times, device=self.device)
         self.seconds = float(scene.seconds[train[-1]] - scene.seconds[train[0]])
         self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
         centres = bin_times(scene.times[train])
@@ -112,6 +124,7 @@ class Trainer:
         self.optimizer = optimizer_of(self.model, self.poses, config)
         self.mean = ParameterMean()
         self.densifier = Densifier(self._densify_config(), len(gaussians), self.device)
+        self.recorder = Recorder(self, self.model.device) if self.device.type == "cuda" else None
         self._foretold = False
         self._saved_at = time.perf_counter()
 
@@ -240,6 +253,8 @@ class Trainer:
         if len(self.densifier.seen) != before:  # it ended between a round of growth and its end
             self.densifier.reset(before)
         forget_demands()
+        if self.recorder is not None:
+            self.recorder.forget()
         torch.cuda.empty_cache()
         self.save(checkpoint)
         moving = len(self.model.open_rows())
@@ -269,30 +284,75 @@ class Trainer:
 
     def step(self) -> Tensor:
         """One optimisation step on one training frame; returns its photometric loss (0-dim). Not finite: left out."""
-        frame, supervision = self._next_frame(), self.config.supervision
+        frame = self._next_frame()
         self._schedule_rates()
-        rows = self.model.open_rows()
-        pairs = self._pairs_to_anchor(rows)
-        deltas, anchored = self._deltas(rows, frame, pairs)
+        kind, facts = self._told(frame)
+        if self.recorder is not None:
+            return self.recorder.step(kind, facts, frame)
+        return self.carry_out(kind, facts.on(self.device), frame)
+
+    def _told(self, frame: int) -> tuple[StepKind, StepFacts]:
+        """What the next step is told of the trained frame at position `frame`. All that is drawn, is drawn here."""
+        model, s, field, c = self.model, self.config.supervision, self.model.field, self.config
+        rows, index, time = model.open_rows(), self.train_ids[frame], self.times[frame]
+        draws = None
+        if field is not None and len(rows) and s.anchors_due(self.iteration, self.progress):
+            draws = draw(len(rows), len(self.centres), s, self.generator)
+        asked = time if field is None else field.training_time(time, self.progress, self.generator)
+        # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
+        background = torch.rand(3, generator=self.generator, device="cpu")
+        left, right, share = model.exposure.place(time)
+        numbers = torch.tensor([asked, share, still_weight(self.progress, s)], dtype=torch.float32, device="cpu")
+        ignored = self.ignored.get(index)
+        movers = self.softened.movers_at(frame, self.progress)
+        facts = StepFacts(
+            numbers=torch.cat([numbers, background]),
+            places=torch.tensor([self._bins[frame], left, right], dtype=torch.int64, device="cpu"),
+            viewmat=self.viewmats[index], K=self.Ks[index], image=self.images[frame], ignored=ignored,
+            movers=movers, draws=draws,
+        )  # fmt: skip
+        asks = self._refines_poses() or (field is not None and s.paper_due(self.iteration, self.progress))
+        kind = StepKind(
+            sh_degree=model.sh_degree,
+            moves=field is not None and len(rows) > 0,
+            detached=self.progress < c.field.detached,
+            hidden=field is not None and s.hidden_due(self.iteration),
+            anchored=draws is not None,
+            penalised=self.iteration % c.field_every == 0,
+            soft=movers is not None,
+            ignored=ignored is not None,
+            recordable=not asks and (field is None or field.recordable),
+        )
+        return kind, facts
+
+    def carry_out(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
+        """A step of a kind on facts that lie on the device; its photometric loss (0-dim).
+
+        One that is recorded is carried out again with other facts: everything in here that is other in two steps of one
+        kind comes from them.
+        """
+        supervision, model = self.config.supervision, self.model
+        rows = model.open_rows()
+        pairs = None if facts.draws is None else anchored_pairs(model.gaussians, rows, facts.draws, supervision)
+        deltas, anchored = self._deltas(rows, facts.numbers[:1], pairs)
         if deltas is not None:
             self.soundness.memory.heed(deltas.means.detach())
-        if deltas is not None and self.progress < self.config.field.detached:
+        if deltas is not None and kind.detached:
             deltas = deltas.detached()
-        state = self.model.moved(rows, deltas)
-        # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
-        background = torch.rand(3, generator=self.generator, device="cpu").to(self.device, non_blocking=True)
-        moves = self.model.field is not None
-        marks_hidden = moves and supervision.hidden_due(self.iteration)
-        out = self.render_trained(state, frame, background=background, with_depth=marks_hidden)
-        paper = moves and supervision.paper_due(self.iteration, self.progress) and len(rows) > 0
+        state = model.moved(rows, deltas)
+        viewmat = corrected(facts.viewmat, self.poses.values[frame]) if self._refines_poses() else facts.viewmat
+        out = render(
+            state, model.sh_degree, viewmat, facts.K, self.width, self.height, background=facts.numbers[3:],
+            with_depth=kind.hidden, with_contributions=True,
+        )  # fmt: skip
+        paper = kind.moves and supervision.paper_due(self.iteration, self.progress)
         if paper:
             state["means"].retain_grad()
-        exposed = self.model.exposure.apply(out.colors[0], self.times[frame])
-        ignored = self.ignored_at(self.train_ids[frame])
-        loss = self.softened.loss(exposed, self.image_of(frame), self.config.dssim, ignored, frame, self.progress)
-        total = loss + self._regularisers(rows)
+        exposed = model.exposure.apply_at(out.colors[0], facts.places[1:], facts.numbers[1])
+        loss = self.softened.loss(exposed, facts.image, self.config.dssim, facts.ignored, facts.movers)
+        total = loss + self._regularisers(rows, kind.penalised)
         if deltas is not None and supervision.preset == "support":
-            price = stillness(deltas, len(self.model.gaussians), loss, self.progress, supervision)
+            price = stillness(deltas, len(model.gaussians), loss, facts.numbers[2], supervision)
             total = total + self.config.field.still * price
         if self._refines_poses():
             total = total + self.poses.regularisation()
@@ -311,10 +371,12 @@ class Trainer:
             self.soundness.skipped(self, frame)
             return loss.detach()
         self.soundness.count(applied)
-        self._observe(frame, rows, state, out, applied)
+        self._observe(facts, rows, state, out, applied)
         return loss.detach()
 
-    def _observe(self, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput, applied: Tensor) -> None:
+    def _observe(
+        self, facts: StepFacts, rows: Tensor, state: dict[str, Tensor], out: RasterOutput, applied: Tensor
+    ) -> None:
         """After a step, applied or not (0-dim bool): what it tells the densifier and the support bitmap."""
         if out.weight_sum is None:
             raise RuntimeError("the frame was rendered without contributions")
@@ -322,20 +384,29 @@ class Trainer:
         if self.device.type != "cpu":
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
-        mark_seen(self.model.gaussians, self._bins[frame], weight)
+        mark_seen(self.model.gaussians, facts.places[:1], weight)
         if out.depth_median is not None:  # at steps that mark who was hidden
-            index = self.train_ids[frame]
-            view = (self.viewmats[index], self.Ks[index], out.depth_median[0])
-            mark_hidden(self.model.gaussians, rows, self._bins[frame], state, *view)
+            view = facts.viewmat, facts.K, out.depth_median[0]
+            mark_hidden(self.model.gaussians, rows, facts.places[:1], state, *view)
 
-    def _deltas(self, rows: Tensor, frame: int, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
-        """The field for the frame's Gaussians and for the pairs to anchor, in one call: (of `rows`, of `pairs`)."""
-        when, field = self._time_tensor[frame : frame + 1], self.model.field
+    def layout(self) -> tuple[int, ...]:
+        """Where everything lies that steps read and write, and how much of it there is (`recorder`)."""
+        model = self.model.gaussians
+        rows = self.model.open_rows()
+        known: list[Tensor] = [
+            rows, model.open, model.support, model.hidden, self.densifier.gradient, self.densifier.seen,
+        ]  # fmt: skip
+        for group in self.optimizer.param_groups:
+            for p in group["params"]:
+                known += (p, *self.optimizer.state.get(p, {}).values())
+        return len(model), len(rows), self.model.pieces or 0, *(t.data_ptr() for t in known)
+
+    def _deltas(self, rows: Tensor, when: Tensor, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
+        """The field for the frame's Gaussians at when [1], and for the pairs to anchor, in one call: (of `rows`, of
+        `pairs`)."""
+        field = self.model.field
         if field is None:
             return None, None
-        time = field.training_time(self.times[frame], self.progress, self.generator)
-        if time != self.times[frame]:
-            when = torch.full_like(when, time)
         if pairs is None:
             return self.model.deltas(rows, when), None
         times = torch.cat([when.expand(len(rows)), self.centres[pairs.bins]])
@@ -500,22 +571,16 @@ class Trainer:
         self.soundness.trains_on(self.order[-1])
         return self.order.pop()
 
-    def _regularisers(self, rows: Tensor) -> Tensor:
+    def _regularisers(self, rows: Tensor, penalised: bool) -> Tensor:
         c, p = self.config, self.model.gaussians.params
         total = c.opacity_weight * torch.sigmoid(p["opacity_logits"]).mean()
         total = total + c.scale_weight * p["log_scales"].exp().mean() + self.model.exposure.regularisation()
         field = self.model.field
         if field is None or not len(rows):
             return total
-        if self.iteration % c.field_every == 0:
+        if penalised:
             total = total + c.field_every * field.regularisation(self.progress, self.generator)
         return total
-
-    def _pairs_to_anchor(self, rows: Tensor) -> Anchored | None:
-        s = self.config.supervision
-        if self.model.field is None or not s.anchors_due(self.iteration, self.progress):
-            return None
-        return draw_anchored(self.model.gaussians, rows, s, self.generator)
 
     def _support_loss(self, pairs: Anchored, deltas: Deltas) -> Tensor:
         s, field = self.config.supervision, self.model.field

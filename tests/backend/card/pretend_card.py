@@ -60,6 +60,8 @@ class Card:
         self.live = self.peak = 0
         """Bytes in use now, and at most."""
         self._held: dict[int, list[int]] = {}
+        self.tape: Tape | None = None
+        """What records now, if something does."""
         self.before_launch: Callable[[str], None] = lambda name: None
         """Called with the name of each kernel of the rasteriser; may raise."""
 
@@ -88,6 +90,63 @@ class Card:
         held[0] -= 1
         if not held[0]:
             self.live -= self._held.pop(key)[1]
+
+
+class Tape:
+    """`train.recorder.Recording` as a card does it: the work is not carried out while it is recorded, and no word of
+    the host's reaches a replay, but through tensors that were there before. What a graph refuses is refused."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.steps: list[Callable[[], Any]] = []
+        self.kept: list[Any] = []
+        """All tensors that were made: kernels know their addresses only."""
+
+    def watched(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def fits(self) -> bool:
+        return True
+
+    def drop(self) -> None:
+        pass
+
+    def record(self, work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+        tape = CARD.tape = Tape(CUDA)
+        try:
+            result = work()
+        finally:
+            CARD.tape = None
+
+        def replay() -> None:
+            for step in tape.steps:
+                step()
+
+        return replay, result
+
+    def run(self, func: Any, name: str, args: Any, kwargs: Any, real: tuple[Any, Any], to_card: bool) -> Any:
+        """Notes an operator on tensors of the card, and carries it out only as far as its result's size needs it."""
+        if func._schema.is_mutable:
+            if name == "copy_" and not isinstance(args[1], Pretended):
+                raise RuntimeError(f"operation not permitted when stream is capturing: {func} at {_place()}")
+            self.kept.append((args, kwargs))
+            self.steps.append(lambda: func(*real[0], **real[1]))
+            return None
+        out = func(*real[0], **real[1])
+        self.kept.append((args, kwargs, out))
+        if not func.is_view and name not in _NOTHING:
+
+            def again() -> None:
+                new = func(*real[0], **real[1])
+                for there, value in zip(tree_flatten(out)[0], tree_flatten(new)[0], strict=True):
+                    there.copy_(value)
+
+            self.steps.append(again)
+        return out
+
+    def launch(self, inputs: list[Any], run: Callable[[list[Any]], None]) -> None:
+        """Notes a launch; structures are the host's, which goes on to write into them."""
+        held = [type(i).from_buffer_copy(i) if isinstance(i, ctypes.Structure) else i for i in inputs]
+        self.steps.append(lambda: run(held))
 
 
 CARD = Card()
@@ -221,7 +280,14 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     held.pop("pin_memory", None)
     if name == "_to_copy":
         held.pop("device", None)  # between two tensors of the host it is always a copy
-    out = func(*tree_map(_real, args), **tree_map(_real, held))
+    real = tree_map(_real, args), tree_map(_real, held)
+    if CARD.tape is not None and (touches or to_card):
+        leaves = name == "_to_copy" and (to_host or not touches)
+        if leaves or name in _ASKED:
+            raise RuntimeError(f"operation not permitted when stream is capturing: {func} at {_place()}")
+        out = CARD.tape.run(func, name, args, kwargs, real, to_card)
+    else:
+        out = func(*real[0], **real[1])
     stays = isinstance(args[0], Pretended) if name == "copy_" else to_card or (touches and not to_host)
     if name == "_local_scalar_dense" or not stays:
         return out
@@ -248,6 +314,7 @@ def pretended_card() -> Iterator[Card]:
     import torch_backend.raster.ssim_cuda as ssim_cuda
     import torch_backend.train.adam as adam
     import torch_backend.train.device as chosen
+    import torch_backend.train.recorder as recorder
     from torch_backend.train.self_test import SelfTest
 
     saved: list[tuple[Any, str, Any]] = []
@@ -260,28 +327,39 @@ def pretended_card() -> Iterator[Card]:
 
     def launch_on(kernel: Any, dim: int, inputs: list[Any], device: torch.device) -> None:
         CARD.launched[kernel.key] += device.type == "cuda"
-        launch_here(kernel, dim, inputs, host)
+        if CARD.tape is not None:
+            CARD.tape.launch(inputs, lambda held: launch_here(kernel, dim, held, host))
+        else:
+            launch_here(kernel, dim, inputs, host)
 
     def launch(self: Any, name: str, args: Any, threads: int, channels: int = 0) -> None:
         if threads:
             CARD.before_launch(name)
             CARD.launched[name] += 1
             dim = -(-threads // cuda.source.BLOCK) * cuda.source.BLOCK
-            with cuda._Fibers(self.wp):
-                launch_here(cuda.build(name, channels), dim, [args], host, cuda.source.BLOCK)
+
+            def go(inputs: list[Any]) -> None:
+                with cuda._Fibers(self.wp):
+                    launch_here(cuda.build(name, channels), dim, inputs, host, cuda.source.BLOCK)
+
+            if CARD.tape is not None:
+                CARD.tape.launch([args], go)
+            else:
+                go([args])
 
     plain = torch.tensor
     patch(torch, "tensor", lambda *values, pin_memory=False, **options: plain(*values, **options))
     patch(torch.Tensor, "pin_memory", lambda self, *_: self)
     patch(torch.cuda, "_lazy_init", lambda: None)
     patch(torch.cuda, "is_available", lambda: True)
-    patch(torch.cuda, "is_current_stream_capturing", lambda: False)
+    patch(torch.cuda, "is_current_stream_capturing", lambda: CARD.tape is not None)
     patch(torch.cuda, "device", lambda device: contextlib.nullcontext())
     patch(torch.cuda, "mem_get_info", lambda device=None: (CARD.limit - CARD.live, CARD.limit))
     patch(torch.cuda, "empty_cache", lambda: None)
     patch(torch.cuda, "memory_reserved", lambda device=None: CARD.live)
     patch(torch.cuda, "memory_allocated", lambda device=None: CARD.live)
     patch(torch.cuda, "synchronize", lambda device=None: None)
+    patch(recorder, "CudaGraphs", Tape)
     patch(chosen, "cuda_refusal", lambda: "")
     patch(chosen, "card_verdict", SelfTest)  # it would ask a process of its own, which has no such card
     for module in (native, ssim_cuda, adam, planes_cuda):

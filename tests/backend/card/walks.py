@@ -83,6 +83,36 @@ def steps(folder: Path, *runs: str) -> dict[str, Any]:
     return told
 
 
+def recorded(folder: Path, *methods: str) -> dict[str, Any]:
+    """Per method: a run whose steps are recorded beside one whose are not, with all events of a run."""
+    world, quiet = small_world(folder)
+    told: dict[str, Any] = {}
+    for method in methods:
+        found: list[Any] = []
+        for records in (False, True):
+            with pretended_card():
+                trainer = new_trainer(world, quiet, method, "support", False, iterations=40)
+                trainer.config.densify.every = 10
+                recorder = trainer.recorder
+                trainer.recorder = recorder if records else None
+                _steps(trainer, 32)
+                model = trainer.model.gaussians
+                values = {name: p.detach()._real.double() for name, p in trainer._named().items()}
+                values |= {name: getattr(model, name)._real.double() for name in ("support", "hidden")}
+                found.append(values)
+                moving = len(trainer.model.open_rows())
+        plain, replayed = found
+        off = {
+            name: float((replayed[name] - value).norm() / value.norm().clamp_min(1e-9)) for name, value in plain.items()
+        }
+        worst = max(off, key=lambda name: off[name])
+        told[method] = {
+            "replayed": recorder.replayed, "refused": recorder.refused, "off": off[worst], "worst": worst,
+            "moving": moving,
+        }  # fmt: skip
+    return told
+
+
 def launches(folder: Path, *methods: str) -> dict[str, Any]:
     """Per method: launches of six steps with our kernels for the field's planes, and with torch's operators: kernels of
     ours and operators, a launch each at the least."""
@@ -97,6 +127,7 @@ def launches(folder: Path, *methods: str) -> dict[str, Any]:
             try:
                 with pretended_card():
                     trainer = new_trainer(world, quiet, method, "support", False)
+                    trainer.recorder = None
                     _steps(trainer, 6)  # the field is there, and its tables
                     for _ in range(6):
                         before = CARD.operators + sum(CARD.launched.values())
@@ -164,6 +195,7 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
     for method in methods:
         with pretended_card():
             trainer = new_trainer(world, quiet, method, "support", False)
+            trainer.recorder = None
             trainer.iteration = 4
             trainer.schedule_events()
             peaks: list[tuple[int, int]] = []
@@ -195,6 +227,7 @@ def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
     memory.LEAST, memory.LEAST_PIECE = 40, 100
     with pretended_card():
         trainer = new_trainer(world, quiet, method, "support", False, iterations=14)
+        trainer.recorder = None  # it would hold as much again, for good
         _steps(trainer, 8)
         CARD.peak = CARD.live
         _steps(trainer, 1)  # the first with anchors, which take most
@@ -257,8 +290,8 @@ def self_test(folder: Path) -> dict[str, Any]:
 
 
 WALKS = {
-    "steps": steps, "launches": launches, "resume": resume, "station": station, "step_bytes": step_bytes,
-    "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test,
+    "steps": steps, "recorded": recorded, "launches": launches, "resume": resume, "station": station,
+    "step_bytes": step_bytes, "memory_ends": memory_ends, "bad_frames": bad_frames, "self_test": self_test,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -11,19 +11,29 @@ from torch_backend.gaussians import PARAM_NAMES, Gaussians
 from torch_backend.supervision import (
     PaperView,
     SupervisionConfig,
+    anchored_pairs,
     bin_of,
     bin_times,
-    draw_anchored,
+    draw,
     mark_hidden,
     mark_seen,
     nearest_bin,
     nearest_supported,
     paper_loss,
+    still_weight,
     stillness,
     support_confidence,
     support_loss,
     well_supervised,
 )
+
+
+CONFIG = SupervisionConfig()
+
+
+def drawn(m, rows, config, seed):
+    draws = draw(len(rows), m.support.shape[1], config, torch.Generator().manual_seed(seed))
+    return anchored_pairs(m, rows, draws, config)
 
 
 def model(support):
@@ -47,7 +57,7 @@ def test_bins_are_the_trained_times_or_256_even_ones():
 
 def test_mark_seen_takes_what_painted():
     m = model([[0, 0], [0, 0]])
-    mark_seen(m, 1, torch.tensor([0.01, 3.0]))
+    mark_seen(m, torch.tensor([1]), torch.tensor([0.01, 3.0]))
     assert m.support.tolist() == [[False, False], [False, True]]
 
 
@@ -93,7 +103,7 @@ def anchor(m, field, bins):
     """The support loss of whatever is drawn from all open Gaussians; None if nothing is."""
     config, centres = SupervisionConfig(), torch.linspace(0, 1, bins)
     rows = torch.nonzero(m.open).flatten()
-    pairs = draw_anchored(m, rows, config, torch.Generator().manual_seed(0))
+    pairs = drawn(m, rows, config, 0)
     if pairs is None:
         return None
     here = field(m.params["means"].detach()[pairs.rows], centres[pairs.bins])
@@ -103,7 +113,7 @@ def anchor(m, field, bins):
 def test_drawn_pairs_are_unsupported_and_half_of_them_near_support():
     flags = [[0, 0, 1, 1, 0, 0, 0, 0], [1, 1, 1, 1, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0, 0, 0]]
     m = model(flags)
-    pairs = draw_anchored(m, torch.arange(3), SupervisionConfig(), torch.Generator().manual_seed(1))
+    pairs = drawn(m, torch.arange(3), SupervisionConfig(), 1)
     assert 200 < len(pairs.rows) <= SupervisionConfig().support_samples
     assert not bool(m.support[pairs.rows, pairs.bins].any())
     assert bool(m.hidden[pairs.rows, pairs.bins].all())
@@ -146,7 +156,7 @@ ERROR = torch.tensor(0.05)
 
 
 def price(deltas, count=1, progress=1.0, error=ERROR):
-    return float(stillness(deltas, count, error, progress, SupervisionConfig()).detach())
+    return float(stillness(deltas, count, error, torch.tensor(still_weight(progress, CONFIG)), CONFIG).detach())
 
 
 def test_stillness_costs_nothing_at_rest_and_less_and_less_beyond():
@@ -172,7 +182,7 @@ def test_stillness_is_the_sum_over_attributes_of_what_each_moves_by():
 def test_stillness_is_paid_in_photometric_loss_and_does_not_change_it():
     error = torch.tensor(0.05, requires_grad=True)
     deltas = shifts(0.1)
-    stillness(deltas, 1, error, 1.0, SupervisionConfig()).backward()
+    stillness(deltas, 1, error, torch.tensor(still_weight(1.0, CONFIG)), CONFIG).backward()
     assert error.grad is None
     assert float(deltas.means.grad[0, 0]) > 0.0
     assert price(shifts(0.1), error=0.5 * ERROR) == pytest.approx(0.5 * price(shifts(0.1)))
@@ -182,7 +192,7 @@ def test_the_price_of_one_gaussian_does_not_depend_on_how_many_are_open():
     many, few = shifts(0.1, 0.0, 0.0, 0.0), shifts(0.1)
     assert price(many, 4) == pytest.approx(price(few, 4))
     for deltas in (many, few):
-        stillness(deltas, 4, ERROR, 1.0, SupervisionConfig()).backward()
+        stillness(deltas, 4, ERROR, torch.tensor(still_weight(1.0, CONFIG)), CONFIG).backward()
     torch.testing.assert_close(many.means.grad[0], few.means.grad[0])
 
 
@@ -201,7 +211,7 @@ def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
     config = SupervisionConfig()
 
     def rows_drawn(config: SupervisionConfig) -> set[int]:
-        pairs = draw_anchored(m, torch.arange(2), config, torch.Generator().manual_seed(1))
+        pairs = drawn(m, torch.arange(2), config, 1)
         return set() if pairs is None else set(pairs.rows.tolist())
 
     assert rows_drawn(config) == {1}
@@ -223,7 +233,7 @@ def test_hidden_is_out_of_the_frame_or_behind_what_is_seen():
     state["log_scales"][6, 1] = math.log(0.5)
     depth = torch.full((16, 32), 3.0)
     depth[8, 18] = 1e10  # a hole in the picture
-    mark_hidden(m, torch.arange(count), 1, state, viewmat, K, depth)
+    mark_hidden(m, torch.arange(count), torch.tensor([1]), state, viewmat, K, depth)
     # On the surface, before it, behind it, right of the frame, behind the camera, in the hole, large and half behind.
     assert m.hidden[:, 1].tolist() == [False, False, True, True, True, False, False]
     assert not bool(m.hidden[:, 0].any())
@@ -256,8 +266,8 @@ def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
     )  # fmt: skip
     m = model([[1, 0]] * 223)
     m.hidden[:] = False
-    mark_seen(m, 1, out.weight_sum[0])
-    mark_hidden(m, torch.tensor([221]), 1, state, torch.eye(4), K, out.depth_median[0])
+    mark_seen(m, torch.tensor([1]), out.weight_sum[0])
+    mark_hidden(m, torch.tensor([221]), torch.tensor([1]), state, torch.eye(4), K, out.depth_median[0])
     assert not bool(m.support[221, 1])
     assert bool(m.hidden[221, 1]) == anchored
 
