@@ -27,7 +27,6 @@ from torch_backend.supervision import (
     well_supervised,
 )
 
-
 CONFIG = SupervisionConfig()
 
 
