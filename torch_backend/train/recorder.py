@@ -51,8 +51,8 @@ class RecordedRun(Protocol):
         """One step; its photometric loss (0-dim)."""
         ...
 
-    def layout(self) -> tuple[int, ...]:
-        """Where everything lies that steps read and write, and how much of it there is."""
+    def layout(self) -> tuple[object, ...]:
+        """What steps read and write: while all of it is the same, it lies where it lay."""
         ...
 
 
@@ -100,11 +100,13 @@ class Recorder:
         """Why nothing is recorded any more; empty if it is."""
         self._recorded: dict[StepKind, _Recorded] = {}
         self._seen: set[tuple[StepKind, int]] = set()
-        self._layout: tuple[int, ...] = ()
+        self._layout: tuple[object, ...] = ()
         self._wanted = 0
+        self._gradients = False
 
     def forget(self) -> None:
         """Drops the recordings, and their memory."""
+        self._layout = ()
         if self._recorded:
             self._recorded.clear()
             self.recording.drop()
@@ -116,7 +118,7 @@ class Recorder:
             return self._launched(kind, facts, frame)
         layout = run.layout()
         wanted = outgrown(self.device, 1, run.width, run.height)
-        if layout != self._layout or wanted > self._wanted:
+        if not _same(layout, self._layout) or wanted > self._wanted:
             self.forget()
             self._layout = layout
         if seen not in self._seen or wanted > self._wanted:  # the rasteriser makes its list larger
@@ -124,7 +126,9 @@ class Recorder:
             self._seen.add(seen)
             with self.recording.watched():
                 return self._launched(kind, facts, frame)
-        run.optimizer.zero_grad(set_to_none=True)
+        if self._gradients:  # of a step before, which a look would take for this one's
+            run.optimizer.zero_grad(set_to_none=True)
+            self._gradients = False
         recorded = self._recorded.get(kind) or self._record(kind, facts, frame)
         if recorded is None:
             return self._launched(kind, facts, frame)
@@ -137,6 +141,7 @@ class Recorder:
         return recorded.loss
 
     def _launched(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
+        self._gradients = True
         return self.run.carry_out(kind, facts.on(self.device), frame)
 
     def _record(self, kind: StepKind, facts: StepFacts, frame: int) -> _Recorded | None:
@@ -156,6 +161,12 @@ class Recorder:
         self.run.optimizer.zero_grad(set_to_none=True)  # the recording's own, which others write over
         made = self._recorded[kind] = _Recorded(room, table, replay, loss)
         return made
+
+
+def _same(one: tuple[object, ...], two: tuple[object, ...]) -> bool:
+    """Are they the same objects, or equal numbers?"""
+    pairs = zip(one, two, strict=False)
+    return len(one) == len(two) and all(a is b or (isinstance(a, int) and a == b) for a, b in pairs)
 
 
 class CudaGraphs:

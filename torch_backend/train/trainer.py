@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,7 +31,7 @@ from ..supervision import (
     stillness,
     support_loss,
 )
-from ..torch_types import backward, integers, norm_of_all
+from ..torch_types import backward, from_numpy, integers, norm_of_all
 from . import memory
 from .average import ParameterMean
 from .checkpoint import MISFITS, load_checkpoint, misfit, optimizer_state, restore_optimizer, save_checkpoint
@@ -302,12 +303,12 @@ class Trainer:
         # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         background = torch.rand(3, generator=self.generator, device="cpu")
         left, right, share = model.exposure.place(time)
-        numbers = torch.tensor([asked, share, still_weight(self.progress, s)], dtype=torch.float32, device="cpu")
+        numbers = from_numpy(np.array([asked, share, still_weight(self.progress, s)], np.float32))
         ignored = self.ignored.get(index)
         movers = self.softened.movers_at(frame, self.progress)
         facts = StepFacts(
             numbers=torch.cat([numbers, background]),
-            places=torch.tensor([self._bins[frame], left, right], dtype=torch.int64, device="cpu"),
+            places=from_numpy(np.array([self._bins[frame], left, right], np.int64)),
             viewmat=self.viewmats[index], K=self.Ks[index], image=self.images[frame], ignored=ignored,
             movers=movers, draws=draws,
         )  # fmt: skip
@@ -389,17 +390,18 @@ class Trainer:
             view = facts.viewmat, facts.K, out.depth_median[0]
             mark_hidden(self.model.gaussians, rows, facts.places[:1], state, *view)
 
-    def layout(self) -> tuple[int, ...]:
-        """Where everything lies that steps read and write, and how much of it there is (`recorder`)."""
-        model = self.model.gaussians
-        rows = self.model.open_rows()
-        known: list[Tensor] = [
-            rows, model.open, model.support, model.hidden, self.densifier.gradient, self.densifier.seen,
-        ]  # fmt: skip
-        for group in self.optimizer.param_groups:
-            for p in group["params"]:
-                known += (p, *self.optimizer.state.get(p, {}).values())
-        return len(model), len(rows), self.model.pieces or 0, *(t.data_ptr() for t in known)
+    def layout(self) -> tuple[object, ...]:
+        """What steps read and write, and how often it was mended: while all of it is the same, it lies where it lay.
+
+        Whatever takes the place of one of them (growth, the gate, a repair, another degree of harmonics, a checkpoint)
+        takes that of all their moments in the optimiser, if of any.
+        """
+        model, growth = self.model.gaussians, self.densifier
+        return (
+            self.soundness.mended, self.model.pieces, len(self.optimizer.param_groups), self.optimizer,
+            self.model.field, self.model.open_rows(), model.open, model.support, model.hidden, growth.gradient,
+            growth.seen, self.model.exposure.values, self.poses.values, *model.params.values(),
+        )  # fmt: skip
 
     def _deltas(self, rows: Tensor, when: Tensor, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
         """The field for the frame's Gaussians at when [1], and for the pairs to anchor, in one call: (of `rows`, of
