@@ -39,6 +39,7 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 WALKS = (
     "steps auto/support/poses hexplane/paper mlp/support control_points/support",
+    "recorded hexplane",
     "launches hexplane",
     "resume static",
     "step_bytes static hexplane control_points",

@@ -15,6 +15,13 @@ def test_a_step_on_a_card_waits_for_nothing_but_at_the_tenth(walk, run):
     assert told["waits"] == {}
 
 
+def test_recorded_steps_do_what_launched_ones_do(walk):
+    """To the bit: with growth, the gate, anchors, the field's penalty, and other frames and times at each replay."""
+    told = walk("recorded")["hexplane"]
+    assert told["replayed"] >= 20 and told["refused"] == "" and told["moving"] > 0
+    assert told["off"] == 0.0, told["worst"]
+
+
 def test_the_fields_kernels_take_the_place_of_hundreds_of_launches(walk):
     told = walk("launches")["hexplane"]
     fewer = [torchs - ours for ours, torchs in zip(told["ours"], told["torch"], strict=True)]

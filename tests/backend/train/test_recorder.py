@@ -1,0 +1,90 @@
+"""When a step is recorded, replayed or launched, on what facts (`step_facts`). That a replay is the
+step that was recorded: `card/test_card.py`."""
+
+import contextlib
+
+import pytest
+import torch
+
+from torch_backend.contract import TrainParams
+from torch_backend.scene import load_images, load_scene
+from torch_backend.train import config_from_params
+from torch_backend.train.recorder import Recorder
+from torch_backend.train.trainer import Trainer
+
+
+class Again:
+    """Carries the work out anew at each replay, on the facts that lie there then."""
+
+    def __init__(self, fails=False, room=True):
+        self.fails, self.room, self.made, self.dropped = fails, room, 0, 0
+
+    def watched(self):
+        return contextlib.nullcontext()
+
+    def fits(self):
+        return self.room
+
+    def drop(self):
+        self.dropped += 1
+
+    def record(self, work):
+        if self.fails:
+            raise RuntimeError("operation not permitted when stream is capturing\nsee the log")
+        self.made += 1
+        result = torch.zeros(())
+        return lambda: result.copy_(work()), result
+
+
+@pytest.fixture
+def trained(world, quiet):
+    scene = load_scene(world.shot)
+    images = load_images(scene, scene.solved, 32, 24)
+
+    def run(recording, steps=24, break_at=-1):
+        config = config_from_params(TrainParams(iterations=40, max_gaussians=330, method="hexplane", width=32))
+        config.densify.every, config.init.seeds, config.field.start, config.densify.start = 10, 0, 0.1, 0.2
+        trainer = Trainer(scene, images, scene.solved, config, quiet, {}, "cpu")
+        if recording is not None:
+            trainer.recorder = Recorder(trainer, torch.device("cpu"), recording)
+        for _ in range(steps):
+            trainer.schedule_events()
+            if trainer.iteration == break_at:
+                trainer.soundness.troubled = True
+            trainer.step()
+            trainer.iteration += 1
+        return trainer
+
+    return run
+
+
+def equal(one, two):
+    return all(torch.equal(p, q) for p, q in zip(one._named().values(), two._named().values(), strict=True))
+
+
+def test_a_kind_is_launched_once_and_then_replayed_until_growth(trained):
+    plain, recording = trained(None), Again()
+    recorded = trained(recording)
+    assert equal(plain, recorded)
+    kinds = {kind for kind, _ in recorded.recorder._seen}
+    assert {(kind.moves, kind.hidden) for kind in kinds} == {(False, False), (True, False), (True, True)}
+    assert recorded.recorder.replayed == 24 - len(kinds) and recorded.recorder.refused == ""
+    assert recording.made > 3 and recording.dropped >= 2, "growth at 10 and 20"
+
+
+def test_a_run_goes_on_where_a_recording_fails_or_finds_no_room(trained):
+    plain = trained(None)
+    failed = trained(Again(fails=True))
+    assert failed.recorder.refused == "operation not permitted when stream is capturing"
+    assert failed.recorder.replayed == 0 and equal(plain, failed)
+    full = trained(Again(room=False))
+    assert full.recorder.refused == "" and full.recorder.replayed == 0 and equal(plain, full)
+
+
+def test_after_a_step_that_was_left_out_the_next_are_launched(trained):
+    recorded = trained(Again(), steps=20, break_at=14)
+    assert recorded.recorder.replayed == trained(Again(), steps=14).recorder.replayed > 0
+    means = recorded.model.gaussians.params["means"]
+    assert means.grad is not None, "a look finds the gradients of the last step"
+
+
