@@ -86,5 +86,3 @@ def test_after_a_step_that_was_left_out_the_next_are_launched(trained):
     assert recorded.recorder.replayed == trained(Again(), steps=14).recorder.replayed > 0
     means = recorded.model.gaussians.params["means"]
     assert means.grad is not None, "a look finds the gradients of the last step"
-
-
