@@ -50,7 +50,7 @@ class HeldConfig:
     least: float = 400.0
     """Square pixels that a region has at least,"""
     least_beside: float = 100.0
-    """or no farther than such gaps from one that was found: a hand and its arm,"""
+    """or no farther than such gaps from one that was found, or is denied: a hand and its arm,"""
     rim: float = 3.0
     """and pixels around it in which it is asked whether the plates agree there,"""
     share: float = 0.4
@@ -90,13 +90,16 @@ class BothPlates:
     """[h, w] in 0..1: how well plate t* sees it."""
 
 
-def held(both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, unit: float, config: HeldConfig) -> Tensor:
+def held(
+    both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, denied: Tensor, unit: float, config: HeldConfig
+) -> Tensor:
     """[h, w] bool: what hangs together with `wrong`, and where the own plate shows another thing than plate t*.
 
     Args:
         render: [h, w, 3] the frozen render, display-referred.
         off: [h, w] low-passed difference of it and the own plate.
         wrong: [h, w] bool, where the own plate is let go of.
+        denied: [h, w] bool, where it is because both others show another thing: a hand whose arm may be left.
         unit: pixels of decisions to one in which the configuration counts.
     """
     both = in_the_same_light(both, wrong, config.light * unit)
@@ -114,7 +117,7 @@ def held(both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, unit: flo
     borne_out, out = _borne_out(both, render, hanging, unit, config), torch.zeros_like(found)
     regions = components(enclosed(found & ~borne_out, agree | wrong, rim, config.share, least_beside))
     for region in sorted(regions, key=lambda each: int(each.sum()), reverse=True):
-        enough = int(region.sum()) >= least or bool((widened(region, 2 * gap) & out).any())
+        enough = int(region.sum()) >= least or bool((widened(region, 2 * gap) & (out | denied)).any())
         if enough and left_by_shifts(soft, region, unit, config) > config.left:
             out |= region
     return out | borne_out

@@ -135,10 +135,11 @@ def _let_go(
     wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
     both = None if truth is None else _both_plates(sightings, posed, frame, truth)
     apart = off if both is None else sightings.difference(both.own, both.instant)
-    contrary = torch.minimum(off, apart)
+    contrary, denied = torch.minimum(off, apart), torch.zeros_like(wrong)
     if truth is not None:
         wrong = wrong | _of_its_time(sightings, config, truth, off, gained, apart)
-        wrong = wrong | _denied(sightings, config, truth, contrary)
+        denied = _denied(sightings, config, truth, contrary)
+        wrong = wrong | denied
     # What the model lacks at the plate's own time, too, is its fault and no motion.
     wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
     wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
@@ -149,7 +150,7 @@ def _let_go(
         wrong = wrong | larger(beyond, config.beyond * sightings.unit**2)
     found = torch.zeros_like(wrong)
     if both is not None:
-        found = held(both, render, off, wrong, sightings.unit, config.held)
+        found = held(both, render, off, wrong, denied, sightings.unit, config.held)
     wrong = closed(wrong | found, round(config.gap * sightings.unit))
     return with_holes(wrong, found, off, sightings.unit, config.held)
 

@@ -31,10 +31,11 @@ def plates(own, instant, seen=None):
     return BothPlates(own * seen[..., None], instant * seen[..., None], seen)
 
 
-def found(both, wrong, off=0.03, config=CONFIG, render=None):
+def found(both, wrong, off=0.03, config=CONFIG, render=None, denied=None):
     """With splats that hold a smear, half of either plate, unless a `render` is given."""
     render = torch.lerp(both.own, both.instant, 0.5) if render is None else render
-    return held(both, render, torch.full((H, W), off), wrong, 1.0, config)
+    denied = torch.zeros_like(wrong) if denied is None else denied
+    return held(both, render, torch.full((H, W), off), wrong, denied, 1.0, config)
 
 
 def with_hand(picture, hand, by=0.1):
@@ -68,6 +69,17 @@ def test_a_hand_beyond_a_wrist_that_looks_like_the_wall_goes_with_its_arm():
     assert found(plates(with_hand(wall(), beyond), wall()), sleeve)[beyond].float().mean() > 0.7
     assert not found(plates(with_hand(wall(), beyond), wall()), sleeve, config=replace(CONFIG, gap=0.0)).any()
     assert not found(plates(with_hand(wall(), elsewhere), wall()), sleeve).any()
+
+
+def test_a_small_piece_goes_with_what_is_denied():
+    """A forearm of less than a hand's size: its fist was let go of because plate t* and the splats deny it."""
+    fist, forearm = torch.zeros(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
+    fist[70:90, 60:84] = True
+    forearm[90:104, 62:78] = True
+    assert CONFIG.least_beside < int(forearm.sum()) < CONFIG.least
+    both = plates(with_hand(wall(), fist | forearm), wall())
+    assert not found(both, fist).any()
+    assert found(both, fist, denied=fist)[forearm].float().mean() > 0.6
 
 
 def test_where_the_render_is_its_own_plate_light_differs_and_nothing_was_held():
