@@ -206,7 +206,7 @@ class HexPlane(Deformation):
 
     @property
     def recordable(self) -> bool:
-        """It is."""
+        """It is: nothing is drawn, and kernels and torch's own operators are launched alike."""
         return True
 
     def _network(self, features: Tensor) -> tuple[Tensor, ...]:

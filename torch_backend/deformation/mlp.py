@@ -181,7 +181,7 @@ class Mlp(Deformation):
 
     @property
     def recordable(self) -> bool:
-        """It is."""
+        """It is: the blur of its times is drawn outside (`training_time`)."""
         return True
 
     def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:

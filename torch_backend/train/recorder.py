@@ -111,6 +111,12 @@ class Recorder:
             self._recorded.clear()
             self.recording.drop()
 
+    def give_up(self, reason: str) -> bool:
+        """Nothing is recorded any more; was there a recording, whose memory is free now?"""
+        held, self.refused = bool(self._recorded), reason
+        self.forget()
+        return held
+
     def step(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
         """One step of a kind; its photometric loss (0-dim), which the next step may overwrite."""
         run, seen = self.run, (kind, self.run.soundness.mended)
@@ -154,9 +160,9 @@ class Recorder:
             with self.run.optimizer.recording(self.device) as table:
                 replay, loss = self.recording.record(lambda: self.run.carry_out(kind, room, frame))
         except Exception as error:  # whatever a driver or torch comes up with: the step can be taken without
-            self.refused = (str(error).strip().splitlines() or [type(error).__name__])[0]
             self.run.optimizer.zero_grad(set_to_none=True)
-            self.forget()
+            self.give_up((str(error).strip().splitlines() or [type(error).__name__])[0])
+            self.recording.drop()  # what a first one had begun to hold
             return None
         self.run.optimizer.zero_grad(set_to_none=True)  # the recording's own, which others write over
         made = self._recorded[kind] = _Recorded(room, table, replay, loss)

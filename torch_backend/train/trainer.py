@@ -125,7 +125,7 @@ class Trainer:
         self.optimizer = optimizer_of(self.model, self.poses, config)
         self.mean = ParameterMean()
         self.densifier = Densifier(self._densify_config(), len(gaussians), self.device)
-        self.recorder = Recorder(self, self.model.device) if self.device.type == "cuda" else None
+        self.recorder = self._recorder()
         self._foretold = False
         self._saved_at = time.perf_counter()
 
@@ -245,8 +245,8 @@ class Trainer:
     def _make_room(self, checkpoint: Path) -> None:
         """After the card's memory ended: saves, and makes the run smaller. JobError if there is nothing left to take.
 
-        First the field works in pieces; then a fifth of the Gaussians goes, those that cover least. In either case no
-        more are made than there are.
+        First go the recordings of steps, which nobody misses; then the field works in pieces; then a fifth of the
+        Gaussians goes, those that cover least. In either of the last two cases no more are made than there are.
         """
         model = self.model.gaussians
         before = len(model)
@@ -254,9 +254,10 @@ class Trainer:
         if len(self.densifier.seen) != before:  # it ended between a round of growth and its end
             self.densifier.reset(before)
         forget_demands()
-        if self.recorder is not None:
-            self.recorder.forget()
+        held = self.recorder is not None and self.recorder.give_up("the memory of the graphics card ended")
         torch.cuda.empty_cache()
+        if held:
+            return
         self.save(checkpoint)
         moving = len(self.model.open_rows())
         if min(self.model.pieces or moving, moving) > memory.LEAST_PIECE:
@@ -389,6 +390,9 @@ class Trainer:
         if out.depth_median is not None:  # at steps that mark who was hidden
             view = facts.viewmat, facts.K, out.depth_median[0]
             mark_hidden(self.model.gaussians, rows, facts.places[:1], state, *view)
+
+    def _recorder(self) -> Recorder | None:
+        return Recorder(self, self.model.device) if self.device.type == "cuda" else None
 
     def layout(self) -> tuple[object, ...]:
         """What steps read and write, and how often it was mended: while all of it is the same, it lies where it lay.
@@ -716,6 +720,7 @@ class Trainer:
                 ExitCode.TRAIN,
             )  # fmt: skip
         self.model = restore_model(tensors, meta, self.config, self.device)
+        self.recorder = self._recorder()  # what the one before has seen was of other tensors
         self.optimizer = optimizer_of(self.model, self.poses, self.config)
         if self.model.field is not None:
             rates = self.soundness.memory.rates = float(meta.get("field_rates", 1.0))

@@ -6,7 +6,7 @@ import contextlib
 import pytest
 import torch
 
-from torch_backend.contract import TrainParams
+from torch_backend.contract import JobError, TrainParams
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
 from torch_backend.train.recorder import Recorder
@@ -44,7 +44,7 @@ def trained(world, quiet):
     def run(recording, steps=24, break_at=-1):
         config = config_from_params(TrainParams(iterations=40, max_gaussians=330, method="hexplane", width=32))
         config.densify.every, config.init.seeds, config.field.start, config.densify.start = 10, 0, 0.1, 0.2
-        trainer = Trainer(scene, images, scene.solved, config, quiet, {}, "cpu")
+        trainer = Trainer(scene, images, scene.solved, config, quiet(), {}, "cpu")
         if recording is not None:
             trainer.recorder = Recorder(trainer, torch.device("cpu"), recording)
         for _ in range(steps):
@@ -79,6 +79,16 @@ def test_a_run_goes_on_where_a_recording_fails_or_finds_no_room(trained):
     assert failed.recorder.replayed == 0 and equal(plain, failed)
     full = trained(Again(room=False))
     assert full.recorder.refused == "" and full.recorder.replayed == 0 and equal(plain, full)
+
+
+def test_where_memory_ends_the_recordings_go_first_and_the_run_stays_as_it_is(trained, tmp_path):
+    recorded = trained(Again(), steps=19)
+    before, told = len(recorded.model.gaussians), len(recorded.report.events)
+    recorded._make_room(tmp_path / "c.safetensors")
+    assert recorded.recorder.refused != "" and recorded.pieces is None
+    assert len(recorded.model.gaussians) == before and len(recorded.report.events) == told
+    with pytest.raises(JobError, match="too little memory"):  # so few Gaussians have nothing else to give
+        recorded._make_room(tmp_path / "c.safetensors")
 
 
 def test_after_a_step_that_was_left_out_the_next_are_launched(trained):
