@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..torch_types import AutogradContext, applied, once_differentiable
+
 
 @dataclass
 class ExposureConfig:
@@ -28,6 +30,23 @@ class ExposureConfig:
     """Weight of the squared difference between neighbouring frames."""
     small: float = 0.01
     """Weight of the squared values: without need, no correction."""
+
+
+class _Between(torch.autograd.Function):
+    """`torch.lerp` of two rows of values [B, 2, 3]; its own gradient takes 1 less the second share, rounded."""
+
+    @staticmethod
+    def forward(ctx: AutogradContext, values: Tensor, bins: Tensor, shares: Tensor) -> Tensor:
+        left, right = values.index_select(0, bins)
+        ctx.save_for_backward(values, bins, shares)
+        return torch.lerp(left, right, shares[1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor, None, None]:
+        saved: tuple[Tensor, ...] = ctx.saved_tensors
+        values, bins, shares = saved
+        return torch.zeros_like(values).index_add_(0, bins, shares[:, None, None] * grads[0]), None, None
 
 
 class Exposure:
@@ -63,12 +82,12 @@ class Exposure:
         gain, offset = self.at(time)
         return color * gain + (offset if alpha is None else offset * alpha[..., None])
 
-    def apply_at(self, color: Tensor, bins: Tensor, share: Tensor) -> Tensor:
-        """`apply` at a place [2] int64, 0-dim float32 on the device (a recorded step is told another one each time)."""
+    def apply_at(self, color: Tensor, bins: Tensor, shares: Tensor) -> Tensor:
+        """`apply` at a place, to the bit: bins [2] int64, shares [2] float32 of the first and of the second, on the
+        device (a recorded step is told other ones each time)."""
         if not self.config.on:
             return color
-        left, right = self.values.index_select(0, bins)
-        log_gain, offset = torch.lerp(left, right, share)
+        log_gain, offset = applied(_Between, self.values, bins, shares)
         return color * log_gain.exp() + offset
 
     def regularisation(self) -> Tensor:

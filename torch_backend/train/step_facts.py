@@ -45,7 +45,7 @@ class StepFacts:
     """What is other in each step. Anywhere, until `on` or `into` brings it to the device."""
 
     numbers: Tensor
-    """[6] float32: normalised time that the field is asked for; the exposure's share of its second bin; what motion is
+    """[7] float32: normalised time that the field is asked for; the shares of the exposure's two bins; what motion is
     priced at; the background's colour."""
     places: Tensor
     """[3] int64: the frame's time bin; the exposure's two bins."""

@@ -304,7 +304,7 @@ class Trainer:
         # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         background = torch.rand(3, generator=self.generator, device="cpu")
         left, right, share = model.exposure.place(time)
-        numbers = from_numpy(np.array([asked, share, still_weight(self.progress, s)], np.float32))
+        numbers = from_numpy(np.array([asked, 1.0 - share, share, still_weight(self.progress, s)], np.float32))
         ignored = self.ignored.get(index)
         movers = self.softened.movers_at(frame, self.progress)
         facts = StepFacts(
@@ -344,17 +344,17 @@ class Trainer:
         state = model.moved(rows, deltas)
         viewmat = corrected(facts.viewmat, self.poses.values[frame]) if self._refines_poses() else facts.viewmat
         out = render(
-            state, model.sh_degree, viewmat, facts.K, self.width, self.height, background=facts.numbers[3:],
+            state, model.sh_degree, viewmat, facts.K, self.width, self.height, background=facts.numbers[4:],
             with_depth=kind.hidden, with_contributions=True,
         )  # fmt: skip
         paper = kind.moves and supervision.paper_due(self.iteration, self.progress)
         if paper:
             state["means"].retain_grad()
-        exposed = model.exposure.apply_at(out.colors[0], facts.places[1:], facts.numbers[1])
+        exposed = model.exposure.apply_at(out.colors[0], facts.places[1:], facts.numbers[1:3])
         loss = self.softened.loss(exposed, facts.image, self.config.dssim, facts.ignored, facts.movers)
         total = loss + self._regularisers(rows, kind.penalised)
         if deltas is not None and supervision.preset == "support":
-            price = stillness(deltas, len(model.gaussians), loss, facts.numbers[2], supervision)
+            price = stillness(deltas, len(model.gaussians), loss, facts.numbers[3], supervision)
             total = total + self.config.field.still * price
         if self._refines_poses():
             total = total + self.poses.regularisation()
