@@ -400,11 +400,11 @@ class Trainer:
         Whatever takes the place of one of them (growth, the gate, a repair, another degree of harmonics, a checkpoint)
         takes that of all their moments in the optimiser, if of any.
         """
-        model, growth = self.model.gaussians, self.densifier
+        model, growth, field = self.model.gaussians, self.densifier, self.model.field
         return (
             self.soundness.mended, self.model.pieces, len(self.optimizer.param_groups), self.optimizer,
-            self.model.field, self.model.open_rows(), model.open, model.support, model.hidden, growth.gradient,
-            growth.seen, self.model.exposure.values, self.poses.values, *model.params.values(),
+            field, None if field is None else self.model.open_rows(), model.open, model.support, model.hidden,
+            growth.gradient, growth.seen, self.model.exposure.values, self.poses.values, *model.params.values(),
         )  # fmt: skip
 
     def _deltas(self, rows: Tensor, when: Tensor, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:

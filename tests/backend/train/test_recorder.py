@@ -41,8 +41,8 @@ def trained(world, quiet):
     scene = load_scene(world.shot)
     images = load_images(scene, scene.solved, 32, 24)
 
-    def run(recording, steps=24, break_at=-1):
-        config = config_from_params(TrainParams(iterations=40, max_gaussians=330, method="hexplane", width=32))
+    def run(recording, steps=24, break_at=-1, method="hexplane"):
+        config = config_from_params(TrainParams(iterations=40, max_gaussians=330, method=method, width=32))
         config.densify.every, config.init.seeds, config.field.start, config.densify.start = 10, 0, 0.1, 0.2
         trainer = Trainer(scene, images, scene.solved, config, quiet(), {}, "cpu")
         if recording is not None:
@@ -70,6 +70,13 @@ def test_a_kind_is_launched_once_and_then_replayed_until_growth(trained):
     assert {(kind.moves, kind.hidden) for kind in kinds} == {(False, False), (True, False), (True, True)}
     assert recorded.recorder.replayed == 24 - len(kinds) and recorded.recorder.refused == ""
     assert recording.made > 3 and recording.dropped >= 2, "growth at 10 and 20"
+
+
+def test_while_nothing_moves_a_kind_is_recorded_once(trained):
+    recording = Again()
+    recorder = trained(recording, steps=10, method="static").recorder
+    assert recorder.replayed == 10 - len(recorder._seen) > 0
+    assert recording.made <= len(recorder._seen) < 5 and recording.dropped == 0, "a kind has other harmonics"
 
 
 def test_a_run_goes_on_where_a_recording_fails_or_finds_no_room(trained):
