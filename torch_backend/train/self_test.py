@@ -209,12 +209,17 @@ def _scene() -> dict[str, Tensor]:
     }  # fmt: skip
 
 
+def _camera(device: torch.device) -> dict[str, Any]:
+    """Where the scene is seen from."""
+    K = torch.tensor([[[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]], device="cpu")
+    return {"viewmats": torch.eye(4, device=device)[None], "Ks": K.to(device)}
+
+
 def _rendered(device: torch.device, backend: str) -> tuple[RasterOutput, dict[str, Tensor]]:
     """The scene's frame, and the gradients of a weighted sum of its colours and depths by every input."""
     leaves: dict[str, Any] = {name: value.to(device).requires_grad_() for name, value in _scene().items()}
-    K = torch.tensor([[[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]], device="cpu")
     out = rasterize(
-        **leaves, viewmats=torch.eye(4, device=device)[None], Ks=K.to(device), width=_WIDTH, height=_HEIGHT,
+        **leaves, **_camera(device), width=_WIDTH, height=_HEIGHT,
         background=torch.full((3,), 0.5, device=device), backend=backend, with_depth=True, with_contributions=True,
         settings=RasterSettings(threads=1),
     )  # fmt: skip
@@ -282,10 +287,7 @@ def _adam(device: torch.device) -> list[Check]:
 def _recording(device: torch.device) -> list[Check]:
     """Three steps of Adam on a frame, two of them replayed, against three that are launched."""
     start = {name: value.to(device) for name, value in _scene().items()}
-    camera: dict[str, Any] = {
-        "viewmats": torch.eye(4, device=device)[None],
-        "Ks": torch.tensor([[[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]], device="cpu").to(device),
-    }
+    camera = _camera(device)
     found: list[Tensor] = []
     for records in (False, True):
         leaves: dict[str, Any] = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}

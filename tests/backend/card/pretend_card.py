@@ -123,7 +123,7 @@ class Tape:
 
         return replay, result
 
-    def run(self, func: Any, name: str, args: Any, kwargs: Any, real: tuple[Any, Any], to_card: bool) -> Any:
+    def run(self, func: Any, name: str, args: Any, kwargs: Any, real: tuple[Any, Any]) -> Any:
         """Notes an operator on tensors of the card, and carries it out only as far as its result's size needs it."""
         if func._schema.is_mutable:
             if name == "copy_" and not isinstance(args[1], Pretended):
@@ -285,7 +285,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         leaves = name == "_to_copy" and (to_host or not touches)
         if leaves or name in _ASKED:
             raise RuntimeError(f"operation not permitted when stream is capturing: {func} at {_place()}")
-        out = CARD.tape.run(func, name, args, kwargs, real, to_card)
+        out = CARD.tape.run(func, name, args, kwargs, real)
     else:
         out = func(*real[0], **real[1])
     stays = isinstance(args[0], Pretended) if name == "copy_" else to_card or (touches and not to_host)
@@ -315,7 +315,7 @@ def pretended_card() -> Iterator[Card]:
     import torch_backend.train.adam as adam
     import torch_backend.train.device as chosen
     import torch_backend.train.recorder as recorder
-    from torch_backend.train.self_test import SelfTest
+    import torch_backend.train.self_test as self_test
 
     saved: list[tuple[Any, str, Any]] = []
 
@@ -359,9 +359,10 @@ def pretended_card() -> Iterator[Card]:
     patch(torch.cuda, "memory_reserved", lambda device=None: CARD.live)
     patch(torch.cuda, "memory_allocated", lambda device=None: CARD.live)
     patch(torch.cuda, "synchronize", lambda device=None: None)
-    patch(recorder, "CudaGraphs", Tape)
+    for module in (recorder, self_test):
+        patch(module, "CudaGraphs", Tape)
     patch(chosen, "cuda_refusal", lambda: "")
-    patch(chosen, "card_verdict", SelfTest)  # it would ask a process of its own, which has no such card
+    patch(chosen, "card_verdict", self_test.SelfTest)  # it would ask a process of its own, which has no such card
     for module in (native, ssim_cuda, adam, planes_cuda):
         patch(module, "launch_on", launch_on)
     patch(cuda, "warp_stream", lambda device: None)

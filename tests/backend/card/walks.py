@@ -284,7 +284,7 @@ def self_test(folder: Path) -> dict[str, Any]:
         CARD.limit = CARD.live + 1000
         full = run_self_test(torch.device("cuda"))
     return {
-        "sound": sound.problem, "checks": len(sound.checks), "broken": broken.problem,
+        "sound": sound.problem, "recording": sound.recording, "checks": len(sound.checks), "broken": broken.problem,
         "full": [full.problem, full.lasting], "launched": sorted(CARD.launched),
     }  # fmt: skip
 

@@ -144,8 +144,8 @@ def test_more_steps_do_not_make_it_worse(trained, quiet):
     world, before = trained
     shutil.copytree(world.shot.run("main"), world.shot.run("ext-better"))
     after = train_shot(world.shot, more("ext-better", 300), quiet())
-    # At 50 dB the rates that it starts anew with can be seen, by 1.2 on some processors; on a real clip, at 25, 800 steps
-    # gain 0.19 dB.
+    # At 50 dB the rates that it starts anew with can be seen, by 1.2 on some processors; on a real clip, at 25, 800
+    # steps gain 0.19 dB.
     assert after["heldout_psnr_db"] > before["heldout_psnr_db"] - 2.0
     losses = {}
     for name in ("main", "ext-better"):
