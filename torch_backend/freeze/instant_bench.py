@@ -15,7 +15,7 @@ from ..shot import Shot
 from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.model import gathered
-from .frozen import FrozenGaussians, FrozenImage, render_frozen
+from .frozen import FrozenGaussians, FrozenImage, freeze_at, render_frozen
 from .ignored import ignore_mattes
 from .instant_depth import DepthConfig, View
 from .instant_track import TrackConfig
@@ -142,6 +142,20 @@ class InstantBench:
         """A frozen scene as camera t* sees it, exposed as plate t* is."""
         camera = self.scene.viewmats[self.index], self.Ks[self.index]
         return render_frozen(frozen, *camera, self.width, self.height, self.exposure, self.time)
+
+    def at_its_time(self, index: int) -> FrozenImage:
+        """Delivered frame `index` as the run has it at that frame's own time."""
+        time, camera = float(self.scene.times[index]), (self.scene.viewmats[index], self.Ks[index])
+        then = freeze_at(self._run.model, time, 1.0)
+        return render_frozen(then, *camera, self.width, self.height, self.exposure, time)
+
+    def as_exposed(self, picture: NDArray[np.float32], index: int) -> NDArray[np.float32]:
+        """Colours [..., 3] of plate `index` as the exposure of plate t* shows them."""
+        (gain, offset), (own_gain, own_offset) = (
+            (value.detach().cpu().numpy() for value in self.exposure.at(time))
+            for time in (float(self.scene.times[index]), self.time)
+        )
+        return np.asarray((picture - offset) / gain * own_gain + own_offset, np.float32)
 
     def seen_inside(self, frozen: FrozenGaussians, mask: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """What camera t* sees of each Gaussian, [N] each: sums of alpha T over pixels of a mask [h, w], and all."""

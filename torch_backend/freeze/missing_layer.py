@@ -20,6 +20,7 @@ from ..scene import Scene
 from ..torch_types import from_numpy
 from ..train import LoadedRun
 from ..train.exposure import Exposure
+from .contradicted import contradicted
 from .frozen import FrozenGaussians, FrozenImage
 from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed, resized_array
 from .instant_depth import Region, as_field, inverse_depth, own_motion
@@ -70,20 +71,21 @@ def instant_layer(
 
     Returns None if plate and scene agree.
     """
-    config = config or InstantConfig()
+    import cv2
+
     index = scene.nearest(t_star)
-    bench = InstantBench(run, scene, index, config, motion)
+    bench = InstantBench(run, scene, index, config or InstantConfig(), motion)
     image = bench.render(frozen)
     things = _small_things(bench, image)
-    if not things and not (bench.difference(image) >= config.seed).any():
-        return None
     kept, ghost = _ghosts(bench, frozen, image)
     if ghost.any():
         frozen = fade(frozen, kept)
         image = bench.render(frozen)
-    state, mask, regions = _shell(bench, frozen, image, _regions(bench, image), things, known)
+    painted = _painted(bench, image)
+    state, mask, regions = _shell(bench, frozen, image, _regions(bench, image, painted), painted, things, known)
     layer = InstantLayer(state, scene.frames[index], from_numpy(mask), from_numpy(ghost), kept, regions)
-    if len(state["means"]) and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, mask > 0):
+    told = (mask > 0) & (cv2.dilate(painted.astype(np.uint8), disc(2.0 * bench.unit)) == 0)
+    if told.any() and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, told):
         empty = {name: value[:0] for name, value in state.items()}
         layer = replace(layer, state=empty, mask=torch.zeros_like(layer.mask), regions=[])
     return layer if len(layer.state["means"]) or ghost.any() else None
@@ -107,17 +109,33 @@ def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
     return replace(frozen, state=state)
 
 
-def _regions(bench: InstantBench, image: FrozenImage) -> list[NDArray[np.bool_]]:
-    """Masks [h, w] of the regions in which plate t* shows something that moves and the render does not."""
+def _painted(bench: InstantBench, image: FrozenImage) -> NDArray[np.bool_]:
+    """bool [h, w]: what moves at t*, and the run has painted onto something still behind it, where it cannot be."""
+    import cv2
+
+    matte = bench.matte()
+    flat = np.zeros((bench.height, bench.width), bool) if matte is None else matte > 0.5
+    flat &= image.motion.numpy() < 0.5
+    if not flat.any():
+        return flat
+    found = (flat & contradicted(bench, image)).astype(np.uint8)
+    closed = cv2.morphologyEx(found, cv2.MORPH_CLOSE, disc(1.5 * bench.unit))
+    return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc(1.0 * bench.unit)) > 0, np.bool_)
+
+
+def _regions(bench: InstantBench, image: FrozenImage, painted: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Masks [h, w] of the regions in which plate t* shows something that moves and the render does not, or has
+    `painted` [h, w] onto what is behind."""
     import cv2
 
     c, unit = bench.config, bench.unit
     difference = bench.difference(image)
-    count, labels = cv2.connectedComponents((difference >= c.grow).astype(np.uint8))
+    count, labels = cv2.connectedComponents(((difference >= c.grow) | painted).astype(np.uint8))
     found: list[NDArray[np.bool_]] = []
     for label in range(1, count):
-        region = labels == label
-        if difference[region].max() >= c.seed and region.sum() >= c.least * unit**2:
+        region, least = labels == label, c.least * unit**2
+        missing = difference[region].max() >= c.seed or painted[region].sum() >= least
+        if missing and region.sum() >= least:
             found.append(region)
     return [region for region in found if _moves(bench, region) and not _stuck(bench, region, image)]
 
@@ -150,18 +168,19 @@ def _shell(
     frozen: FrozenGaussians,
     image: FrozenImage,
     regions: list[NDArray[np.bool_]],
+    painted: NDArray[np.bool_],
     things: list[Track],
     known: NDArray[np.float32] | None,
 ) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
     """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
     nothing, parts, facts_of_regions = np.zeros((bench.height, bench.width), np.float32), list[_Part](), list[Region]()
     others = bench.neighbours() if regions or things else []
-    explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9)
+    explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9) & ~painted
     matte = bench.matte()
     mover = image.motion.numpy() if matte is None else np.maximum(matte, image.motion.numpy())
     alone = np.zeros_like(explained) if not things else np.any([t.pixels for t in things], axis=0)
     covers: list[tuple[NDArray[np.float32], Track | None]]
-    covers = [(_cover(bench, image, r), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
+    covers = [(_cover(bench, image, r, painted), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
     covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
     fields = _fields_inverse(bench, frozen) if covers else nothing
     for soft, thing in covers:
@@ -333,8 +352,10 @@ def _unexposed(color: Tensor, exposure: Exposure, time: float) -> Tensor:
     return (color - offset.cpu()) / gain.cpu()
 
 
-def _cover(bench: InstantBench, image: FrozenImage, region: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """How much of each pixel [h, w] around a region is what the model lacks, 0..1.
+def _cover(
+    bench: InstantBench, image: FrozenImage, region: NDArray[np.bool_], painted: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """How much of each pixel [h, w] around a region is what the model lacks, or has `painted` elsewhere, 0..1.
 
     The low-passed region has the shape of a blot. Inside, the model stands for what is hidden, so what differs from
     it is in front of it; gaps where it happens to have the same colour are closed.
@@ -347,7 +368,7 @@ def _cover(bench: InstantBench, image: FrozenImage, region: NDArray[np.bool_]) -
     off = np.abs(low_passed(plate - shown, 0.7 * unit)) - 0.5 * c.shift * unit * np.hypot(down, right)
     ramp = np.clip(2.0 * off.max(-1) / c.solid - 1.0, 0.0, 1.0).astype(np.float32)
     near = cv2.dilate(region.astype(np.uint8), disc(2.0 * unit)) > 0
-    ramp = np.where(near, ramp, 0.0).astype(np.float32)
+    ramp = np.where(near, np.maximum(ramp, painted & region), 0.0).astype(np.float32)
     closed = cv2.morphologyEx(ramp, cv2.MORPH_CLOSE, disc(2.5 * unit))
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc(1.0 * unit))
     return np.where(near, opened, 0.0).astype(np.float32)
