@@ -128,10 +128,6 @@ class Draws:
         """All of them."""
         return self.picked, self.anywhere, self.start, self.step
 
-    def to(self, device: torch.device) -> Draws:
-        """The same numbers on a device."""
-        return Draws(*(t.to(device, non_blocking=True) for t in self.tensors()))
-
 
 def draw(rows: int, bins: int, config: SupervisionConfig, generator: torch.Generator) -> Draws:
     """Draws for so many open rows and time bins."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import weakref
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -92,7 +93,9 @@ class Recorder:
 
     def __init__(self, run: RecordedRun, device: torch.device, recording: Recording | None = None) -> None:
         """`recording`: CUDA graphs, unless told otherwise."""
-        self.run, self.device = run, device
+        self.run: RecordedRun = weakref.proxy(run)
+        """It holds this recorder: a cycle would keep all of a finished run on the card until Python looks for cycles."""
+        self.device = device
         self.recording = recording or CudaGraphs(device)
         self.replayed = 0
         """Steps that were carried out from a recording."""
@@ -105,7 +108,8 @@ class Recorder:
         self._gradients = False
 
     def forget(self) -> None:
-        """Drops the recordings, and their memory."""
+        """Drops the recordings, and their memory: all at once, for with one graph goes the cuBLAS workspace of the stream
+        that it was recorded on, which others would go on writing to."""
         self._layout = ()
         if self._recorded:
             self._recorded.clear()
@@ -120,14 +124,16 @@ class Recorder:
     def step(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
         """One step of a kind; its photometric loss (0-dim), which the next step may overwrite."""
         run, seen = self.run, (kind, self.run.soundness.mended)
-        if self.refused or not kind.recordable or run.soundness.troubled:
+        if self.refused:
             return self._launched(kind, facts, frame)
-        layout = run.layout()
-        wanted = outgrown(self.device, 1, run.width, run.height)
-        if not _same(layout, self._layout) or wanted > self._wanted:
+        layout, wanted = run.layout(), outgrown(self.device, 1, run.width, run.height)
+        outgrew = wanted > self._wanted  # a launched call has the rasteriser make its list larger
+        if outgrew or not _same(layout, self._layout):
             self.forget()
             self._layout = layout
-        if seen not in self._seen or wanted > self._wanted:  # the rasteriser makes its list larger
+        if not kind.recordable or run.soundness.troubled:
+            return self._launched(kind, facts, frame)
+        if outgrew or seen not in self._seen:
             self._wanted = max(wanted, self._wanted)
             self._seen.add(seen)
             with self.recording.watched():
@@ -151,7 +157,7 @@ class Recorder:
         return self.run.carry_out(kind, facts.on(self.device), frame)
 
     def _record(self, kind: StepKind, facts: StepFacts, frame: int) -> _Recorded | None:
-        """None if there is no room for it, or it cannot be recorded after all: then nothing is any more."""
+        """None if there is no room for it; or if it cannot be recorded after all: then nothing is any more."""
         if not self.recording.fits():
             return None
         room = facts.room(self.device)
@@ -159,14 +165,20 @@ class Recorder:
         try:
             with self.run.optimizer.recording(self.device) as table:
                 replay, loss = self.recording.record(lambda: self.run.carry_out(kind, room, frame))
+        except torch.OutOfMemoryError:  # there was less room than a step took: the next launched one is measured anew
+            self._seen.clear()
         except Exception as error:  # whatever a driver or torch comes up with: the step can be taken without
-            self.run.optimizer.zero_grad(set_to_none=True)
-            self.give_up((str(error).strip().splitlines() or [type(error).__name__])[0])
-            self.recording.drop()  # what a first one had begun to hold
-            return None
-        self.run.optimizer.zero_grad(set_to_none=True)  # the recording's own, which others write over
-        made = self._recorded[kind] = _Recorded(room, table, replay, loss)
-        return made
+            self.refused = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        else:
+            self.run.optimizer.zero_grad(set_to_none=True)  # the recording's own, which others write over
+            made = self._recorded[kind] = _Recorded(room, table, replay, loss)
+            return made
+        # Out here the error is gone, and with its frames the graph that was begun and the tensors of its step.
+        self.run.optimizer.zero_grad(set_to_none=True)
+        self._recorded.clear()
+        self._layout = ()
+        self.recording.drop()
+        return None
 
 
 def _same(one: tuple[object, ...], two: tuple[object, ...]) -> bool:
@@ -194,7 +206,12 @@ class CudaGraphs:
 
     def fits(self) -> bool:
         """As `Recording` says; recordings share what they hold, so one that is there has made room for the next."""
-        return self._pool is not None or free_bytes(self.device) > _SPARE * self._took
+        if self._pool is not None:
+            return True
+        if free_bytes(self.device) <= _SPARE * self._took:
+            return False
+        torch.cuda.empty_cache()  # a recording is given nothing of what torch keeps for launched steps
+        return True
 
     def record(self, work: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
         """As `Recording` says."""

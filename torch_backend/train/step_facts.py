@@ -62,6 +62,36 @@ class StepFacts:
     draws: Draws | None
     """What pairs to anchor are drawn by."""
 
+    @property
+    def asked(self) -> Tensor:
+        """[1] float32 normalised time that the field is asked for."""
+        return self.numbers[:1]
+
+    @property
+    def exposure_shares(self) -> Tensor:
+        """[2] float32 shares of the exposure's two bins."""
+        return self.numbers[1:3]
+
+    @property
+    def motion_price(self) -> Tensor:
+        """0-dim float32, what motion is priced at."""
+        return self.numbers[3]
+
+    @property
+    def background(self) -> Tensor:
+        """[3] float32 colour."""
+        return self.numbers[4:]
+
+    @property
+    def time_bin(self) -> Tensor:
+        """[1] int64, the frame's."""
+        return self.places[:1]
+
+    @property
+    def exposure_bins(self) -> Tensor:
+        """[2] int64."""
+        return self.places[1:]
+
     def on(self, device: torch.device) -> StepFacts:
         """The same on a device."""
         return self._made(lambda t: t.to(device, non_blocking=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import time
@@ -185,12 +186,12 @@ class Trainer:
                     self._make_room(checkpoint)
                     continue
                 self.iteration += 1
-                self._average(length)
+                self._with_room(lambda: self._average(length))
                 self.trained_seconds = time.perf_counter() - since
                 if watch is not None:
                     self._foretell(watch, resumed=started > 0)
                 if (self.iteration - begin) % every == 0:
-                    evaluate(self)
+                    self._with_room(lambda: evaluate(self))
                     if watch is not None:
                         watch.begin()
                 if self.iteration % INSPECT_EVERY == 0 or self.iteration == self.end:
@@ -198,13 +199,23 @@ class Trainer:
                     text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {float(loss):.4f}"
                     self.report.progress("training", self.iteration - begin, self.end - begin, text)
                 if time.perf_counter() - self._saved_at > self.config.checkpoint_seconds:
-                    self.save(checkpoint)
+                    self._with_room(lambda: self.save(checkpoint))
         except Cancelled:
             if self.iteration > started:
                 self.save(checkpoint)
             raise
         self.trained_seconds = time.perf_counter() - since
+        if self.recorder is not None:
+            self.recorder.forget()
         self.save(checkpoint)
+
+    def _with_room(self, work: Callable[[], None]) -> None:
+        """Work between steps, which may be begun again: once more, without recordings, where the card's memory ends."""
+        with contextlib.suppress(torch.OutOfMemoryError):
+            return work()
+        if self.recorder is None or not self.recorder.give_up("the memory of the graphics card ended"):
+            torch.cuda.empty_cache()
+        return work()
 
     def _foretell(self, watch: Stopwatch, resumed: bool) -> None:
         """After a step on the processor: how long the run will still take, once some were timed; the first time a
@@ -294,7 +305,8 @@ class Trainer:
         return self.carry_out(kind, facts.on(self.device), frame)
 
     def _told(self, frame: int) -> tuple[StepKind, StepFacts]:
-        """What the next step is told of the trained frame at position `frame`. All that is drawn, is drawn here."""
+        """What the next step is told of the trained frame at position `frame`. All that a step which can be recorded draws
+        is drawn here; others draw in `carry_out`, too."""
         model, s, field, c = self.model, self.config.supervision, self.model.field, self.config
         rows, index, time = model.open_rows(), self.train_ids[frame], self.times[frame]
         draws = None
@@ -331,12 +343,12 @@ class Trainer:
         """A step of a kind on facts that lie on the device; its photometric loss (0-dim).
 
         One that is recorded is carried out again with other facts: everything in here that is other in two steps of one
-        kind comes from them.
+        kind comes from them; `frame` is read by steps alone that are not.
         """
         supervision, model = self.config.supervision, self.model
         rows = model.open_rows()
         pairs = None if facts.draws is None else anchored_pairs(model.gaussians, rows, facts.draws, supervision)
-        deltas, anchored = self._deltas(rows, facts.numbers[:1], pairs)
+        deltas, anchored = self._deltas(rows, facts.asked, pairs)
         if deltas is not None:
             self.soundness.memory.heed(deltas.means.detach())
         if deltas is not None and kind.detached:
@@ -344,17 +356,17 @@ class Trainer:
         state = model.moved(rows, deltas)
         viewmat = corrected(facts.viewmat, self.poses.values[frame]) if self._refines_poses() else facts.viewmat
         out = render(
-            state, model.sh_degree, viewmat, facts.K, self.width, self.height, background=facts.numbers[4:],
+            state, model.sh_degree, viewmat, facts.K, self.width, self.height, background=facts.background,
             with_depth=kind.hidden, with_contributions=True,
         )  # fmt: skip
         paper = kind.moves and supervision.paper_due(self.iteration, self.progress)
         if paper:
             state["means"].retain_grad()
-        exposed = model.exposure.apply_at(out.colors[0], facts.places[1:], facts.numbers[1:3])
+        exposed = model.exposure.apply_at(out.colors[0], facts.exposure_bins, facts.exposure_shares)
         loss = self.softened.loss(exposed, facts.image, self.config.dssim, facts.ignored, facts.movers)
         total = loss + self._regularisers(rows, kind.penalised)
         if deltas is not None and supervision.preset == "support":
-            price = stillness(deltas, len(model.gaussians), loss, facts.numbers[3], supervision)
+            price = stillness(deltas, len(model.gaussians), loss, facts.motion_price, supervision)
             total = total + self.config.field.still * price
         if self._refines_poses():
             total = total + self.poses.regularisation()
@@ -386,10 +398,10 @@ class Trainer:
         if self.device.type != "cpu":
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
-        mark_seen(self.model.gaussians, facts.places[:1], weight)
+        mark_seen(self.model.gaussians, facts.time_bin, weight)
         if out.depth_median is not None:  # at steps that mark who was hidden
             view = facts.viewmat, facts.K, out.depth_median[0]
-            mark_hidden(self.model.gaussians, rows, facts.places[:1], state, *view)
+            mark_hidden(self.model.gaussians, rows, facts.time_bin, state, *view)
 
     def _recorder(self) -> Recorder | None:
         return Recorder(self, self.model.device) if self.device.type == "cuda" else None
@@ -451,6 +463,8 @@ class Trainer:
             self._freeze_poses()
         due = self.iteration > 0 and self.iteration % c.densify.every == 0
         if due and c.densify.start <= self.progress < 0.9:
+            if self.recorder is not None:
+                self.recorder.forget()  # growth takes the place of what they read, and needs the room
             self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress, self.policy.growing)
         if c.method == "static":
             return

@@ -2,6 +2,9 @@
 step that was recorded: `card/test_card.py`."""
 
 import contextlib
+import dataclasses
+import gc
+import weakref
 
 import pytest
 import torch
@@ -16,8 +19,8 @@ from torch_backend.train.trainer import Trainer
 class Again:
     """Carries the work out anew at each replay, on the facts that lie there then."""
 
-    def __init__(self, fails=False, room=True):
-        self.fails, self.room, self.made, self.dropped = fails, room, 0, 0
+    def __init__(self, fails=False, room=True, short=0):
+        self.fails, self.room, self.short, self.made, self.dropped = fails, room, short, 0, 0
 
     def watched(self):
         return contextlib.nullcontext()
@@ -31,6 +34,9 @@ class Again:
     def record(self, work):
         if self.fails:
             raise RuntimeError("operation not permitted when stream is capturing\nsee the log")
+        self.short -= 1
+        if self.short >= 0:
+            raise torch.OutOfMemoryError("CUDA out of memory")
         self.made += 1
         result = torch.zeros(())
         return lambda: result.copy_(work()), result
@@ -86,6 +92,50 @@ def test_a_run_goes_on_where_a_recording_fails_or_finds_no_room(trained):
     assert failed.recorder.replayed == 0 and equal(plain, failed)
     full = trained(Again(room=False))
     assert full.recorder.refused == "" and full.recorder.replayed == 0 and equal(plain, full)
+
+
+def test_a_recording_that_found_too_little_room_is_tried_again(trained):
+    plain, recording = trained(None), Again(short=2)
+    recorded = trained(recording)
+    assert recorded.recorder.refused == "" and recorded.recorder.replayed > 0 and equal(plain, recorded)
+    assert recording.short < 0 and recording.dropped >= 2
+
+
+def test_recordings_go_when_steps_come_that_cannot_be_recorded(trained):
+    recording = Again()
+    recorded = trained(recording, steps=9)
+    assert recorded.recorder._recorded
+    kind, facts = recorded._told(0)
+    recorded.model.gaussians.rebuild(
+        torch.arange(len(recorded.model.gaussians)), torch.zeros(len(recorded.model.gaussians), dtype=torch.bool),
+        recorded.optimizer,
+    )  # fmt: skip
+    recorded.recorder.step(dataclasses.replace(kind, recordable=False), facts, 0)
+    assert not recorded.recorder._recorded, "what they read is no part of the run any more"
+
+
+def test_a_finished_run_goes_with_the_last_who_knows_it(trained):
+    gc.collect()
+    gc.disable()
+    try:
+        run = trained(Again(), steps=1)  # this stand-in's recordings know the run
+        gone = weakref.ref(run.recorder)
+        del run
+        assert gone() is None
+    finally:
+        gc.enable()
+
+
+def test_work_between_steps_has_the_room_of_recordings(trained):
+    recorded, tries = trained(Again(), steps=9), []
+
+    def work():
+        tries.append(bool(recorded.recorder._recorded))
+        if len(tries) == 1:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+
+    recorded._with_room(work)
+    assert tries == [True, False] and recorded.recorder.refused != ""
 
 
 def test_where_memory_ends_the_recordings_go_first_and_the_run_stays_as_it_is(trained, tmp_path):
