@@ -39,7 +39,7 @@ class ContradictedConfig:
 def contradicted(
     bench: InstantBench, image: FrozenImage, config: ContradictedConfig | None = None
 ) -> NDArray[np.bool_]:
-    """bool [h, w]: where most plates that see what t*'s camera sees of a frozen scene show something else than plate t*.
+    """bool [h, w]: where most plates that see what t*'s camera sees of a frozen scene show other colours than plate t*.
 
     Args:
         image: the scene frozen at t*, `bench.render`.

@@ -2,8 +2,9 @@
 so that it stands where it stood from every pose, as a layer of small Gaussians in front of the frozen scene.
 
 Whole regions are looked for, on a low-passed residual: a model trained at 320 px is soft everywhere, and softness is
-not disagreement. Depth is told by what a region hangs on (the arm), by the frames around t*, and by what it hides;
-where the field has the hand itself, if paler or softer than the plate, it is as deep as that.
+not disagreement. What it has painted onto the wall behind (`contradicted.py`) counts as missing, too. Depth is told by
+what a region hangs on (the arm), by the frames around t*, and by what it hides; where the field has the hand itself, if
+paler or softer than the plate, it is as deep as that.
 """
 
 from __future__ import annotations
@@ -84,6 +85,7 @@ def instant_layer(
     painted = _painted(bench, image)
     state, mask, regions = _shell(bench, frozen, image, _regions(bench, image, painted), painted, things, known)
     layer = InstantLayer(state, scene.frames[index], from_numpy(mask), from_numpy(ghost), kept, regions)
+    # Of what was painted the difference says nothing: it looked right. Its neighbours are half of it each.
     told = (mask > 0) & (cv2.dilate(painted.astype(np.uint8), disc(2.0 * bench.unit)) == 0)
     if told.any() and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, told):
         empty = {name: value[:0] for name, value in state.items()}

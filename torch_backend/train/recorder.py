@@ -34,6 +34,8 @@ refused = ""
 is."""
 _SPARE = 1.5
 """Of what a step took at its peak, how much has to be free for a recording."""
+_TRIES = 4
+"""Recordings that find less room than that, before none is tried any more."""
 
 
 class RecordedRun(Protocol):
@@ -94,7 +96,7 @@ class Recorder:
     def __init__(self, run: RecordedRun, device: torch.device, recording: Recording | None = None) -> None:
         """`recording`: CUDA graphs, unless told otherwise."""
         self.run: RecordedRun = weakref.proxy(run)
-        """It holds this recorder: a cycle would keep all of a finished run on the card until Python looks for cycles."""
+        """It holds this recorder; a cycle would keep a finished run on the card until Python looks for cycles."""
         self.device = device
         self.recording = recording or CudaGraphs(device)
         self.replayed = 0
@@ -106,10 +108,11 @@ class Recorder:
         self._layout: tuple[object, ...] = ()
         self._wanted = 0
         self._gradients = False
+        self._short = 0
 
     def forget(self) -> None:
-        """Drops the recordings, and their memory: all at once, for with one graph goes the cuBLAS workspace of the stream
-        that it was recorded on, which others would go on writing to."""
+        """Drops the recordings, and their memory: all at once, for with one graph goes the cuBLAS workspace of the
+        stream that it was recorded on, which others would go on writing to."""
         self._layout = ()
         if self._recorded:
             self._recorded.clear()
@@ -167,6 +170,9 @@ class Recorder:
                 replay, loss = self.recording.record(lambda: self.run.carry_out(kind, room, frame))
         except torch.OutOfMemoryError:  # there was less room than a step took: the next launched one is measured anew
             self._seen.clear()
+            self._short += 1
+            if self._short == _TRIES:
+                self.refused = "the graphics card has too little memory for it"
         except Exception as error:  # whatever a driver or torch comes up with: the step can be taken without
             self.refused = (str(error).strip().splitlines() or [type(error).__name__])[0]
         else:

@@ -305,8 +305,8 @@ class Trainer:
         return self.carry_out(kind, facts.on(self.device), frame)
 
     def _told(self, frame: int) -> tuple[StepKind, StepFacts]:
-        """What the next step is told of the trained frame at position `frame`. All that a step which can be recorded draws
-        is drawn here; others draw in `carry_out`, too."""
+        """What the next step is told of the trained frame at position `frame`. All that is drawn for a step that can be
+        recorded is drawn here; others draw in `carry_out`, too."""
         model, s, field, c = self.model, self.config.supervision, self.model.field, self.config
         rows, index, time = model.open_rows(), self.train_ids[frame], self.times[frame]
         draws = None

@@ -99,6 +99,8 @@ def test_a_recording_that_found_too_little_room_is_tried_again(trained):
     recorded = trained(recording)
     assert recorded.recorder.refused == "" and recorded.recorder.replayed > 0 and equal(plain, recorded)
     assert recording.short < 0 and recording.dropped >= 2
+    never = trained(Again(short=100), steps=12, method="static")
+    assert "too little memory" in never.recorder.refused and never.recorder.recording.short == 96
 
 
 def test_recordings_go_when_steps_come_that_cannot_be_recorded(trained):
