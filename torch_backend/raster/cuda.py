@@ -172,6 +172,12 @@ def outgrown(device: torch.device, cameras: int, width: int, height: int) -> int
     return wanted if demand is not None and wanted > _FULL * demand.capacity else 0
 
 
+def listed(device: torch.device, cameras: int, width: int, height: int) -> int:
+    """Hits that calls of this device and size have room for now."""
+    demand = _demands.get((device, cameras, width, height))
+    return 0 if demand is None else demand.capacity
+
+
 def report_demands(device: torch.device) -> None:
     """Has the host told what calls came to want: those that a CUDA graph carries out do not tell it themselves."""
     with _lock:

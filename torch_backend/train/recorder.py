@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from ..native import warp_stream
-from ..raster.cuda import outgrown, report_demands
+from ..raster.cuda import listed, outgrown, report_demands
 from .adam import FusedAdam, StepTable
 from .memory import free_bytes
 from .soundness import INSPECT_EVERY, Soundness
@@ -88,6 +88,8 @@ class _Recorded:
     """Where its optimiser does."""
     replay: Callable[[], None]
     loss: Tensor
+    listed: int
+    """Hits that its rasteriser has room for."""
 
 
 class Recorder:
@@ -144,7 +146,11 @@ class Recorder:
         if self._gradients:  # of a step before, which a look would take for this one's
             run.optimizer.zero_grad(set_to_none=True)
             self._gradients = False
-        recorded = self._recorded.get(kind) or self._record(kind, facts, frame)
+        recorded = self._recorded.get(kind)
+        if recorded is not None and recorded.listed < self._listed():  # a call that is no step wanted more
+            self.forget()
+            self._layout, recorded = layout, None
+        recorded = recorded or self._record(kind, facts, frame)
         if recorded is None:
             return self._launched(kind, facts, frame)
         facts.into(recorded.facts)
@@ -154,6 +160,9 @@ class Recorder:
         if self.replayed % INSPECT_EVERY == 0:
             report_demands(self.device)
         return recorded.loss
+
+    def _listed(self) -> int:
+        return listed(self.device, 1, self.run.width, self.run.height)
 
     def _launched(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
         self._gradients = True
@@ -177,7 +186,7 @@ class Recorder:
             self.refused = (str(error).strip().splitlines() or [type(error).__name__])[0]
         else:
             self.run.optimizer.zero_grad(set_to_none=True)  # the recording's own, which others write over
-            made = self._recorded[kind] = _Recorded(room, table, replay, loss)
+            made = self._recorded[kind] = _Recorded(room, table, replay, loss, self._listed())
             return made
         # Out here the error is gone, and with its frames the graph that was begun and the tensors of its step.
         self.run.optimizer.zero_grad(set_to_none=True)

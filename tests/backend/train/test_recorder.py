@@ -103,6 +103,19 @@ def test_a_recording_that_found_too_little_room_is_tried_again(trained):
     assert "too little memory" in never.recorder.refused and never.recorder.recording.short == 96
 
 
+def test_a_longer_list_of_hits_is_recorded_anew(trained, monkeypatch):
+    rooms = [100] * 9 + [200] * 999  # a held-out frame, say, wants more
+    monkeypatch.setattr("torch_backend.train.recorder.listed", lambda *_: rooms.pop(0))
+    plain, recording = trained(None), Again()
+    recorded = trained(recording)
+    assert equal(plain, recorded) and len(rooms) < 999
+    assert {made.listed for made in recorded.recorder._recorded.values()} == {200}
+    usual = Again()
+    monkeypatch.setattr("torch_backend.train.recorder.listed", lambda *_: 100)
+    trained(usual)
+    assert recording.made > usual.made
+
+
 def test_recordings_go_when_steps_come_that_cannot_be_recorded(trained):
     recording = Again()
     recorded = trained(recording, steps=9)
