@@ -112,12 +112,12 @@ def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
 
 
 def _painted(bench: InstantBench, image: FrozenImage) -> NDArray[np.bool_]:
-    """bool [h, w]: what moves at t*, and the run has painted onto something still behind it, where it cannot be."""
+    """bool [h, w]: what moves at t* and looks right, but is on something still behind, where it cannot be."""
     import cv2
 
     matte = bench.matte()
     flat = np.zeros((bench.height, bench.width), bool) if matte is None else matte > 0.5
-    flat &= image.motion.numpy() < 0.5
+    flat &= (image.motion.numpy() < 0.5) & (bench.difference(image) < bench.config.grow)
     if not flat.any():
         return flat
     found = (flat & contradicted(bench, image)).astype(np.uint8)

@@ -76,6 +76,15 @@ def test_it_is_put_where_its_arm_is(on_the_wall):
         assert after < 0.4 * before, f"frame {n}: {before:.4f} {after:.4f}"
 
 
+def test_a_hand_that_is_merely_missing_is_judged_by_its_difference(tmp_path):
+    """Other plates contradict the wall in its place, too."""
+    static = together(wall(), arm())
+    made = world(tmp_path, static, lambda n: together(static, hand(n, drift=DRIFT)))
+    usual, layer = made.layer(), made.layer(mattes(made))
+    assert usual is not None and layer is not None
+    assert torch.equal(usual.mask, layer.mask)
+
+
 def test_without_mattes_nothing_is_said_to_be_painted(on_the_wall):
     assert on_the_wall.layer() is None
 
