@@ -11,11 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..scene import evenly_spaced
+from ..torch_types import from_numpy
 from .frozen import FrozenImage
 from .instant_bench import InstantBench, low_passed
 from .instant_depth import View
+from .reproject import project
 
 
 @dataclass(frozen=True)
@@ -45,34 +48,34 @@ def contradicted(
         image: the scene frozen at t*, `bench.render`.
     """
     config = config or ContradictedConfig()
-    depth = np.maximum(image.depth.numpy().astype(np.float64), 1e-6)
+    grid, depth = bench.view.grid(), image.depth.numpy().astype(np.float64)
+    places = from_numpy(bench.view.unproject(grid[..., 0], grid[..., 1], depth)).float()
     own = low_passed(bench.view.picture, config.blur * bench.unit)
     sees, differs = np.zeros((2, *depth.shape), np.int32)
     for index in evenly_spaced(len(bench.scene.frames), config.frames):
         found = None if index == bench.index else bench.frame(index)
         if found is not None:
-            off = _difference(bench, *found, depth, own, config)
+            off = _difference(bench, *found, places, own, config)
             sees, differs = sees + np.isfinite(off), differs + (np.nan_to_num(off) > config.differs)
     return np.asarray((sees >= config.least) & (2 * differs > sees), np.bool_)
 
 
 def _difference(
-    bench: InstantBench, other: View, moving: NDArray[np.bool_], depth: NDArray[np.float64],
-    own: NDArray[np.float32], config: ContradictedConfig,
+    bench: InstantBench, other: View, moving: NDArray[np.bool_], places: Tensor, own: NDArray[np.float32],
+    config: ContradictedConfig,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Difference [h, w] between `own` colours [h, w, 3] and those of another plate, in which `moving` [h, w] moves, at
-    the places that t*'s camera sees at `depth` [h, w]; NaN where that plate does not see them, or something moves."""
+    `places` [h, w, 3], which t*'s camera sees; NaN where that plate does not see them, or something moves."""
     import cv2
 
-    grid, at = bench.view.grid(), (bench.view.project(other, 1.0 / depth) - 0.5).astype(np.float32)
+    pixels, depth = project(places, bench.scene.viewmats[other.index], bench.Ks[other.index])
+    at, away = pixels.numpy() - np.float32(0.5), depth.numpy()
 
     def there(values: NDArray[np.float32], how: int) -> NDArray[np.float32]:
         return np.asarray(cv2.remap(values, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_CONSTANT), np.float32)
 
     then = bench.at_its_time(other.index)
     still = ((then.motion.numpy() < 0.5) & ~moving).astype(np.float32)
-    places = bench.view.unproject(grid[..., 0], grid[..., 1], depth)
-    away = places @ other.viewmat[2, :3] + other.viewmat[2, 3]
     shown = there(then.depth.numpy().astype(np.float32), cv2.INTER_NEAREST)
     seen = (away > 0.0) & (np.abs(shown - away) < config.surface * away) & (there(still, cv2.INTER_NEAREST) > 0.5)
     picture = bench.as_exposed(low_passed(other.picture, config.blur * bench.unit), other.index)

@@ -85,7 +85,7 @@ def instant_layer(
     painted = _painted(bench, image)
     state, mask, regions = _shell(bench, frozen, image, _regions(bench, image, painted), painted, things, known)
     layer = InstantLayer(state, scene.frames[index], from_numpy(mask), from_numpy(ghost), kept, regions)
-    # Of what was painted the difference says nothing: it looked right. Its neighbours are half of it each.
+    # Of what was painted the difference says nothing, it looked right; nor of pixels beside it, which are mixtures.
     told = (mask > 0) & (cv2.dilate(painted.astype(np.uint8), disc(2.0 * bench.unit)) == 0)
     if told.any() and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, told):
         empty = {name: value[:0] for name, value in state.items()}
